@@ -44,7 +44,7 @@ bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.md)
 	@$(BIN)/python -m bench.soak --minutes 60
 
-campaigns: setup-test ## the tests that are too long for `make test`: whole grids, a hidden patient on the wire
+campaigns: setup-test ## the tests that are too long for `make test`: whole grids
 	@$(BIN)/python -m pytest --campaigns -m campaign tests
 
 postgresql: setup-test ## every test of the service on PostgreSQL instead of SQLite

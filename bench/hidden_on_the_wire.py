@@ -4,11 +4,11 @@
     python -m bench.hidden_on_the_wire --moving --seeds 2520:2540
 
 `--moving`: patients whose joint moves, with an angle sensor; one test, sealed, read and diagnosed, and beside it the
-same patient's record as a CSV file (`tests/harness/moving_on_the_wire.py`). `--hiding`: only the seeds among them that
+same patient's record as a CSV file (`bench/hidden_moving_played.py`). `--hiding`: only the seeds among them that
 hide this effect, asked before they are played.
 
 Every seed counts. `--speed` lets emulator and rig run faster than real time (a busy machine makes the result noisy).
-`tests/harness/hidden_on_the_wire.py` plays one seed.
+`bench/hidden_played.py` plays one seed.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import Any
 
 from api.cli.errors import CommandError
 from api.client.errors import ServiceError
-from tests.harness.hidden_on_the_wire import reveal, run
-from tests.harness.moving_on_the_wire import DESIGN
-from tests.harness.moving_on_the_wire import run as run_moving
+from bench.hidden_moving_played import DESIGN
+from bench.hidden_moving_played import run as run_moving
+from bench.hidden_played import reveal, run
 
 
 def main() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import json
 from pathlib import Path
 from typing import Any
@@ -69,30 +68,6 @@ def test_effect_makes_a_new_version_with_lineage(client: httpx.Client, participa
     refused = client.post(f"/v1/models/{parent}/effects", json={"effects": ["phlogiston"]})
     assert refused.status_code == 422 and "Take one of" in refused.json()["detail"]
     assert client.get(f"/v1/models/{parent}").json()["effects"] == []
-
-
-def test_second_test_is_refused_naming_the_holder(client: httpx.Client, service: Service, participant: str) -> None:
-    service.rig.speed = 0.5
-    client.post("/v1/participants", json={"code": "P018"})
-    running = client.post("/v1/tests", json={"participant": participant}).json()
-    second = client.post("/v1/tests", json={"participant": "P018"})
-    assert second.status_code == 409
-    assert second.headers["content-type"] == "application/problem+json"
-    assert second.json()["holder"] == {"test_id": running["id"], "participant": participant, "by": "administrator"}
-    assert participant in second.json()["detail"]
-
-
-def test_fifty_starts_at_once_give_one_test(client: httpx.Client, service: Service, participant: str) -> None:
-    service.rig.speed = 0.5  # on a busy machine fifty starts take seconds: the first test must outlast them
-
-    def start(_: int) -> int:
-        with service.client() as mine:
-            return mine.post("/v1/tests", json={"participant": participant}).status_code
-
-    with concurrent.futures.ThreadPoolExecutor(16) as pool:
-        codes = list(pool.map(start, range(50)))
-    assert sorted(codes) == [202] + [409] * 49
-    assert service.rig.starts == 1
 
 
 def test_live_channel_tells_history_frames_and_the_end(

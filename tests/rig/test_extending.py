@@ -15,7 +15,7 @@ from rig import journal as jn
 from rig.clock import utc_text
 from rig.control.building import previewed
 from rig.control.calibration import end_of_day_s
-from rig.errors import PlanError, RefusedError, TooLateError
+from rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from rig.messages import (
     AdaptivePlan,
     EnoughRequest,
@@ -119,7 +119,9 @@ def test_only_who_started_it_extends_it(make: Make):
         with pytest.raises(PlanError, match="at least 16 characters"):
             live.start(plan(live), short)
     live.start(plan(live, hold_s=20.0), KEY)
-    for wrong in ("", KEY[:-1], KEY + "0", "0123456789abcdeF", "\ud800" * 16):
+    with pytest.raises(BusyError):
+        live.start(plan(live, "two"), KEY[::-1])  # its key opens nothing
+    for wrong in ("", KEY[::-1], KEY[:-1], KEY + "0", "0123456789abcdeF", "\ud800" * 16):
         with pytest.raises(PlanError, match="not the key"):
             extend(live, 20, key=wrong)
     with pytest.raises(TooLateError, match="test 'two' is not running"):

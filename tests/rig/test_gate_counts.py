@@ -50,6 +50,15 @@ def test_a_reset_forgets_the_test_before(tmp_path: Path):
     assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED, "the interval of the test before counts no more"
 
 
+def test_each_test_has_limits_of_its_own(tmp_path: Path):
+    setup = Setup(tmp_path)
+    assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED
+    narrow = limits.tightened(limits.HARD_LIMITS, "pulse_width_us", 99.0, "rig file")
+    setup.machine.run(setup.gate.open(setup.journal, narrow, lambda: False))
+    setup.wait(0.025)
+    assert (setup.fire(100), setup.fire(99)) == (PulseStatus.REFUSED, PulseStatus.UNACKNOWLEDGED)
+
+
 def test_lateness_charge_and_delay_are_those_of_the_pulses_sent(tmp_path: Path):
     setup = Setup(tmp_path)
     setup.stimulator.ack_delay_s = 0.004

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 
 from rig import limits
@@ -208,6 +209,24 @@ def test_a_damaged_journal_is_sealed_and_kept(make: Make, tmp_path: Path):
     assert any("the journal is damaged" in words for words in again.rig.finished.summary["warnings"])
     assert (tmp_path / "journals" / "dead.damaged").read_bytes() == left
     assert not (tmp_path / "journals" / "dead.journal").exists()
+
+
+def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make):
+    live = make()
+    live.start(live.plan("one"))
+    live.wait_pulses(10)
+    for hours in (1, -2):
+        live.clock.set_unix_ahead(3600 * hours)
+        live.wait_pulses(10)
+    live.wait("ready")
+    assert live.rig.finished is not None
+    assert live.rig.finished.outcome == "completed"
+    with h5py.File(str(live.rig.finished.recording_path)) as file:
+        times = file["pulses/written_time_s"][:]
+        assert 0.4 < times[times == times].min() < times[times == times].max() < 3.0
+        assert np.all(np.diff(times[times == times]) > 0)
+        assert np.diff(file["torque/time_s"][:]) == pytest.approx(1 / 1600, rel=0.02)
+        assert file["torque/time_s"][-1] == pytest.approx(3.0, abs=0.5)  # the jumps are of hours
 
 
 def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPatch):

@@ -56,12 +56,12 @@ LANES = {
         ("--postgresql",),
     ),
     "dear": Lane(f"not wire and not ({FAST})", PROCESSORS + 2),
-    # two emulated rigs leave half of two processors idle
-    "wire": Lane("wire and not realtime", 2),
+    # emulated rigs wait most of their time, in a time that waits for whoever is given no processor
+    "wire": Lane("wire and not realtime", PROCESSORS + 2),
 }
 
 CAMPAIGNS = {
-    "make campaigns": "whole grids, of which one of each kind is run here; a hidden patient on the wire",
+    "make campaigns": "whole grids, of which one of each kind is run here",
     "make postgresql": "every test of the service on PostgreSQL, of which nine files are run here",
     "make pauses": "every test while its processes are stopped and continued at random",
     "make late": "the page's tests with answers that come late and in pieces",

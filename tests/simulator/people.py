@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tests.simulator.life import Life
 
 LOOK_S = 0.25
+"""On average."""
 KEY = "a key that only its maker knows"
 SEGMENTS = [
     SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.25}),
@@ -45,7 +46,7 @@ class People:
         life.world.after(LOOK_S, self._look)
 
     def _look(self) -> None:
-        self.life.world.after(LOOK_S, self._look)
+        self.life.world.after(self.chance.uniform(0.02, 2 * LOOK_S), self._look)
         process, state, quiet = self.clinic.process, self.clinic.state, self.life.quiet
         if process is None or not process.alive:
             return
@@ -61,8 +62,8 @@ class People:
             self._repeat(self.clinic.stop)
         elif state == "running" and self.life.adaptive and self.chance.random() < 0.4:
             self._extend()
-        elif self.chance.random() < 0.05:
-            self.clinic.stop()
+        elif self.chance.random() < 0.25:  # arming, stopping, sealing: in the middle of something
+            self.chance.choice((self.clinic.stop, self.clinic.stop, self._start_test, self._rearm))()
 
     def _repeat(self, action: Callable[[], object]) -> None:
         """Most people press once."""

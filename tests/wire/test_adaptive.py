@@ -19,7 +19,7 @@ from api.web.app import create_app
 from tests.api.conftest import TOKEN, Server, wait_done
 from tests.harness.processes import Bench
 
-pytestmark = [pytest.mark.wire, pytest.mark.realtime, pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.wire, pytest.mark.timeout(600)]
 PATIENCE_S = 300.0
 
 

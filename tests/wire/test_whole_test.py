@@ -14,7 +14,7 @@ import pytest
 
 from rig import align, archive
 from rig.signals import PulseStatus
-from tests.harness.processes import Bench, control, default_plan, short_plan
+from tests.harness.processes import Bench, control, short_plan
 
 pytestmark = pytest.mark.wire
 
@@ -66,26 +66,6 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
         for name in ("torque/torque_nm", "pulses/pulse_width_us", "segments/start_s"):
             assert file[name].attrs["unit"]
             assert file[name].attrs["description"]
-
-
-@pytest.mark.realtime
-@pytest.mark.slow
-def test_the_default_test(make_bench: Callable[..., Bench]):
-    """Twice as fast; at the world's speed the soak plays it."""
-    bench = make_bench("--noise-seed", "3")
-    event = play(bench, default_plan("real"))
-    assert event["outcome"] == "completed", event["reason"]
-    check_recording(bench, event)
-    summary = event["summary"]
-    assert summary["duration_s"] == pytest.approx(38.7)
-    assert summary["lost_samples"] == 0
-    assert summary["alignment"]["method"] == "sync"
-    assert summary["alignment"]["error_ms"] < 1.0
-    assert summary["torque_peak_nm"] > 3.0
-    with h5py.File(event["recording_path"]) as file:
-        names = [n.decode() for n in file["segments/name"][:]]
-        assert names == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
-        assert file["segments/end_s"][-1] == pytest.approx(38.7)
 
 
 def test_a_test_over_slcan(make_bench: Callable[..., Bench]):

@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from bench.hidden_played import agrees, reveal
 from hardware_sim.hidden_records import of_patient, write_csv
 from identify.diagnosis import diagnose
 from identify.records.read import read
 from identify.records.record import Record
-from tests.harness.hidden_on_the_wire import agrees, reveal
 from tests.harness.processes import Bench, default_plan
 
 DESIGN = ("--arm", "design")
