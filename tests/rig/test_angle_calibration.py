@@ -121,16 +121,10 @@ def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed:
 @pytest.mark.parametrize(
     "content",
     [
-        "[" * 100_000,
-        '{"sensor": 1',
-        '{"sensor":' * 100_000,
-        "[]",
-        '"x"',
-        "",
-        "\udcff",
+        "[" * 100_000, '{"sensor": 1', '{"sensor":' * 100_000, "[]", '"x"', "", "\udcff",
         '{"sensor":' + 5_000 * "9" + "}",
     ],
-)
+)  # fmt: skip
 def test_a_rig_comes_up_whatever_stands_in_the_file(tmp_path: Path, content: str):
     (tmp_path / "angle-calibration.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     assert kept(tmp_path) is None
