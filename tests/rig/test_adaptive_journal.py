@@ -53,7 +53,7 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
     rig.execute()
     whole = rig.path.read_bytes()
     copy, acknowledged = tmp_path / "copy.journal", []
-    for end in np.linspace(0, len(whole), 40).astype(int):
+    for end in np.linspace(0, len(whole), 25).astype(int):
         copy.write_bytes(whole[:end])
         try:
             contents = journal.read(copy)

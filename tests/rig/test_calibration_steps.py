@@ -213,7 +213,7 @@ actions = st.lists(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.floats(0.5, 100), st.floats(1, 25), st.lists(plausible, min_size=3, max_size=3), st.floats(0.5, 130),
     st.booleans(), st.one_of(st.none(), st.floats(1, 500)), st.sampled_from([1.0, 20.0]), actions,
