@@ -10,17 +10,9 @@ import pytest
 
 from rig.errors import RigError
 from rig.messages import AdaptivePlan, SegmentPlan
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import VirtualRig, hold, rest
 
 RATE_HZ = 40.0
-
-
-def rest(duration_s: float) -> SegmentPlan:
-    return SegmentPlan(name="rest", sequence="rest", settings={"duration_s": duration_s})
-
-
-def hold(name: str = "hold", on_s: float = 1.0, **settings: float) -> SegmentPlan:
-    return SegmentPlan(name=name, sequence="steps", settings={"on_s": on_s, "off_s": 0.0, "repeats": 1, **settings})
 
 
 FIXED = [rest(0.5), hold("first"), SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.5, "down_s": 0.5})]

@@ -11,7 +11,7 @@ import numpy as np
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.errors import DeviceError
 from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
-from tests.simulator.virtual_time import VirtualClock
+from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 RATE_HZ = 200.0
 PER_BLOCK = 2
@@ -85,3 +85,38 @@ class FakeSensor:
     def _arrive(self, receiver: AngleReceiver, block: AngleBlock) -> None:
         block.samples["host_time_s"] = self.clock.now_s()
         receiver.take(block)
+
+
+class OpenedSensor(FakeSensor):
+    """Its samples come while it is open; its adapter may be missing or slow."""
+
+    def __init__(self, machine: VirtualMachine, angle_rad: Callable[[float], float] = still) -> None:
+        super().__init__(machine.clock, angle_rad)
+        self.tasks = machine.tasks
+        self.gone, self.opens_s, self.closes_s, self.per_block = False, 0.0, 0.0, PER_BLOCK
+        self.done: list[str] = []
+        self._opened = 0
+
+    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+        await self.tasks.sleep(self.opens_s)
+        if self.gone:
+            raise DeviceError("angle sensor: no adapter")
+        self.done.append("opened")
+        self.on_lost, self._opened = on_lost, len(self.done)
+        self._beat(on_block, self._opened)
+        return {"device": "here"}
+
+    async def close(self) -> None:
+        self._opened = 0
+        await self.tasks.sleep(self.closes_s)
+        self.done.append("closed")
+
+    def _beat(self, on_block: Callable[[AngleBlock], None], opened: int) -> None:
+        if self._opened != opened:
+            return
+        if self.gone:
+            self.on_lost("angle sensor on x: the bus was lost: gone")
+            return
+        if not self.silent:
+            on_block(self.block(self.per_block))
+        self.clock.call_at(self.clock.now_s() + self.per_block / RATE_HZ, lambda: self._beat(on_block, opened))

@@ -30,6 +30,14 @@ RATE_HZ = 1600.0
 OF_ANGLE = {"angle": {"sample_rate_hz": 200.0, "of_the_cell": False, "one_bus": True, "calibration": {"by": "nurse"}}}
 
 
+def rest(duration_s: float) -> SegmentPlan:
+    return SegmentPlan(name="rest", sequence="rest", settings={"duration_s": duration_s})
+
+
+def hold(name: str = "hold", on_s: float = 1.0, **settings: float) -> SegmentPlan:
+    return SegmentPlan(name=name, sequence="steps", settings={"on_s": on_s, "off_s": 0.0, "repeats": 1, **settings})
+
+
 class FakeStimulator:
     """Acknowledges each pulse `ack_delay_s` later; its faults are plain attributes."""
 
@@ -199,9 +207,9 @@ class VirtualRig:
         self.gate = Gate(self.stimulator, self.clock, fault, fault)
         self.receiver = Receiver(self.cell, self.machine.tasks, fault)
         segments = segments or [
-            SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
+            rest(0.5),
             SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 1.0}),
-            SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
+            rest(0.5),
         ]
         self.plan = TestPlan(
             test_id="t", participant="P", kind=kind, profile=Profile(**profile), segments=segments, adaptive=adaptive,

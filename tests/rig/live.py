@@ -15,15 +15,14 @@ from rig import config
 from rig.control import pair
 from rig.control.rig import Rig
 from rig.errors import DeviceError
-from rig.limits import Admitted, Steps
 from rig.machine import Disk
-from rig.messages import Event, Profile, SegmentPlan, Status, StopEvidence, TestPlan
-from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
+from rig.messages import Event, Profile, Status, StopEvidence, TestPlan
+from rig.signals import SAMPLE, TorqueBlock
 from rig.tasks import Outcome, Task, Tasks
+from tests.rig.fakes import RATE_HZ, FakeStimulator, hold, rest
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 T = TypeVar("T")
-RATE_HZ = 1600.0
 SPEED = 4.0
 BLOCK_S, ACK_S = 0.02, 0.002
 """Rig seconds from one block of the cell to the next, and until a pulse is acknowledged."""
@@ -47,17 +46,13 @@ class LiveMachine(VirtualMachine):
         self.clock.call_at(done_s, lambda: self._work(action, outcome))
 
 
-class LiveStimulator:
-    """Answers and acknowledges a moment later."""
-
-    steps = Steps()
-    silence_s = 0.0
+class LiveStimulator(FakeStimulator):
+    """Answers a moment later, or not at all."""
 
     def __init__(self, machine: LiveMachine) -> None:
-        self.machine, self.clock = machine, machine.clock
-        self.missing = self.deaf = self.stalled = self.armed = False
-        self.error: str | None = None
-        self.sent: list[tuple[float, Admitted]] = []
+        super().__init__(machine.clock)
+        self.machine, self.ack_delay_s = machine, ACK_S
+        self.missing = self.deaf = self.stalled = False
 
     async def open(self) -> dict[str, Any]:
         await self._wait()
@@ -65,45 +60,26 @@ class LiveStimulator:
             raise DeviceError("stimulator: the port is not there")
         return {"device": "live"}
 
-    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
-        self.on_ack, self.on_lost = on_ack, on_lost
-
     async def arm(self) -> None:
         self.armed = True
         await self._wait()
 
-    def feed(self) -> None: ...
-
-    def send(self, pulse: Admitted, latest_s: float) -> int:
-        if not (self.clock.now_s() <= latest_s):
-            raise LateError
-        assert self.armed
-        self.sent.append((self.clock.now_s(), pulse))
-        number = len(self.sent) % 64
-        self.clock.call_at(self.clock.now_s() + ACK_S, lambda: self._acknowledge(number))
-        return number
-
-    def _acknowledge(self, number: int) -> None:
-        now_s = self.clock.now_s()
+    def _acknowledge(self, number: int, error: str | None) -> None:
         if self.stalled:
-            self.clock.call_at(now_s + ACK_S, lambda: self._acknowledge(number))
+            self.clock.call_at(self.clock.now_s() + ACK_S, lambda: self._acknowledge(number, error))
         else:
-            self.on_ack(Ack(number, now_s, self.error))
+            super()._acknowledge(number, error)
 
     async def stop(self) -> None:
         self.armed = self.armed and self.stalled
         await self._wait()
-        if self.stalled:
-            raise DeviceError("stimulator: no answer")
+        self.silent = self.stalled
+        self._answer()
 
     async def state(self) -> tuple[bool, str]:
         await self._wait()
-        if self.deaf or self.stalled:
-            raise DeviceError("stimulator: no answer")
-        return not self.armed, "armed" if self.armed else "not initialised"
-
-    def close(self) -> None:
-        self.armed = False
+        self.silent = self.deaf or self.stalled
+        return await super().state()
 
     async def _wait(self) -> None:
         self.machine.asked += 1
@@ -126,7 +102,6 @@ class LiveCell:
     def __init__(self, clock: VirtualClock, stimulator: LiveStimulator) -> None:
         self.clock, self.stimulator = clock, stimulator
         self.silent = self.gone = self.broken = self.stuck = False
-        self.rate = 1.0
         self._rng = np.random.default_rng(1)
         self._began_s = clock.now_s()
         self._count = 0
@@ -154,7 +129,7 @@ class LiveCell:
 
     def _samples(self) -> np.ndarray:
         now_s = self.clock.now_s()
-        due = int((now_s - self._began_s) * RATE_HZ * self.rate)
+        due = int((now_s - self._began_s) * RATE_HZ)
         samples = np.zeros(0 if self.silent else due - self._count, SAMPLE)
         samples["host_time_s"], samples["stamp_s"], samples["sync"] = now_s, np.nan, 255
         recent = [pulse for time_s, pulse in self.stimulator.sent[-2:] if now_s - time_s < 0.1]
@@ -185,7 +160,6 @@ class LiveRig:
         self,
         folder: Path,
         monkeypatch: pytest.MonkeyPatch,
-        rate: float = 1.0,
         armed: bool = False,
         clock: VirtualClock | None = None,
         disk: Disk | None = None,
@@ -196,7 +170,7 @@ class LiveRig:
         self.machine = LiveMachine(self.clock, disk)
         self.stimulator = LiveStimulator(self.machine)
         self.cell = LiveCell(self.clock, self.stimulator)
-        self.cell.rate, self.stimulator.armed = rate, armed
+        self.stimulator.armed = armed
         made = self.devices()
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _machine: made[kind]))
         monkeypatch.setattr(pair, "devices", found)
@@ -233,10 +207,7 @@ class LiveRig:
         self.ask(self.rig.close())
 
     def plan(self, test_id: str, hold_s: float = 2.0, **fields: Any) -> TestPlan:
-        segments = [
-            SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.5}),
-            SegmentPlan(name="hold", sequence="steps", settings={"on_s": hold_s, "off_s": 0.5, "repeats": 1}),
-        ]
+        segments = [rest(0.5), hold(on_s=hold_s, off_s=0.5)]
         return TestPlan(
             **{"test_id": test_id, "participant": "P", "profile": Profile(), "segments": segments, **fields}
         )

@@ -99,27 +99,6 @@ def test_the_bound_of_the_whole_test_holds_with_its_safe_end(tmp_path: Path):
     assert rig.run.score.left(0.0).duration_left_s == pytest.approx(1.0)
 
 
-def test_however_often_it_is_extended_it_ends_within_its_bound(tmp_path: Path):
-    rig = adaptive(tmp_path, max_duration_s=8.0)
-    score = rig.run.score
-
-    def add() -> None:
-        if not score.ended_by:
-            try:
-                extend(rig, len(score.laid), [hold("more", on_s=0.5, off_s=0.2)])
-            except (RefusedError, BusyError):
-                return
-
-    for tenth in range(100):
-        rig.at(tenth / 10, add)
-    result = rig.execute()
-    assert (result.outcome, result.ended_by) == ("completed", "limit")
-    assert 6.0 < result.duration_s <= 8.0
-    recording = rig.recording()
-    assert len(recording.columns["pulses/pulse_width_us"]) <= 8.0 * RATE_HZ
-    assert np.all(recording.columns["pulses/pulse_width_us"][-40:] == 0)
-
-
 def test_a_fixed_plan_that_does_not_fit_its_own_bound_is_refused_before_the_first_pulse(tmp_path: Path):
     with pytest.raises(RefusedError, match=r"with its safe end: duration_s 3\.475 s is outside 0 … 3\.4"):
         adaptive(tmp_path, max_duration_s=3.4)
@@ -190,7 +169,7 @@ def mad_segment(rng: np.random.Generator) -> SegmentPlan:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path: Path, seed: int):
     """Right and wrong extensions at random times, some ends among them; judged by arithmetic of its own."""
     rng = np.random.default_rng(1300 + seed)

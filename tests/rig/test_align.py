@@ -34,7 +34,7 @@ def made(seed: int, ppm: float, jitter_ms: float, duration_s: float = 38.7, sync
 @pytest.mark.parametrize("jitter_ms", [0.2, 2.0])
 @pytest.mark.parametrize("sync", [True, False])
 def test_error_is_below_a_millisecond(ppm: float, jitter_ms: float, sync: bool):
-    for seed in range(3):
+    for seed in range(2):
         counter, host_s, flag, written_s, true_s = made(seed, ppm, jitter_ms, sync=sync)
         cell_s = cell_time(counter, np.full(len(counter), np.nan), RATE_HZ)
         time_s, found = align(cell_s, host_s, flag, written_s, RATE_HZ)
@@ -82,28 +82,6 @@ def test_a_cell_without_counter_is_counted_or_stamped():
     assert list(cell_time(none, np.array([7.0, 7.5, 8.0, 9.0]), 1000.0)) == [0.0, 0.5, 1.0, 2.0]
 
 
-@pytest.mark.parametrize("ppm", [0.0, 200.0, -200.0])
-@pytest.mark.parametrize("jitter_us", [0.0, 150.0])
-@pytest.mark.parametrize("wired", [True, False])
-def test_within_a_millisecond_whatever_the_clocks_do(ppm: float, jitter_us: float, wired: bool):
-    """Truth is made here: when each sample was really taken, on the host's clock."""
-    rng = np.random.default_rng(int(abs(ppm) + jitter_us) + 7)
-    n, rate = 40 * 1600, 1600.0
-    true_s = 3.7 + np.arange(n) / rate * (1 + ppm * 1e-6) + rng.normal(0, jitter_us * 1e-6, n)
-    batch = np.ceil(true_s / 0.0025) * 0.0025  # handed over in batches, some of them late
-    host_s = np.maximum.accumulate(batch + 0.0003 + rng.exponential(0.0004, n) + (rng.random(n) < 0.001) * 0.02)
-    pulses_s = 4.0 + np.arange(1500) * 0.025 + rng.exponential(0.0001, 1500)
-    sync = np.zeros(n, np.uint8) if wired else np.full(n, 255, np.uint8)
-    if wired:
-        sync[np.searchsorted(true_s, pulses_s)] = 1
-    time_s, found = align(np.arange(n) / rate, host_s, sync, pulses_s, rate)
-    assert found.method == ("sync" if wired else "regression")
-    assert np.max(np.abs(time_s - true_s)) < 1e-3 + 5 * jitter_us * 1e-6  # a jittering sample is off by its jitter
-    assert np.abs(np.mean(time_s - true_s)) < 1e-3
-    assert found.error_ms < 1.0
-    assert found.rate_ppm == pytest.approx(ppm, abs=10)
-
-
 def test_a_clock_that_is_no_line_is_not_called_exact():
     """The cell samples 5 % faster from half-way on: a line misses by far more than its standard error."""
     rate, n = 1600.0, 20 * 1600
@@ -141,11 +119,11 @@ def test_a_host_that_stands_still_for_most_of_a_short_test_does_not_bend_the_tim
     assert not alignment.error_ms > 10  # where it is unknown, that is said
 
 
-@pytest.mark.parametrize("apart_s", [0.0, 1e-4])
-def test_samples_that_all_came_in_a_moment_say_nothing_of_the_rate(apart_s: float):
-    cell_s = np.arange(3200) / 1600.0
-    host_s = 2.0 + apart_s * np.repeat(np.arange(4), 800)
-    time_s, alignment = align(cell_s, host_s, np.full(3200, 255, np.uint8), np.zeros(0), 1600.0)
+@pytest.mark.parametrize(("count", "apart_s"), [(3200, 0.0), (3200, 1e-4), (800, 0.0)])
+def test_samples_that_all_came_in_a_moment_say_nothing_of_the_rate(count: int, apart_s: float):
+    cell_s = np.arange(count) / 1600.0
+    host_s = 2.0 + apart_s * (np.arange(count) // 800)
+    time_s, alignment = align(cell_s, host_s, np.full(count, 255, np.uint8), np.zeros(0), 1600.0)
     assert np.isnan(alignment.error_ms)
     assert alignment.rate_ppm == 0.0
     assert np.diff(time_s) == pytest.approx(1 / 1600.0)
@@ -162,10 +140,3 @@ def test_lost_samples_of_a_cell_without_a_counter_are_not_called_exact(duration_
     time_s, alignment = align(cell_s, host_s, np.full(cell_s.size, 255, np.uint8), np.zeros(0), 1600.0)
     assert np.max(np.abs(time_s - true_s[came])) > 0.01
     assert alignment.error_ms > 5.0
-
-
-def test_what_came_in_one_read_is_not_called_exact_however_short():
-    cell_s = np.arange(800) / 1600.0
-    time_s, alignment = align(cell_s, np.full(800, 0.5), np.full(800, 255, np.uint8), np.zeros(0), 1600.0)
-    assert np.isnan(alignment.error_ms)
-    assert time_s[-1] == pytest.approx(0.5, abs=1e-3)

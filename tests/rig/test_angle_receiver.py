@@ -4,51 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 
 from rig.acquire.angle_receiver import REOPEN_S, AngleReceiver
 from rig.acquire.stream import LOOK_S, SILENCE_S, CounterUnwrapper
-from rig.errors import DeviceError
-from rig.signals import AngleBlock, AngleScale
-from tests.rig.angle import RATE_HZ, FakeSensor
+from rig.signals import AngleScale
+from tests.rig.angle import OpenedSensor
 from tests.simulator.virtual_time import VirtualMachine
 
 
 def swinging(time_s: float) -> float:
     return 1.0 + 0.5 * math.sin(time_s)
-
-
-class Sensor(FakeSensor):
-    """One whose adapter may be missing or slow, and whose samples come while it is open."""
-
-    def __init__(self, machine: VirtualMachine) -> None:
-        super().__init__(machine.clock, swinging)
-        self.machine, self.noise_deg = machine, 0.0
-        self.gone, self.opens_s, self.closes_s = False, 0.0, 0.0
-        self.done: list[str] = []
-
-    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
-        await self.machine.tasks.sleep(self.opens_s)
-        if self.gone:
-            raise DeviceError("angle sensor: no adapter")
-        self.done.append("opened")
-        self.on_lost, self.opened = on_lost, len(self.done)
-        self._beat(on_block, self.opened)
-        return {"device": "here"}
-
-    async def close(self) -> None:
-        self.opened = 0
-        await self.machine.tasks.sleep(self.closes_s)
-        self.done.append("closed")
-
-    def _beat(self, on_block: Callable[[AngleBlock], None], opened: int) -> None:
-        if self.opened == opened:
-            if not self.silent:
-                on_block(self.block(1))
-            self.clock.call_at(self.clock.now_s() + 1 / RATE_HZ, lambda: self._beat(on_block, opened))
 
 
 class Heard:
@@ -57,7 +25,8 @@ class Heard:
     def __init__(self) -> None:
         self.machine = VirtualMachine()
         self.clock, self.wait = self.machine.clock, self.machine.wait
-        self.sensor = Sensor(self.machine)
+        self.sensor = OpenedSensor(self.machine, swinging)
+        self.sensor.noise_deg, self.sensor.per_block = 0.0, 1
         self.receiver = AngleReceiver(self.sensor, self.machine.tasks)
 
     def feed(self, duration_s: float) -> AngleReceiver:
@@ -204,12 +173,3 @@ def test_an_adapter_is_opened_again_only_once_it_is_closed(heard: Heard):
     heard.sensor.on_lost("angle sensor: unplugged")
     heard.wait(4.0)
     assert heard.sensor.done == ["opened", "closed", "opened"]
-
-
-def test_a_mistake_in_a_driver_is_told_too(heard: Heard, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(heard.sensor, "angle_rad", lambda _: 1.0)
-    heard.receiver.start()
-    heard.wait(0.1)
-    monkeypatch.setattr(AngleBlock, "__len__", lambda _: 1 // 0)
-    heard.wait(0.01)
-    assert "internal: ZeroDivisionError" in heard.receiver.problem

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -135,16 +136,21 @@ def test_a_long_gap_breaks_the_velocity_and_a_short_one_does_not():
     assert np.isfinite(angle_velocity.centred(np.array([1.0]), np.array([5]), SENSOR_HZ)).all()
 
 
-def played(folder: Path) -> VirtualRig:
-    rig = VirtualRig(folder, has_sensor=True)
-    rig.sensor.angle_rad = swinging
-    rig.execute()
-    return rig
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> VirtualRig:
+    """One that has played while the joint swung."""
+    made = VirtualRig(tmp_path_factory.mktemp("swung"), has_sensor=True)
+    made.sensor.angle_rad = swinging
+    assert made.execute().outcome == "completed"
+    return made
 
 
-def test_the_sealed_file_holds_the_angle(tmp_path: Path):
-    rig = played(tmp_path)
-    sealed = rig.seal()
+@pytest.fixture(scope="module")
+def sealed(rig: VirtualRig) -> archive.Sealed:
+    return rig.seal()
+
+
+def test_the_sealed_file_holds_the_angle(rig: VirtualRig, sealed: archive.Sealed):
     with h5py.File(sealed.path) as file:
         group = file["angle"]
         assert {f"angle/{name}" for name in group} == {path for path, _, _ in archive.ANGLE_COLUMNS}
@@ -161,12 +167,18 @@ def test_the_sealed_file_holds_the_angle(tmp_path: Path):
     assert archive.verify(sealed.path) == sealed.content_sha256
 
 
-@pytest.mark.parametrize("change", ["value", "left out", "added"])
-def test_a_changed_angle_is_found(tmp_path: Path, change: str):
-    rig = VirtualRig(tmp_path, has_sensor=change != "added")
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording without angles."""
+    rig = VirtualRig(tmp_path_factory.mktemp("plain"))
     rig.execute()
-    sealed = rig.seal()
-    with h5py.File(sealed.path, "a") as file:
+    return rig.seal().path
+
+
+@pytest.mark.parametrize("change", ["value", "left out", "added"])
+def test_a_changed_angle_is_found(tmp_path: Path, plain: Path, sealed: archive.Sealed, change: str):
+    copy = Path(shutil.copy(plain if change == "added" else sealed.path, tmp_path))
+    with h5py.File(copy, "a") as file:
         if change == "value":
             file["angle/angle_rad"][5] += 1e-6
         elif change == "left out":
@@ -175,7 +187,7 @@ def test_a_changed_angle_is_found(tmp_path: Path, change: str):
             for path, _, _ in archive.ANGLE_COLUMNS:
                 file[path] = np.zeros(3)
     with pytest.raises(RecordingError, match="does not match"):
-        archive.verify(sealed.path)
+        archive.verify(copy)
 
 
 @pytest.mark.parametrize(
@@ -186,11 +198,9 @@ def test_a_changed_angle_is_found(tmp_path: Path, change: str):
         ("text", "not a readable recording.*holds no numbers"),
     ],
 )
-def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, change: str, words: str):
-    rig = VirtualRig(tmp_path)
-    rig.execute()
-    sealed = rig.seal()
-    with h5py.File(sealed.path, "a") as file:
+def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, plain: Path, change: str, words: str):
+    path = shutil.copy(plain, tmp_path)
+    with h5py.File(path, "a") as file:
         del file["torque/torque_nm"]
         if change == "a group":
             file.create_group("torque/torque_nm")
@@ -199,24 +209,13 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, change: str, word
         else:
             file["torque/torque_nm"] = "none"
     with pytest.raises(RecordingError, match=words) as told:
-        archive.verify(sealed.path)
+        archive.verify(Path(path))
     assert "\n" not in str(told.value)
 
 
-def test_without_a_sensor_the_file_is_what_it_was(tmp_path: Path):
-    rig = VirtualRig(tmp_path)
-    rig.execute()
-    sealed = rig.seal()
-    recording = sealed.recording
-    assert recording.angle == {} and not any(path.startswith("angle/") for path in recording.columns)
-    with h5py.File(sealed.path) as file:
-        assert "angle" not in file
-    assert archive.verify(sealed.path) == sealed.content_sha256
-
-
-def damaged(path: Path, spoil: Any) -> journal.JournalContents:
-    """The journal with some blocks' payloads overwritten."""
-    data = bytearray(path.read_bytes())
+def damaged(rig: VirtualRig, folder: Path, spoil: Any) -> journal.JournalContents:
+    """A copy of its journal with some blocks' payloads overwritten."""
+    path, data = folder / "t.journal", bytearray(rig.path.read_bytes())
     at = data.find(journal.MARK)
     while at >= 0:
         kind, length = data[at + 4], struct.unpack_from("<I", data, at + 8)[0]
@@ -227,10 +226,9 @@ def damaged(path: Path, spoil: Any) -> journal.JournalContents:
     return journal.read(path)
 
 
-def test_angles_are_saved_where_both_headers_are_lost(tmp_path: Path):
-    rig = played(tmp_path)
+def test_angles_are_saved_where_both_headers_are_lost(tmp_path: Path, rig: VirtualRig):
     whole = rig.recording()
-    found = assembly.assemble(damaged(rig.path, lambda kind: kind in (Kind.HEADER, Kind.PLAN)))
+    found = assembly.assemble(damaged(rig, tmp_path, lambda kind: kind in (Kind.HEADER, Kind.PLAN)))
     assert "header are lost" in found.attributes["journal_note"]
     off_s = found.columns["angle/time_s"][0] - whole.columns["angle/time_s"][0]
     assert abs(off_s) < 0.02  # by times of arrival alone: the header said that both are on one bus
@@ -239,10 +237,9 @@ def test_angles_are_saved_where_both_headers_are_lost(tmp_path: Path):
     assert found.angle["sample_rate_hz"] == pytest.approx(200.0, rel=0.02)
 
 
-def test_lost_blocks_of_angles_are_gaps(tmp_path: Path):
-    rig = played(tmp_path)
+def test_lost_blocks_of_angles_are_gaps(tmp_path: Path, rig: VirtualRig):
     count = iter(range(10_000))
-    spoiled = damaged(rig.path, lambda kind: kind == Kind.ANGLE and 100 <= next(count) < 110)
+    spoiled = damaged(rig, tmp_path, lambda kind: kind == Kind.ANGLE and 100 <= next(count) < 110)
     found = assembly.assemble(spoiled)
     gaps = found.columns["angle/gaps"]
     assert gaps.shape == (1, 2) and gaps[0, 1] == 20
@@ -252,9 +249,7 @@ def test_lost_blocks_of_angles_are_gaps(tmp_path: Path):
 
 
 @pytest.mark.parametrize("back", [100, 20])
-def test_angles_that_overlap_are_taken_once(tmp_path: Path, back: int):
-    rig = VirtualRig(tmp_path, has_sensor=True)
-    assert rig.execute().outcome == "completed"
+def test_angles_that_overlap_are_taken_once(tmp_path: Path, rig: VirtualRig, back: int):
     contents = journal.read(rig.path)
     angles = [np.frombuffer(payload, ANGLE_SAMPLE) for kind, payload in contents.blocks if kind == Kind.ANGLE]
     whole = np.concatenate(angles)

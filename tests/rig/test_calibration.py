@@ -13,7 +13,7 @@ from rig.clock import utc_text
 from rig.control.calibration import Calibration, check_profile, end_of_day_s
 from rig.errors import PlanError, RefusedError
 from rig.limits import HARD_LIMITS, Steps
-from rig.messages import CalibrateStartRequest, FinishedEvent, Profile, SegmentPlan, TestPlan
+from rig.messages import CalibrateStartRequest, FinishedEvent, Profile
 
 NOON_S = datetime(2026, 3, 4, 12, tzinfo=UTC).timestamp()
 
@@ -139,22 +139,6 @@ def test_what_a_coarse_stimulator_would_not_send_is_no_train():
         calibration.next_width_us("down")
 
 
-def test_what_each_step_would_send_is_told_before():
-    """So that a button can say it: the width that the device sends, and none where the step would be refused."""
-    request = CalibrateStartRequest(
-        calibration_id="c1", participant="P01", by="therapist", step_us=10.5, max_pulse_width_us=45.0
-    )
-    calibration = Calibration(request, HARD_LIMITS, NOON_S, Steps(shortest_us=20.0))
-    assert calibration.status().next_us == {"up": 20.0, "fine": 20.0}
-    play(calibration, "up")
-    assert calibration.status().next_us == {"up": 30.0, "fine": 30.0, "repeat": 20.0}
-    play(calibration, "up", "up")
-    assert calibration.status().next_us == {"repeat": 40.0, "down": 29.0}
-    calibration.mark("comfort")
-    play(calibration, "down")
-    assert calibration.status().next_us == {"up": 39.0, "fine": 39.0, "repeat": 29.0}
-
-
 def test_midnight_ends_an_open_calibration_and_says_so():
     calibration = opened()
     for threshold in ("sensory", "motor", "comfort"):
@@ -220,22 +204,6 @@ def test_no_test_without_a_calibration_where_the_rig_asks_for_one():
     check_profile(Profile(), NOON_S, required=False)
     with pytest.raises(RefusedError, match="not calibrated"):
         check_profile(Profile(), NOON_S, required=True)
-
-
-def test_a_sequence_never_exceeds_the_comfort_maximum():
-    calibrated = profile()
-    table = limits.for_profile(HARD_LIMITS, calibrated)
-    request = calibrated_plan(calibrated)
-    assert plan.build(request, table).pulse_width_us.max() == 180.0
-    wide = request.model_copy(
-        update={"segments": [SegmentPlan(name="r", sequence="ramp", settings={"max_pulse_width_us": 181})]}
-    )
-    with pytest.raises(RefusedError, match="participant's profile, over by"):
-        plan.build(wide, table)
-
-
-def calibrated_plan(of: Profile) -> Any:
-    return TestPlan(test_id="t", participant="P01", profile=of)
 
 
 @pytest.mark.parametrize("hours", [0, 1, 11.99, 12, 23.9])

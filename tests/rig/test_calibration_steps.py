@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.control.calibration import ORDER, Calibration
+from rig.devices.p24 import P24
+from rig.devices.rehastim2 import RehaStim2
 from rig.errors import PlanError, RefusedError
 from rig.limits import HARD_LIMITS, Steps
 from rig.messages import CalibrateStartRequest, FinishedEvent, Profile
@@ -123,6 +125,48 @@ def test_the_last_step_up_ends_at_the_ceiling_and_no_other_follows() -> None:
     assert widths(calibration)[-1] == calibration.status().marks_us["comfort"]
 
 
+def first(
+    current_ma: float, steps: Steps = RehaStim2.steps, *, sensory_us: float = 0, large: bool = True, step_us: float = 5
+):
+    """A calibration on a stimulator that has a shortest pulse."""
+    last = None
+    if sensory_us:
+        last = Profile(
+            current_ma=100, max_pulse_width_us=500, sensory_pulse_width_us=sensory_us, motor_pulse_width_us=sensory_us
+        )
+    request = CalibrateStartRequest(
+        calibration_id="c1", participant="P01", by="t", large_steps=large, last=last, current_ma=current_ma,
+        step_us=step_us,
+    )  # fmt: skip
+    return Calibration(request, HARD_LIMITS, NOON_S, steps)
+
+
+@pytest.mark.parametrize("large", [True, False])
+def test_a_current_whose_shortest_pulse_is_too_strong_is_refused_with_the_one_to_choose(large: bool) -> None:
+    with pytest.raises(RefusedError) as caught:
+        first(80, large=large)
+    assert str(caught.value) == (
+        "calibration: at 80 mA the stimulator's shortest pulse, 20 µs, is 1.6 µC, too strong for a first train; "
+        "choose 50 mA or less"
+    )
+    assert first(80, P24.steps, large=large).next_width_us("up") <= 12
+
+
+def test_the_bound_counts_what_is_sent_with_the_current_rounded_toward_zero() -> None:
+    for current_ma in (50, 51, 51.9):
+        assert first(current_ma).next_width_us("up") == 20
+    with pytest.raises(RefusedError, match=r"at 52 mA .* is 1.04 µC"):
+        first(52)
+
+
+def test_who_felt_more_last_time_may_begin_with_it() -> None:
+    """60 % of the last sensory threshold, at most 2 µC; narrower than the shortest pulse is no beginning."""
+    assert first(80, sensory_us=40).next_width_us("up") == 24
+    assert first(100, sensory_us=200).next_width_us("up") == 20
+    with pytest.raises(RefusedError, match="choose 50 mA or less"):
+        first(80, sensory_us=30)
+
+
 @pytest.mark.parametrize(
     "last",
     [
@@ -169,7 +213,7 @@ actions = st.lists(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.floats(0.5, 100), st.floats(1, 25), st.lists(plausible, min_size=3, max_size=3), st.floats(0.5, 130),
     st.booleans(), st.one_of(st.none(), st.floats(1, 500)), st.sampled_from([1.0, 20.0]), actions,
@@ -183,7 +227,7 @@ def test_whatever_is_pressed(
     last = known(*sorted(marks), current_ma=last_ma) if is_known else None
     try:
         calibration = opened(device, current_ma=current_ma, step_us=step_us, last=last, max_pulse_width_us=most_us)
-    except RefusedError:  # tests/rig/test_first_train.py
+    except RefusedError:
         assert shortest_us * device.current(current_ma) * 1e-3 > 1
         return
     now_us = 0.0

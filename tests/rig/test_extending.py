@@ -28,7 +28,7 @@ from rig.messages import (
     TestPlan,
 )  # fmt: skip
 from rig.signals import PulseStatus
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import VirtualRig, hold, rest
 from tests.rig.live import LiveRig
 
 KEY = "0123456789abcdef"
@@ -41,7 +41,7 @@ def plan(live: LiveRig, test_id: str = "one", max_duration_s: float = 60.0, **fi
 
 
 def added(on_s: float = 0.5) -> list[SegmentPlan]:
-    return [SegmentPlan(name="added", sequence="steps", settings={"on_s": on_s, "off_s": 0.1, "repeats": 1})]
+    return [hold("added", on_s, off_s=0.1)]
 
 
 def laid(live: LiveRig) -> int:
@@ -87,8 +87,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
 
 
 def test_what_the_muscle_did_not_feel_is_known_by_its_index(tmp_path: Path):
-    hold = SegmentPlan(name="hold", sequence="steps", settings={"on_s": 1.0, "off_s": 0.0, "repeats": 1})
-    rig = VirtualRig(tmp_path, [hold])
+    rig = VirtualRig(tmp_path, [hold()])
     rig.stimulator.ack_delay_s = 0.06  # the two pulses that come due meanwhile are dropped
     assert rig.execute().outcome == "completed"
     skipped = [jn.SKIPPED.unpack(p) for kind, p in jn.read(rig.path).blocks if kind == jn.Kind.SKIPPED]
@@ -163,24 +162,13 @@ def test_a_fixed_test_and_a_calibration_are_not_extended(make: Make):
             ask()
 
 
-def test_many_at_the_same_time_lay_one(make: Make):
-    live = make()
-    live.start(plan(live, hold_s=20.0), KEY)
-    asked = [live.begin(live.rig.extend(request())) for _ in range(16)]
-    live.until(lambda: all(one.done.is_set() for one in asked))
-    errors = [one.error for one in asked if one.error is not None]
-    assert len(errors) == 15
-    assert {type(error) for error in errors} <= {TooLateError, BusyError}
-    assert laid(live) == 44
-
-
 def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make: Make):
     """The fixed plan would not stimulate for a minute, an extension might after half a second."""
     live = make()
     live.start(live.plan("before", hold_s=0.5))
     live.wait("ready")
     rested = Profile(rest_between_tests_s=30.0)
-    quiet = [SegmentPlan(name="rest", sequence="rest", settings={"duration_s": seconds}) for seconds in (0.5, 60.0)]
+    quiet = [rest(0.5), rest(60.0)]
     assert live.start(live.plan("fixed", profile=rested, segments=[*quiet, *added()])).state == "arming"
     live.stop("that was only to show it")
     live.wait("latched")
@@ -203,9 +191,3 @@ def test_the_day_must_last_as_long_as_the_bound(make: Make):
     with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
         previewed(PreviewRequest(plan=late), live.rig.table, midnight_s - 10.0, live.clock.speed)
     assert live.start(plan(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
-
-
-def test_a_watcher_that_did_not_ask_gets_no_samples(make: Make):
-    event = make().rig.live()
-    assert event is not None
-    assert (event.samples, event.laid, event.laid_segments) == (None, 0, [])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -142,7 +143,9 @@ def test_the_journal_says_of_each_pulse_that_was_not_sent_why(tmp_path: Path):
     now_s = setup.clock.now_s()
     setup.gate.fire(1, Pulse(100, 20), now_s, now_s)
     setup.gate.fire(2, Pulse(400, 20), now_s, now_s)
-    setup.gate.fire(3, Pulse(100, 20), now_s, now_s - 1)
+    for index, latest_s in ((3, now_s - 1), (4, math.nan)):
+        assert setup.gate.fire(index, Pulse(100, 20), now_s, latest_s) == PulseStatus.DROPPED
+    assert (len(setup.stimulator.sent), setup.gate.dropped) == (1, 3)
     arm, too_close, refused = setup.events()
     assert arm == {"event": "arm", "time_s": T0_S}
     row = limits.for_profile(limits.HARD_LIMITS, Profile())
@@ -162,6 +165,7 @@ def test_the_journal_says_of_each_pulse_that_was_not_sent_why(tmp_path: Path):
         (1, PulseStatus.DROPPED, now_s),
         (2, PulseStatus.REFUSED, now_s),
         (3, PulseStatus.DROPPED, now_s),
+        (4, PulseStatus.DROPPED, now_s),
     ]
 
 

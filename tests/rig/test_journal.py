@@ -74,7 +74,7 @@ def test_cut_anywhere_only_the_tail_is_lost(tmp_path: Path):
         assert journal.read(cut).blocks == BLOCKS[: sum(length >= end for end in ends[1:])]
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(data=st.data())
 def test_damage_costs_the_damaged_block_only(tmp_path: Path, data: st.DataObject):
     path = tmp_path / "j"

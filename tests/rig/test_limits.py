@@ -23,7 +23,7 @@ anything = st.one_of(
 
 
 @pytest.mark.slow
-@settings(max_examples=2000, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(anything, anything, st.floats(0, 500), st.floats(0, 100))
 def test_no_pulse_outside_passes(width_us: float, current_ma: float, most_us: float, most_ma: float):
     profile = Profile(current_ma=most_ma, max_pulse_width_us=most_us)
@@ -63,22 +63,6 @@ def test_refusal_names_the_limit(pulse: Pulse, limit: str):
     verdict = admit(pulse, HARD_LIMITS)
     assert isinstance(verdict, Refusal)
     assert verdict.limit == limit
-
-
-def test_refusal_says_whose_limit_and_by_how_much():
-    table = limits.for_profile(HARD_LIMITS, Profile(max_pulse_width_us=250))
-    words = str(admit(Pulse(260, 20), table))
-    assert "participant's profile" in words
-    assert "over by 10" in words
-    assert "250" in words
-
-
-def test_a_profile_tightens_and_never_widens():
-    table = limits.for_profile(HARD_LIMITS, Profile(max_pulse_width_us=9999, current_ma=9999, max_torque_nm=9999))
-    assert table["pulse_width_us"].hi == 500
-    assert table["current_ma"].hi == 100
-    assert table["torque_nm"].hi == 60
-    assert limits.for_profile(HARD_LIMITS, Profile(max_torque_nm=5))["torque_nm"].lo == -5
 
 
 @pytest.mark.parametrize("field", ["max_pulse_width_us", "current_ma", "max_torque_nm"])
@@ -183,6 +167,7 @@ def test_a_bound_that_leaves_nothing_is_refused_and_says_what_would_do():
     assert {name: row.owner for name, row in narrowed.items() if row != HARD_LIMITS[name]} == dict.fromkeys(
         ("pulse_width_us", "current_ma", "torque_nm", "rest_between_tests_s"), "participant's profile"
     )
+    assert (narrowed["current_ma"].hi, narrowed["torque_nm"].lo, narrowed["torque_nm"].hi) == (15, -9, 9)
     gentle = limits.for_plan(HARD_LIMITS, request(Profile(max_torque_nm=0.9), max_torque_nm=0.8))
     assert (gentle["torque_nm"].lo, gentle["torque_nm"].hi) == (-0.8, 0.8)
 

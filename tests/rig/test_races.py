@@ -99,32 +99,6 @@ def test_a_stop_at_each_moment_of_a_start(make: Make):
     assert outcomes == {LatchedError, None}
 
 
-def test_a_stop_that_comes_while_the_computer_stands_still_counts_before_the_pulse_that_is_due_by_then(make: Make):
-    live = make()
-    live.start(live.plan("one", hold_s=20.0))
-    live.wait_pulses(5)
-    live.machine.wait(0.02)
-    live.clock.advance(0.008)
-    assert live.stop("now").confirmed
-    assert len(live.stimulator.sent) == 5
-
-
-def test_a_lost_device_at_each_moment_of_a_start(make: Make):
-    for live, task in moments(make, begin_test, playing):
-        sent = len(live.stimulator.sent)
-        live.stimulator.on_lost("stimulator: unplugged")
-        live.until(task.done.is_set)
-        live.until(lambda live=live: not live.rig.busy)
-        live.machine.wait(2.0)
-        assert len(live.stimulator.sent) == sent
-        assert not live.stimulator.armed
-        status = live.rig.status()
-        assert status.state in ("latched", "disconnected") and "unplugged" in status.reason
-        with pytest.raises((LatchedError, DeviceError), match="unplugged"):
-            live.start(live.plan("two"))
-        assert live.rearm().state == "ready"
-
-
 def test_an_end_of_the_process_at_each_moment_of_a_start(make: Make):
     """It waits for no test that begins only then."""
     for live, task in moments(make, begin_test, playing):
@@ -205,22 +179,6 @@ def test_a_start_that_was_asked_while_stopped_is_not_played_once_rearmed(make: M
         assert live.stimulator.sent == []
 
 
-def test_two_stops_at_once_at_each_moment_of_the_first(make: Make):
-    """Both get the evidence."""
-
-    def begin(live: LiveRig) -> Coroutine[Any, Any, Any]:
-        live.start(live.plan("one", hold_s=20.0))
-        live.wait_pulses(5)
-        return live.rig.stop("now", "nurse")
-
-    for live, task in moments(make, begin, lambda live: live.states[-1] == "latched"):
-        sent = len(live.stimulator.sent)
-        assert live.stop("too").confirmed
-        live.until(task.done.is_set)
-        assert task.result.confirmed
-        is_stopped(live, task, sent)
-
-
 def test_a_stop_at_each_moment_of_a_calibration_and_its_train(make: Make):
     async def begin_train(rig: Rig) -> None:
         await rig.calibrate(CALIBRATION)
@@ -234,24 +192,6 @@ def test_a_stop_at_each_moment_of_a_calibration_and_its_train(make: Make):
         live.wait("latched")
         assert live.rig.status().calibration is None
         is_stopped(live, task, sent)
-
-
-def test_a_disk_that_fails_at_each_moment_of_a_start(make: Make):
-    """No test begins without its journal, and none goes on without it."""
-    for live, task in moments(make, begin_test, playing):
-        disk: Any = live.machine.disk
-        disk.failing = True
-        live.until(task.done.is_set)
-        live.until(lambda live=live: not live.rig.busy)
-        sent, state = len(live.stimulator.sent), live.states[-1]
-        assert isinstance(task.error, RigError) if state == "ready" else state == "latched"
-        assert not live.stimulator.armed
-        live.machine.wait(2.0)
-        assert len(live.stimulator.sent) == sent
-        disk.failing = False
-        assert live.rearm().state == "ready"
-        live.start(live.plan("two", hold_s=0.5))
-        live.wait("ready")
 
 
 def test_a_latch_that_the_disk_refused_is_written_once_it_takes_it(make: Make):

@@ -11,13 +11,8 @@ from rig import archive
 from rig.acquire.plausibility import PlausibilityCheck
 from rig.acquire.receiver import Receiver
 from rig.control.sealing import warnings
-from rig.messages import SegmentPlan
 from rig.signals import SAMPLE
-from tests.rig.fakes import VirtualRig
-
-
-def hold(duration_s: float) -> list[SegmentPlan]:
-    return [SegmentPlan(name="hold", sequence="steps", settings={"on_s": duration_s, "off_s": 0.0, "repeats": 1})]
+from tests.rig.fakes import VirtualRig, hold
 
 
 def restless(rig: VirtualRig) -> None:
@@ -28,7 +23,7 @@ def restless(rig: VirtualRig) -> None:
 
 @pytest.mark.parametrize("rate", [0.5, 0.94, 1.06, 2.0])
 def test_a_short_test_of_a_cell_with_another_rate_is_a_fault(tmp_path: Path, rate: float):
-    rig = VirtualRig(tmp_path, hold(2.8))  # shorter than the window in which it would be told at once
+    rig = VirtualRig(tmp_path, [hold(on_s=2.8)])  # shorter than the window in which it would be told at once
     rig.cell.rate = rate
     result = rig.execute()
     assert result.outcome == "fault"
@@ -39,30 +34,23 @@ def test_a_short_test_of_a_cell_with_another_rate_is_a_fault(tmp_path: Path, rat
     assert rig.recording().attributes["outcome"] == "fault"
 
 
-@pytest.mark.parametrize("rate", [0.95, 1.05])
-def test_a_rate_off_by_5_percent_stops_a_longer_test_within_4_s(tmp_path: Path, rate: float):
-    rig = VirtualRig(tmp_path, hold(12.0))
-    rig.cell.rate = rate
-    began_s = rig.clock.now_s()
-    assert rig.execute().outcome == "fault"
-    assert rig.stimulator.sent[-1][0] - began_s < 4.0
-
-
 @pytest.mark.parametrize(
     ("rate", "outcome"), [(0.95, "fault"), (1.05, "fault"), (1.0, "completed"), (1.01, "completed")]
 )
 def test_a_restless_host_hides_no_rate_and_is_not_taken_for_one(tmp_path: Path, rate: float, outcome: str):
-    rig = VirtualRig(tmp_path, hold(12.0))
+    rig = VirtualRig(tmp_path, [hold(on_s=8.0)])
     rig.cell.rate = rate
     restless(rig)
+    began_s = rig.clock.now_s()
     result = rig.execute()
     assert result.outcome == outcome, result.reason
     assert ("samples/s arrive" in result.reason) == (outcome == "fault")
+    assert (rig.stimulator.sent[-1][0] - began_s < 4.5) == (outcome == "fault")
 
 
 def test_a_rig_that_runs_faster_than_the_world_still_sees_half_a_rate(tmp_path: Path):
     """Its window of 3 real seconds is then longer than the test."""
-    rig = VirtualRig(tmp_path, hold(6.0))
+    rig = VirtualRig(tmp_path, [hold(on_s=6.0)])
     rig.clock.speed = 20.0
     rig.cell.rate = 0.5
     result = rig.execute()
@@ -82,8 +70,7 @@ def heard(arrival_s: list[float], size: int = 16) -> list[str | None]:
 
 
 @pytest.mark.parametrize("rate", [1.0, 1.05])
-@pytest.mark.parametrize("still_s", [0.07, 0.3, 2.0])
-@pytest.mark.parametrize("began_s", [0.0, 1.0, 2.9, 3.5])
+@pytest.mark.parametrize(("began_s", "still_s"), [(0.0, 0.3), (1.0, 2.0), (2.9, 0.3), (2.9, 2.0), (3.5, 0.07)])
 def test_what_piled_up_while_the_host_stood_still_is_no_rate(began_s: float, still_s: float, rate: float):
     before_s = [i * 0.01 for i in range(int(began_s * 100))]
     piled = int(still_s * 100 * 1.25)
@@ -94,8 +81,10 @@ def test_what_piled_up_while_the_host_stood_still_is_no_rate(began_s: float, sti
     assert all(float(words.split()[2]) == pytest.approx(1600 * rate, rel=0.01) for words in told), told
 
 
-@pytest.mark.parametrize("every_s", [0.5, 1.5, 3.5])
-@pytest.mark.parametrize("rate", [0.5, 0.95, 1.0, 1.05, 2.0])
+@pytest.mark.parametrize(
+    ("rate", "every_s"),
+    [(0.5, 1.5), (0.95, 0.5), (0.95, 3.5), (1.0, 0.5), (1.0, 1.5), (1.0, 3.5), (1.05, 1.5), (2.0, 3.5)],
+)
 def test_holes_again_and_again_hide_no_rate(rate: float, every_s: float):
     due_s = [i * 0.01 / rate for i in range(int(1200 * rate))]
     held_s = [max(t_s, every_s * (t_s // every_s) + 0.07) for t_s in due_s]  # then all at once
@@ -126,8 +115,7 @@ def test_a_rate_that_is_another_altogether_is_told_at_the_end_of_a_short_test(ra
     assert float(told.split()[2]) == pytest.approx(1600 * rate, rel=0.01)
 
 
-@pytest.mark.parametrize("every_s", [1.5, 3.5, 100.0])
-@pytest.mark.parametrize("rate", [0.5, 0.94, 1.06])
+@pytest.mark.parametrize(("rate", "every_s"), [(0.5, 3.5), (0.94, 1.5), (0.94, 100.0), (1.06, 3.5)])
 def test_a_rate_that_changes_in_the_test_is_told(rate: float, every_s: float):
     due_s = [i * 0.01 for i in range(800)] + [8.0 + i * 0.01 / rate for i in range(500)]
     held_s = [max(t_s, every_s * (t_s // every_s) + 0.07) for t_s in due_s]
@@ -163,20 +151,8 @@ def test_a_backlog_that_is_read_slowly_is_no_rate(holes_s: list[tuple[float, flo
     assert not any(heard(arrival_s))
 
 
-def test_a_backlog_read_before_the_test_is_no_rate():
-    judge, found = PlausibilityCheck(5.0, 1e9, 1e9, 1600.0, 1.0), []
-    for i in range(1000):
-        block = np.zeros(16, SAMPLE)
-        now_s = i * 0.005 if i < 300 else 1.5 + (i - 300) * 0.01  # 1.5 s read at twice the rate
-        block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s, i % 2
-        if i == 300:
-            judge.begin()
-        found.append(judge.fault(block))
-    assert not any([*found, judge.fault_at_end()])
-
-
 def test_a_backlog_read_while_arming_does_not_end_the_test(tmp_path: Path):
-    rig = VirtualRig(tmp_path, hold(8.0))
+    rig = VirtualRig(tmp_path, [hold(on_s=8.0)])
     feed = rig.cell.feed
 
     def slowly(receiver: Receiver, until_s: float) -> None:

@@ -56,19 +56,6 @@ def test_a_single_pulse_and_what_cannot_be_one():
         wire.single_pulse(1, 0, 300, float("nan"))
 
 
-@given(st.lists(st.tuples(st.integers(0, 255), st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.data())
-def test_any_packets_cut_anywhere_come_back(packets: list[tuple[int, int, bytes]], data: st.DataObject):
-    sent = [Packet(*packet) for packet in packets]
-    stream = b"".join(wire.FRAMING.encode(packet) for packet in sent)
-    reader, got = wire.FRAMING.reader(), []
-    while stream:
-        n = data.draw(st.integers(1, len(stream)))
-        got += list(reader.feed(stream[:n]))
-        stream = stream[n:]
-    assert got == sent
-    assert reader.damaged == 0
-
-
 @given(st.binary(max_size=40), st.integers(0, 10), st.integers(1, 255))
 def test_after_damage_the_next_frames_are_found(junk: bytes, at: int, change: int):
     good = wire.FRAMING.encode(Packet(9, 37, b"\x00"))

@@ -6,23 +6,21 @@ from pathlib import Path
 
 import pytest
 
-from rig.messages import SegmentPlan
-from tests.rig.fakes import VirtualRig
+from tests.rig.fakes import VirtualRig, hold, rest
 
 pytestmark = pytest.mark.slow
 
 
 def rig_with_noise(folder: Path, on_s: float, repeats: int = 1, ceiling_nm: float = 5.0) -> VirtualRig:
     """Torque rises to 6 N·m in each hold, above the ceiling."""
-    settings = {"on_s": on_s, "off_s": 1.0, "repeats": repeats}
-    rig = VirtualRig(folder, [SegmentPlan(name="hold", sequence="steps", settings=settings)])
+    rig = VirtualRig(folder, [hold(on_s=on_s, off_s=1.0, repeats=repeats)])
     rig.cell.noise_nm, rig.cell.ceiling_nm = 0.04, ceiling_nm
     return rig
 
 
 @pytest.mark.parametrize("sign", [1, -1])  # a cell may be mounted the other way round
 def test_a_cell_at_its_ceiling_in_each_hold_goes_on_to_the_end(tmp_path: Path, sign: int):
-    rig = rig_with_noise(tmp_path, on_s=2.5, repeats=3)
+    rig = rig_with_noise(tmp_path, on_s=2.5, repeats=2)
     rig.cell.sign = sign
     result = rig.execute()
     assert result.outcome == "completed", result.reason
@@ -38,7 +36,7 @@ def test_a_cell_that_stays_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Pat
 
 
 def test_a_cell_that_dies_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Path):
-    rig = rig_with_noise(tmp_path, on_s=1.5, repeats=10)
+    rig = rig_with_noise(tmp_path, on_s=1.5, repeats=4)
     rig.at(3.7, lambda: setattr(rig.cell, "frozen", True))
     assert rig.execute().outcome == "fault"
     assert rig.stimulator.sent[-1][0] - rig.stimulator.sent[0][0] < 3.7 + 3.1
@@ -46,7 +44,7 @@ def test_a_cell_that_dies_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Path
 
 @pytest.mark.parametrize("at_s", [0.1, 0.9, 3.05])  # rising, high, and falling
 def test_a_cell_that_dies_anywhere_else_ends_the_test_within_half_a_second(tmp_path: Path, at_s: float):
-    rig = rig_with_noise(tmp_path, on_s=2.0, repeats=10, ceiling_nm=20.0)
+    rig = rig_with_noise(tmp_path, on_s=2.0, repeats=2, ceiling_nm=20.0)
     rig.at(at_s, lambda: setattr(rig.cell, "frozen", True))
     result = rig.execute()
     assert result.outcome == "fault"
@@ -58,9 +56,7 @@ def test_a_cell_that_dies_anywhere_else_ends_the_test_within_half_a_second(tmp_p
 @pytest.mark.parametrize("at_s", [0.3, 4.9])  # before the first pulse, and in a later rest
 def test_a_coarse_cell_that_dies_at_rest_is_not_taken_for_one_at_its_end(tmp_path: Path, at_s: float):
     """Of a coarse converter's few codes at rest the least one comes again and again."""
-    settings = {"on_s": 2.0, "off_s": 2.0, "repeats": 3}
-    rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 1.0})
-    rig = VirtualRig(tmp_path, [rest, SegmentPlan(name="hold", sequence="steps", settings=settings)])
+    rig = VirtualRig(tmp_path, [rest(1.0), hold(on_s=2.0, off_s=2.0, repeats=3)])
     rig.cell.noise_nm, rig.cell.step_nm = 0.03, 0.1
 
     def die() -> None:

@@ -56,30 +56,25 @@ ANSWERS: dict[str, tuple[Callable[[bytes], bytes], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("what", [name for name in ANSWERS if name != "a P24"])
-def test_a_p24_that_is_none(what: str):
-    line = Other(*ANSWERS[what])
-    device = p24.create(p24.Settings(device="p24", port=PORT), line)
+ASKING_P24 = {
+    sciencemode4.Command.DEVICE_ID, sciencemode4.Command.EXTENDED_VERSION, sciencemode4.Command.STIM_STATUS,
+}  # fmt: skip
+DRIVERS: dict[str, tuple[Any, Any, set[Any]]] = {
+    "a P24": (p24, sciencemode4, ASKING_P24),
+    "a RehaStim 2": (rehastim2, sciencemode2, {sciencemode2.Command.GET_MODE}),
+}
+
+
+@pytest.mark.parametrize(("of", "what"), [(of, what) for of in DRIVERS for what in ANSWERS if what != of])
+def test_a_stimulator_that_is_another_is_only_asked_who_it_is(of: str, what: str):
+    line, (driver, wire, asking) = Other(*ANSWERS[what]), DRIVERS[of]
+    device = driver.create(driver.Settings(device=driver.__name__.rpartition(".")[2], port=PORT), line)
     device.listen(lambda _: None, lambda _: None)
     with pytest.raises(DeviceError, match=PORT):
         line.run(device.open())
-    asking = {
-        sciencemode4.Command.DEVICE_ID, sciencemode4.Command.EXTENDED_VERSION, sciencemode4.Command.STIM_STATUS,
-    }  # fmt: skip
-    commands = {packet.command for packet in sciencemode4.FRAMING.reader().feed(line.heard)}
+    commands = {packet.command for packet in wire.FRAMING.reader().feed(line.heard)}
     assert commands
     assert commands <= asking
-
-
-@pytest.mark.parametrize("what", [name for name in ANSWERS if name != "a RehaStim 2"])
-def test_a_rehastim2_that_is_none(what: str):
-    line = Other(*ANSWERS[what])
-    device = rehastim2.create(rehastim2.Settings(device="rehastim2", port=PORT), line)
-    device.listen(lambda _: None, lambda _: None)
-    with pytest.raises(DeviceError, match=PORT):
-        line.run(device.open())
-    commands = {packet.command for packet in sciencemode2.FRAMING.reader().feed(line.heard)}
-    assert commands == {sciencemode2.Command.GET_MODE}
 
 
 def test_a_mistake_in_a_driver_is_told_at_once():
