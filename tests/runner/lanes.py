@@ -56,8 +56,8 @@ LANES = {
         ("--postgresql",),
     ),
     "dear": Lane(f"not wire and not ({FAST})", PROCESSORS + 2),
-    # emulated rigs wait most of their time, in a time that waits for whoever is given no processor
-    "wire": Lane("wire and not realtime", PROCESSORS + 2),
+    # more than two emulated rigs leave too little of two processors to each
+    "wire": Lane("wire and not realtime", 2),
 }
 
 CAMPAIGNS = {
