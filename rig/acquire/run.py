@@ -24,7 +24,7 @@ from rig.acquire.receiver import Receiver
 from rig.errors import DeviceError, JournalError
 from rig.gate import Gate
 from rig.journal import Journal, Kind
-from rig.limits import Limit, check
+from rig.limits import Limit
 from rig.machine import Machine
 from rig.messages import StopEvidence, TestOutcome
 from rig.plan import PlannedTest
@@ -248,10 +248,8 @@ class TestRun:
             if wrong is not None:
                 self._fault(wrong)
                 return
-            # pulses that were left out must not make a steeper rise than the plan's
-            if not self.score.laid.jumps[index] and (steep := check(self._table["width_rise_us"], width_us - felt_us)):
-                self._fault(f"pulses were left out while the width rose: {steep}")
-                return
+            if not self.score.laid.jumps[index]:  # after pulses that were left out it climbs back within the limit
+                width_us = min(width_us, felt_us + self._table["width_rise_us"].hi)
             self._gate.feed()
             status = self._gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
             if status in (PulseStatus.UNACKNOWLEDGED, PulseStatus.REST):

@@ -112,21 +112,22 @@ def test_a_stimulator_that_restarts_in_a_test_is_told():
     assert "it restarted during a test" in str(line.told[0].error)
 
 
-@pytest.mark.parametrize(("up_s", "outcome"), [(2.0, "completed"), (0.2, "fault")])
-def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: Path, up_s: float, outcome: str):
-    """Of 4 µs a pulse some may be missing, of 37 µs not: the next one would be far above the last one that was felt."""
+@pytest.mark.parametrize("up_s", [2.0, 0.2])
+def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: Path, up_s: float):
+    """The width climbs back by at most the limit a pulse, so the test goes on and startles nobody."""
     rig = VirtualRig(tmp_path, [SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": up_s, "down_s": 1.0})])
     rig.at(0.01, lambda: rig.clock.advance(0.16))
     result = rig.execute()
-    assert result.outcome == outcome
-    assert ("left out while the width rose" in result.reason) is (outcome == "fault")
+    assert result.outcome == "completed"
     widths_us = [0, *(pulse.pulse_width_us for _, pulse in rig.stimulator.sent)]
     assert max(np.diff(widths_us)) <= 50
     columns = rig.recording().columns
     dropped = columns["pulses/status"] == PulseStatus.DROPPED
-    assert np.sum(dropped) > 3
-    assert np.sum(dropped) == result.dropped or outcome == "fault"  # what was due after its end counts as dropped, too
-    assert np.all(np.isnan(columns["pulses/sent_pulse_width_us"][dropped]))
+    assert np.sum(dropped) == result.dropped > 3
+    planned_us, sent_us = (columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
+    assert np.all(np.isnan(sent_us[dropped]))
+    climbed = np.flatnonzero(planned_us - sent_us > 1)
+    assert len(climbed) == 0 if up_s == 2.0 else 0 < len(climbed) < 20
 
 
 def test_a_damaged_answer_of_the_stimulator_ends_a_test_like_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
