@@ -17,8 +17,9 @@ from typing import Any
 from dask import config
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
+from distributed.comm import CommClosedError
 
-from api.cohort.errors import CohortError
+from api.cohort.errors import SCHEDULER_GONE, CohortError, CutOffError
 from api.version import software_version
 
 CONNECT_S = 15.0
@@ -79,17 +80,19 @@ def connected(workers: Workers) -> Iterator[Client]:
     ------
     CohortError
         No scheduler, no worker, or workers of another version.
+    CutOffError
+        The scheduler went while it was asked for something.
     """
     quiet()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if workers.scheduler:
-            with _remote(workers) as client:
-                check_versions(client)
+        try:
+            with _remote(workers) if workers.scheduler else _local(workers) as client:
+                if workers.scheduler:
+                    check_versions(client)
                 yield client
-        else:
-            with _local(workers) as client:
-                yield client
+        except CommClosedError:
+            raise CutOffError(SCHEDULER_GONE) from None
 
 
 def quiet() -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from api.errors import ApiError
 
+GOES_ON = "What is done is kept; the same command goes on."
+SCHEDULER_GONE = f"the scheduler is gone. {GOES_ON}"
+
 
 class CohortError(ApiError):
     """The run cannot begin: wrong input, a scheduler that is not there, results of other options.

@@ -10,7 +10,7 @@ from typing import Any
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
-from api.cohort.errors import CohortError, CutOffError
+from api.cohort.errors import GOES_ON, SCHEDULER_GONE, CohortError, CutOffError
 from api.cohort.tasks import Task
 from api.cohort.worker import Bounds, Done, Record, lost, run_parcel
 
@@ -18,7 +18,6 @@ TRIES = 3
 """A record with which so many workers were lost is a row that says so."""
 PARCEL_S, LARGEST_PARCEL = 0.5, 8
 """A parcel ends after so long: sending a record alone costs more than reading it. Long records travel alone."""
-GOES_ON = "What is done is kept; the same command goes on."
 
 
 @dataclass
@@ -112,7 +111,7 @@ class Flight:
             _source, entry, _alike = one.records[0]
             return [lost(entry, self.task, "its workers were lost, one after the other, while it was computed.")]
         if self.client.status != "running":
-            raise CutOffError(f"the scheduler is gone. {GOES_ON}")
+            raise CutOffError(SCHEDULER_GONE)
         for record in one.records:
             self.send([record], one.tries + 1)
         return []

@@ -294,5 +294,5 @@ def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
     process.kill()
     _, err = run.communicate(timeout=PATIENCE_S)
     said = [line for line in err.splitlines() if not line.startswith("dashboard")]
-    assert run.returncode == 1 and len(said) == 1, err
+    assert run.returncode == 1 and len(said) == 1 and "the scheduler is gone" in said[0], err
     assert rows_in(tmp_path / "r.parquet.parts") >= 3
