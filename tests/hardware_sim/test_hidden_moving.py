@@ -79,14 +79,11 @@ def test_another_patient_than_without_an_arm(capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.wire
 def test_the_design_moves_the_arm_and_the_sensor_is_there() -> None:
-    with emulated("--hidden", "101", "--arm", "design", "--speed", "10") as rig:
+    with emulated("--hidden", "101", "--arm", "design") as rig:
         assert rig.ready["arm"] == "waves"
         assert rig.ready["angle_sensor"]["frame_id"] == 386
         assert "torque" not in json.dumps(rig.ready)
-        angles = []
-        for _ in range(20):
-            angles.append(rig.ask(cmd="state")["angle_deg"])
-            rig.ask(cmd="faults")
+        assert np.isfinite(rig.ask(cmd="state")["angle_deg"])
         assert not rig.ask(cmd="arm", mode="free")["ok"]
         assert rig.ask(cmd="arm", mode="robot")["ok"]
 
