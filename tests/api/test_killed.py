@@ -19,7 +19,7 @@ from api.cli.launcher import Child
 from tests.api.conftest import TOKEN, soon, wait_done
 
 ROOT = Path(__file__).parents[2]
-KILLS, SEED = 6, 61
+KILLS, SEED = 3, 61
 AUTHORIZED = {"Authorization": f"Bearer {TOKEN}"}
 
 

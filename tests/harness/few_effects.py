@@ -13,7 +13,9 @@ from identify import effects
 def only(*names: str) -> Iterator[None]:
     """In this process the library holds these effects alone."""
     kept = [effects.get(name) for name in names]
-    with mock.patch.object(effects, "_own", lambda: kept):
+    try:
+        with mock.patch.object(effects, "_own", lambda: kept):
+            effects._everything.cache_clear()
+            yield
+    finally:
         effects._everything.cache_clear()
-        yield
-    effects._everything.cache_clear()

@@ -106,10 +106,6 @@ def test_the_number_of_knots_that_somebody_asks_for_is_kept():
     assert not any("chosen again" in reason for reason in asked.reasons)
 
 
-def test_the_model_says_that_its_curve_was_chosen_again():
-    assert any("chosen again" in reason for reason in identify.fit(whole(), effects=MOVING_JOINT).reasons)
-
-
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():
     search = search_effects(whole(), most=1, effects=[get("passive_torque")])
     plain, found = steps(search)

@@ -10,6 +10,7 @@ import pytest
 import stimrig
 from tests.api.conftest import TOKEN, Service
 from tests.api.test_worker import made_up_csv
+from tests.harness import few_effects
 
 TEXT = (Path(__file__).parents[2] / "docs" / "python.md").read_text("utf-8")
 
@@ -19,8 +20,9 @@ def test_every_block_runs_in_order(tmp_path: Path, service: Service) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
     assert len(blocks) >= 9
     scope = {"path": made_up_csv(tmp_path / "record.csv"), "url": service.url, "token": TOKEN}
-    for block in blocks:
-        exec(compile(block, "python.md", "exec"), scope)
+    with few_effects.only("threshold_drift", "recruitment_hysteresis", "fatigue"):
+        for block in blocks:
+            exec(compile(block, "python.md", "exec"), scope)
 
 
 def test_the_page_names_everything() -> None:
