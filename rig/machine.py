@@ -64,6 +64,8 @@ class Listener(NamedTuple):
 
     Attributes
     ----------
+    is_extended
+        Whether the identifier has 29 bits: the one of 11 bits that has the same number is another one.
     decode
         Pure; makes a block of frames. Its arguments: the frames, and how many damaged and error frames came with them.
     take
@@ -75,6 +77,7 @@ class Listener(NamedTuple):
     """
 
     frame_id: int
+    is_extended: bool
     decode: Callable[[Sequence[Frame], int, int], Any]
     take: Callable[[Any], None]
     lost: Told

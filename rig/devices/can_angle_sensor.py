@@ -83,7 +83,7 @@ class CanAngleSensor:
             if self.of_the_cell:
                 raise DeviceError(f"{KIND}.of_the_cell: the load cell's bus is not open")
             bus = await self._machine.tasks.work(self._machine.open_bus, arguments, NAME)
-        self._bus, self._listener = bus, Listener(frame_id, self.decode, on_block, on_lost, GATHER_S)
+        self._bus, self._listener = bus, Listener(*self._frame.identifier, self.decode, on_block, on_lost, GATHER_S)
         bus.listen(self._listener)
         return {
             "device": "can_angle_sensor",

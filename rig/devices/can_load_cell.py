@@ -83,7 +83,7 @@ class CanLoadCell:
     async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         work = self._machine.tasks.work
         bus = self._bus = await work(self._machine.open_bus, self._settings.bus, "load cell")
-        listener = Listener(self._frame.frame_id, self.decode, on_block, on_lost, GATHER_S)
+        listener = Listener(*self._frame.identifier, self.decode, on_block, on_lost, GATHER_S)
         bus.listen(listener)
         try:
             await work(bus.send, [message_of(frame) for frame in self._settings.start_frames])

@@ -133,6 +133,11 @@ class SampleFrame:
         return self.message.frame_id
 
     @property
+    def identifier(self) -> tuple[int, bool]:
+        """Arbitration id, and whether it has 29 bits."""
+        return self.message.frame_id, self.message.is_extended_frame
+
+    @property
     def samples_per_frame(self) -> int:
         """Number of samples per frame."""
         return len(self._signals)

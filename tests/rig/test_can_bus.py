@@ -153,7 +153,8 @@ def test_a_cell_on_slcan_gives_every_frame_and_sends_its_own(machine: Adapters, 
     while len(said) < len(opened := b"O\rt00020100\r"):
         said += os.read(ours, 100)
     assert said == opened
-    os.write(ours, b"".join(map(torque, range(FRAMES))))
+    of_another = b"T000001818" + b"00" * 8 + b"\r"  # the same number in 29 bits
+    os.write(ours, of_another.join(map(torque, range(FRAMES))))
     samples = cell.samples(FRAMES)
     assert samples["counter"].tolist() == list(range(FRAMES))
     assert samples["torque_nm"].tolist() == [0.5 * i for i in range(FRAMES)]
