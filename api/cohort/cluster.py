@@ -17,7 +17,7 @@ from typing import Any
 from dask import config
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
-from distributed.comm import CommClosedError
+from distributed.comm.core import CommClosedError
 
 from api.cohort.errors import SCHEDULER_GONE, CohortError, CutOffError
 from api.version import software_version
