@@ -25,26 +25,11 @@ from hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, sim
 pytestmark = pytest.mark.slow
 
 CONTRACT = {
-    "fatigue",
-    "potentiation",
-    "recruitment_hysteresis",
-    "asymmetric_relaxation",
-    "electromechanical_delay",
-    "mixed_fibres",
-    "threshold_drift",
-    "baseline_drift",
-    "voluntary_effort",
-    "tremor",
-    "mains_hum",
-    "output_saturation",
-    "sensor_clipping",
-    "series_compliance",
-    "torque_angle",
-    "torque_velocity",
-    "passive_torque",
-    "activation_dependent_speed",
-    "catch_like",
-}
+    "fatigue", "potentiation", "recruitment_hysteresis", "asymmetric_relaxation", "electromechanical_delay",
+    "mixed_fibres", "threshold_drift", "baseline_drift", "voluntary_effort", "tremor", "mains_hum",
+    "output_saturation", "sensor_clipping", "series_compliance", "torque_angle", "torque_velocity",
+    "passive_torque", "activation_dependent_speed", "catch_like",
+}  # fmt: skip
 STEP_S = 1.0 / 1600.0
 NOISE_SD_NM = 0.04
 ALL = [

@@ -88,13 +88,6 @@ class TestSampler:
         assert noise.std() == pytest.approx(0.1, rel=0.03)
         assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.03
 
-    def test_rate_factor_changes_from_the_next_sample_on(self) -> None:
-        made = cell()
-        made.produce(1.0)
-        made.clock.set_rate_factor(1.05)
-        made.produce(2.0)
-        assert made.clock.samples == pytest.approx(1600 + 1680, abs=1)
-
 
 class TestCells:
     def test_counts_have_stops(self) -> None:
