@@ -124,6 +124,8 @@ class FakeCell:
         self.noise_nm = 0.0
         self.ceiling_nm = math.inf
         self.lasting_s = 0.03
+        self.read_share = 1.0  # below 1 its reader falls behind
+        self._credit = 0.0
         self.step_nm = 0.0
         self.sign = 1
         self.frozen = False
@@ -173,9 +175,14 @@ class FakeCell:
         self._held.append(block)
         if self.held(now_s):  # the host or the bus stands still; what was measured comes afterwards, all at once
             return
-        block = np.concatenate(self._held)
+        self._credit = min(1.0, self._credit + self.read_share)
+        if self._credit < 1.0:
+            return
+        self._credit = 0.0
+        block = self._held.pop(0) if self.read_share < 1.0 else np.concatenate(self._held)
         block["host_time_s"] = now_s
-        self._held.clear()
+        if self.read_share == 1.0:
+            self._held.clear()
         take(TorqueBlock(block))
 
 
