@@ -16,6 +16,7 @@ from hardware_sim.settings import Settings
 from rig import archive
 from rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
 from rig.adapters.files import Files
+from rig.control.sealing import warnings
 from rig.devices import p24, rehastim2
 from rig.errors import WireError
 from rig.messages import SegmentPlan
@@ -182,7 +183,7 @@ FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str, float]] = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_stops_the_test(tmp_path: Path, name: str):
     inject, words, within_s = FAULTS[name]
-    rig = VirtualRig(tmp_path, [hold(on_s=6.0)])
+    rig = VirtualRig(tmp_path, [hold(on_s=3.5)])
     rig.machine.disk = Failing()
     rig.cell.noise_nm = 0.01
     at: list[float] = []
@@ -260,6 +261,7 @@ def test_no_torque_no_test(tmp_path: Path):
     recording = rig.recording()
     assert recording.names == []
     assert {path: len(column) for path, column in recording.columns.items()} == {p: 0 for p, _, _ in archive.COLUMNS}
+    assert warnings(recording) == []
 
 
 @pytest.mark.parametrize(("held_s", "confirmed"), [(0.2, True), (0.6, False)])
