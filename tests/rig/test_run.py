@@ -183,7 +183,7 @@ FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str, float]] = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_stops_the_test(tmp_path: Path, name: str):
     inject, words, within_s = FAULTS[name]
-    rig = VirtualRig(tmp_path, [hold(on_s=3.5)])
+    rig = VirtualRig(tmp_path, [hold(on_s=5.0)])
     rig.machine.disk = Failing()
     rig.cell.noise_nm = 0.01
     at: list[float] = []
