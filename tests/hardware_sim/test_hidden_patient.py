@@ -92,7 +92,7 @@ def test_the_emulated_cell_converts_after_its_noise() -> None:
 
 def test_reveal_tells_of_the_muscle_that_make_gives() -> None:
     kinds = set()
-    for seed in range(40, 52):
+    for seed in range(40, 47):
         told = hidden.reveal(seed)
         json.dumps(told)
         hidden._scenario.cache_clear()  # or the scenario would be compared with itself
