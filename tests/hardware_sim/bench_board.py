@@ -1,12 +1,14 @@
-"""A P24 on a virtual clock, with a muscle that only takes notes."""
+"""A stimulator on a virtual clock, with a muscle that only takes notes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from hardware_sim.electrodes import Electrodes, Point
+from hardware_sim.stimulators import p24, sciencemode4
 from hardware_sim.stimulators.board import Board
 from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.p24 import Firmware
-from hardware_sim.stimulators.sciencemode4 import Decoder, encode
 from hardware_sim.timeline import Timeline
 
 LL_INIT, LL_CONFIG, LL_STOP = 0, 2, 4
@@ -25,22 +27,23 @@ class NotingMuscle:
 
 
 class Bench:
-    def __init__(self) -> None:
+    def __init__(self, firmware: Callable[[Board], Any] = p24.Firmware, wire: Any = sciencemode4) -> None:
         self.timeline = Timeline()
         self.muscle = NotingMuscle()
         self.syncs: list[float] = []
         self.electrodes = Electrodes(self.muscle, lambda: self.syncs.append(self.timeline.now_s))
         self.sent: list[tuple[float, Packet]] = []
-        self._decoder = Decoder()
-        self.board = Board(self.timeline, self.electrodes, self._take)
-        self.firmware = Firmware(self.board)
+        self.unread = 0
+        self._wire, self._decoder = wire, wire.Decoder()
+        self.board = Board(self.timeline, self.electrodes, self._take, lambda: self.unread)
+        self.firmware = firmware(self.board)
 
     def _take(self, frame: bytes) -> None:
         now_s = self.timeline.now_s
         self.sent += [(now_s, packet) for packet in self._decoder.feed(frame, now_s)]
 
-    def send(self, number: int, command: int, data: bytes = b"") -> None:
-        self.firmware.received(encode(Packet(number, command, data)))
+    def send(self, command: int, data: bytes = b"", number: int = 9) -> None:
+        self.firmware.received(self._wire.encode(Packet(number, command, data)))
 
     def run(self, seconds: float) -> None:
         self.timeline.run_until(self.timeline.now_s + seconds)
@@ -48,7 +51,7 @@ class Bench:
     def ask(self, command: int, data: bytes = b"", number: int = 9, wait_s: float = 0.05) -> Packet:
         """The answer to one command, which must be the only one."""
         before = len(self.sent)
-        self.send(number, command, data)
+        self.send(command, data, number)
         self.run(wait_s)
         assert len(self.sent) == before + 1
         return self.sent[-1][1]

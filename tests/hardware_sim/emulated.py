@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -38,10 +37,6 @@ class Emulated:
     def ask(self, **request: Any) -> dict[str, Any]:
         self._control.sendall(json.dumps(request).encode() + b"\n")
         return json.loads(self._lines.readline())
-
-    def cpu_s(self) -> float:
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def close(self) -> int:
         self._lines.close()

@@ -213,12 +213,6 @@ def test_cell_unplugged_and_back() -> None:
 
 
 @pytest.mark.wire
-def test_faults_from_the_start() -> None:
-    with emulated("--fault", "torque_saturated,limit_nm=0.01", "--fault", "no_ack") as rig:
-        assert rig.ask(cmd="state")["faults"] == ["no_ack", "torque_saturated"]
-
-
-@pytest.mark.wire
 def test_the_library_is_listed(rig: Emulated) -> None:
     listed = rig.ask(cmd="faults")["faults"]
     assert set(listed) == set(library()) >= {"no_ack", "cell_silent"}
@@ -234,6 +228,7 @@ def test_the_library_is_listed(rig: Emulated) -> None:
         ({"cmd": "fault", "name": "late_ack", "delay_s": "long"}, "must be like"),
         ({"cmd": "fault", "name": "late_ack", "delay": 1}, "no setting"),
         ({"cmd": "fault", "name": "late_ack", "for_s": -1}, "for_s"),
+        ({"cmd": "arm", "mode": "held"}, "this rig has no arm; start it with --arm"),
         ({}, "cmd"),
     ],
 )

@@ -17,9 +17,9 @@ from hardware_sim.patients.hidden.draw import MOVING, Scenario, draw_scenario
 from hardware_sim.patients.hidden.live import HiddenMuscle
 from hardware_sim.patients.hidden.scenario import simulate
 from tests.hardware_sim.emulated import emulated
+from tests.hardware_sim.test_hidden_patient import RATE_HZ, play
 
 pytestmark = pytest.mark.slow
-RATE_HZ = 1600
 SECONDS = 12.0
 
 
@@ -32,16 +32,8 @@ def played(scenario: Scenario, late_s: float = 0.0) -> np.ndarray:
         "phase_rad": list(map(float, phase)),
     }
     limb = Limb(HiddenMuscle(scenario), Arm("waves", {**waves, "deg_s": 1000.0}, bare()))
-    width = scenario.design.width_us
-    at = np.arange(width.size) * 0.025 + np.random.default_rng(1).uniform(0.0, late_s or 1e-12, width.size)
-    torque, pulse = np.empty(round(SECONDS * RATE_HZ)), 0
-    for k in range(torque.size):
-        while pulse < width.size and at[pulse] <= k / RATE_HZ:
-            if width[pulse] > 0.0:
-                limb.pulse(float(at[pulse]), float(width[pulse]), 20.0)
-            pulse += 1
-        torque[k] = limb.torque_nm(k / RATE_HZ)
-    return torque
+    late = np.random.default_rng(1).uniform(0.0, late_s or 1e-12, scenario.design.width_us.size)
+    return play(limb, scenario, SECONDS, late)
 
 
 @pytest.mark.parametrize("effect", sorted(MOVING))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +21,11 @@ pytestmark = pytest.mark.slow
 RATE_HZ = 1600
 
 
-def play(muscle: HiddenMuscle, scenario: Scenario, seconds: float, late_s: np.ndarray | None = None) -> np.ndarray:
-    """Torque at 1600 Hz while the scenario's design is sent, pulse by pulse."""
+def play(muscle: Any, scenario: Scenario, seconds: float, late_s: np.ndarray | float = 0.0) -> np.ndarray:
+    """What a cell reads of it at 1600 Hz while the scenario's design is sent, pulse by pulse."""
     width = scenario.design.width_us
-    at = np.arange(width.size) * 0.025 + (0.0 if late_s is None else late_s)
+    at = np.arange(width.size) * 0.025 + late_s
+    converted_nm = getattr(muscle, "converted_nm", lambda torque_nm, _: torque_nm)
     torque = np.empty(round(seconds * RATE_HZ))
     pulse = 0
     for k in range(torque.size):
@@ -31,7 +33,7 @@ def play(muscle: HiddenMuscle, scenario: Scenario, seconds: float, late_s: np.nd
             if width[pulse] > 0.0:
                 muscle.pulse(float(at[pulse]), float(width[pulse]), 20.0)
             pulse += 1
-        torque[k] = muscle.converted_nm(muscle.torque_nm(k / RATE_HZ), k / RATE_HZ)
+        torque[k] = converted_nm(muscle.torque_nm(k / RATE_HZ), k / RATE_HZ)
     return torque
 
 
@@ -90,7 +92,7 @@ def test_the_emulated_cell_converts_after_its_noise() -> None:
 
 def test_reveal_tells_of_the_muscle_that_make_gives() -> None:
     kinds = set()
-    for seed in range(40, 52):
+    for seed in range(40, 47):
         told = hidden.reveal(seed)
         json.dumps(told)
         hidden._scenario.cache_clear()  # or the scenario would be compared with itself

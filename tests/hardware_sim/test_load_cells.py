@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import os
 import queue
@@ -89,13 +88,6 @@ class TestSampler:
         assert noise.std() == pytest.approx(0.1, rel=0.03)
         assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.03
 
-    def test_rate_factor_changes_from_the_next_sample_on(self) -> None:
-        made = cell()
-        made.produce(1.0)
-        made.clock.set_rate_factor(1.05)
-        made.produce(2.0)
-        assert made.clock.samples == pytest.approx(1600 + 1680, abs=1)
-
 
 class TestCells:
     def test_counts_have_stops(self) -> None:
@@ -117,31 +109,6 @@ def listen(bus: can.BusABC, number: int) -> list[can.Message]:
         assert message is not None
         messages.append(message)
     return messages
-
-
-@pytest.mark.wire
-@pytest.mark.parametrize("transport", ["socketcand", "slcan"])
-def test_python_can_loses_no_frame(transport: str) -> None:
-    with emulated("--load-cell", transport) as rig, can.Bus(**rig.ready["can"]) as bus:
-        messages = listen(bus, 2400)
-    counters = [LAYOUT.unpack(message.data)[1] for message in messages]
-    assert {(later - earlier) & 0xFFFF for earlier, later in itertools.pairwise(counters)} == {1}
-    assert {(m.arbitration_id, m.dlc, m.is_extended_id) for m in messages} == {(0x181, 8, False)}
-    if transport == "socketcand":
-        steps_s = np.diff([message.timestamp for message in messages])
-        assert steps_s == pytest.approx(np.full(steps_s.size, 1 / 1600), abs=2e-6)
-
-
-@pytest.mark.wire
-@pytest.mark.parametrize("transport", ["socketcand", "slcan"])
-def test_a_canopen_cell_is_started_and_stopped_over_the_bus(transport: str) -> None:
-    with emulated("--load-cell", transport, "--cell", "canopen") as rig, can.Bus(**rig.ready["can"]) as bus:
-        assert bus.recv(0.3) is None
-        bus.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
-        listen(bus, 300)
-        bus.send(can.Message(arbitration_id=0, data=[2, 0], is_extended_id=False))
-        on_its_way = iter(lambda: bus.recv(0.3), None)
-        assert len(list(itertools.islice(on_its_way, 2000))) < 2000  # one that did not stop would go on
 
 
 @pytest.mark.wire

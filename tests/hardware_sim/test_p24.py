@@ -40,7 +40,7 @@ def update(*shape: tuple[int, float], period_ms: float = 25, ramp: int = 0, mask
 
 
 def test_init_takes_40_ms_and_turns_the_source_on(bench: Bench) -> None:
-    bench.send(4, LL_INIT, b"\x00")
+    bench.send(LL_INIT, b"\x00", number=4)
     bench.run(0.039)
     assert bench.sent == []
     bench.run(0.002)
@@ -84,8 +84,8 @@ def test_not_initialised_before_init_and_after_stop(bench: Bench) -> None:
 
 
 def test_a_pulse_behind_a_stop_is_not_fired(ready: Bench) -> None:
-    ready.send(1, LL_STOP)
-    ready.send(2, LL_CONFIG, config(*biphasic(250, 20)))
+    ready.send(LL_STOP, number=1)
+    ready.send(LL_CONFIG, config(*biphasic(250, 20)), number=2)
     ready.run(0.1)
     assert [(p.number, p.data[0]) for _, p in ready.sent[-2:]] == [(1, OK), (2, NOT_INITIALISED)]
     assert ready.muscle.pulses == []
@@ -151,7 +151,7 @@ def test_unknown_command_and_corrupt_frame(bench: Bench) -> None:
 def test_reset_forgets_everything(ready: Bench) -> None:
     assert ready.ask(58, wait_s=0.3).data == bytes((OK,))
     assert ready.ask(STATUS).data == bytes((OK, 0, 0))
-    ready.send(1, LL_INIT, b"\x00")
+    ready.send(LL_INIT, b"\x00")
     ready.firmware.reset()
     ready.run(0.1)
     assert ready.firmware.state()["mode"] == "none"
@@ -192,20 +192,20 @@ class TestMidLevel:
         start_s = running.muscle.pulses[0][0]
         for _ in range(4):
             running.run(0.45)
-            running.send(1, ML_UPDATE, update(*biphasic(100, 20)))
+            running.send(ML_UPDATE, update(*biphasic(100, 20)))
         running.run(1.0)
         assert start_s + 1.97 < running.muscle.pulses[-1][0] <= start_s + 2.0
 
     def test_update_changes_a_running_channel_on_its_grid(self, running: Bench) -> None:
         running.run(0.030)
-        running.send(1, ML_UPDATE, update(*biphasic(100, 10)))
+        running.send(ML_UPDATE, update(*biphasic(100, 10)))
         running.run(0.050)
         first_s = running.muscle.pulses[0][0]
         assert [w for _, w, _ in running.muscle.pulses] == [250, 250, 100, 100]
         assert running.muscle.pulses[-1][0] == pytest.approx(first_s + 0.075)
 
     def test_stop_and_empty_mask(self, running: Bench) -> None:
-        running.send(1, ML_UPDATE, b"\x00")
+        running.send(ML_UPDATE, b"\x00")
         fired = len(running.muscle.pulses)
         running.run(1.0)
         assert len(running.muscle.pulses) == fired
@@ -220,7 +220,7 @@ class TestMidLevel:
     @pytest.mark.parametrize("stop_on_error", [0, 1])
     def test_electrode_error(self, bench: Bench, stop_on_error: int) -> None:
         bench.ask(ML_INIT, bytes((stop_on_error,)))
-        bench.send(1, ML_UPDATE, update(*biphasic(250, 20)))
+        bench.send(ML_UPDATE, update(*biphasic(250, 20)))
         bench.run(0.1)
         bench.electrodes.attached = False
         bench.run(0.1)

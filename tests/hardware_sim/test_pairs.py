@@ -120,6 +120,9 @@ def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None
         state = rig.ask(cmd="state")
         assert rig.ready["stimulator_device"] == stimulator
         assert rig.ready["samples_per_frame"] == samples_per_frame
+        angle = ("in_cell", 0x181, 400.0) if cell == "with_angle" else None
+        told = rig.ready.get("angle_sensor")
+        assert angle == (told and (told["kind"], told["frame_id"], told["rate_hz"]))
     assert [(pulse["width_us"], pulse["current_ma"], pulse["delivered"]) for pulse in pulses] == [(300, 20, True)] * 12
     assert state["unbalanced_pulses"] == 0
 

@@ -24,14 +24,21 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_ready_line() -> None:
-    with emulated("--noise-seed", "3", "--rate-hz", "800", "--speed", "2") as rig:
+def test_the_ready_line_and_the_speed_of_the_emulators_time() -> None:
+    """The time between two answers lies between the shortest and the longest that the asker can have seen."""
+    with emulated("--noise-seed", "3", "--rate-hz", "800", "--speed", "10") as rig:
         ready = rig.ready
         assert Path(ready["stimulator"]).is_char_device()
         assert Path(ready["stimulator_link"]).resolve() == Path(ready["stimulator"])
         assert set(ready["can"]) == {"interface", "host", "port", "channel"}
-        wanted = {"pid": rig.process.pid, "sample_rate_hz": 800.0, "speed": 2.0, "patient": "paper", "noise_seed": 3}
+        wanted = {"pid": rig.process.pid, "sample_rate_hz": 800.0, "speed": 10.0, "patient": "paper", "noise_seed": 3}
         assert {key: ready[key] for key in wanted} == wanted
+        asked_s, before, told_s = time.monotonic(), rig.ask(cmd="state"), time.monotonic()
+        time.sleep(0.2)
+        again_s, after, end_s = time.monotonic(), rig.ask(cmd="state"), time.monotonic()
+        passed_s = after["time_s"] - before["time_s"]
+        assert 10 * (again_s - told_s) <= passed_s <= 10 * (end_s - asked_s)
+        assert after["samples"] - before["samples"] == pytest.approx(800 * passed_s, abs=2)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -72,11 +79,13 @@ def _is_zombie(pid: int) -> bool:
         return True
 
 
-def test_patient_file_and_readable_lines(tmp_path: Path) -> None:
+def test_patient_file_faults_and_readable_lines(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text('patient = "calcium"\n[parameters]\nmoment_arm_m = 0.04\n')
-    with emulated("--patient", str(path)) as rig:
+    faults = "--fault", "torque_saturated,limit_nm=0.01", "--fault", "no_ack"
+    with emulated("--patient", str(path), *faults) as rig:
         assert rig.ready["patient"] == str(path)
+        assert rig.ask(cmd="state")["faults"] == ["no_ack", "torque_saturated"]
     process = subprocess.Popen(
         [sys.executable, "-m", "hardware_sim", "--no-json"], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
@@ -126,17 +135,6 @@ def test_help() -> None:
     done = run("--help")
     assert done.returncode == 0
     assert "--speed" in done.stdout
-
-
-def test_speed_moves_the_emulators_time() -> None:
-    """The time between two answers lies between the shortest and the longest that the asker can have seen."""
-    with emulated("--speed", "10") as rig:
-        asked_s, before, told_s = time.monotonic(), rig.ask(cmd="state"), time.monotonic()
-        time.sleep(0.5)
-        again_s, after, end_s = time.monotonic(), rig.ask(cmd="state"), time.monotonic()
-        passed_s = after["time_s"] - before["time_s"]
-        assert 10 * (again_s - told_s) <= passed_s <= 10 * (end_s - asked_s)
-        assert after["samples"] - before["samples"] == pytest.approx(1600 * passed_s, abs=2)
 
 
 def test_stopped_and_continued_it_catches_up() -> None:

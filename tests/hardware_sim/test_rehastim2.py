@@ -6,43 +6,26 @@ from itertools import pairwise
 
 import pytest
 
-from hardware_sim.electrodes import Electrodes
-from hardware_sim.stimulators.board import Board
+from hardware_sim.stimulators import rehastim2, sciencemode2
 from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.rehastim2 import Firmware
-from hardware_sim.stimulators.sciencemode2 import Decoder, encode
-from hardware_sim.timeline import Timeline
-from tests.hardware_sim.bench_board import NotingMuscle
+from hardware_sim.stimulators.sciencemode2 import encode
+from tests.hardware_sim.bench_board import Bench
 
 INIT, INIT_ACK, UNKNOWN, WATCHDOG, GET_MODE, INIT_LIST, START, STOP, SINGLE, ERROR = 1, 2, 3, 4, 10, 30, 32, 34, 36, 38
 OK, TRANSFER, PARAMETER, WRONG_MODE, BUSY = 0, -1, -2, -3, -8
 START_MODE, INITIALISED, STARTED = 0, 1, 2
 
 
-class Bench:
-    def __init__(self) -> None:
-        self.timeline = Timeline()
-        self.muscle = NotingMuscle()
-        self.electrodes = Electrodes(self.muscle)
-        self.sent: list[tuple[float, Packet]] = []
-        self.unread = 0
-        self._decoder = Decoder()
-        self.board = Board(self.timeline, self.electrodes, self._take, lambda: self.unread)
-        self.firmware = Firmware(self.board)
+class Host(Bench):
+    """A RehaStim 2's, which acknowledges at once."""
 
-    def _take(self, frame: bytes) -> None:
-        self.sent += [(self.timeline.now_s, packet) for packet in self._decoder.feed(frame, self.timeline.now_s)]
+    def __init__(self) -> None:
+        super().__init__(rehastim2.Firmware, sciencemode2)
 
     def packets(self, command: int) -> list[Packet]:
         return [packet for _, packet in self.sent if packet.command == command]
 
-    def run(self, seconds: float) -> None:
-        self.timeline.run_until(self.timeline.now_s + seconds)
-
-    def send(self, command: int, data: bytes = b"", number: int = 9) -> None:
-        self.firmware.received(encode(Packet(number, command, data)))
-
-    def ask(self, command: int, data: bytes = b"", number: int = 9) -> int:
+    def result(self, command: int, data: bytes = b"", number: int = 9) -> int:
         """The result of a command, whose ack must be the first thing that comes, at once."""
         before = len(self.sent)
         self.send(command, data, number)
@@ -51,7 +34,7 @@ class Bench:
         return int.from_bytes(ack.data[:1], "big", signed=True)
 
     def mode(self) -> int:
-        assert self.ask(GET_MODE) == OK
+        assert self.result(GET_MODE) == OK
         return self.sent[-1][1].data[1]
 
     def widths(self) -> list[float]:
@@ -70,12 +53,12 @@ def setup(active: int = 1, low: int = 0, factor: int = 0, interpulse: int = 13, 
 
 
 @pytest.fixture
-def bench() -> Bench:
-    return Bench()
+def bench() -> Host:
+    return Host()
 
 
 @pytest.fixture
-def connected(bench: Bench) -> Bench:
+def connected(bench: Host) -> Host:
     bench.run(0.5)
     bench.send(INIT_ACK, b"\x00", number=bench.sent[-1][1].number)
     assert bench.mode() == START_MODE
@@ -83,14 +66,14 @@ def connected(bench: Bench) -> Bench:
 
 
 @pytest.fixture
-def running(connected: Bench) -> Bench:
-    assert connected.ask(INIT_LIST, setup()) == OK
-    assert connected.ask(START, pulse(250, 20)) == OK
+def running(connected: Host) -> Host:
+    assert connected.result(INIT_LIST, setup()) == OK
+    assert connected.result(START, pulse(250, 20)) == OK
     return connected
 
 
 class TestConnection:
-    def test_init_comes_every_500_ms_until_the_ack(self, bench: Bench) -> None:
+    def test_init_comes_every_500_ms_until_the_ack(self, bench: Host) -> None:
         bench.run(2.2)
         assert [time for time, _ in bench.sent] == pytest.approx([0.5, 1.0, 1.5, 2.0])
         assert [packet.command for _, packet in bench.sent] == [INIT] * 4
@@ -99,7 +82,7 @@ class TestConnection:
         bench.run(1.1)
         assert len(bench.sent) == 4
 
-    def test_a_refused_version_or_another_number_is_no_connection(self, bench: Bench) -> None:
+    def test_a_refused_version_or_another_number_is_no_connection(self, bench: Host) -> None:
         bench.run(0.6)
         bench.send(INIT_ACK, b"\xfb", number=0)
         bench.send(INIT_ACK, b"\x00", number=77)
@@ -110,7 +93,7 @@ class TestConnection:
         assert len(bench.packets(INIT)) == 3
         assert bench.muscle.pulses == []
 
-    def test_no_init_piles_up_where_nobody_reads(self, bench: Bench) -> None:
+    def test_no_init_piles_up_where_nobody_reads(self, bench: Host) -> None:
         bench.unread = 9
         bench.run(60.0)
         assert bench.sent == []
@@ -118,7 +101,7 @@ class TestConnection:
         bench.run(0.5)
         assert len(bench.packets(INIT)) == 1
 
-    def test_watchdog_command_keeps_the_connection_without_an_ack(self, connected: Bench) -> None:
+    def test_watchdog_command_keeps_the_connection_without_an_ack(self, connected: Host) -> None:
         have = len(connected.sent)
         for _ in range(5):
             connected.run(1.19)
@@ -126,8 +109,8 @@ class TestConnection:
         assert len(connected.sent) == have
         assert connected.mode() == START_MODE
 
-    def test_silence_of_1200_ms_ends_modes_and_connection(self, connected: Bench) -> None:
-        assert connected.ask(INIT_LIST, setup()) == OK
+    def test_silence_of_1200_ms_ends_modes_and_connection(self, connected: Host) -> None:
+        assert connected.result(INIT_LIST, setup()) == OK
         silent_s = connected.timeline.now_s
         connected.run(1.19)
         assert connected.firmware.state()["mode"] == "initialised"
@@ -140,7 +123,7 @@ class TestConnection:
         assert connected.mode() == START_MODE  # not where it was
 
     @pytest.mark.parametrize("command", [GET_MODE, WATCHDOG, INIT_LIST])
-    def test_any_valid_command_is_a_sign_of_life_a_damaged_one_is_not(self, connected: Bench, command: int) -> None:
+    def test_any_valid_command_is_a_sign_of_life_a_damaged_one_is_not(self, connected: Host, command: int) -> None:
         connected.run(1.0)
         connected.send(command, setup() if command == INIT_LIST else b"")
         connected.run(1.0)
@@ -149,11 +132,11 @@ class TestConnection:
         connected.run(0.3)
         assert connected.firmware.state()["mode"] == "none"
 
-    def test_unknown_command(self, connected: Bench) -> None:
+    def test_unknown_command(self, connected: Host) -> None:
         connected.send(99, number=5)
         assert connected.sent[-1][1] == Packet(5, UNKNOWN, b"")
 
-    def test_a_damaged_command_is_a_transfer_error(self, connected: Bench) -> None:
+    def test_a_damaged_command_is_a_transfer_error(self, connected: Host) -> None:
         frame = bytearray(encode(Packet(6, SINGLE, pulse(300, 24))))
         frame[-2] ^= 0x40
         connected.firmware.received(bytes(frame))
@@ -163,9 +146,9 @@ class TestConnection:
 
 
 class TestSinglePulse:
-    def test_a_pulse_is_balanced_and_flows_at_receipt(self, connected: Bench) -> None:
+    def test_a_pulse_is_balanced_and_flows_at_receipt(self, connected: Host) -> None:
         now_s = connected.timeline.now_s
-        assert connected.ask(SINGLE, pulse(300, 24)) == OK
+        assert connected.result(SINGLE, pulse(300, 24)) == OK
         assert connected.muscle.pulses == [(now_s, 300.0, 24.0)]
         assert connected.electrodes.unbalanced_pulses == 0
         connected.run(1.0)
@@ -175,45 +158,45 @@ class TestSinglePulse:
         ("asked", "given"), [((300, 25), (300, 24)), ((20, 126), (20, 126)), ((500, 2), (500, 2)), ((21, 3), (21, 2))]
     )
     def test_limits_are_inclusive_and_odd_currents_sink(
-        self, connected: Bench, asked: tuple[int, int], given: tuple[int, int]
+        self, connected: Host, asked: tuple[int, int], given: tuple[int, int]
     ) -> None:
-        assert connected.ask(SINGLE, pulse(*asked)) == OK
+        assert connected.result(SINGLE, pulse(*asked)) == OK
         assert connected.muscle.pulses[0][1:] == given
 
     @pytest.mark.parametrize("asked", [(0, 20), (19, 20), (501, 20), (65535, 20), (250, 127), (250, 255)])
-    def test_beyond_the_limits(self, connected: Bench, asked: tuple[int, int]) -> None:
-        assert connected.ask(SINGLE, pulse(*asked)) == PARAMETER
-        assert connected.ask(SINGLE, pulse(250, 20)[1:]) == PARAMETER
-        assert connected.ask(SINGLE, pulse(250, 20, mode=8)) == PARAMETER
+    def test_beyond_the_limits(self, connected: Host, asked: tuple[int, int]) -> None:
+        assert connected.result(SINGLE, pulse(*asked)) == PARAMETER
+        assert connected.result(SINGLE, pulse(250, 20)[1:]) == PARAMETER
+        assert connected.result(SINGLE, pulse(250, 20, mode=8)) == PARAMETER
         assert connected.muscle.pulses == []
 
-    def test_no_current_is_no_pulse(self, connected: Bench) -> None:
-        assert connected.ask(SINGLE, pulse(300, 1)) == OK
+    def test_no_current_is_no_pulse(self, connected: Host) -> None:
+        assert connected.result(SINGLE, pulse(300, 1)) == OK
         assert connected.electrodes.log == []
 
-    def test_start_mode_only(self, running: Bench) -> None:
-        assert running.ask(SINGLE, pulse(300, 24)) == WRONG_MODE
-        assert running.ask(STOP) == OK
-        assert running.ask(SINGLE, pulse(300, 24)) == OK
-        assert running.ask(INIT_LIST, setup()) == OK
-        assert running.ask(SINGLE, pulse(300, 24)) == WRONG_MODE
+    def test_start_mode_only(self, running: Host) -> None:
+        assert running.result(SINGLE, pulse(300, 24)) == WRONG_MODE
+        assert running.result(STOP) == OK
+        assert running.result(SINGLE, pulse(300, 24)) == OK
+        assert running.result(INIT_LIST, setup()) == OK
+        assert running.result(SINGLE, pulse(300, 24)) == WRONG_MODE
 
-    def test_busy_while_one_flows(self, connected: Bench) -> None:
-        assert connected.ask(SINGLE, pulse(300, 24)) == OK
+    def test_busy_while_one_flows(self, connected: Host) -> None:
+        assert connected.result(SINGLE, pulse(300, 24)) == OK
         connected.run(690e-6)
-        assert connected.ask(SINGLE, pulse(300, 24)) == BUSY
+        assert connected.result(SINGLE, pulse(300, 24)) == BUSY
         connected.run(20e-6)
-        assert connected.ask(SINGLE, pulse(300, 24)) == OK
+        assert connected.result(SINGLE, pulse(300, 24)) == OK
         assert len(connected.muscle.pulses) == 2
 
-    def test_the_muscle_hangs_on_channel_1(self, connected: Bench) -> None:
-        assert connected.ask(SINGLE, pulse(300, 24, mode=1)) == OK
+    def test_the_muscle_hangs_on_channel_1(self, connected: Host) -> None:
+        assert connected.result(SINGLE, pulse(300, 24, mode=1)) == OK
         assert connected.muscle.pulses == []
         assert connected.packets(ERROR) == [Packet(1, ERROR, b"\xfe")]
 
 
 class TestChannelList:
-    def test_pulses_on_its_own_grid_and_beyond_the_hosts_silence_until_1200_ms(self, running: Bench) -> None:
+    def test_pulses_on_its_own_grid_and_beyond_the_hosts_silence_until_1200_ms(self, running: Host) -> None:
         start_s = running.timeline.now_s
         running.run(0.010)
         assert running.mode() == STARTED
@@ -223,24 +206,24 @@ class TestChannelList:
         assert running.packets(ERROR) == []
         assert running.firmware.state()["mode"] == "none"
 
-    def test_watchdog_keeps_it_pulsing(self, running: Bench) -> None:
+    def test_watchdog_keeps_it_pulsing(self, running: Host) -> None:
         for _ in range(5):
             running.run(1.0)
             running.send(WATCHDOG)
         running.run(0.01)
         assert len(running.muscle.pulses) == 201
 
-    def test_update_waits_for_the_devices_grid(self, running: Bench) -> None:
+    def test_update_waits_for_the_devices_grid(self, running: Host) -> None:
         start_s = running.timeline.now_s
         running.run(0.030)
-        assert running.ask(START, pulse(100, 10)) == OK
+        assert running.result(START, pulse(100, 10)) == OK
         running.run(0.050)
         assert running.widths() == [250, 250, 100, 100]
         assert running.times()[-1] == pytest.approx(start_s + 0.075)
 
     @pytest.mark.parametrize(("host_period_s", "repeated", "lost"), [(0.026, (3, 5), (0, 0)), (0.024, (0, 1), (3, 5))])
     def test_the_hosts_and_the_devices_grids_slip(
-        self, running: Bench, host_period_s: float, repeated: tuple[int, int], lost: tuple[int, int]
+        self, running: Host, host_period_s: float, repeated: tuple[int, int], lost: tuple[int, int]
     ) -> None:
         """A slower host has a level repeated now and then, a faster one has a level left out."""
         for k in range(100):
@@ -251,24 +234,24 @@ class TestChannelList:
         last = round(widths[-1]) - 100
         assert lost[0] <= sum(100 + k not in widths for k in range(last)) <= lost[1]
 
-    def test_stop_ends_it_and_the_mode(self, running: Bench) -> None:
+    def test_stop_ends_it_and_the_mode(self, running: Host) -> None:
         running.run(0.1)
-        assert running.ask(STOP) == OK
+        assert running.result(STOP) == OK
         fired = len(running.muscle.pulses)
         running.run(1.0)
         assert len(running.muscle.pulses) == fired
         assert running.mode() == START_MODE
-        assert running.ask(START, pulse(250, 20)) == WRONG_MODE
-        assert running.ask(STOP) == OK
+        assert running.result(START, pulse(250, 20)) == WRONG_MODE
+        assert running.result(STOP) == OK
 
-    def test_init_while_running_is_the_wrong_mode(self, running: Bench) -> None:
-        assert running.ask(INIT_LIST, setup()) == WRONG_MODE
+    def test_init_while_running_is_the_wrong_mode(self, running: Host) -> None:
+        assert running.result(INIT_LIST, setup()) == WRONG_MODE
         running.run(0.03)
         assert len(running.muscle.pulses) == 2
 
-    def test_a_bad_update_changes_nothing(self, running: Bench) -> None:
+    def test_a_bad_update_changes_nothing(self, running: Host) -> None:
         for data in (b"", pulse(501, 20), pulse(250, 127), pulse(250, 20, mode=3), pulse(250, 20) * 2, pulse(19, 20)):
-            assert running.ask(START, data) == PARAMETER
+            assert running.result(START, data) == PARAMETER
         running.run(0.06)
         assert running.widths() == [250, 250, 250]
 
@@ -284,45 +267,45 @@ class TestChannelList:
             setup(execute=1),
         ],
     )
-    def test_a_bad_list_is_refused(self, connected: Bench, data: bytes) -> None:
-        assert connected.ask(INIT_LIST, data) == PARAMETER
+    def test_a_bad_list_is_refused(self, connected: Host, data: bytes) -> None:
+        assert connected.result(INIT_LIST, data) == PARAMETER
         assert connected.mode() == START_MODE
 
-    def test_doublets_and_triplets(self, connected: Bench) -> None:
-        assert connected.ask(INIT_LIST, setup()) == OK
+    def test_doublets_and_triplets(self, connected: Host) -> None:
+        assert connected.result(INIT_LIST, setup()) == OK
         start_s = connected.timeline.now_s
-        assert connected.ask(START, pulse(250, 20, mode=2)) == OK
+        assert connected.result(START, pulse(250, 20, mode=2)) == OK
         connected.run(0.049)
         expected = [0.0, 0.008, 0.016, 0.025, 0.033, 0.041]
         assert [time - start_s for time in connected.times()] == pytest.approx(expected)
         connected.send(STOP)
-        assert connected.ask(INIT_LIST, setup(period=46)) == OK  # 24 ms hold just three of 8 ms
-        assert connected.ask(START, pulse(250, 20, mode=2)) == OK
+        assert connected.result(INIT_LIST, setup(period=46)) == OK  # 24 ms hold just three of 8 ms
+        assert connected.result(START, pulse(250, 20, mode=2)) == OK
         connected.send(STOP)
-        assert connected.ask(INIT_LIST, setup(period=45)) == OK
-        assert connected.ask(START, pulse(250, 20, mode=2)) == PARAMETER
+        assert connected.result(INIT_LIST, setup(period=45)) == OK
+        assert connected.result(START, pulse(250, 20, mode=2)) == PARAMETER
 
-    def test_one_shot(self, connected: Bench) -> None:
-        assert connected.ask(INIT_LIST, setup(period=0)) == OK
-        assert connected.ask(START, pulse(250, 20, mode=1)) == OK
-        assert connected.ask(START, pulse(250, 20)) == BUSY
+    def test_one_shot(self, connected: Host) -> None:
+        assert connected.result(INIT_LIST, setup(period=0)) == OK
+        assert connected.result(START, pulse(250, 20, mode=1)) == OK
+        assert connected.result(START, pulse(250, 20)) == BUSY
         connected.run(0.1)
         assert len(connected.muscle.pulses) == 2
-        assert connected.ask(START, pulse(300, 20)) == OK
+        assert connected.result(START, pulse(300, 20)) == OK
         connected.run(0.1)
         assert connected.widths() == [250, 250, 300]
 
-    def test_a_low_frequency_channel_leaves_groups_out(self, connected: Bench) -> None:
+    def test_a_low_frequency_channel_leaves_groups_out(self, connected: Host) -> None:
         connected.send(INIT_LIST, setup(low=1, factor=3))
         start_s = connected.timeline.now_s
         connected.send(START, pulse(250, 20))
         connected.run(0.25)
         assert [time - start_s for time in connected.times()] == pytest.approx([0.0, 0.1, 0.2])
 
-    def test_several_channels_come_in_the_order_of_the_mask(self, connected: Bench) -> None:
-        assert connected.ask(INIT_LIST, setup(active=0b101)) == OK
-        assert connected.ask(START, pulse(250, 20)) == PARAMETER
-        assert connected.ask(START, pulse(250, 20) + pulse(100, 0)) == OK
+    def test_several_channels_come_in_the_order_of_the_mask(self, connected: Host) -> None:
+        assert connected.result(INIT_LIST, setup(active=0b101)) == OK
+        assert connected.result(START, pulse(250, 20)) == PARAMETER
+        assert connected.result(START, pulse(250, 20) + pulse(100, 0)) == OK
         connected.run(0.03)
         assert connected.widths() == [250, 250]
         assert connected.packets(ERROR) == []
@@ -338,7 +321,7 @@ class TestErrors:
         ],
         ids=["emergency switch", "electrode", "module"],
     )
-    def test_the_device_stops_by_itself_and_says_why_once(self, running: Bench, break_it, error: int) -> None:
+    def test_the_device_stops_by_itself_and_says_why_once(self, running: Host, break_it, error: int) -> None:
         running.run(0.05)
         delivered = len(running.muscle.pulses)
         break_it(running)
@@ -346,28 +329,28 @@ class TestErrors:
         assert running.packets(ERROR) == [Packet(1, ERROR, bytes((error & 0xFF,)))]
         assert len(running.muscle.pulses) == delivered
         assert running.mode() == START_MODE
-        assert running.ask(SINGLE, pulse(300, 24)) == OK  # taken, then failed
+        assert running.result(SINGLE, pulse(300, 24)) == OK  # taken, then failed
         assert running.sent[-1][1] == Packet(2, ERROR, bytes((error & 0xFF,)))
         assert len(running.muscle.pulses) == delivered
 
-    def test_it_does_not_resume_when_the_electrode_is_back(self, running: Bench) -> None:
+    def test_it_does_not_resume_when_the_electrode_is_back(self, running: Host) -> None:
         running.electrodes.attached = False
         running.run(0.05)
         running.electrodes.attached = True
         running.run(0.5)
         assert len(running.muscle.pulses) == 1
-        assert running.ask(START, pulse(250, 20)) == WRONG_MODE
+        assert running.result(START, pulse(250, 20)) == WRONG_MODE
 
-    def test_a_failing_first_pulse_takes_its_doublet_along(self, connected: Bench) -> None:
+    def test_a_failing_first_pulse_takes_its_doublet_along(self, connected: Host) -> None:
         connected.electrodes.attached = False
         connected.send(INIT_LIST, setup())
-        assert connected.ask(START, pulse(250, 20, mode=1)) == OK
+        assert connected.result(START, pulse(250, 20, mode=1)) == OK
         connected.electrodes.attached = True
         connected.run(0.5)
         assert len(connected.packets(ERROR)) == 1
         assert connected.muscle.pulses == []
 
-    def test_reset_forgets_everything_and_offers_a_connection_anew(self, running: Bench) -> None:
+    def test_reset_forgets_everything_and_offers_a_connection_anew(self, running: Host) -> None:
         running.firmware.reset()
         fired, have = len(running.muscle.pulses), len(running.sent)
         running.send(START, pulse(250, 20))

@@ -123,6 +123,9 @@ class FakeCell:
         self.rate = 1.0
         self.noise_nm = 0.0
         self.ceiling_nm = math.inf
+        self.lasting_s = 0.03
+        self.read_share = 1.0  # below 1 its reader falls behind
+        self._credit = 0.0
         self.step_nm = 0.0
         self.sign = 1
         self.frozen = False
@@ -145,15 +148,15 @@ class FakeCell:
         period_s = per_block / RATE_HZ / self.rate
         first_s = self.clock.now_s()
         for i in range(1, math.ceil((until_s - first_s) / period_s)):
-            self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver, per_block))
+            self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver.take, per_block))
 
-    def _block(self, receiver: Receiver, n: int) -> None:
+    def _block(self, take: Callable[[TorqueBlock], None], n: int) -> None:
         self.counter += n + self.skip
         self.skip = 0
         if self.silent:
             return
         now_s = self.clock.now_s()
-        recent = [p for t, p in self.stimulator.sent[-3:] if now_s - t < 0.03]
+        recent = [p for t, p in self.stimulator.sent[-3:] if now_s - t < self.lasting_s]
         target_nm = 0.02 * recent[-1].pulse_width_us if recent else 0.0
         self.torque_nm += (target_nm - self.torque_nm) * (n / RATE_HZ) / 0.1
         block = np.zeros(n, SAMPLE)
@@ -172,10 +175,15 @@ class FakeCell:
         self._held.append(block)
         if self.held(now_s):  # the host or the bus stands still; what was measured comes afterwards, all at once
             return
-        block = np.concatenate(self._held)
+        self._credit = min(1.0, self._credit + self.read_share)
+        if self._credit < 1.0:
+            return
+        self._credit = 0.0
+        block = self._held.pop(0) if self.read_share < 1.0 else np.concatenate(self._held)
         block["host_time_s"] = now_s
-        self._held.clear()
-        receiver.take(TorqueBlock(block))
+        if self.read_share == 1.0:
+            self._held.clear()
+        take(TorqueBlock(block))
 
 
 class VirtualRig:

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
-import numpy as np
 import pytest
 
 from rig import config
@@ -17,9 +16,9 @@ from rig.control.rig import Rig
 from rig.errors import DeviceError
 from rig.machine import Disk
 from rig.messages import Event, Profile, Status, StopEvidence, TestPlan
-from rig.signals import SAMPLE, TorqueBlock
+from rig.signals import TorqueBlock
 from rig.tasks import Outcome, Task, Tasks
-from tests.rig.fakes import RATE_HZ, FakeStimulator, hold, rest
+from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, hold, rest
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 T = TypeVar("T")
@@ -93,19 +92,13 @@ class MistakenBlock(TorqueBlock):
         raise ZeroDivisionError("a mistake in a driver")
 
 
-class LiveCell:
-    """Torque that follows the pulses, with a counter, 1600 samples a rig second."""
-
-    sample_rate_hz = RATE_HZ
-    counter_modulus = 65536
+class LiveCell(FakeCell):
+    """Gives its blocks while it is open."""
 
     def __init__(self, clock: VirtualClock, stimulator: LiveStimulator) -> None:
-        self.clock, self.stimulator = clock, stimulator
-        self.silent = self.gone = self.broken = self.stuck = False
-        self._rng = np.random.default_rng(1)
-        self._began_s = clock.now_s()
-        self._count = 0
-        self._torque_nm = 0.0
+        super().__init__(clock, stimulator)
+        self.noise_nm, self.lasting_s = 0.01, 0.1
+        self.gone = self.broken = False
         self._opened = 0
 
     async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
@@ -124,25 +117,9 @@ class LiveCell:
         if self.gone:
             on_lost("load cell: the bus is gone")
             return
-        on_block(MistakenBlock(self._samples()) if self.broken else TorqueBlock(self._samples()))
+        take = (lambda block: on_block(MistakenBlock(block.samples))) if self.broken else on_block
+        self._block(take, round(BLOCK_S * RATE_HZ))
         self.clock.call_at(self.clock.now_s() + BLOCK_S, lambda: self._beat(opened, on_block, on_lost))
-
-    def _samples(self) -> np.ndarray:
-        now_s = self.clock.now_s()
-        due = int((now_s - self._began_s) * RATE_HZ)
-        samples = np.zeros(0 if self.silent else due - self._count, SAMPLE)
-        samples["host_time_s"], samples["stamp_s"], samples["sync"] = now_s, np.nan, 255
-        recent = [pulse for time_s, pulse in self.stimulator.sent[-2:] if now_s - time_s < 0.1]
-        target_nm = 0.02 * recent[-1].pulse_width_us if recent else 0.0
-        fallen = np.exp(-np.arange(1, len(samples) + 1) / RATE_HZ / 0.1)  # a muscle of 0.1 s
-        samples["torque_nm"] = target_nm + (self._torque_nm - target_nm) * fallen
-        self._torque_nm = samples["torque_nm"][-1] if len(samples) else self._torque_nm
-        samples["torque_nm"] += 0.01 * self._rng.standard_normal(len(samples))
-        if self.stuck:
-            samples["torque_nm"] = 0.25
-        samples["counter"] = (self._count + np.arange(len(samples))) % 65536
-        self._count = due
-        return samples
 
 
 class LiveRig:

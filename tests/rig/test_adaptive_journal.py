@@ -12,6 +12,7 @@ from rig.errors import JournalError, RecordingError
 from rig.journal import Kind, LaidBlock
 from rig.signals import PulseStatus
 from tests.rig.adaptive import adaptive, extend, hold, refusals, widths_sent
+from tests.rig.test_damaged import blocks_of
 
 
 def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
@@ -72,7 +73,7 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
         acknowledged.append(told)
         archive.to_bytes(recording)
     assert acknowledged == sorted(acknowledged) and acknowledged[-1] > 50
-    at = [place for place in range(len(whole)) if whole.startswith(journal.MARK + bytes([Kind.LAID]), place)]
+    at = blocks_of(whole, Kind.LAID)
     assert len(at) == 3
     for lost in ([0], [1], [2], [0, 1], [0, 1, 2]):
         spoiled = bytearray(whole)

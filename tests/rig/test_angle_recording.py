@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import shutil
-import struct
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -22,6 +20,7 @@ from rig.journal import Kind
 from rig.signals import ANGLE_SAMPLE, SAMPLE
 from tests.rig.fakes import VirtualRig
 from tests.rig.test_angle_run import swinging
+from tests.rig.test_damaged import blocks_of
 
 CELL_HZ, SENSOR_HZ = 1600.0, 200.0
 PPM = 150.0
@@ -213,22 +212,18 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, plain: Path, chan
     assert "\n" not in str(told.value)
 
 
-def damaged(rig: VirtualRig, folder: Path, spoil: Any) -> journal.JournalContents:
-    """A copy of its journal with some blocks' payloads overwritten."""
+def damaged(rig: VirtualRig, folder: Path, blocks: list[int]) -> journal.JournalContents:
+    """A copy of its journal with these blocks' payloads overwritten."""
     path, data = folder / "t.journal", bytearray(rig.path.read_bytes())
-    at = data.find(journal.MARK)
-    while at >= 0:
-        kind, length = data[at + 4], struct.unpack_from("<I", data, at + 8)[0]
-        if spoil(Kind(kind)):
-            data[at + 20 : at + 20 + min(length, 8)] = b"\xff" * min(length, 8)
-        at = data.find(journal.MARK, at + 16 + length)
+    for at in blocks:
+        data[at + 20 : at + 24] = b"\xff" * 4
     path.write_bytes(bytes(data))
     return journal.read(path)
 
 
 def test_angles_are_saved_where_both_headers_are_lost(tmp_path: Path, rig: VirtualRig):
     whole = rig.recording()
-    found = assembly.assemble(damaged(rig, tmp_path, lambda kind: kind in (Kind.HEADER, Kind.PLAN)))
+    found = assembly.assemble(damaged(rig, tmp_path, blocks_of(rig.path.read_bytes(), Kind.HEADER, Kind.PLAN)))
     assert "header are lost" in found.attributes["journal_note"]
     off_s = found.columns["angle/time_s"][0] - whole.columns["angle/time_s"][0]
     assert abs(off_s) < 0.02  # by times of arrival alone: the header said that both are on one bus
@@ -238,9 +233,7 @@ def test_angles_are_saved_where_both_headers_are_lost(tmp_path: Path, rig: Virtu
 
 
 def test_lost_blocks_of_angles_are_gaps(tmp_path: Path, rig: VirtualRig):
-    count = iter(range(10_000))
-    spoiled = damaged(rig, tmp_path, lambda kind: kind == Kind.ANGLE and 100 <= next(count) < 110)
-    found = assembly.assemble(spoiled)
+    found = assembly.assemble(damaged(rig, tmp_path, blocks_of(rig.path.read_bytes(), Kind.ANGLE)[100:110]))
     gaps = found.columns["angle/gaps"]
     assert gaps.shape == (1, 2) and gaps[0, 1] == 20
     first = gaps[0, 0]

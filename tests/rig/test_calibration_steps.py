@@ -27,7 +27,9 @@ def known(sensory: float = 60, motor: float = 100, comfort: float = 300, current
 
 
 def opened(steps: Steps | None = None, **fields: Any) -> Calibration:
-    request = CalibrateStartRequest(calibration_id="c1", participant="P01", by="t", large_steps=True, **fields)
+    request = CalibrateStartRequest(
+        **{"calibration_id": "c1", "participant": "P01", "by": "t", "large_steps": True, **fields}
+    )
     return Calibration(request, HARD_LIMITS, NOON_S, steps or Steps())
 
 
@@ -125,46 +127,35 @@ def test_the_last_step_up_ends_at_the_ceiling_and_no_other_follows() -> None:
     assert widths(calibration)[-1] == calibration.status().marks_us["comfort"]
 
 
-def first(
-    current_ma: float, steps: Steps = RehaStim2.steps, *, sensory_us: float = 0, large: bool = True, step_us: float = 5
-):
-    """A calibration on a stimulator that has a shortest pulse."""
-    last = None
-    if sensory_us:
-        last = Profile(
-            current_ma=100, max_pulse_width_us=500, sensory_pulse_width_us=sensory_us, motor_pulse_width_us=sensory_us
-        )
-    request = CalibrateStartRequest(
-        calibration_id="c1", participant="P01", by="t", large_steps=large, last=last, current_ma=current_ma,
-        step_us=step_us,
-    )  # fmt: skip
-    return Calibration(request, HARD_LIMITS, NOON_S, steps)
-
-
 @pytest.mark.parametrize("large", [True, False])
 def test_a_current_whose_shortest_pulse_is_too_strong_is_refused_with_the_one_to_choose(large: bool) -> None:
     with pytest.raises(RefusedError) as caught:
-        first(80, large=large)
+        opened(RehaStim2.steps, current_ma=80, large_steps=large)
     assert str(caught.value) == (
         "calibration: at 80 mA the stimulator's shortest pulse, 20 µs, is 1.6 µC, too strong for a first train; "
         "choose 50 mA or less"
     )
-    assert first(80, P24.steps, large=large).next_width_us("up") <= 12
+    assert opened(P24.steps, current_ma=80, large_steps=large).next_width_us("up") <= 12
 
 
 def test_the_bound_counts_what_is_sent_with_the_current_rounded_toward_zero() -> None:
     for current_ma in (50, 51, 51.9):
-        assert first(current_ma).next_width_us("up") == 20
+        assert opened(RehaStim2.steps, current_ma=current_ma).next_width_us("up") == 20
     with pytest.raises(RefusedError, match=r"at 52 mA .* is 1.04 µC"):
-        first(52)
+        opened(RehaStim2.steps, current_ma=52)
 
 
 def test_who_felt_more_last_time_may_begin_with_it() -> None:
     """60 % of the last sensory threshold, at most 2 µC; narrower than the shortest pulse is no beginning."""
-    assert first(80, sensory_us=40).next_width_us("up") == 24
-    assert first(100, sensory_us=200).next_width_us("up") == 20
+
+    def knowing(current_ma: float, felt_us: float) -> Calibration:
+        last = known(felt_us, felt_us, comfort=500, current_ma=100)
+        return opened(RehaStim2.steps, current_ma=current_ma, last=last)
+
+    assert knowing(80, 40).next_width_us("up") == 24
+    assert knowing(100, 200).next_width_us("up") == 20
     with pytest.raises(RefusedError, match="choose 50 mA or less"):
-        first(80, sensory_us=30)
+        knowing(80, 30)
 
 
 @pytest.mark.parametrize(

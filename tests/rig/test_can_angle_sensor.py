@@ -18,6 +18,7 @@ from rig.devices.can_load_cell import CanLoadCell
 from rig.errors import ConfigError, DeviceError
 from rig.machine import Frame
 from rig.signals import AngleScale
+from tests.rig.test_config import GOOD, load
 from tests.simulator.virtual_time import VirtualMachine
 
 MACHINE = VirtualMachine()
@@ -64,20 +65,8 @@ def test_a_signal_in_the_cells_own_frame():
 
 
 def test_the_rig_file_names_the_sensor(tmp_path: Path):
-    base = f"""data_dir = "{tmp_path}"
-socket = "{tmp_path}/s"
-[stimulator]
-device = "p24"
-port = "/dev/ttyUSB0"
-[load_cell]
-device = "can_load_cell"
-bus = {{ interface = "slcan", channel = "/dev/ttyACM0" }}
-"""
-
     def loaded(text: str) -> Any:
-        path = tmp_path / "rig.toml"
-        path.write_text(base + text)
-        return config.load(path)
+        return load(tmp_path, GOOD.partition("[limits]")[0] + text)
 
     assert loaded("").angle_sensor is None and list(loaded("").devices()) == ["stimulator", "load_cell"]
     found = loaded('[angle_sensor]\ndevice = "can_angle_sensor"\n[limits]\nangle_rad = [0.1, 2]\nangle_jump_rad = 0.05')

@@ -10,10 +10,8 @@ from typing import Any
 import pytest
 
 from rig.acquire.evidence import DECAY_S, NO_SIGNAL, SILENT_S, watch_decay
-from rig.acquire.receiver import Receiver
 from rig.messages import SegmentPlan
-from rig.signals import TorqueBlock
-from tests.rig.fakes import FakeCell, VirtualRig, rest
+from tests.rig.fakes import VirtualRig, rest
 from tests.simulator.virtual_time import VirtualMachine
 
 
@@ -101,36 +99,12 @@ def test_torque_that_falls_long_after_the_time_for_it_confirms_no_stop():
     assert not confirmed
 
 
-class Starved(FakeCell):
-    """Its samples are made in time, and read at a share of their rate: the reader falls behind."""
-
-    share = 1.0
-
-    def feed(self, receiver: Receiver, until_s: float, per_block: int = 10) -> None:
-        made: list[TorqueBlock] = []
-        given, credit = 0, 0.0
-
-        def take(block: TorqueBlock) -> None:
-            nonlocal given, credit
-            made.append(block)
-            credit += self.share
-            if credit >= 1.0:
-                credit -= 1.0
-                samples: Any = made[given].samples.copy()
-                samples["host_time_s"] = self.clock.now_s()
-                given += 1
-                receiver.take(TorqueBlock(samples))
-
-        super().feed(type("Later", (), {"take": staticmethod(take)})(), until_s, per_block)  # pyright: ignore[reportArgumentType]
-
-
 @pytest.mark.slow
 def test_a_reader_that_fell_behind_confirms_no_stop_by_torque_from_before_the_first_pulse(tmp_path: Path):
     """The run is stopped because samples arrive at half the rate; their torque is still that of the rest."""
     ramp = SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 4.0})
     rig = VirtualRig(tmp_path, [rest(2.0), ramp])
-    rig.cell.__class__ = Starved
-    rig.at(0.0, lambda: setattr(rig.cell, "share", 0.5))
+    rig.at(0.0, lambda: setattr(rig.cell, "read_share", 0.5))
     result = rig.execute()
     assert result.outcome == "fault"
     assert "samples/s arrive" in result.reason

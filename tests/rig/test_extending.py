@@ -44,12 +44,6 @@ def added(on_s: float = 0.5) -> list[SegmentPlan]:
     return [hold("added", on_s, off_s=0.1)]
 
 
-def laid(live: LiveRig) -> int:
-    run = live.rig._run
-    assert run is not None
-    return len(run.score.laid)
-
-
 def request(after: int = 20, test_id: str = "one", key: str = KEY) -> ExtendRequest:
     return ExtendRequest(test_id=test_id, key=key, after=after, segments=added())
 
@@ -60,19 +54,40 @@ def extend(live: LiveRig, *which: Any, **key: str) -> Extended:
 
 def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: Make):
     live = make()
+    for short in ("", "15 characters!!"):
+        with pytest.raises(PlanError, match="at least 16 characters"):
+            live.start(plan(live), short)
     live.start(plan(live, hold_s=20.0), KEY)
+    with pytest.raises(BusyError):
+        live.start(plan(live, "two"), KEY[::-1])  # its key opens nothing
+    for wrong in ("", KEY[::-1], KEY[:-1], KEY + "0", "0123456789abcdeF", "\ud800" * 16):
+        with pytest.raises(PlanError, match="not the key"):
+            extend(live, 20, key=wrong)
+    for ask in (lambda: extend(live, 20, "two"), lambda: live.ask(live.rig.enough(EnoughRequest(test_id="two")))):
+        with pytest.raises(TooLateError, match="test 'two' is not running"):
+            ask()
     first = extend(live, 20)
     assert (first.laid, first.boundary_s, first.ended_by) == (44, 1.1, "")
     assert first.duration_left_s == pytest.approx(60 - 1.1)
     live.wait("running")
     live.wait_pulses(5)
     assert extend(live, 44).laid == 68
+    run = live.rig._run
+    assert run is not None
+    run._gate.late, run._gate.not_sent = [(3, 0.004)], [4]
     event = live.rig.live(samples=True)
     assert event is not None and event.samples is not None and event.pulse_time_s
     assert (event.laid, event.boundary_s, event.duration_s) == (68, 1.7, 60.0)
     assert [(s.name, s.by) for s in event.laid_segments] == [("rest", "plan"), *[("added", "extension")] * 2]
     assert len(event.samples.torque_nm) == len(event.samples.counter) == len(event.samples.host_time_s) > 0
     assert np.all(np.diff(event.samples.counter) == 1)
+    assert [(late.index, late.by_s) for late in event.late] == [(3, 0.004)]
+    assert event.not_sent == [4]
+    assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event, "read as it was sent"
+    live.machine.wait(0.1)
+    plain = live.rig.live()
+    assert plain is not None
+    assert (plain.late, plain.samples) == ([], None), "only who chooses pieces needs them"
     assert live.rig.status().duration_s == 60.0
     ending = live.ask(live.rig.enough(EnoughRequest(test_id="one", by="nurse")))
     assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))
@@ -93,42 +108,6 @@ def test_what_the_muscle_did_not_feel_is_known_by_its_index(tmp_path: Path):
     skipped = [jn.SKIPPED.unpack(p) for kind, p in jn.read(rig.path).blocks if kind == jn.Kind.SKIPPED]
     dropped = [index for index, status, _ in skipped if status == PulseStatus.DROPPED]
     assert len(dropped) > 20 and rig.run.not_sent == dropped
-
-
-def test_a_live_event_is_read_as_it_was_sent(make: Make):
-    live = make()
-    live.start(plan(live, hold_s=20.0), KEY)
-    live.wait_pulses(5)
-    run = live.rig._run
-    assert run is not None
-    run._gate.late, run._gate.not_sent = [(3, 0.004)], [4]
-    event = live.rig.live(samples=True)
-    assert event is not None
-    assert [(late.index, late.by_s) for late in event.late] == [(3, 0.004)]
-    assert event.not_sent == [4]
-    live.machine.wait(0.1)
-    plain = live.rig.live()
-    assert plain is not None
-    assert (plain.late, plain.samples) == ([], None), "only who chooses pieces needs them"
-    assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event
-
-
-def test_only_who_started_it_extends_it(make: Make):
-    live = make()
-    for short in ("", "15 characters!!"):
-        with pytest.raises(PlanError, match="at least 16 characters"):
-            live.start(plan(live), short)
-    live.start(plan(live, hold_s=20.0), KEY)
-    with pytest.raises(BusyError):
-        live.start(plan(live, "two"), KEY[::-1])  # its key opens nothing
-    for wrong in ("", KEY[::-1], KEY[:-1], KEY + "0", "0123456789abcdeF", "\ud800" * 16):
-        with pytest.raises(PlanError, match="not the key"):
-            extend(live, 20, key=wrong)
-    with pytest.raises(TooLateError, match="test 'two' is not running"):
-        extend(live, 20, "two")
-    with pytest.raises(TooLateError, match="test 'two' is not running"):
-        live.ask(live.rig.enough(EnoughRequest(test_id="two")))
-    assert extend(live, 20).laid == 44
 
 
 def test_neither_before_nor_after_a_test_nor_when_it_is_stopped(make: Make):

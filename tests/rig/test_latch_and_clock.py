@@ -12,7 +12,7 @@ from rig.clock import MonotonicClock, utc_text
 from rig.control.latch import Latch
 from rig.errors import BusyError
 from tests.rig.fakes import slow_work
-from tests.simulator.virtual_time import VirtualClock, VirtualMachine
+from tests.simulator.virtual_time import VirtualMachine
 
 
 def test_the_latch_is_remembered(tmp_path: Path):
@@ -52,19 +52,6 @@ def test_one_rig_a_folder(tmp_path: Path):
         Files().lock(tmp_path)
     held.close()
     Files().lock(tmp_path).close()
-
-
-def test_a_virtual_clock_runs_events_in_order():
-    machine, seen = VirtualMachine(VirtualClock(start_s=10.0)), []
-    clock, at = machine.clock, machine.clock.call_at
-    at(12.0, lambda: seen.append(("b", clock.now_s())))
-    at(11.0, lambda: seen.append(("a", clock.now_s())))
-    machine.wait(3.0)
-    assert seen == [("a", 11.0), ("b", 12.0)]
-    assert clock.now_s() == 13.0
-    at(14.0, lambda: seen.append(("c", clock.now_s())))
-    assert clock.run(machine.tasks, 20.0, lambda: len(seen) == 3)
-    assert clock.now_s() == 14.0
 
 
 def test_a_fast_clock_runs_faster():

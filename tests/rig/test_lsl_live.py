@@ -176,12 +176,19 @@ def test_damage_costs_only_what_it_hit(tmp_path: Path):
 
 def test_one_that_joins_sends_only_what_comes_from_then_on(tmp_path: Path):
     source = tmp_path / "t.journal"
-    write_journal(source, 6, 0.6, 14.0)
+    write_journal(source, 6, 0.6, 9.0)
     whole = joined(streamed(source, tmp_path / "a.journal"))
-    late = joined(streamed(source, tmp_path / "b.journal", test=LiveTest(since_s=T0_S + 8.0)))
+    late = joined(streamed(source, tmp_path / "b.journal", test=LiveTest(since_s=T0_S + 5.0)))
     assert np.array_equal(late[1], whole[1][-len(late[1]) :])
-    assert len(late[1]) == pytest.approx(6 * RATE_HZ, abs=100)
-    assert late[2].min() >= T0_S + 8.0
+    assert len(late[1]) == pytest.approx(4 * RATE_HZ, abs=100)
+    assert late[2].min() >= T0_S + 5.0
+
+
+def streaming_of(folder: Path) -> tuple[Streaming, list[Batch]]:
+    """One that follows a rig's folder, and what it sends."""
+    sent: list[Batch] = []
+    (folder / "journals").mkdir()
+    return Streaming(folder, SimpleNamespace(push=sent.append), 0.0, RATE_HZ, 1.0), sent  # pyright: ignore
 
 
 @pytest.mark.parametrize(
@@ -190,9 +197,7 @@ def test_one_that_joins_sends_only_what_comes_from_then_on(tmp_path: Path):
 )
 def test_a_block_of_nonsense_ends_nothing(tmp_path: Path, kind: Kind, payload: bytes):
     """Its check sum is right, its content is not: it is passed over, with one line."""
-    sent: list[Batch] = []
-    (tmp_path / "journals").mkdir()
-    streaming = Streaming(tmp_path, SimpleNamespace(push=sent.append), 0.0, RATE_HZ, 1.0)  # pyright: ignore
+    streaming, sent = streaming_of(tmp_path)
     book = journal_at(tmp_path / "journals" / "t.journal")
     book.append(kind, payload)
     book.append_json(Kind.START, {"t0_s": T0_S})
@@ -208,10 +213,8 @@ def test_one_whose_end_could_not_be_written_keeps_no_later_one_from_being_sent(
 ):
     """The disk was full: the journal lies there without an end, and cannot be sealed yet."""
     monkeypatch.setattr("rig.lsl_outlets.streaming.LOOK_S", 0.0)
-    sent: list[Batch] = []
-    (tmp_path / "journals").mkdir()
-    streaming = Streaming(tmp_path, SimpleNamespace(push=sent.append), 0.0, RATE_HZ, 1.0)  # pyright: ignore
-    write_journal(tmp_path / "whole", 7, 0.6, 14.0)
+    streaming, sent = streaming_of(tmp_path)
+    write_journal(tmp_path / "whole", 7, 0.6, 9.0)
     data = (tmp_path / "whole").read_bytes()
     (tmp_path / "journals" / "first.journal").write_bytes(data[: len(data) // 2])
     while streaming.tick():

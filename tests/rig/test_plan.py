@@ -24,24 +24,11 @@ def widths(*values: float) -> list[SegmentPlan]:
     return [SegmentPlan(name="mine", sequence="widths", settings={"pulse_width_us": list(values)})]
 
 
-def test_the_default_test():
-    test = built(max_pulse_width_us=280.0)
-    assert test.duration_s == pytest.approx(38.7)
-    assert [s.name for s in test.segments] == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
-    assert test.pulse_width_us.max() == 280.0
-    for segment in test.segments:
-        part = test.pulse_width_us[segment.start : segment.end]
-        assert (part.max() == 0) == (segment.name == "rest")
-        if segment.name == "validate":
-            assert part.max() > 0.8 * 280
-    assert test.charge_uc == pytest.approx(test.pulse_width_us.sum() * 0.02)
-    assert [(s.start / 40, s.end / 40) for s in test.segments[:3]] == [(0.0, 2.0), (2.0, 14.7), (14.7, 17.7)]
-
-
 def test_preview():
     test = built()
     shown = plan.preview(test, RecruitmentTable(pulse_width_us=[0, 300], torque_nm=[0, 6]))
     assert shown.duration_s == pytest.approx(38.7)
+    assert shown.charge_uc == test.charge_uc == pytest.approx(test.pulse_width_us.sum() * 0.02)
     assert shown.torque_time_nms == pytest.approx(np.sum(test.pulse_width_us) * 0.02 / 40)
     assert plan.preview(test).torque_time_nms is None
     assert shown.segments[1] == {"name": "prbs", "start_s": 2.0, "end_s": pytest.approx(14.7)}

@@ -24,6 +24,8 @@ def test_every_protocol_fits_every_comfort_maximum(protocol: str, comfort_us: fl
     test = built(protocol, max_pulse_width_us=comfort_us)
     assert test.pulse_width_us.max() == comfort_us
     assert {"prbs", "ramp", "validate"} <= {segment.name for segment in test.segments}
+    for segment in test.segments:
+        assert segment.name != "rest" or not test.pulse_width_us[segment.start : segment.end].any()
     held_out = next(segment for segment in test.segments if segment.name == "validate")
     assert test.pulse_width_us[held_out.start : held_out.end].max() > 0.7 * comfort_us
     assert np.all(test.pulse_width_us[-40:] == 0)
@@ -42,6 +44,7 @@ def test_the_default_is_the_papers_and_is_told_first():
     told = plan.library()
     assert told.protocols[0].id == protocols.DEFAULT == "paper"
     assert [segment.name for segment in told.default] == told.protocols[0].segments
+    assert told.protocols[0].segments == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
     assert np.array_equal(
         built("paper").pulse_width_us, built(TestPlan.model_fields["protocol"].default).pulse_width_us
     )

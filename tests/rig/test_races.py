@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Coroutine, Iterator
 from itertools import count
+from types import NoneType
 from typing import Any
 
 import pytest
 
-from rig.control.rig import Rig
 from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RigError
 from rig.messages import CalibrateStartRequest
 from rig.tasks import Task
@@ -66,37 +67,87 @@ def playing(live: LiveRig) -> bool:
     return len(live.stimulator.sent) >= 3
 
 
+def ready(live: LiveRig) -> bool:
+    return live.states[-1] == "ready"
+
+
 def begin_test(live: LiveRig) -> Coroutine[Any, Any, Any]:
     return live.rig.start(live.plan("one", hold_s=0.5))
 
 
-def is_stopped(live: LiveRig, task: Task[Any], sent: int, reason: str = "now (by nurse)") -> None:
-    """It stimulates no more, says so, remembers it, and only a person undoes it."""
-    assert live.wait("latched") == reason
-    live.until(task.done.is_set)
-    live.machine.wait(2.0)
-    assert len(live.stimulator.sent) == sent
-    assert not live.stimulator.armed
-    assert live.states[-1] == "latched"
-    assert remembered(live) == {"state": "latched", "reason": reason}
-    with pytest.raises(LatchedError):
-        live.start(live.plan("two"))
-    assert live.rearm().state == "ready"
-    assert live.states[-1] == "ready"
-    live.start(live.plan("two", hold_s=0.5))
-    live.wait("ready")
-    assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+async def begin_train(live: LiveRig) -> None:
+    await live.rig.calibrate(CALIBRATION)
+    await live.rig.calibrate_step("up")
 
 
-def test_a_stop_at_each_moment_of_a_start(make: Make):
-    """While it builds its plan, makes its files, arms, and waits for its first pulse."""
-    outcomes = set()
-    for live, task in moments(make, begin_test, playing):
-        sent = len(live.stimulator.sent)
+def rearm_and_start(live: LiveRig) -> Coroutine[Any, Any, Any]:
+    """Of a ready rig, while a start waits behind it."""
+    rearming, starting = live.begin(live.rig.rearm("nurse")), live.begin(begin_test(live))
+
+    async def both() -> None:
+        with contextlib.suppress(BusyError):
+            await live.machine.tasks.join(rearming)
+        await live.machine.tasks.join(starting)
+
+    return both()
+
+
+def library(live: LiveRig) -> Coroutine[Any, Any, Any]:
+    return live.rig.library()  # nothing else
+
+
+def rearm(live: LiveRig) -> Coroutine[Any, Any, Any]:
+    return live.rig.rearm("nurse")
+
+
+def nothing(live: LiveRig) -> object: ...
+
+
+def stop_first(live: LiveRig) -> object:
+    return live.stop("first")
+
+
+def play_to_the_end(live: LiveRig) -> object:
+    live.start(live.plan("one", hold_s=0.5))
+    return live.wait("sealing")
+
+
+STORIES = {
+    "a start": (begin_test, playing, nothing, {LatchedError, NoneType}),
+    "a calibration and its train": (begin_train, playing, nothing, {LatchedError, PlanError, NoneType}),
+    "sealing": (library, ready, play_to_the_end, {NoneType}),
+    "re-arming": (rearm, ready, stop_first, {BusyError}),
+    "re-arming before a start": (rearm_and_start, playing, nothing, {LatchedError, NoneType}),
+}
+"""What is asked for, until when, what happened before, and how it may end."""
+
+
+@pytest.mark.parametrize("story", STORIES)
+def test_a_stop_at_each_moment_holds_until_a_person_undoes_it(make: Make, story: str):
+    begin, over, before, errors = STORIES[story]
+    reason = "first (by nurse)" if story == "re-arming" else "now (by nurse)"
+    for live, task in moments(make, begin, over, before):
+        sent, told = len(live.stimulator.sent), len(live.states)
         assert live.stop("now").confirmed
-        outcomes.add(type(task.error) if task.error else live.rig.trouble())
-        is_stopped(live, task, sent)
-    assert outcomes == {LatchedError, None}
+        assert live.wait("latched") == reason
+        live.until(task.done.is_set)
+        assert type(task.error) in errors
+        live.machine.wait(2.0)
+        assert len(live.stimulator.sent) == sent
+        assert not live.stimulator.armed
+        assert live.states[-1] == "latched" and "ready" not in live.states[told:]
+        assert live.rig.status().calibration is None and live.rig.trouble() is None
+        assert remembered(live) == {"state": "latched", "reason": reason}
+        if story == "sealing":
+            assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+            assert live.rig.finished.recording_path is not None
+        with pytest.raises(LatchedError):
+            live.start(live.plan("two"))
+        assert live.rearm().state == "ready"
+        assert live.states[-1] == "ready"
+        live.start(live.plan("two", hold_s=0.5))
+        live.wait("ready")
+        assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
 
 
 def test_an_end_of_the_process_at_each_moment_of_a_start(make: Make):
@@ -115,83 +166,14 @@ def test_an_end_of_the_process_at_each_moment_of_a_start(make: Make):
         assert again.states[-1] == ("latched" if live.states[-1] == "latched" else "ready")
 
 
-def test_a_stop_at_each_moment_of_sealing(make: Make):
-    def seals(live: LiveRig) -> Coroutine[Any, Any, Any]:
-        live.start(live.plan("one", hold_s=0.5))
-        live.wait("sealing")
-        return live.rig.library()  # nothing else
-
-    for live, _ in moments(make, seals, lambda live: live.states[-1] == "ready"):
-        sent = len(live.stimulator.sent)
-        assert live.stop("now").confirmed
-        assert live.wait("latched") == "now (by nurse)"
-        assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
-        assert live.rig.finished.recording_path is not None
-        assert len(live.stimulator.sent) == sent
-        assert remembered(live) == {"state": "latched", "reason": "now (by nurse)"}
-        assert live.rearm().state == "ready"
-
-
-def test_a_stop_at_each_moment_of_re_arming(make: Make):
-    for live, task in moments(
-        make,
-        lambda live: live.rig.rearm("nurse"),
-        lambda live: live.states[-1] == "ready",
-        lambda live: live.stop("first"),
-    ):
-        assert live.stop("now").confirmed
-        live.until(task.done.is_set)
-        assert isinstance(task.error, BusyError)
-        assert "ready" not in live.states[2:]
-        is_stopped(live, task, 0, "first (by nurse)")
-
-
-def test_a_stop_at_each_moment_of_re_arming_a_ready_rig_behind_which_a_start_waits(make: Make):
-    starts: list[Task[Any]] = []
-
-    def begin(live: LiveRig) -> Coroutine[Any, Any, Any]:
-        rearming = live.begin(live.rig.rearm("nurse"))
-        starts.append(live.begin(begin_test(live)))
-        return live.machine.tasks.join(rearming)
-
-    for live, task in moments(make, begin, playing):
-        sent = len(live.stimulator.sent)
-        assert live.stop("now").confirmed
-        live.until(task.done.is_set)
-        live.until(starts[-1].done.is_set)
-        assert task.error is None or isinstance(task.error, BusyError)
-        assert starts[-1].error is None or isinstance(starts[-1].error, LatchedError)
-        is_stopped(live, starts[-1], sent)
-
-
 def test_a_start_that_was_asked_while_stopped_is_not_played_once_rearmed(make: Make):
-    for live, task in moments(
-        make,
-        lambda live: live.rig.rearm("nurse"),
-        lambda live: live.states[-1] == "ready",
-        lambda live: live.stop("first"),
-    ):
+    for live, task in moments(make, rearm, ready, stop_first):
         with pytest.raises(LatchedError):
             live.start(live.plan("early"))
         live.until(task.done.is_set)
         live.machine.wait(4.0)
         assert live.states[-1] == "ready"
         assert live.stimulator.sent == []
-
-
-def test_a_stop_at_each_moment_of_a_calibration_and_its_train(make: Make):
-    async def begin_train(rig: Rig) -> None:
-        await rig.calibrate(CALIBRATION)
-        await rig.calibrate_step("up")
-
-    for live, task in moments(make, lambda live: begin_train(live.rig), playing):
-        sent = len(live.stimulator.sent)
-        assert live.stop("now").confirmed
-        live.until(task.done.is_set)
-        assert task.error is None or isinstance(task.error, LatchedError | PlanError)
-        live.wait("latched")
-        assert live.rig.status().calibration is None
-        is_stopped(live, task, sent)
 
 
 def test_a_latch_that_the_disk_refused_is_written_once_it_takes_it(make: Make):
@@ -239,7 +221,7 @@ def test_a_stop_is_remembered_by_the_next_process_once_it_is_answered(make: Make
     def go_on(live: LiveRig) -> Coroutine[Any, Any, Any]:
         return live.rig.rearm("nurse") if begin == "re-arming" else live.machine.tasks.sleep(2.0)
 
-    for live, _ in moments(make, go_on, lambda live: live.states[-1] == "ready", before):
+    for live, _ in moments(make, go_on, ready, before):
         live.stop("now")
         died = live.clock.now_s()
         while live.clock.now_s() < died + 0.3:

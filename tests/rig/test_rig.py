@@ -87,9 +87,15 @@ def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
     live = make()
     midnight_s = end_of_day_s(live.clock.unix_s())
     live.clock.set_unix_ahead(midnight_s - 10.0 - live.clock.unix_s())
+    with pytest.raises(PlanError, match="none is open"):
+        live.ask(live.rig.calibrate_step("up"))
     live.ask(live.rig.calibrate(CalibrateStartRequest(calibration_id="c", participant="P", by="t", train_s=2.0)))
+    with pytest.raises(BusyError, match="calibration"):
+        live.start(live.plan("one"))
     live.ask(live.rig.calibrate_step("up"))
     live.wait_pulses(5)
+    with pytest.raises(BusyError):
+        live.ask(live.rig.calibrate_step("up"))
     live.clock.set_unix_ahead(midnight_s + 1.0 - live.clock.unix_s())
     live.wait("calibrating")
     assert len(live.stimulator.sent) == 80  # the train that had begun was played to its end
@@ -99,6 +105,7 @@ def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
     with pytest.raises(RefusedError, match="began on an earlier day"):
         live.ask(live.rig.calibrate_finish("t", discard=False))
     assert live.ask(live.rig.calibrate_finish("t", discard=True)).profile is None
+    assert live.rig.finished is None, "a train is no test"
     assert live.rig.status().state == "ready"
 
 
@@ -111,7 +118,7 @@ def test_a_test_of_which_the_stimulator_would_send_nothing_is_refused(make: Make
 def test_a_cell_that_sticks_right_before_the_test_is_a_fault(make: Make):
     live = make()
     live.machine.wait(0.8)  # it has noise
-    live.cell.stuck = True
+    live.cell.frozen, live.cell.last_nm = True, 0.25
     live.start(live.plan("one", hold_s=20.0))
     assert "has stayed at exactly 0.250" in live.wait("latched")
 
@@ -144,31 +151,6 @@ def test_a_stop_of_a_deaf_device_is_not_called_confirmed(make: Make):
     live.stimulator.deaf = True
     assert not live.stop("check").confirmed
     assert live.rig.status().state == "latched"
-
-
-def test_a_calibration_from_start_to_its_profile(make: Make):
-    live = make()
-    with pytest.raises(PlanError, match="none is open"):
-        live.ask(live.rig.calibrate_step("up"))
-    request = CalibrateStartRequest(calibration_id="c", participant="P", by="therapist", step_us=25.0, train_s=0.5)
-    assert live.ask(live.rig.calibrate(request)).state == "calibrating"
-    with pytest.raises(BusyError, match="calibration"):
-        live.start(live.plan("one"))
-    for threshold in ("sensory", "motor", "comfort"):
-        live.ask(live.rig.calibrate_step("up"))
-        with pytest.raises(BusyError):
-            live.ask(live.rig.calibrate_step("up"))
-        live.wait("calibrating")
-        assert threshold in live.ask(live.rig.calibrate_mark(threshold)).calibration.marks_us  # pyright: ignore
-    with pytest.raises(RefusedError, match="comfort maximum"):
-        live.ask(live.rig.calibrate_step("up"))
-    result = live.ask(live.rig.calibrate_finish("therapist", discard=False))
-    assert result.profile is not None
-    assert result.profile.max_pulse_width_us == 75.0
-    assert len(result.recordings) == 3
-    assert live.rig.finished is None  # a train is no test
-    assert max(pulse.pulse_width_us for _, pulse in live.stimulator.sent) == 75
-    assert live.rig.status().state == "ready"
 
 
 def test_a_journal_without_an_end_comes_back_uncertain(make: Make, tmp_path: Path):

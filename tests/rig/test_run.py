@@ -14,12 +14,15 @@ import pytest
 from hardware_sim.factory import make_devices
 from hardware_sim.settings import Settings
 from rig import archive
+from rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
+from rig.adapters.files import Files
+from rig.control.sealing import warnings
 from rig.devices import p24, rehastim2
 from rig.errors import WireError
 from rig.messages import SegmentPlan
 from rig.signals import Ack, Pulse, PulseStatus
 from rig.tasks import Task
-from tests.rig.fakes import VirtualRig, hold, void
+from tests.rig.fakes import VirtualRig, hold, rest, slow_work, void
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.host import Computer, Process
 from tests.simulator.wires import SimulatedPort, Wires
@@ -143,37 +146,67 @@ def test_a_damaged_answer_of_the_stimulator_ends_a_test_like_none(tmp_path: Path
     assert rig.recording().attributes["outcome"] == "fault"
 
 
-FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str]] = {
-    "silent cell": (lambda r: setattr(r.cell, "silent", True), "torque is stale"),
-    "NaN": (lambda r: setattr(r.cell, "nan", True), "not a number"),
-    "torque over its limit": (lambda r: setattr(r.cell, "add_nm", 35.0), "outside -30 … 30"),
-    "torque under its limit": (lambda r: setattr(r.cell, "add_nm", -35.0), "outside -30 … 30"),
-    "counter jump": (lambda r: setattr(r.cell, "skip", 5000), "jumped"),
-    "no ack": (lambda r: setattr(r.stimulator, "ack_delay_s", None), "not acknowledged"),
-    "late ack": (lambda r: setattr(r.stimulator, "ack_delay_s", 0.3), "not acknowledged"),
-    "electrode": (lambda r: setattr(r.stimulator, "error", "electrode error"), "electrode error at pulse"),
-    "line broken": (lambda r: setattr(r.stimulator, "send_error", "no bytes taken"), "no bytes taken"),
-    "unplugged": (lambda r: r.stimulator.on_lost("unplugged"), "unplugged"),
-    "journal": (lambda r: setattr(r.journal, "_failure", "disk full"), "disk full"),
+class Failing(Files):
+    """A disk that is full or gone once it is told so."""
+
+    fault = ""
+
+    def free_bytes(self, folder: Path) -> int:
+        if self.fault == "gone":
+            raise OSError(5, "Input/output error")
+        return 8 * 2**20 - 1 if self.fault == "full" else super().free_bytes(folder)
+
+
+WATCH_S = 0.15
+"""A watch of 100 ms, and two pulses."""
+FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str, float]] = {
+    "silent cell": (lambda r: setattr(r.cell, "silent", True), "torque is stale", WATCH_S),
+    "NaN": (lambda r: setattr(r.cell, "nan", True), "not a number", WATCH_S),
+    "torque over its limit": (lambda r: setattr(r.cell, "add_nm", 35.0), "outside -30 … 30", WATCH_S),
+    "torque under its limit": (lambda r: setattr(r.cell, "add_nm", -40.0), "outside -30 … 30", WATCH_S),
+    "counter jump": (lambda r: setattr(r.cell, "skip", 5000), "jumped", WATCH_S),
+    "no ack": (lambda r: setattr(r.stimulator, "ack_delay_s", None), "not acknowledged", WATCH_S),
+    "late ack": (lambda r: setattr(r.stimulator, "ack_delay_s", 0.3), "not acknowledged", WATCH_S),
+    "electrode": (lambda r: setattr(r.stimulator, "error", "electrode error"), "electrode error at pulse", WATCH_S),
+    "line broken": (lambda r: setattr(r.stimulator, "send_error", "no bytes taken"), "no bytes taken", WATCH_S),
+    "unplugged": (lambda r: r.stimulator.on_lost("unplugged"), "unplugged", WATCH_S),
+    "journal": (lambda r: setattr(r.journal, "_failure", "disk full"), "disk full", WATCH_S),
+    "disk slow": (lambda r: slow_work(r.machine, 10.0), "too slow", DEFAULT_WATCH.stale_disk_s + 0.03),
+    "disk full": (lambda r: setattr(r.machine.disk, "fault", "full"), "MB free", SYNC_PERIOD_S + 0.03),
+    "disk gone": (lambda r: setattr(r.machine.disk, "fault", "gone"), "too slow", DEFAULT_WATCH.stale_disk_s + 0.03),
+    "sender": (lambda r: r.clock.advance(0.5), "blocked", 0.03),
 }
+"""What happens, what is told, and within how many seconds nothing is sent or fed to the device's watchdog any more."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_stops_the_test(tmp_path: Path, name: str):
-    inject, words = FAULTS[name]
-    rig = VirtualRig(tmp_path)
+    inject, words, within_s = FAULTS[name]
+    rig = VirtualRig(tmp_path, [hold(on_s=5.0)])
+    rig.machine.disk = Failing()
+    rig.cell.noise_nm = 0.01
     at: list[float] = []
     rig.at(1.2, lambda: (at.append(rig.clock.now_s()), inject(rig)))
     result = rig.execute()
     assert result.outcome == "fault"
     assert words in result.reason
     assert rig.stimulator.stops >= 1
-    assert max(rig.stimulator.sent[-1][0], rig.stimulator.fed_s[-1]) - at[0] < 0.15  # watch of 100 ms and two pulses
+    assert rig.stimulator.fed_s[-1] - rig.stimulator.fed_s[0] > 0.9, "before the fault it was fed"
+    assert max(rig.stimulator.sent[-1][0], rig.stimulator.fed_s[-1]) - at[0] < within_s
     assert rig.gate.fire(99, Pulse(100.0, 20.0), rig.clock.now_s(), math.inf) == PulseStatus.REFUSED
     recording = rig.recording()
     assert recording.attributes["outcome"] == "fault"
     assert len(recording.columns["pulses/status"]) < len(rig.test.pulse_width_us)
+
+
+def test_through_a_rest_the_device_is_fed_at_every_pulses_time(tmp_path: Path):
+    rig = VirtualRig(tmp_path, [rest(3.0)])
+    assert rig.execute().outcome == "completed"
+    assert rig.stimulator.sent == []
+    assert len(rig.stimulator.fed_s) == 120
+    rig.gate.feed()  # after the test nothing feeds any more
+    assert len(rig.stimulator.fed_s) == 120
 
 
 def test_a_stop_is_confirmed_by_the_torque_falling(tmp_path: Path):
@@ -228,6 +261,7 @@ def test_no_torque_no_test(tmp_path: Path):
     recording = rig.recording()
     assert recording.names == []
     assert {path: len(column) for path, column in recording.columns.items()} == {p: 0 for p, _, _ in archive.COLUMNS}
+    assert warnings(recording) == []
 
 
 @pytest.mark.parametrize(("held_s", "confirmed"), [(0.2, True), (0.6, False)])
