@@ -20,6 +20,7 @@ import uvicorn
 from argon2 import PasswordHasher
 from sqlalchemy import text
 
+from api.clock import Clock
 from api.people import passwords
 from api.settings import Settings
 from api.store import Store, engines
@@ -158,6 +159,19 @@ def answers_come_late(request: pytest.FixtureRequest) -> Iterator[None]:
         if seed is not None:
             patch.setattr(Server, "behind", staticmethod(partial(LateAnswers, seed=seed)))
         yield
+
+
+class SetClock(Clock):
+    """Both clocks stand where a test sets them."""
+
+    def __init__(self) -> None:
+        self.unix, self.now_s = 1_800_000_000.0, 1000.0
+
+    def unix_s(self) -> float:
+        return self.unix
+
+    def monotonic_s(self) -> float:
+        return self.now_s
 
 
 @dataclass

@@ -15,8 +15,8 @@ from api.clock import Clock
 from api.errors import ApiError
 from api.people.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
 from api.people.passwords import MOST_STRANGERS, Passwords
-from tests.api.conftest import TOKEN, Service, run_test
-from tests.api.test_people import PASSWORD, SetClock, standing_still
+from tests.api.conftest import TOKEN, Service, SetClock, run_test
+from tests.api.test_people import PASSWORD, standing_still
 
 OWN, ELSEWHERE = "10.0.0.1", "10.9.9.9"
 

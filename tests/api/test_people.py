@@ -13,22 +13,13 @@ import pytest
 from sqlalchemy import inspect
 
 from api.cli import main
-from api.clock import Clock
 from api.people import passwords
 from api.people.pace import Pace
 from api.settings import Settings
 from api.web.server import configuration, loopback, refuse_open_door
-from tests.api.conftest import PATIENCE_S, Service, run_test
+from tests.api.conftest import PATIENCE_S, Service, SetClock, run_test
 
 PASSWORD = "correct horse battery"
-
-
-class SetClock(Clock):
-    def __init__(self) -> None:
-        self.now_s = 1000.0
-
-    def monotonic_s(self) -> float:
-        return self.now_s
 
 
 def standing_still(service: Service) -> SetClock:

@@ -261,17 +261,6 @@ def test_a_trial_begun_under_an_older_approval_moves_nothing(client: httpx.Clien
     assert tracked(client).content == client.get(MODEL).content and trials(client) == []
 
 
-def test_an_approval_ends_with_its_day_and_so_does_what_was_tracked(
-    service: Service, client: httpx.Client, approved: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    play(client)
-    assert tracked(client).status_code == 200
-    clock = service.app.state.context.clock
-    tomorrow = clock.unix_s() + 86400.0
-    monkeypatch.setattr(clock, "unix_s", lambda: tomorrow)
-    assert tracked(client).status_code == client.get(TRACKING).status_code == 404
-
-
 # ---- what goes wrong ----------------------------------------------------------------------------------------------
 
 
