@@ -126,12 +126,19 @@ def test_what_was_typed_is_kept_with_a_line_beside_it_and_nothing_happens(
     assert limits(client) == before and service.rig.starts == 0
 
 
+def test_a_name_is_refused_politely(tab: httpx.Client) -> None:
+    refused = tab.post("/participants", data={"csrf": csrf(tab), "code": "Anna Schmidt"})
+    assert refused.status_code == 422 and "Please no names" in refused.text
+
+
 def test_bounds_are_this_rigs_own(tab: httpx.Client, client: httpx.Client) -> None:
     page = tab.get(PAGE).text
     assert "at most 60 mA (rig file)" in page and "at most 500 µs (hard limit)" in page
     refused = send(tab, current_ma="60,5")
     assert refused.status_code == 422 and "at most 60 mA, as this rig asks (rig file)" in refused.text
     assert "above this rig" not in refused.text
+    wide = send(tab, max_pulse_width_us="5000")
+    assert "&#39;5000&#39;: 5000 µs" in wide.text and inputs(wide.text)["max_pulse_width_us"] == "5000"
     charged = send(tab, current_ma="60", max_pulse_width_us="400")
     assert charged.status_code == 422 and "above the 20 µC that this rig takes" in charged.text
     assert limits(client)["current_ma"] == 20
