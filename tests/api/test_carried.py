@@ -178,10 +178,11 @@ def test_model_page_says_what_carries_over(
         assert 'id="carried"' not in browser.get(f"/models/{approved['id']}").text
 
 
-def test_an_approved_model_that_is_no_text_any_more_leaves_the_plain_one() -> None:
+@pytest.mark.parametrize("document", [b"\xff\xfe", b'{"sample_rate_hz": 41.0}'], ids=["no text", "another digit"])
+def test_a_damaged_approved_model_leaves_the_plain_one(document: bytes) -> None:
     """A damaged row of the database must not cost a test its model."""
     plain = SimpleNamespace(id="M2", participant="P1", recording_id="R2", effects=[])
-    earlier = SimpleNamespace(id="M1", recording_id="R1", document=b"\xff\xfe", etag="")
+    earlier = SimpleNamespace(id="M1", recording_id="R1", document=document, etag="")
     kept: list[dict[str, Any]] = []
     versions: Any = SimpleNamespace(
         last_approved=lambda _: earlier,
