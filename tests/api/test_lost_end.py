@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
 from api.sessions.rig_client import RigClient
-from tests.api import fake_rig
 from tests.api.conftest import Service, let_go, run_test
 
 
@@ -78,17 +76,3 @@ def test_a_failure_in_a_poll_does_not_end_the_polling(client: httpx.Client, serv
         assert time.monotonic() < end, calls
         time.sleep(0.05)
     assert client.get("/v1/rig").json()["connected"]
-
-
-def test_a_fake_rig_that_fails_at_a_tests_end_says_so(
-    client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What held the rig for ever in a loaded run of the page's tests: the player's own failure was told to nobody."""
-
-    def broken(folder: Path, *_: Any) -> Any:
-        raise AttributeError("partially initialized module")
-
-    monkeypatch.setattr(fake_rig, "write_recording", broken)
-    ended = run_test(client, participant)
-    assert ended["state"] == "fault" and "partially initialized" in ended["reason"]
-    assert let_go(client)
