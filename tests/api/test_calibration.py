@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import threading
 from typing import Any
 
@@ -90,6 +91,8 @@ def test_whole_calibration_by_plain_forms(service: Service, participant: str) ->
         assert "Begin the calibration" in browser.get(page).text
         assert browser.post(page, data={**token, "current_ma": "x", "step_us": "10"}).status_code == 422
         assert browser.post(page, data={**token, "current_ma": "20", "step_us": "10"}).status_code == 303
+        (wider,) = re.findall(r'<button[^>]*id="step-up"[^>]*>', browser.get(page).text)
+        assert "disabled" not in wider, "it works without scripts"
         for threshold in ("sensory", "motor", "comfort"):
             browser.post(f"{page}/step/up", data=sight(service, token))
             browser.post(f"{page}/mark/{threshold}", data=sight(service, token))

@@ -196,15 +196,3 @@ def test_last_times_marks_stand_beside_todays(page: Any, service: Service) -> No
     rows = page.locator(".marks tbody tr").all_inner_texts()
     assert ["10 µs" in rows[0], "20 µs" in rows[1], "30 µs" in rows[2]] == [True] * 3
     assert service.rig.asked.large_steps and service.rig.asked.last.sensory_pulse_width_us == 10
-
-
-def test_without_scripts_the_forms_do_the_same(browser: Any, service: Service) -> None:
-    for tab in open_tab(browser, service, java_script_enabled=False):
-        with service.client() as http:
-            http.post("/v1/participants", json={"code": "K2"})
-        tab.goto(f"{service.url}/participants/K2/calibration")
-        tab.get_by_role("button", name="Begin the calibration").click()
-        tab.get_by_role("button", name="Wider: 10 µs at 20 mA").click()
-        tab.get_by_role("button", name="Mark: It is felt").click()
-        assert widths(service) == [10] and service.rig.calibration.marks_us == {"sensory": 10}  # pyright: ignore[reportOptionalMemberAccess]
-        tab.get_by_role("button", name="Discard").click()

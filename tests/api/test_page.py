@@ -24,7 +24,7 @@ from tests.api.browser import (
     participant,
     start,
 )
-from tests.api.conftest import Service, run_test, shared_service
+from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 
@@ -44,6 +44,7 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     left = int(tab.locator("#left").inner_text().split()[0])
     assert 0 < left < 25
     assert not tab.locator("#stale").is_visible()
+    service.rig.speed = 60.0
     tab.wait_for_url("**/models/M-*", timeout=60_000)
     tab.locator(".figure-box .main-svg").first.wait_for()
     tab.locator("[data-job]").wait_for(state="detached")  # the diagnosis adds more when it is ready
@@ -145,33 +146,6 @@ def test_limits_for_today_are_set_by_a_key(tab: Any, service: Service) -> None:
     tab.keyboard.press("Enter")
     tab.get_by_text("17.5 mA").wait_for()
     assert service.rig.state == "ready", "the key in the field starts nothing"
-
-
-def test_hidden_effect_is_found_and_added_by_clicking(tab: Any, service: Service) -> None:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "P103"})
-        model = run_test(http, "P103")["model_id"]
-    for width, height in (WIDE, NARROW, PHONE):
-        tab.set_viewport_size({"width": width, "height": height})
-        tab.goto(f"{service.url}/models/{model}")
-        tab.get_by_role("link", name="Fatigue").wait_for()
-        tab.locator("[data-figure=overview] .main-svg").first.wait_for()
-        assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), width
-    tab.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
-    tab.locator("summary", has_text="Where the error sits").click()
-    tab.locator("[data-figure=residual] .main-svg").first.wait_for()
-    expected(tab.locator(".place-share", has_text="31 %")).to_be_visible()
-    tab.get_by_role("button", name="Add this effect").click()
-    tab.get_by_text("Error of each version", exact=True).wait_for()
-    tab.locator("[data-figure=falling] .main-svg").first.wait_for()
-    assert tab.locator("tr.current").inner_text().startswith("2. + fatigue")
-    tab.locator("[data-job]").wait_for(state="detached")
-    tab.locator(".undo").get_by_label("Your password, once more").fill(PASSWORD)
-    tab.get_by_role("button", name="Undo").click()
-    tab.wait_for_url(f"**/models/{model}#versions")
-    assert tab.locator("tr.current").inner_text().startswith("1. base model")
-    hosts = {urlsplit(url).netloc for url in tab.requests if url.startswith("http")}
-    assert tab.errors == [] and hosts == {urlsplit(service.url).netloc}
 
 
 def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> None:

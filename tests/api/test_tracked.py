@@ -19,13 +19,6 @@ WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us":
 MODEL, TRACKING = "/v1/participants/P017/model", "/v1/participants/P017/tracking"
 
 
-@pytest.fixture
-def approved(client: httpx.Client, participant: str) -> str:
-    model: str = run_test(client, participant)["model_id"]
-    assert client.post(f"/v1/models/{model}/approve").status_code == 200
-    return model
-
-
 def play(client: httpx.Client, **more: Any) -> dict[str, Any]:
     body = {"participant": "P017", "kind": "sequence", "segments": WIDTHS, **more}
     started = client.post("/v1/tests", json=body)
