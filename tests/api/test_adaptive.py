@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,13 @@ import httpx
 import pytest
 
 from api.sessions import runner
-from api.sessions.adaptive_tests import KEPT
+from api.sessions.adaptive_tests import KEPT, AdaptiveTests
 from api.sessions.requests import TargetIn, TestIn
 from api.sessions.rig_client import no_rig
+from api.store.tables import Test
 from identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
-from tests.api.conftest import Service, own_service, wait_done
+from rig.messages import FinishedEvent
+from tests.api.conftest import Service, own_service, soon, wait_done
 
 service = own_service(speed=1.0)
 """Adaptive tests are decided in seconds of the rig: it plays at the speed of the world."""
@@ -29,14 +30,6 @@ def played(client: httpx.Client, **more: Any) -> dict[str, Any]:
     started = start(client, **more)
     assert started.status_code == 202, started.text
     return wait_done(client, started.json()["id"])
-
-
-def wait_for(client: httpx.Client, test_id: str, what: Any, limit_s: float = 30.0) -> dict[str, Any]:
-    end = time.monotonic() + limit_s
-    while not what(document := client.get(f"/v1/tests/{test_id}").json()):
-        assert time.monotonic() < end, document
-        time.sleep(0.02)
-    return document
 
 
 def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service: Service, participant: str) -> None:
@@ -168,7 +161,7 @@ def test_a_model_of_another_arm_or_current_says_nothing_of_this_one(
 
 def test_enough_ends_it_well_at_any_time(client: httpx.Client, service: Service, participant: str) -> None:
     test_id = start(client, target={"curve_percent": 0.2, "step_percent": 0.2}).json()["id"]
-    wait_for(client, test_id, lambda document: document["elapsed_s"] > 1)
+    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] > 1)
     answer = client.post(f"/v1/tests/{test_id}/enough")
     assert answer.status_code == 200 and answer.json()["ended_by"] == "enough"
     document = wait_done(client, test_id)
@@ -219,7 +212,7 @@ def test_what_the_rig_refuses_is_not_played(client: httpx.Client, service: Servi
 
 def test_a_stop_stops_it_like_any_test(client: httpx.Client, service: Service, participant: str) -> None:
     test_id = start(client).json()["id"]
-    wait_for(client, test_id, lambda document: document["elapsed_s"] > 1)
+    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] > 1)
     assert client.post("/v1/stop").status_code == 200
     document = wait_done(client, test_id)
     assert (document["state"], document["adaptive"]["ended"]) == ("stopped", "stopped")
@@ -263,3 +256,56 @@ def test_the_bounds_of_a_target_are_those_of_identify() -> None:
         for outside in (0.99 * LEAST_PERCENT, 1.01 * MOST_PERCENT):
             with pytest.raises(ValueError, match=name):
                 TargetIn.model_validate({name: outside})
+
+
+class Nobody:
+    """Participants without models, and a store without tests."""
+
+    def all_approved_ones(self, _participant: str) -> list[Any]:
+        return []
+
+    @property
+    def store(self) -> Nobody:
+        return self
+
+    def all(self, *_: Any) -> list[Any]:
+        return []
+
+
+@pytest.fixture
+def adaptive() -> AdaptiveTests:
+    nothing: Any = None
+    models: Any = Nobody()
+    return AdaptiveTests(nothing, nothing, models, nothing, lambda _message: None)
+
+
+def row(max_duration_s: float = 45.0, planned: tuple[str, ...] = ("opening", "prbs", "validate")) -> Test:
+    bounds = {"max_duration_s": max_duration_s, "max_torque_time_nms": 360.0}
+    segments = [{"name": name, "start_s": 0.0, "end_s": 1.0} for name in planned]
+    plan = {"adaptive": bounds, "target": {}, "reach": None, "preview": {"segments": segments}}
+    return Test(id="T1", participant="P017", kind="adaptive", state="running", plan=plan, summary={})
+
+
+@pytest.mark.parametrize(
+    ("by", "duration_s", "ended"),
+    [("plan", 42.0, "fixed-rest"), ("torque_time", 9.0, "torque-time"), ("limit", 44.4, "time"),
+     ("limit", 20.0, "limit"), ("enough", 9.0, "enough"), ("stopped", 9.0, "stopped")],
+)  # fmt: skip
+def test_the_end_is_told_by_its_cause(adaptive: AdaptiveTests, by: str, duration_s: float, ended: str) -> None:
+    summary = {"ended_by": by, "duration_s": duration_s, "torque_time_nms": 8.0}
+    event = FinishedEvent(test_id="T1", outcome="completed", last_sample_unix_s=None, summary=summary)
+    told = adaptive.outcome(row(), event)["adaptive"]
+    assert (told["ended"], told["torque_time_nm_s"], told["state"]) == (ended, 8.0, "ended")
+
+
+@pytest.mark.parametrize(
+    ("ended", "planned", "helped"),
+    [("known-enough", ("opening", "validate"), True), ("fixed-rest", ("opening", "prbs", "validate"), False),
+     ("fixed-rest", ("opening", "prbs"), True)],
+)  # fmt: skip
+def test_only_a_whole_fixed_test_is_fitted_like_one(
+    adaptive: AdaptiveTests, ended: str, planned: tuple[str, ...], helped: bool
+) -> None:
+    test = row(planned=planned)
+    test.summary = {"adaptive": {"ended": ended}}
+    assert bool(adaptive.fit_options(test)) == helped

@@ -40,9 +40,9 @@ def model(record: Path) -> Path:
     return path
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     capsys.readouterr()
-    code = main.run(list(arguments))
+    code = main.run(list(map(str, arguments)))
     out, err = capsys.readouterr()
     return code, out, err
 
