@@ -23,9 +23,8 @@ WIDE, NARROW, PHONE = (1280, 860), (1024, 768), (390, 844)
 NAME, PASSWORD = "Ada", "correct horse battery"
 
 
-def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: Any) -> Iterator[Any]:
-    """A tab, signed in; at its end the rig is brought to rest and re-armed."""
-    service.rig.confirms_stop = True
+def watched(browser: Any, **options: Any) -> Any:
+    """A tab that takes down every request, error and console message."""
     # a color on its way to another one is neither of the two
     context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, reduced_motion="reduce", **options)
     page = context.new_page()
@@ -33,10 +32,17 @@ def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: 
     page.on("request", lambda request: page.requests.append(request.url))
     page.on("pageerror", lambda error: page.errors.append(str(error)))
     page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
+    return page
+
+
+def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: Any) -> Iterator[Any]:
+    """A tab, signed in; at its end the rig is brought to rest and re-armed."""
+    service.rig.confirms_stop = True
+    page = watched(browser, **options)
     if signed_in:
         enter(page, service)
     yield page
-    close(context)
+    close(page.context)
     bring_to_rest(service)
 
 

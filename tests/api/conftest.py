@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 import ssl
 import tempfile
@@ -20,6 +21,7 @@ import uvicorn
 from argon2 import PasswordHasher
 from sqlalchemy import text
 
+from api.clock import Clock
 from api.people import passwords
 from api.settings import Settings
 from api.store import Store, engines
@@ -158,6 +160,19 @@ def answers_come_late(request: pytest.FixtureRequest) -> Iterator[None]:
         if seed is not None:
             patch.setattr(Server, "behind", staticmethod(partial(LateAnswers, seed=seed)))
         yield
+
+
+class SetClock(Clock):
+    """Both clocks stand where a test sets them."""
+
+    def __init__(self) -> None:
+        self.unix, self.now_s = 1_800_000_000.0, 1000.0
+
+    def unix_s(self) -> float:
+        return self.unix
+
+    def monotonic_s(self) -> float:
+        return self.now_s
 
 
 @dataclass
@@ -345,6 +360,40 @@ def client(service: Service) -> Iterator[httpx.Client]:
 def participant(client: httpx.Client) -> str:
     assert client.post("/v1/participants", json={"code": "P017"}).status_code == 201
     return "P017"
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[Any]:
+    """A server of S3 in this process, and the variables by which fsspec and botocore find it."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    given = {
+        "AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing", "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+    }  # fmt: skip
+    kept = {name: os.environ.get(name) for name in given}
+    os.environ.update(given)
+    try:
+        import s3fs
+
+        s3fs.S3FileSystem.clear_instance_cache()  # one of another module would ask that one's server
+        yield s3fs.S3FileSystem(anon=False)
+    finally:
+        server.stop()
+        for name, value in kept.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@pytest.fixture
+def approved(client: httpx.Client, participant: str) -> str:
+    """The participant's model, in use."""
+    model: str = run_test(client, participant)["model_id"]
+    assert client.post(f"/v1/models/{model}/approve").status_code == 200
+    return model
 
 
 def soon(found: Callable[[], Any], limit_s: float = 60.0) -> Any:

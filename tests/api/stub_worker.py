@@ -147,15 +147,13 @@ def knowledge(percent: float) -> dict[str, Any]:
 
 def advised(advice: int, target: float, pause: Pause) -> dict[str, Any]:
     """Each answer halves the bands, from 8 %; the target of 45 % is one at which the worker dies, of 44 % one at which
-    it is slow, of 43 % one at which the structure fits badly, of 42 % one at which the answer holds nothing."""
+    it is slow."""
     percent = 16.0 * 0.5**advice
     if advice > 2 and target == 45.0:
         sys.exit(9)
     if advice > 2 and target == 44.0:
         pause(3)
-    if target == 42.0:
-        return {}
-    kind = "next" if target >= 44.0 or percent > target else "misfit" if target == 43.0 else "enough"
+    kind = "next" if target >= 44.0 or percent > target else "enough"
     widths = [100.0, 200.0] * 20
     segments = [{"name": f"step {advice}", "sequence": "widths",
                  "settings": {"pulse_width_us": widths, "jumps": True}}]  # fmt: skip

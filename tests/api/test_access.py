@@ -13,7 +13,7 @@ import pytest
 from api.clock import utc_label
 from api.people.auth import Scope
 from api.settings import Settings
-from tests.api.conftest import TOKEN, Service, run_test
+from tests.api.conftest import TOKEN, Service, run_test, wait_done
 
 HTML = {"Accept": "text/html,application/xhtml+xml"}
 
@@ -32,16 +32,6 @@ def csrf(browser: httpx.Client) -> str:
     return re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
 
 
-def test_controller_key_reads_its_model_and_nothing_else(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    document = run_test(client, participant)
-    client.post(f"{document['model_url']}/approve")
-    controller = service.client(service.token("controller", "read-model"))
-    assert controller.get(f"/v1/participants/{participant}/model").status_code == 200
-    assert controller.post("/v1/tests", json={"participant": participant}).status_code == 403
-
-
 def test_wrong_revoked_and_expired_tokens_are_refused(client: httpx.Client, service: Service) -> None:
     assert service.client("wrong").get("/v1/rig").status_code == 401
     assert service.client(None).get("/v1/rig", headers={"Authorization": "Basic eDp5"}).status_code == 401
@@ -50,9 +40,10 @@ def test_wrong_revoked_and_expired_tokens_are_refused(client: httpx.Client, serv
     entry = next(row for row in client.get("/v1/tokens").json() if row["name"] == "leaver")
     assert client.delete(f"/v1/tokens/{entry['id']}").status_code == 204
     assert service.client(token).get("/v1/rig").status_code == 401
-    body = {"name": "late", "scopes": ["read-live"], "expires_utc": "2020-01-01T00:00:00Z"}
+    body = {"name": "late", "scopes": ["run-test"], "expires_utc": "2020-01-01T00:00:00Z"}
     late = client.post("/v1/tokens", json=body).json()["token"]
     assert "expired" in service.client(late).get("/v1/rig").json()["detail"]
+    assert service.client(late).post("/v1/stop").status_code == 200, "it ran out in a test: it still stops"
 
 
 def test_database_holds_no_token(service: Service) -> None:
@@ -118,7 +109,6 @@ def test_stop_by_json_and_without_a_body_says_the_rigs_evidence(
     answer = client.post("/v1/stop", json={"reason": "pain"}).json()
     assert answer["stopped"] and answer["evidence"]["device_state"] == "stopped"
     assert client.post("/v1/stop").json()["stopped"]
-    assert client.post("/v1/stop", content=b"{not json", headers={"content-type": "application/json"}).json()["stopped"]
 
 
 def test_stop_is_open_to_anyone_signed_in_and_to_nobody_else(service: Service) -> None:
@@ -142,35 +132,15 @@ def test_stop_by_plain_form_works_without_csrf_and_after_the_session_ran_out(
     assert service.rig.stopped_by == "administrator"
 
 
-def test_unconfirmed_stop_is_never_called_stopped(client: httpx.Client, service: Service) -> None:
-    service.rig.confirms_stop = False
-    answer = client.post("/v1/stop")
-    assert answer.status_code == 503
-    assert answer.json()["title"] == "The stop is not confirmed" and "emergency switch" in answer.json()["detail"]
-    with signed_in(service) as browser:
-        page = browser.post("/v1/stop", data={}, follow_redirects=True)
-        assert page.status_code == 503 and "not confirmed" in page.text and "confirms" not in page.text
-
-
 def test_stop_says_so_when_the_rig_is_gone(client: httpx.Client, service: Service) -> None:
     service.rig_thread.__exit__()
     answer = client.post("/v1/stop")
     assert answer.status_code == 503 and "emergency switch" in answer.json()["detail"]
 
 
-def test_after_a_stop_the_rig_waits_for_a_person(client: httpx.Client, service: Service, participant: str) -> None:
-    client.post("/v1/stop")
-    refused = client.post("/v1/tests", json={"participant": participant})
-    assert refused.status_code == 409 and refused.json()["type"] == "/problems/rig-latched"
-    assert client.post("/v1/rearm").json()["state"] == "ready"
-    assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
-
-
 def test_stopped_test_keeps_its_recording_and_makes_no_model(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    from tests.api.conftest import wait_done
-
     service.rig.speed = 0.5
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     client.post("/v1/stop", json={"reason": "pain"})
@@ -190,6 +160,8 @@ def test_approval_ends_with_its_day(client: httpx.Client, service: Service, part
     clock.unix_s = lambda: now + 25 * 3600
     gone = client.get(fetch)
     assert gone.status_code == 404 and "ends with its day" in gone.json()["detail"]
+    for tracked in (f"{fetch}?tracked=true", f"/v1/participants/{participant}/tracking"):
+        assert client.get(tracked).status_code == 404
     assert client.get(document["model_url"]).json()["served"] is False
     client.post(f"{document['model_url']}/approve")
     assert client.get(fetch).status_code == 200

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,13 @@ import httpx
 import pytest
 
 from api.sessions import runner
-from api.sessions.adaptive_tests import KEPT
+from api.sessions.adaptive_tests import KEPT, AdaptiveTests
 from api.sessions.requests import TargetIn, TestIn
 from api.sessions.rig_client import no_rig
+from api.store.tables import Test
 from identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
-from tests.api.conftest import Service, own_service, wait_done
+from rig.messages import FinishedEvent
+from tests.api.conftest import Service, own_service, soon, wait_done
 
 service = own_service(speed=1.0)
 """Adaptive tests are decided in seconds of the rig: it plays at the speed of the world."""
@@ -29,14 +30,6 @@ def played(client: httpx.Client, **more: Any) -> dict[str, Any]:
     started = start(client, **more)
     assert started.status_code == 202, started.text
     return wait_done(client, started.json()["id"])
-
-
-def wait_for(client: httpx.Client, test_id: str, what: Any, limit_s: float = 30.0) -> dict[str, Any]:
-    end = time.monotonic() + limit_s
-    while not what(document := client.get(f"/v1/tests/{test_id}").json()):
-        assert time.monotonic() < end, document
-        time.sleep(0.02)
-    return document
 
 
 def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service: Service, participant: str) -> None:
@@ -57,55 +50,30 @@ def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service:
     assert "key" not in plan and service.rig.key not in str(plan)
 
 
-def test_only_new_samples_are_sent_and_none_is_lost(client: httpx.Client, service: Service, participant: str) -> None:
+def test_only_new_samples_are_sent_and_none_is_lost(
+    client: httpx.Client, service: Service, participant: str, tmp_path: Path
+) -> None:
+    """The adviser is busy at first: a record without its beginning would mislead. And a recording in a folder that the
+    pool learns meanwhile starts the pool's workers anew, not the one that keeps the test."""
     asked: list[dict[str, Any]] = []
-    adviser = service.app.state.context.runner.adaptive.adviser
+    context = service.app.state.context
+    adviser = context.runner.adaptive.adviser
     ask = adviser.ask
 
     async def listening(verb: str, **arguments: Any) -> dict[str, Any]:
         asked.append(arguments if verb == "adaptive_advise" else {})
+        context.pool.places.learn({"data": str(tmp_path / verb / "recording.h5")})
+        await asyncio.sleep(1.5 if verb == "adaptive_begin" else 0.0)
         return await ask(verb, **arguments)
 
     adviser.ask = listening
-    played(client)
+    assert played(client)["adaptive"]["ended"] == "known-enough"
     advised = [arguments for arguments in asked if arguments]
     counters = [number for arguments in advised for number in arguments["counter"]]
     assert counters == list(range(len(counters))) and len(counters) > 800
     for arguments in advised:
         assert len(arguments["laid_us"]) == arguments["segments"][-1][2]
     assert advised[-1]["laid_us"][-40:] == [100.0, 200.0] * 20
-
-
-def test_samples_are_heard_before_the_adviser_is_ready(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    """It may be busy with what another test can reach; a record without its beginning would mislead."""
-    adviser = service.app.state.context.runner.adaptive.adviser
-    ask, counters = adviser.ask, []
-
-    async def busy(verb: str, **arguments: Any) -> dict[str, Any]:
-        counters.extend(arguments.get("counter", []))
-        await asyncio.sleep(1.5 if verb == "adaptive_begin" else 0.0)
-        return await ask(verb, **arguments)
-
-    adviser.ask = busy
-    assert played(client)["adaptive"]["ended"] == "known-enough"
-    assert counters == list(range(len(counters))) and len(counters) > 800
-
-
-def test_a_folder_that_the_pool_learns_ends_no_test(
-    client: httpx.Client, service: Service, participant: str, tmp_path: Path
-) -> None:
-    """A recording elsewhere starts the pool's workers anew, not the one that keeps the test."""
-    context = service.app.state.context
-    ask = context.runner.adaptive.adviser.ask
-
-    async def meanwhile(verb: str, **arguments: Any) -> dict[str, Any]:
-        context.pool.places.learn({"data": str(tmp_path / verb / "recording.h5")})
-        return await ask(verb, **arguments)
-
-    context.runner.adaptive.adviser.ask = meanwhile
-    assert played(client)["adaptive"]["ended"] == "known-enough"
 
 
 def test_a_start_that_took_long_is_not_played_and_is_quick_when_asked_again(
@@ -170,6 +138,7 @@ def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan(
         return found
 
     rig.ask = deaf
+    service.rig.speed = 1.5
     told = played(client, max_duration_s=11)["adaptive"]
     assert "did not answer" in told["problem"] and told["ended"] == "fixed-rest"
 
@@ -192,7 +161,7 @@ def test_a_model_of_another_arm_or_current_says_nothing_of_this_one(
 
 def test_enough_ends_it_well_at_any_time(client: httpx.Client, service: Service, participant: str) -> None:
     test_id = start(client, target={"curve_percent": 0.2, "step_percent": 0.2}).json()["id"]
-    wait_for(client, test_id, lambda document: document["elapsed_s"] > 1)
+    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] > 1)
     answer = client.post(f"/v1/tests/{test_id}/enough")
     assert answer.status_code == 200 and answer.json()["ended_by"] == "enough"
     document = wait_done(client, test_id)
@@ -210,19 +179,15 @@ def test_a_fixed_test_knows_no_enough(client: httpx.Client, service: Service, pa
     assert client.post("/v1/tests/none/enough").status_code == 404
 
 
-@pytest.mark.parametrize(
-    ("percent", "why"),
-    [(45.0, "The worker process died"), (43.0, "The curve is known within"), (42.0, "KeyError")],
-    ids=["dies", "misfit", "nonsense"],
-)
-def test_the_fixed_plan_plays_on_and_it_is_told(
-    client: httpx.Client, service: Service, participant: str, percent: float, why: str
+def test_after_its_workers_death_the_fixed_plan_plays_on_and_it_is_told(
+    client: httpx.Client, service: Service, participant: str
 ) -> None:
+    """What else an adviser may answer: test_follower."""
     service.rig.speed = 1.5
-    document = played(client, target={"curve_percent": percent}, max_duration_s=11)
+    document = played(client, target={"curve_percent": 45.0}, max_duration_s=11)
     told = document["adaptive"]
     assert document["state"] == "completed" and told["ended"] == "fixed-rest"
-    assert told["problem"].startswith("The fixed plan plays on") and why in told["problem"]
+    assert told["problem"].startswith("The fixed plan plays on") and "The worker process died" in told["problem"]
     assert document["summary"]["duration_s"] > 8
 
 
@@ -247,7 +212,7 @@ def test_what_the_rig_refuses_is_not_played(client: httpx.Client, service: Servi
 
 def test_a_stop_stops_it_like_any_test(client: httpx.Client, service: Service, participant: str) -> None:
     test_id = start(client).json()["id"]
-    wait_for(client, test_id, lambda document: document["elapsed_s"] > 1)
+    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] > 1)
     assert client.post("/v1/stop").status_code == 200
     document = wait_done(client, test_id)
     assert (document["state"], document["adaptive"]["ended"]) == ("stopped", "stopped")
@@ -262,9 +227,8 @@ def test_out_of_reach_is_said_before_the_first_pulse(client: httpx.Client, servi
     client.post("/v1/stop")
 
 
-@pytest.mark.parametrize(
-    ("more", "place"),
-    [
+def test_what_is_no_target_is_refused_by_its_place(client: httpx.Client, participant: str) -> None:
+    wrong: list[tuple[dict[str, Any], str]] = [
         ({"target": {"curve_percent": -1}}, "target.curve_percent"),
         ({"target": {"curve_percent": "2"}}, "target.curve_percent"),
         ({"target": {"step_percent": True}}, "target.step_percent"),
@@ -273,17 +237,11 @@ def test_out_of_reach_is_said_before_the_first_pulse(client: httpx.Client, servi
         ({"max_torque_time_nm_s": -3}, "max_torque_time_nm_s"),
         ({"kind": "pre-session", "target": {"curve_percent": 2}}, ""),
         ({"segments": [{"name": "a", "sequence": "rest"}]}, ""),
-    ],
-)
-def test_what_is_no_target_is_refused_by_its_place(
-    client: httpx.Client, participant: str, more: dict[str, Any], place: str
-) -> None:
-    refused = start(client, **more)
-    assert refused.status_code == 422
-    assert refused.json()["errors"][0]["field"].endswith(place), refused.json()
-
-
-def test_nan_is_no_target(client: httpx.Client, participant: str) -> None:
+    ]
+    for more, place in wrong:
+        refused = start(client, **more)
+        assert refused.status_code == 422, more
+        assert refused.json()["errors"][0]["field"].endswith(place), refused.json()
     for number in ("NaN", "Infinity", "1e999"):
         body = f'{{"participant": "P017", "kind": "adaptive", "target": {{"curve_percent": {number}}}}}'
         answer = client.post("/v1/tests", content=body, headers={"Content-Type": "application/json"})
@@ -298,3 +256,56 @@ def test_the_bounds_of_a_target_are_those_of_identify() -> None:
         for outside in (0.99 * LEAST_PERCENT, 1.01 * MOST_PERCENT):
             with pytest.raises(ValueError, match=name):
                 TargetIn.model_validate({name: outside})
+
+
+class Nobody:
+    """Participants without models, and a store without tests."""
+
+    def all_approved_ones(self, _participant: str) -> list[Any]:
+        return []
+
+    @property
+    def store(self) -> Nobody:
+        return self
+
+    def all(self, *_: Any) -> list[Any]:
+        return []
+
+
+@pytest.fixture
+def adaptive() -> AdaptiveTests:
+    nothing: Any = None
+    models: Any = Nobody()
+    return AdaptiveTests(nothing, nothing, models, nothing, lambda _message: None)
+
+
+def row(max_duration_s: float = 45.0, planned: tuple[str, ...] = ("opening", "prbs", "validate")) -> Test:
+    bounds = {"max_duration_s": max_duration_s, "max_torque_time_nms": 360.0}
+    segments = [{"name": name, "start_s": 0.0, "end_s": 1.0} for name in planned]
+    plan = {"adaptive": bounds, "target": {}, "reach": None, "preview": {"segments": segments}}
+    return Test(id="T1", participant="P017", kind="adaptive", state="running", plan=plan, summary={})
+
+
+@pytest.mark.parametrize(
+    ("by", "duration_s", "ended"),
+    [("plan", 42.0, "fixed-rest"), ("torque_time", 9.0, "torque-time"), ("limit", 44.4, "time"),
+     ("limit", 20.0, "limit"), ("enough", 9.0, "enough"), ("stopped", 9.0, "stopped")],
+)  # fmt: skip
+def test_the_end_is_told_by_its_cause(adaptive: AdaptiveTests, by: str, duration_s: float, ended: str) -> None:
+    summary = {"ended_by": by, "duration_s": duration_s, "torque_time_nms": 8.0}
+    event = FinishedEvent(test_id="T1", outcome="completed", last_sample_unix_s=None, summary=summary)
+    told = adaptive.outcome(row(), event)["adaptive"]
+    assert (told["ended"], told["torque_time_nm_s"], told["state"]) == (ended, 8.0, "ended")
+
+
+@pytest.mark.parametrize(
+    ("ended", "planned", "helped"),
+    [("known-enough", ("opening", "validate"), True), ("fixed-rest", ("opening", "prbs", "validate"), False),
+     ("fixed-rest", ("opening", "prbs"), True)],
+)  # fmt: skip
+def test_only_a_whole_fixed_test_is_fitted_like_one(
+    adaptive: AdaptiveTests, ended: str, planned: tuple[str, ...], helped: bool
+) -> None:
+    test = row(planned=planned)
+    test.summary = {"adaptive": {"ended": ended}}
+    assert bool(adaptive.fit_options(test)) == helped

@@ -8,10 +8,9 @@ import pytest
 
 from tests.api.browser import open_tab, participant
 from tests.api.conftest import Service, own_service, wait_done
+from tests.api.test_access import csrf, signed_in
 from tests.api.test_axe import examined
-
-pytestmark = pytest.mark.browser
-
+from tests.api.test_forms import fields
 
 service = own_service(speed=0.25)
 """Slow enough to look at a running test from all sides."""
@@ -30,6 +29,7 @@ def begun(tab: Any, target: str) -> None:
     tab.locator("#knows").wait_for()
 
 
+@pytest.mark.browser
 def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> None:
     participant(tab, service, "X1")
     tab.locator("[name=plan][value=adaptive]").check()
@@ -60,6 +60,7 @@ def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> Non
     assert tab.errors == []
 
 
+@pytest.mark.browser
 def test_in_german(tab: Any, service: Service) -> None:
     """Also where somebody else has seen the same page in English before."""
     participant(tab, service, "X1")
@@ -80,16 +81,16 @@ LOOKS = (
 )
 
 
-@pytest.mark.parametrize("colours", ["light", "dark"])
-def test_numbers_that_are_out_of_date_look_so_and_can_be_read(browser: Any, service: Service, colours: str) -> None:
+@pytest.mark.browser
+def test_numbers_that_are_out_of_date_look_so_and_can_be_read(browser: Any, service: Service) -> None:
     cut: list[bool] = []
 
     def forward(socket: Any) -> None:
         server = socket.connect_to_server()
         server.on_message(lambda message: None if cut else socket.send(message))
 
-    for page in open_tab(browser, service, color_scheme=colours):
-        participant(page, service, f"X{colours}")
+    for page in open_tab(browser, service, color_scheme="dark"):
+        participant(page, service, "X1")
         page.route_web_socket("**/live", forward)
         begun(page, "0,2")
         page.locator("#known-words", has_text="known within 8.0 %").wait_for()
@@ -103,6 +104,7 @@ def test_numbers_that_are_out_of_date_look_so_and_can_be_read(browser: Any, serv
         assert page.locator("#live.is-stale").count() == 1
 
 
+@pytest.mark.browser
 def test_a_worker_that_dies_is_told_on_the_page(tab: Any, service: Service) -> None:
     service.rig.speed = 1.0
     participant(tab, service, "X1")
@@ -111,11 +113,10 @@ def test_a_worker_that_dies_is_told_on_the_page(tab: Any, service: Service) -> N
     tab.locator("#stops-once").wait_for(state="hidden")
 
 
-def test_what_is_no_target_starts_nothing(tab: Any, service: Service) -> None:
-    participant(tab, service, "X1")
-    for typed in ("", "-1", "nan", "0,1", "51", "zwei", "1e1"):
-        tab.goto(f"{service.url}/participants/X1")
-        chosen(tab, typed)
-        tab.get_by_text("Target:").wait_for()
-        tab.get_by_text("Nothing was started").wait_for()
-        assert service.rig.starts == 0, typed
+def test_what_is_no_target_starts_nothing(service: Service) -> None:
+    with signed_in(service) as browser:
+        browser.post("/participants", data={"csrf": csrf(browser), "code": "X1"})
+        for typed in ("", "-1", "nan", "0,1", "51", "zwei", "1e1"):
+            form = {**fields(browser, "/participants/X1"), "plan": "adaptive", "target": typed}
+            told = browser.post("/participants/X1/tests", data=form).text
+            assert "Target:" in told and "Nothing was started" in told and service.rig.starts == 0, typed

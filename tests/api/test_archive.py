@@ -136,3 +136,12 @@ def test_the_page_of_an_archived_participant_offers_the_way_out_and_no_test(
         out = browser.post("/participants/A3/unarchive", data={"csrf": csrf(browser)})
         assert out.status_code == 303
         assert "Start the pre-session test" in browser.get("/participants/A3").text
+
+
+def test_side_and_muscle_are_asked_for_on_the_page(service: Service, http: httpx.Client) -> None:
+    with signed_in(service) as browser:
+        assert '<option value="right"' in browser.get("/").text and 'name="muscle"' in browser.get("/").text
+        form = {"csrf": csrf(browser), "code": "A4", "side": "right", "muscle": "triceps brachii"}
+        assert browser.post("/participants", data=form).headers["location"] == "/participants/A4"
+    made = http.get("/v1/participants/A4").json()
+    assert (made["side"], made["muscle"]) == ("right", "triceps brachii")

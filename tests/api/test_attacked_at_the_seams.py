@@ -17,8 +17,7 @@ from api.people.auth import Auth, Scope, digest
 from api.people.idle_lock import IdleLock
 from api.people.pace import Guesses
 from api.store import Store
-from api.store.tables import Model
-from tests.api.conftest import Service, let_go, run_test, wait_done
+from tests.api.conftest import Service, let_go, wait_done
 from tests.api.test_problems import problem
 
 
@@ -61,13 +60,12 @@ def test_a_stop_that_is_answered_with_nonsense_names_the_emergency_switch(
     assert "stop failed" in str(entries), "it is in the audit trail, too"
 
 
-@pytest.mark.parametrize("line", [b"", b"nonsense\n", b"5\n", b"x" * (33 * 1024 * 1024)], ids=len)
-def test_a_stop_whose_answer_is_no_answer_names_the_emergency_switch(
-    client: httpx.Client, service: Service, line: bytes
-) -> None:
+def test_a_stop_whose_answer_is_no_answer_names_the_emergency_switch(client: httpx.Client, service: Service) -> None:
+    answers = [b"", b"nonsense\n", b"5\n", b"x" * (33 * 1024 * 1024)]
+
     async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readline()
-        writer.write(line)
+        writer.write(answers.pop())
         writer.close()
 
     door = service.rig.path.with_name(service.rig.path.name + ".stop")
@@ -80,12 +78,13 @@ def test_a_stop_whose_answer_is_no_answer_names_the_emergency_switch(
     server = asyncio.run_coroutine_threadsafe(serve(), service.rig_thread.loop).result(10)
     context.rig.path = door
     try:
-        told = problem(client.post("/v1/stop", json={}), 503)
+        while answers:
+            told = problem(client.post("/v1/stop", json={}), 503)
+            assert told["detail"].startswith("Use the stimulator's own emergency switch now."), answers
+            assert "validation error" not in told["detail"]
     finally:
         context.rig.path = path
         service.rig_thread.loop.call_soon_threadsafe(server.close)
-    assert told["detail"].startswith("Use the stimulator's own emergency switch now.")
-    assert "validation error" not in told["detail"]
 
 
 def test_a_start_that_cannot_be_written_down_plays_nothing_on(
@@ -107,21 +106,6 @@ def test_a_start_that_cannot_be_written_down_plays_nothing_on(
         (test,) = client.get("/v1/tests").json()
         assert wait_done(client, test["id"], 20)["state"] == "stopped"
         assert let_go(client)
-
-
-def test_no_structure_is_carried_over_from_a_damaged_model(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    made = run_test(client, participant)["model_id"]
-    assert client.post(f"/v1/models/{made}/approve").status_code == 200
-    context = service.app.state.context
-    with context.store.write() as session:
-        row = session.get(Model, made)
-        row.document = row.document.replace(b"1", b"2", 1)
-    ended = run_test(client, participant)
-    assert ended["state"] == "completed"
-    carried = client.get(f"/v1/models/{ended['model_id']}").json()["carried"]
-    assert carried["why"] == "model-damaged"
 
 
 def test_a_stop_key_whose_answer_is_nonsense_says_that_the_stop_is_not_confirmed(

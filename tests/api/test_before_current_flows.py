@@ -11,29 +11,15 @@ from typing import Any
 import httpx
 import pytest
 
-from api.clock import Clock
 from api.people.auth import Principal
 from api.sessions.questions import LIFE_S, MOST, Question, Questions
 from rig import messages as m
-from tests.api.conftest import Service, run_test, wait_done
+from tests.api.conftest import Service, SetClock, run_test, wait_done
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_forms import fields
 from tests.api.test_profiles import calibrate
 
 PAGE = "/participants/P017"
-
-
-class SetClock(Clock):
-    """Both clocks as a test sets them."""
-
-    def __init__(self) -> None:
-        self.unix, self.monotonic = 1_800_000_000.0, 1000.0
-
-    def unix_s(self) -> float:
-        return self.unix
-
-    def monotonic_s(self) -> float:
-        return self.monotonic
 
 
 @pytest.fixture
@@ -64,7 +50,10 @@ def status_heard(service: Service) -> m.Status:
     return asyncio.run_coroutine_threadsafe(context.rig.fresh_status(), context.rig._task.get_loop()).result(10)
 
 
-def test_start_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, service: Service) -> None:
+def test_start_shows_who_and_how_much_and_plays_nothing(
+    tab: httpx.Client, client: httpx.Client, service: Service
+) -> None:
+    client.put("/v1/participants/P017/muscle", json={"side": "right", "muscle": "triceps brachii"})
     page = tab.get(ask(tab)).text
     assert "Start the pre-session test of P017?" in page and "P017 is not calibrated" in page
     told = rows(page)
@@ -72,6 +61,7 @@ def test_start_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, servi
     assert told["Widest pulse"] == "300 µs, comfort maximum 300 µs" and told["Stops at"] == "30.0 N·m"
     assert re.fullmatch(r"\d+ pulses, \d\.\d\d mC", told["Dose"]) and "FAKE P24" in told["Rig"]
     assert told["Calibration"] == "not calibrated"
+    assert (told["Side and muscle"], told["Run by"]) == ("right, triceps brachii", "administrator")
     assert re.search(r'class="stimulate big" data-needs-ready[^>]*>Start now: 20 mA, 300 µs<', page)
     assert service.rig.starts == 0 and service.app.state.context.runner.current is None
 
@@ -102,13 +92,13 @@ def test_a_question_is_open_for_five_minutes_by_either_clock(
 ) -> None:
     clock = service.app.state.context.questions.clock = SetClock()
     question = ask(tab)
-    clock.unix, clock.monotonic = clock.unix + unix_s, clock.monotonic + monotonic_s
+    clock.unix, clock.now_s = clock.unix + unix_s, clock.now_s + monotonic_s
     for answer in (tab.get(question), yes(tab, question)):
         assert (
             answer.status_code == 410 and "Nothing was done" in answer.text and "Back to the participant" in answer.text
         )
     assert service.rig.starts == 0
-    clock.unix, clock.monotonic = 1_800_000_000.0 + LIFE_S, 1000.0 + LIFE_S
+    clock.unix, clock.now_s = SetClock().unix + LIFE_S, SetClock().now_s + LIFE_S
     assert tab.get(question).status_code == 200
 
 
@@ -123,11 +113,20 @@ def test_a_question_belongs_to_whom_it_was_asked(tab: httpx.Client, client: http
     assert service.rig.starts == 0
 
 
-def test_limits_changed_meanwhile_are_not_played(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
+@pytest.mark.parametrize(
+    ("what", "body", "words"),
+    [
+        ("profile", {"current_ma": 10}, "limits of P017 were"),
+        ("muscle", {"side": "right"}, "Side or muscle of P017 was"),
+    ],
+)
+def test_limits_changed_meanwhile_are_not_played(
+    tab: httpx.Client, client: httpx.Client, service: Service, what: str, body: dict[str, Any], words: str
+) -> None:
     question = ask(tab)
-    client.put("/v1/participants/P017/profile", json={"current_ma": 10})
+    client.put(f"/v1/participants/P017/{what}", json=body)
     refused = yes(tab, question)
-    assert refused.status_code == 409 and "limits of P017 were changed meanwhile" in refused.text
+    assert refused.status_code == 409 and f"{words} changed meanwhile" in refused.text
     assert service.rig.starts == 0 and service.app.state.context.runner.current is None
 
 

@@ -18,10 +18,10 @@ import pytest
 
 from api.errors import ApiError
 from api.sessions.rig_client import LONGEST_LINE, line_of
-from api.store.tables import AuditEntry
 from api.web import body_limit, connections
 from rig.messages import PreviewRequest, Profile, SegmentPlan, TestPlan
-from tests.api.conftest import Server, Service
+from tests.api.conftest import Server, Service, soon
+from tests.api.test_stop_right import stops_noted
 
 
 def connect(url: str, words: bytes = b"") -> socket.socket:
@@ -62,15 +62,7 @@ def test_a_stop_is_answered_while_every_thread_waits_for_the_database(
         assert codes == []
     assert answer.status_code == 200, answer.text
     assert codes == [201] * 80
-    assert stops_noted(store) == ["choked"]
-
-
-def stops_noted(store: Any) -> list[str]:
-    """The reasons of the stops in the audit trail; the entry may come after the answer."""
-    end = time.monotonic() + 60
-    while not (found := store.all(AuditEntry, AuditEntry.action == "stop")) and time.monotonic() < end:
-        time.sleep(0.05)
-    return [entry.detail["reason"] for entry in found]
+    assert [entry["detail"]["reason"] for entry in soon(lambda: stops_noted(client))] == ["choked"]
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import NAME, PASSWORD, expected, participant, start
+from tests.api.browser import PASSWORD, expected, participant, start
 from tests.api.conftest import Service, run_test, shared_service
 from tests.api.test_axe import examined
 
@@ -61,30 +61,6 @@ def test_the_archive_on_the_pages(tab: Any, service: Service) -> None:
     assert tab.get_by_role("button", name="Start the pre-session test").count() == 0
     tab.get_by_role("button", name="Take out of the archive").first.click()
     tab.get_by_text("In the archive since").wait_for(state="detached")
-
-
-def test_side_and_muscle_are_asked_for_and_seen_before_current_flows(tab: Any, service: Service) -> None:
-    tab.goto(service.url + "/")
-    tab.get_by_label("Code").fill("Y1")
-    tab.get_by_label("Side").select_option("right")
-    tab.get_by_label("Muscle").fill("triceps brachii")
-    tab.get_by_role("button", name="Create").click()
-    tab.get_by_role("heading", name="Y1").wait_for()
-    tab.get_by_role("button", name="Start the pre-session test").first.click()
-    tab.get_by_role("row", name="Side and muscle right, triceps brachii").wait_for()
-    expected(tab.get_by_role("row", name=f"Run by {NAME}")).to_be_visible()
-
-
-def test_a_question_whose_side_was_changed_starts_nothing(tab: Any, service: Service) -> None:
-    make(service, "Y2", side="left")
-    tab.goto(service.url + "/participants/Y2")
-    tab.get_by_role("button", name="Start the pre-session test").first.click()
-    tab.get_by_role("button", name="Start now").wait_for()
-    with service.client() as http:
-        http.put("/v1/participants/Y2/muscle", json={"side": "right"})
-        tab.get_by_role("button", name="Start now").click()
-        tab.get_by_text("Side or muscle of Y2 was changed meanwhile").wait_for()
-        assert http.get("/v1/participants/Y2/tests").json() == []
 
 
 def test_a_note_is_shown_as_it_was_written_and_struck_with_a_click(tab: Any, service: Service) -> None:
@@ -167,18 +143,6 @@ def test_what_was_typed_is_not_shown_to_the_next_person(tab: Any, service: Servi
     tab.goto(service.url + "/participants/V2")
     assert tab.locator("#notes").get_by_label("Note", exact=True).input_value() == ""
     assert "half" not in tab.evaluate("JSON.stringify({...sessionStorage})")
-
-
-def test_a_locked_page_stops_a_test_that_was_not_touched(tab: Any, service: Service) -> None:
-    service.rig.speed = 1.0
-    participant(tab, service, "V3")
-    start(tab)
-    lock(tab)
-    assert service.rig.state == "running"
-    tab.get_by_role("button", name="Stop stimulation").click()
-    tab.get_by_text("The rig confirms").wait_for()
-    assert tab.get_by_role("link", name="See what was recorded").count() == 0, "locked: nothing about the test"
-    service.rig.speed = 30.0
 
 
 def test_a_persons_hand_is_told_and_a_scripts_is_not(tab: Any, service: Service) -> None:

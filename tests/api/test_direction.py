@@ -9,6 +9,7 @@ import identify
 from api.cli.commands.diagnose import effect_lines
 from api.models import explanation, summary
 from api.web.pages.environment import environment
+from tests.harness import few_effects
 from tests.identify import hidden_muscles
 
 PULLS = "as the muscle pulls"
@@ -42,13 +43,13 @@ def test_numbers_without_a_direction_and_those_of_the_sensor_say_nothing() -> No
 
 @pytest.mark.slow
 def test_the_diagnosis_tells_it_too_in_a_terminal_and_on_the_page() -> None:
-    missing = identify.diagnose(drifting(-1)).missing
+    with few_effects.only("baseline_drift", "fatigue"):
+        missing, upright = (identify.diagnose(drifting(sign)).missing for sign in (-1, 1))
     entry = next(entry for entry in missing if entry["effect"] == "baseline_drift")
     assert any(line.endswith(PULLS) for line in effect_lines(entry))
     effect = environment.get_template("why.html").make_module().effect  # type: ignore[attr-defined]
     assert PULLS in effect(explanation.card(entry, {}), 1, {})
-    upright = identify.diagnose(drifting(1)).missing[0]
-    assert PULLS not in effect(explanation.card(upright, {}), 1, {})
+    assert PULLS not in effect(explanation.card(upright[0], {}), 1, {})
 
 
 def test_threshold_plateau_and_validity_are_those_of_the_same_cell_mounted_upright() -> None:

@@ -7,16 +7,16 @@ import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
 from babel.messages.catalog import Catalog
 
 from api import language
-from api.language import catalogues, extract
+from api.language import extract
 from tests.api.conftest import STUB, Service, run_service, run_test
 from tests.api.test_access import csrf, signed_in
+from tests.api.test_languages import forget
 
 MADE_UP = "fr"
 """A locale that babel knows and the pages do not have."""
@@ -49,12 +49,6 @@ def made_up() -> Iterator[None]:
         forget()
         yield
     forget()
-
-
-def forget() -> None:
-    words: Any = importlib.import_module("api.language.translated")
-    for cached in (catalogues.translations, words._certain, words._patterns, words._same):
-        cached.cache_clear()
 
 
 @pytest.fixture(scope="module")

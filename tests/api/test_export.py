@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,7 @@ def test_report_holds_the_figures_and_no_script(done: Done) -> None:
     assert len(page.encode()) < 600_000
 
 
+@cache
 def measured(after: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """A made-up muscle's record, and the model fitted to it; `after` bends the torque."""
     widths, segments = default_widths()

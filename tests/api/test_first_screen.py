@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import time
 from typing import Any
 
 import pytest
@@ -39,16 +37,14 @@ def show(tab: Any, address: str, size: tuple[int, int]) -> None:
     tab.locator("[data-figure=overview] .main-svg").first.wait_for()
 
 
-@pytest.mark.parametrize("size", [LAPTOP, TABLET], ids=["laptop", "tablet"])
-def test_verdict_chart_and_missing_effect_stand_in_the_first_screen(
-    tab: Any, service: Service, model: str, size: tuple[int, int]
-) -> None:
-    show(tab, f"{service.url}/models/{model}", size)
-    tab.locator(".missing li").wait_for()
-    expected(tab.get_by_text("Emulated rig")).to_be_visible()  # with the strip that takes the most room
-    for what, place in FIRST.items():
-        box = tab.locator(place).first.bounding_box()
-        assert box["y"] >= 0 and box["y"] + box["height"] <= size[1], (what, box)
+def test_verdict_chart_and_missing_effect_stand_in_the_first_screen(tab: Any, service: Service, model: str) -> None:
+    for size in (LAPTOP, TABLET):
+        show(tab, f"{service.url}/models/{model}", size)
+        tab.locator(".missing li").wait_for()
+        expected(tab.get_by_text("Emulated rig")).to_be_visible()  # with the strip that takes the most room
+        for what, place in FIRST.items():
+            box = tab.locator(place).first.bounding_box()
+            assert box["y"] >= 0 and box["y"] + box["height"] <= size[1], (what, box)
     assert tab.evaluate("scrollY") == 0
     assert tab.locator(".first-screen .primary").count() == 1, "one button is the first one"
 
@@ -83,7 +79,8 @@ def test_a_folded_chart_is_drawn_as_wide_as_its_box_when_it_is_opened(tab: Any, 
     show(tab, f"{service.url}/models/{model}", LAPTOP)
     folded = tab.locator("#curves [data-figure=recruitment]")
     assert not folded.is_visible() and folded.locator(".main-svg").count() == 0
-    tab.locator("#curves > summary").click()
+    tab.locator("#curves > summary").focus()
+    tab.keyboard.press("Enter")
     folded.locator(".main-svg").first.wait_for()
     assert folded.locator(".main-svg").first.bounding_box()["width"] > 300
     tab.locator("#curves > summary").click()
@@ -114,13 +111,6 @@ def test_paper_shows_all_with_its_charts(tab: Any, service: Service, model: str)
     assert not tab.locator("#curves").evaluate("part => part.open")
 
 
-def test_what_is_folded_is_reached_by_keys(tab: Any, service: Service, model: str) -> None:
-    show(tab, f"{service.url}/models/{model}", LAPTOP)
-    tab.locator("#curves > summary").focus()
-    tab.keyboard.press("Enter")
-    tab.locator("#curves [data-figure=step] .main-svg").first.wait_for()
-
-
 def test_the_line_follows_the_rig_and_takes_nothing_away(tab: Any, service: Service) -> None:
     with service.client() as http:
         http.post("/v1/participants", json={"code": "F3"})
@@ -137,37 +127,3 @@ def test_the_line_follows_the_rig_and_takes_nothing_away(tab: Any, service: Serv
         tab.get_by_role("button", name="Show it").wait_for()
         assert tab.get_by_label("Current of every pulse").input_value() == "19"
     service.rig.speed = 8.0
-
-
-def test_a_model_that_is_not_usable_wants_a_reason_that_is_one(tab: Any, service: Service, model: str) -> None:
-    poor = make_poor(service, model)
-    show(tab, f"{service.url}/models/{poor}", LAPTOP)
-    assert tab.get_by_role("button", name="Approve").count() == 0, "not by the first button"
-    assert tab.locator(".first-screen .primary").inner_text() == "Test again"
-    tab.get_by_role("link", name="Approve it all the same").click()
-    tab.get_by_text("the recruitment curve is not identified").wait_for()
-    expected(tab.get_by_text("the error is 31 % of the torque")).to_be_visible()
-    for words, taken in (("asdf asdf asdf", False), ("only the delay is used today", True)):
-        tab.get_by_label("Why may the controller").fill(words)
-        tab.get_by_label("Your password, once more").fill("correct horse battery")
-        tab.get_by_role("button", name="Approve it all the same").click()
-        if not taken:
-            tab.get_by_text("This is not a reason yet.").wait_for()
-            assert tab.get_by_label("Why may the controller").input_value() == words
-    tab.get_by_text("Done. The controller has today's model until 23:59.").wait_for()
-    with service.client() as http:
-        assert http.get(f"/v1/models/{poor}").json()["decision_reason"] == "only the delay is used today"
-
-
-def make_poor(service: Service, model: str) -> str:
-    """A version of the same recording that identify would call not usable."""
-    context = service.app.state.context
-    row = context.versions.get(model)
-    document = json.loads(row.document) | {"model_id": f"M-poor{time.time_ns()}"}
-    says = "stimulation hardly changes the torque: check electrodes, current and load cell"
-    document["fit"] = document["fit"] | {"held_out_fit_percent": 69.0}
-    document["quality"] = {
-        "verdict": "not usable", "words": f"Do not use this model: {says}.", "reasons": [says],
-        "gates": {"torque": {"passed": False, "severity": "refuse", "says": says}},
-    }  # fmt: skip
-    return context.versions.add(json.dumps(document), row.participant, row.recording_id, "a test").id

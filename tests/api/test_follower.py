@@ -109,8 +109,18 @@ def test_the_adviser_learns_what_the_muscle_felt(monkeypatch: pytest.MonkeyPatch
     assert (world.asked[0]["not_sent"], world.asked[0]["late"]) == ([4], [(2, 0.01)])
 
 
-def test_an_answer_that_cannot_be_used_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World([{**SAID, "segments": [{**NEXT, "settings": {}}]}])
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        ({**SAID, "segments": [{**NEXT, "settings": {}}]}, "KeyError"),
+        ({**SAID, "kind": "misfit", "segments": []}, "Known a little."),
+        ({}, "KeyError"),
+    ],
+)
+def test_an_answer_that_cannot_be_used_is_told(
+    monkeypatch: pytest.MonkeyPatch, answer: dict[str, Any], why: str
+) -> None:
+    world = World([answer])
     told = followed(world, 40.0, monkeypatch).told
-    assert told.state == "fixed" and told.problem.startswith("The fixed plan plays on: ")
+    assert told.state == "fixed" and told.problem.startswith("The fixed plan plays on: ") and why in told.problem
     assert world.requests == []

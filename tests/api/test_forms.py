@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -112,18 +113,22 @@ def test_nine_and_a_half_is_no_ninety_five(tab: httpx.Client, client: httpx.Clie
     assert limits(client) == {"current_ma": 9.5, "max_pulse_width_us": 300, "max_torque_nm": 30}
 
 
-@pytest.mark.parametrize("path", [f"{PAGE}/profile", f"{PAGE}/tests"])
-@pytest.mark.parametrize("text", ["9,5,1", "1e3", "9٫5", "", "95.000"])
 def test_what_was_typed_is_kept_with_a_line_beside_it_and_nothing_happens(
-    tab: httpx.Client, client: httpx.Client, service: Service, path: str, text: str
+    tab: httpx.Client, client: httpx.Client, service: Service
 ) -> None:
     before = limits(client)
-    refused = send(tab, path, current_ma=text, max_torque_nm="25")
-    assert refused.status_code == 422 and "Nothing was changed" in refused.text
-    assert inputs(refused.text)["current_ma"] == text and inputs(refused.text)["max_torque_nm"] == "25"
-    line = re.search(r'id="current_ma-error">([^<]*)<', refused.text)
-    assert line and "like 9 or 9,5" in line[1] and (text in line[1] or not text)
+    for path, text in itertools.product((f"{PAGE}/profile", f"{PAGE}/tests"), ("9,5,1", "1e3", "9٫5", "", "95.000")):
+        refused = send(tab, path, current_ma=text, max_torque_nm="25")
+        assert refused.status_code == 422 and "Nothing was changed" in refused.text, (path, text)
+        assert inputs(refused.text)["current_ma"] == text and inputs(refused.text)["max_torque_nm"] == "25"
+        line = re.search(r'id="current_ma-error">([^<]*)<', refused.text)
+        assert line and "like 9 or 9,5" in line[1] and (text in line[1] or not text)
     assert limits(client) == before and service.rig.starts == 0
+
+
+def test_a_name_is_refused_politely(tab: httpx.Client) -> None:
+    refused = tab.post("/participants", data={"csrf": csrf(tab), "code": "Anna Schmidt"})
+    assert refused.status_code == 422 and "Please no names" in refused.text
 
 
 def test_bounds_are_this_rigs_own(tab: httpx.Client, client: httpx.Client) -> None:
@@ -132,6 +137,8 @@ def test_bounds_are_this_rigs_own(tab: httpx.Client, client: httpx.Client) -> No
     refused = send(tab, current_ma="60,5")
     assert refused.status_code == 422 and "at most 60 mA, as this rig asks (rig file)" in refused.text
     assert "above this rig" not in refused.text
+    wide = send(tab, max_pulse_width_us="5000")
+    assert "&#39;5000&#39;: 5000 µs" in wide.text and inputs(wide.text)["max_pulse_width_us"] == "5000"
     charged = send(tab, current_ma="60", max_pulse_width_us="400")
     assert charged.status_code == 422 and "above the 20 µC that this rig takes" in charged.text
     assert limits(client)["current_ma"] == 20

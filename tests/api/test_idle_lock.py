@@ -166,6 +166,8 @@ def test_the_red_button_works_on_a_locked_page(service: Service, clock: SetClock
         right = page.split('name="right" value="')[1].split('"')[0]
         with service.client(token=None) as nobody:
             assert nobody.post("/v1/stop", data={"right": right}).status_code == 200
+        told = http.post("/v1/stop", data={"right": right}, headers=HTML, follow_redirects=True).text
+        assert "The rig confirms" in told and "See what was recorded" not in told, "nothing about the test"
         assert locked(http)
         with service.client() as admin:
             assert wait_done(admin, test["id"])["state"] == "stopped"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from typing import Any
 
 import httpx
@@ -71,9 +70,9 @@ def test_two_poses_calibrate_and_are_written_down(service: Service, client: http
     assert (made["subject"], made["detail"]["offset"], len(made["detail"]["poses"])) == ("rig", 12.0, 2)
 
 
-@pytest.mark.parametrize("angle", ["1.5", None, True, 4.0, [1.0]])
-def test_what_is_no_angle_is_no_pose(client: httpx.Client, ready: str, angle: Any) -> None:
-    assert client.post("/v1/rig/angle/pose", json={"angle_rad": angle}).status_code == 422
+def test_what_is_no_angle_is_no_pose(client: httpx.Client, ready: str) -> None:
+    for angle in ("1.5", None, True, 4.0, [1.0]):
+        assert client.post("/v1/rig/angle/pose", json={"angle_rad": angle}).status_code == 422, angle
 
 
 # ---- the participant's range ----------------------------------------------------------------------------------
@@ -89,16 +88,12 @@ def test_a_range_is_kept_changed_and_taken_away(client: httpx.Client, ready: str
     assert begin(client, ready, "passive").json()["type"] == "/problems/no-angle-range"
 
 
-@pytest.mark.parametrize("wrong", [[1.0], [1.0, 0.5], [0.2, 0.21], [0.2, "2"], [0.2, 9.0], "x", [0.2, None], [0, 1, 2]])
-def test_what_is_no_range_is_refused(client: httpx.Client, ready: str, wrong: Any) -> None:
-    answer = client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": wrong})
-    assert answer.status_code == 422
+def test_what_is_no_range_is_refused(client: httpx.Client, ready: str) -> None:
+    beyond = [0.2, 2.8]
+    for wrong in ([1.0], [1.0, 0.5], [0.2, 0.21], [0.2, "2"], [0.2, 9.0], "x", [0.2, None], [0, 1, 2], beyond):
+        answer = client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": wrong})
+        assert answer.status_code == 422 and ("as this rig asks" in answer.text) >= (wrong == beyond), wrong
     assert client.get(f"/v1/participants/{ready}").json()["profile"]["angle_range_rad"] == pytest.approx(RANGE)
-
-
-def test_a_range_beyond_the_rigs_is_refused(client: httpx.Client, ready: str) -> None:
-    answer = client.put(f"/v1/participants/{ready}/profile", json={"angle_range_rad": [0.2, 2.8]})
-    assert answer.status_code == 422 and "as this rig asks" in answer.text
 
 
 def test_a_test_may_narrow_the_range_and_not_widen_it(service: Service, client: httpx.Client, ready: str) -> None:
@@ -215,9 +210,7 @@ def test_the_three_cost_at_most_the_papers_test(client: httpx.Client, ready: str
     listed = client.get(f"/v1/participants/{ready}/joint").json()
     doses = listed["doses"]
     assert not listed["known"], "no model is approved: nothing but the share is told"
-    assert doses["total"] <= doses["paper"] and listed["share_of_paper"] == pytest.approx(
-        doses["total"] / doses["paper"]
-    )
+    assert listed["share_of_paper"] == pytest.approx(doses["total"] / doses["paper"]) and listed["share_of_paper"] <= 1
     assert doses["held"] == pytest.approx(5 * doses["held_each"])
     model = run_test(client, ready)["model_id"]
     client.post(f"/v1/models/{model}/approve", json={"reason": ""})
@@ -227,21 +220,17 @@ def test_the_three_cost_at_most_the_papers_test(client: httpx.Client, ready: str
     assert preview["joint"]["doses"] == known["doses"]
 
 
-@pytest.mark.parametrize(
-    ("kind", "more"),
-    [
+def test_what_does_not_go_together_is_refused(client: httpx.Client, ready: str) -> None:
+    wrong: list[tuple[str, dict[str, Any]]] = [
         ("passive", {"segments": [{"name": "rest", "sequence": "rest"}]}), ("held", {"protocol": "paper"}),
         ("moving", {"target": {"curve_percent": 2}}), ("held", {"max_duration_s": 20}), ("passive", {"joins": "M1"}),
         ("passive", {"angle": {"target_rad": 1.0}}), ("pre-session", {"angle": {}}), ("held", {"angle": {"x": 1}}),
         ("passive", {"max_torque_time_nm_s": 3}), ("held", {"angle": {"target_rad": 2.5}}),
         ("held", {"angle": {"tolerance_rad": 1.0}}), ("moving", {"angle": {"still_s": 0}}),
-    ],
-)  # fmt: skip
-def test_what_does_not_go_together_is_refused(
-    client: httpx.Client, ready: str, kind: str, more: dict[str, Any]
-) -> None:
-    answer = begin(client, ready, kind, **more)
-    assert answer.status_code == 422, answer.text
+    ]  # fmt: skip
+    for kind, more in wrong:
+        answer = begin(client, ready, kind, **more)
+        assert answer.status_code == 422, (kind, more, answer.text)
 
 
 def test_a_controllers_trial_can_be_watched(service: Service, client: httpx.Client, ready: str) -> None:
@@ -305,28 +294,19 @@ def test_one_model_of_several_recordings(client: httpx.Client, ready: str, recor
     assert told["detail"]["recordings"] == recordings
     one = client.post(f"/v1/participants/{ready}/models", json={"recordings": recordings[:1], "effects": []}).json()
     assert (one["recording_id"], one["effects"]) == (recordings[0], [])
-
-
-def test_long_work_may_be_left_alone(client: httpx.Client, ready: str, recordings: list[str]) -> None:
     begun = client.post(f"/v1/participants/{ready}/models?wait=false", json={"recordings": recordings})
-    assert begun.status_code == 202
-    end = time.monotonic() + 30
-    while not (job := client.get(begun.headers["Location"]).json())["done"]:
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    assert begun.status_code == 202, "long work may be left alone"
+    job = soon(lambda: (found := client.get(begun.headers["Location"]).json())["done"] and found)
     assert (job["kind"], job["participant"], job["model_id"]) == ("fit-recordings", ready, None)
     assert job["result_url"].startswith("/v1/models/")
 
 
-def test_a_recording_without_an_angle_is_named(
+def test_recordings_without_an_angle_of_others_and_twice_are_refused(
     service: Service, client: httpx.Client, ready: str, recordings: list[str]
 ) -> None:
     (service.data / "recordings" / "no-angle").touch()
     answer = client.post(f"/v1/participants/{ready}/models", json={"recordings": recordings})
     assert answer.status_code == 422 and f"recording {recordings[1]}: it has no angle_rad" in answer.json()["detail"]
-
-
-def test_recordings_of_others_and_twice_are_refused(client: httpx.Client, ready: str, recordings: list[str]) -> None:
     client.post("/v1/participants", json={"code": "P2"})
     other = client.post("/v1/participants/P2/models", json={"recordings": recordings})
     assert other.status_code == 422 and other.json()["type"] == "/problems/other-participant"

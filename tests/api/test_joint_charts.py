@@ -164,8 +164,7 @@ def test_reports_have_them_and_pages_of_other_models_do_not(service: Service, mo
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize(("language", "scheme"), [("en", "dark"), ("de", "light")])
 def test_the_page_is_examined(
     browser: Any, service: Service, models: tuple[str, str], language: str, scheme: str
 ) -> None:

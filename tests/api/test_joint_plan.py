@@ -8,9 +8,14 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import TypeAdapter
 
+from api.models.together import JOINT_EFFECTS
 from api.sessions import joint_plan
 from api.sessions.joint_plan import Curve, curve_of, layout, targets, torque_time, widths_of
+from api.web.routes.joint import EffectId
+from identify.effects import get
+from identify.fitting import MOVING_JOINT
 from rig.limits import HARD_LIMITS, for_profile
 from rig.messages import Profile, TestPlan
 from rig.plan import build
@@ -103,3 +108,14 @@ def test_the_plans_pass_the_rigs_limits() -> None:
 def test_the_inverse_is_the_smallest_width() -> None:
     curve = Curve((100.0, 200.0, 300.0), (0.0, 4.0, 4.0), True)
     assert curve.width(2.0, 300.0) == 150.0 and curve.width(4.0, 300.0) == 200.0 and curve.width(9.0, 250.0) == 250.0
+
+
+def test_the_service_names_the_effects_of_identify():
+    assert JOINT_EFFECTS == MOVING_JOINT
+
+
+def test_each_form_is_known_and_may_be_asked_for():
+    for name in JOINT_EFFECTS:
+        assert TypeAdapter(EffectId).validate_python(name) == name
+        effect, _, forms = name.partition(":")
+        assert [get(effect).form(form).name for form in forms.split("|")] == forms.split("|")

@@ -160,12 +160,3 @@ def test_a_message_at_the_moment_of_closing_does_not_keep_the_channel_open(turns
         return bool((await asyncio.wait([task], timeout=5))[0])
 
     assert asyncio.run(closed())
-
-
-def test_the_stop_button_of_a_page_whose_channel_was_closed_still_stops(service: Service, test_id: str) -> None:
-    right = service.app.state.context.stop_rights.give("Ada", test_id)
-    with signed_in(service, "Ada") as http, watching(service, test_id, cookie(http)) as socket:
-        sign_out(http, service)
-        last(socket)
-    with service.client(token=None) as nobody:
-        assert nobody.post("/v1/stop", json={}, headers={"X-Stop-Right": right}).status_code == 200

@@ -33,21 +33,16 @@ def limited(client: httpx.Client) -> str:
     return "N1"
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [
+def test_a_wider_limit_is_refused_and_nothing_starts(client: httpx.Client, service: Service, limited: str) -> None:
+    for name, value, words in (
         ("current_ma", 18.5, "18.5 mA is above the participant's 18 mA by 0.5"),
         ("max_pulse_width_us", 221, "221 µs is above the participant's 220 µs by 1"),
         ("max_torque_nm", 30, "30 N·m is above the participant's 12 N·m by 18"),
-    ],
-)
-def test_a_wider_limit_is_refused_and_nothing_starts(
-    client: httpx.Client, service: Service, limited: str, name: str, value: float, words: str
-) -> None:
-    body = {"participant": limited, "profile": {name: value}}
-    for path in ("/v1/tests", "/v1/preview"):
-        refused = problem(client.post(path, json=body), 422)
-        assert words in refused["detail"] and refused["errors"][0]["field"] == f"profile.{name}"
+    ):
+        body = {"participant": limited, "profile": {name: value}}
+        for path in ("/v1/tests", "/v1/preview"):
+            refused = problem(client.post(path, json=body), 422)
+            assert words in refused["detail"] and refused["errors"][0]["field"] == f"profile.{name}"
     assert service.rig.starts == 0 and client.get("/v1/tests").json() == []
 
 

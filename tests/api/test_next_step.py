@@ -149,13 +149,6 @@ def test_a_stopped_test_says_so_until_the_next_one(client: httpx.Client, service
     assert shown(service)[1].startswith("The last test was stopped.")
 
 
-def test_only_who_may_test_reads_the_line(client: httpx.Client, service: Service, participant: str) -> None:
-    key = client.post("/v1/tokens", json={"name": "ilc", "scopes": ["read-model"]}).json()["token"]
-    with service.client(key) as controller:
-        assert controller.get(f"/participants/{participant}/next").status_code == 403
-    assert client.get("/participants/nobody/next").status_code == 404
-
-
 def test_the_start_in_the_line_sets_what_was_typed(client: httpx.Client, service: Service, participant: str) -> None:
     """It is a button of the limits' form: one click sets them and asks."""
     run_test(client, participant)

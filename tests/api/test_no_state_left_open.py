@@ -6,14 +6,23 @@ import asyncio
 import logging
 import threading
 import time
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
 
+from api.clock import Clock
 from api.sessions import runner
+from api.sessions.following import Follower
+from api.sessions.lifecycle import Lifecycle
+from api.sessions.rig_client import RigClient
+from api.store import Store
+from api.store.holds import Alone
+from api.store.tables import Model, Participant, Recording, Test
 from rig.messages import StartRequest
-from tests.api.conftest import Service, let_go, run_test, wait_done
+from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
 
 def fails(*_args: Any, **_more: Any) -> Any:
@@ -121,3 +130,119 @@ def test_a_start_that_fails_unexpectedly_is_stopped_and_leaves_nothing_open(
         assert test["state"] == "failed" and test["reason"] == "something unexpected"
         assert service.rig.stopped_by == "service", "the rig may have heard the start all the same"
         assert client.get("/v1/rig").json()["holder"] is None
+
+
+def store_with_a_test(folder: Path, followed_by: str) -> Store:
+    store, now = Store(f"sqlite:///{folder / 'stimrig.db'}"), "2026-11-23T08:00:00.000Z"
+    rows: list[Any] = [
+        Participant(code="P1", profile={}, created_utc=now, created_by="Ada"),
+        Test(
+            id="T1", participant="P1", kind="identification", state="identifying", plan={}, summary={}, reason="",
+            requested_by="Ada", requested_utc=now, followed_by=followed_by,
+        ),
+        Recording(id="R1", participant="P1", test_id="T1", path="r.h5", file_sha256="", origin="rig", created_utc=now),
+    ]  # fmt: skip
+    with store.write() as session:
+        for row in rows:
+            session.add(row)
+            session.flush()
+        rows[1].recording_id = "R1"
+    return store
+
+
+@pytest.mark.parametrize("taken_up", [False, True])
+def test_a_test_that_was_taken_up_during_the_fit_is_left_to_who_did(tmp_path: Path, taken_up: bool) -> None:
+    holds, added = Alone(), []
+    store = store_with_a_test(tmp_path, holds.me)
+
+    async def fit(*_given: Any, **_how: Any) -> tuple[dict[str, str], str]:
+        if taken_up:
+            with store.write() as session:
+                session.get_one(Test, "T1").followed_by = "another"
+        return {"json": "{}"}, ""
+
+    async def carry(model: Model, *_given: Any, **_how: Any) -> Model:
+        return model
+
+    def add(_json: str, participant: str, recording_id: str, by: str, _parent: str | None) -> Model:
+        row = Model(id=f"M{len(added)}", participant=participant, recording_id=recording_id, method="ml")
+        row.document, row.etag = b"{}", "0" * 64
+        row.effects, row.fit, row.created_utc, row.created_by = [], {}, "2026-11-23T08:00:00.000Z", by
+        with store.write() as session:
+            session.add(row)
+        added.append(row)
+        return row
+
+    async def diagnose_ahead(_model: Model) -> None: ...
+
+    carried = SimpleNamespace(fit=fit, carry=carry)
+    analyses: Any = SimpleNamespace(carried_structure=carried, diagnose_ahead=diagnose_ahead)
+    nothing: Any = SimpleNamespace(fit_options=lambda _row: {}, add=add)
+    follower = Follower(store, holds, "rig")
+    lifecycle = Lifecycle(
+        store, Clock(), nothing, nothing, nothing, analyses, nothing, nothing, tmp_path, follower, lambda _test_id: None
+    )
+    asyncio.run(lifecycle.identify("T1"))
+    row = store.get(Test, "T1")
+    assert (len(added), row.state) == ((0, "identifying") if taken_up else (1, "completed"))
+    store.close()
+
+
+def test_an_end_that_was_never_told_is_found_by_asking(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    service.rig.loses_ends = True
+    ended = run_test(client, participant)
+    assert ended["recording_id"] == f"R-{ended['id']}" and ended["state"] == "completed" and ended["model_id"]
+    service.rig.loses_ends = False
+    assert let_go(client)
+    assert run_test(client, participant)["state"] == "completed"
+    ends = [e for e in client.get("/v1/audit").json()["entries"] if e["action"].startswith("test ")]
+    assert len(ends) == 2, "each end is written down once"
+
+
+def test_a_failing_listener_costs_nobody_else_the_news(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    """The first events come while the start is under way: a link that broke there made the start a 503."""
+    rig, told = service.app.state.context.rig, []
+
+    def always(event: Any) -> None:
+        told.append(type(event).__name__)
+        raise RuntimeError("unexpected")
+
+    links: list[bool] = []
+    rig.listeners.insert(0, always)
+    rig.link_listeners.append(links.append)
+    assert run_test(client, participant)["state"] == "completed"
+    assert {"StateEvent", "LiveEvent", "FinishedEvent"} <= set(told)
+    assert links == [] and client.get("/v1/rig").json()["connected"]
+
+
+def test_a_message_that_cannot_be_taken_costs_one_connection_at_most(
+    client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An unexpected error outside a listener; a service that never connects again hears of no test's end."""
+    rig, failures = service.app.state.context.rig, []
+
+    def once(message: dict[str, Any], subscription_id: int) -> None:
+        if not failures:
+            failures.append(message)
+            raise RuntimeError("unexpected")
+        RigClient._take(rig, message, subscription_id)
+
+    monkeypatch.setattr(rig, "_take", once)
+    soon(lambda: failures and rig.connected, 20)  # its next poll is the message; then it connects anew
+    assert run_test(client, participant)["state"] == "completed"
+
+
+def test_a_failure_in_a_poll_does_not_end_the_polling(client: httpx.Client, service: Service) -> None:
+    rig, calls = service.app.state.context.rig, []
+
+    def always(_status: Any) -> None:
+        calls.append(time.monotonic())
+        raise RuntimeError("unexpected")
+
+    rig.poll_listeners.insert(0, always)
+    soon(lambda: len(calls) >= 2, 20)
+    assert client.get("/v1/rig").json()["connected"]

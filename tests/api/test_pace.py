@@ -15,8 +15,8 @@ from api.clock import Clock
 from api.errors import ApiError
 from api.people.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
 from api.people.passwords import MOST_STRANGERS, Passwords
-from tests.api.conftest import TOKEN, Service, run_test
-from tests.api.test_people import PASSWORD, SetClock, standing_still
+from tests.api.conftest import TOKEN, Service, SetClock, run_test
+from tests.api.test_people import PASSWORD, standing_still
 
 OWN, ELSEWHERE = "10.0.0.1", "10.9.9.9"
 
@@ -170,6 +170,8 @@ def test_guesses_of_tokens_are_slowed_down_and_keep_no_controller_out(
     with service.client(token=None, headers={"X-Forwarded-For": "10.0.0.7"}) as page:
         answers = [page.post("/sign-in", data={"token": f"guess {number}"}).status_code for number in range(6)]
         assert answers == [401] * 5 + [429], "the page's door is held to the same pace"
+        told = page.post("/sign-in", data={"token": "guess"}, headers={"Accept": "text/html"})
+        assert told.status_code == 429 and int(told.headers["retry-after"]) >= 1 and "Try again in" in told.text
         assert page.get(path, headers={"Authorization": "Bearer guess"}).status_code == 429
         assert page.post("/v1/stop", headers={"Authorization": f"Bearer {drawn}"}).status_code == 200
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
+import json
+import re
+import time
 from typing import Any
 
 import httpx
@@ -12,12 +16,25 @@ from api.models import advice, reasons
 from identify.estimation import quality
 from tests.api.conftest import Service, run_test
 from tests.api.test_access import csrf, signed_in
-from tests.api.test_first_screen import make_poor
 
 NONE = ["", " ", ".", "ok", "asdf", "......", "xxxxxxxxxxxx", "asdf asdf asdf", "a b c", "aaaa bbbb cccc dddd",
         "1234 5678 9012", "ja ja ja ja", "ok ok ok", "test test test test"]  # fmt: skip
 SOME = ["only the delay is used today", "Nur die Verzögerung wird heute gebraucht", "plateau measured twice, same",
         "Engineer Kim watches every trial"]  # fmt: skip
+
+
+def make_poor(service: Service, model: str) -> str:
+    """A version of the same recording that identify would call not usable."""
+    context = service.app.state.context
+    row = context.versions.get(model)
+    document = json.loads(row.document) | {"model_id": f"M-poor{time.time_ns()}"}
+    says = "stimulation hardly changes the torque: check electrodes, current and load cell"
+    document["fit"] = document["fit"] | {"held_out_fit_percent": 69.0}
+    document["quality"] = {
+        "verdict": "not usable", "words": f"Do not use this model: {says}.", "reasons": [says],
+        "gates": {"torque": {"passed": False, "severity": "refuse", "says": says}},
+    }  # fmt: skip
+    return context.versions.add(json.dumps(document), row.participant, row.recording_id, "a test").id
 
 
 @pytest.mark.parametrize("text", NONE)
@@ -60,15 +77,21 @@ def test_the_form_asks_again_and_writes_nothing_down(client: httpx.Client, servi
     model = run_test(client, participant)["model_id"]
     poor = make_poor(service, model)
     with signed_in(service) as browser:
+        page = browser.get(f"/models/{poor}?diagnose=0").text
+        assert "Approve it all the same" in page and "Test again" in page
+        assert not re.search(r">\s*Approve\s*</button>", page), "not by the first button"
         assert browser.get(f"/models/{model}/approve").headers["location"] == f"/models/{model}", "no question needed"
         question = browser.get(f"/models/{poor}/approve")
         assert question.status_code == 200 and "What the controller would risk" in question.text
+        assert "the recruitment curve is not identified" in question.text
+        assert "the error is 31 % of the torque" in question.text
         again = browser.post(f"/models/{poor}/approve", data={"csrf": csrf(browser), "reason": "ok <b>"})
         assert again.status_code == 422 and "not a reason yet" in again.text and "ok &lt;b&gt;" in again.text
         assert client.get(f"/v1/models/{poor}").json()["decision"] is None
         taken = browser.post(f"/models/{poor}/approve", data={"csrf": csrf(browser), "reason": SOME[0]})
         assert taken.status_code == 303
-    assert client.get(f"/v1/models/{poor}").json()["served"]
+    approved = client.get(f"/v1/models/{poor}").json()
+    assert approved["served"] and approved["decision_reason"] == SOME[0]
 
 
 # ---- words --------------------------------------------------------------------------------------------------
@@ -76,9 +99,6 @@ def test_the_form_asks_again_and_writes_nothing_down(client: httpx.Client, servi
 
 def test_each_gate_of_identify_has_words() -> None:
     """A new gate without words would be silent on the page."""
-    import inspect
-    import re
-
     named = set(re.findall(r'"(\w+)": _', inspect.getsource(quality.quality)))
     assert named - {"words"} == set(advice.GATES)
 

@@ -10,6 +10,7 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
+from api.errors import ApiError
 from api.store import Store, engines
 from tests.api.conftest import DURABLE, TOKEN, Service, run_test, soon, wait_done
 
@@ -63,6 +64,8 @@ def test_effect_makes_a_new_version_with_lineage(client: httpx.Client, participa
     child = made.json()
     assert child["parent_id"] == parent and child["added_effect"] == "fatigue" and child["effects"] == ["fatigue"]
     assert made.headers["location"] == f"/v1/models/{child['id']}"
+    same = client.post(f"/v1/models/{parent}/effects", json={"effects": ["fatigue"]})
+    assert same.json()["id"] == child["id"], "it is there already"
     twice = client.post(f"/v1/models/{child['id']}/effects", json={"effects": ["fatigue"]})
     assert twice.status_code == 409
     refused = client.post(f"/v1/models/{parent}/effects", json={"effects": ["phlogiston"]})
@@ -185,3 +188,35 @@ def test_operation_needs_no_token_and_names_nobody(service: Service, participant
         answer = stranger.get(path)
     assert answer.status_code == 200
     assert participant not in answer.text
+
+
+def test_version_with_other_contents_is_refused_and_the_old_one_stays(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    document = run_test(client, participant)
+    path = f"/v1/models/{document['model_id']}/file"
+    before = client.get(path)
+    model = json.loads(before.content)
+    model["recruitment"]["torque_nm"][-1] += 1.0
+    versions = service.app.state.context.versions
+    with pytest.raises(ApiError, match="cannot be changed"):
+        versions.add(json.dumps(model), participant, document["recording_id"], "somebody")
+    same = versions.add(before.content.decode(), participant, document["recording_id"], "somebody")
+    assert same.created_by != "somebody"
+    after = client.get(path)
+    assert after.content == before.content and after.headers["etag"] == before.headers["etag"]
+
+
+def test_no_route_changes_or_deletes_a_model(client: httpx.Client, participant: str) -> None:
+    document = run_test(client, participant)
+    for address in (document["model_url"], f"{document['model_url']}/file", document["recording_url"]):
+        for method in ("PUT", "PATCH", "DELETE"):
+            assert client.request(method, address).status_code == 405
+    described = client.get("/openapi.json").json()["paths"]
+    changing = {
+        (method, path)
+        for path, methods in described.items()
+        for method in methods
+        if method in ("put", "patch", "delete") and ("/models" in path or "/recordings" in path)
+    }
+    assert changing == set()

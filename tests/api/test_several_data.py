@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 
+import identify
 from api.cli import main
+from identify.records import parts_csv
+from tests.api.test_cli import run
 from tests.api.test_worker import made_up_csv
+from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow
 
@@ -23,13 +27,6 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     more = [f"{t},{w},{0.97 * float(nm):.6f},{s},{0.8 + 0.001 * k:.4f},0.04" for k, (t, w, nm, s) in enumerate(rows)]
     moved.write_text("\n".join([",".join([*head, "angle_rad", "velocity_rad_s"]), *more]))
     return [plain, moved]
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    capsys.readouterr()
-    code = main.run([str(each) for each in arguments])
-    out = capsys.readouterr()
-    return code, out.out, out.err
 
 
 def test_a_fit_of_two_is_of_both(parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,3 +72,39 @@ def test_what_cannot_be_joined_names_its_file(
     short.write_text("\n".join(parts[0].read_text().splitlines()[:6]))
     code, _, err = run(capsys, "fit", parts[0], short)
     assert code == 2 and "short.csv" in err and len(err.strip().splitlines()) == 1, err
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The model of a first session, and the record of a second one without the effect."""
+    folder = tmp_path_factory.mktemp("carry")
+    model, data = folder / "MODEL.json", folder / "second.csv"
+    earlier = identify.fit(
+        hidden_muscles.record("electromechanical_delay", seed=7), effects=["electromechanical_delay"]
+    )
+    model.write_text(earlier.to_json())
+    parts_csv.write(hidden_muscles.record("", seed=8), data)
+    return model, data
+
+
+def test_words_and_json_say_what_is_no_longer_needed(
+    files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, data = files
+    out = tmp_path / "new.json"
+    assert main.run(["fit", str(data), "--carry", str(model), "-o", str(out)]) == 0
+    words = capsys.readouterr().out
+    assert "offered: the plain structure" in words and "no longer needed: electromechanical_delay." in words
+    assert main.run(["fit", str(data), "--carry", str(model), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["effects"] == [] and found["extra"]["carried"]["no_longer_needed"] == ["electromechanical_delay"]
+    assert json.loads(out.read_text())["extra"]["carried"]["offered"] == "plain"
+
+
+def test_options_of_another_structure_are_one_line(
+    files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, data = files
+    assert main.run(["fit", str(data), "--carry", str(model), "--effects", "fatigue"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "Leave out --method, --effects and --fit-on." in err

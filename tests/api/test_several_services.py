@@ -21,6 +21,7 @@ from sqlalchemy import inspect
 from api.errors import ApiError
 from api.settings import Settings
 from api.store import Store, audit, holds
+from api.store.holds import Among
 from api.store.tables import AuditEntry, Model, Test
 from api.web.app import create_app
 from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Server, Service, run_test, soon, wait_done
@@ -44,11 +45,13 @@ def two(tmp_path: Path, short_dir: Path, address: str, speed: float = 30.0) -> I
     socket = short_dir / f"rig-{time.time_ns()}.sock"
     with ExitStack() as stack:
         rig = stack.enter_context(RigThread(socket, tmp_path / "rig", speed=speed))
-        found = []
-        for name in ("a", "b"):
-            app = create_app(settings(tmp_path / name, address, socket), worker=STUB)
-            found.append(Service(stack.enter_context(Server(app)), app, rig, tmp_path / name))
-        yield found
+        yield [one(stack, tmp_path / name, address, rig) for name in ("a", "b")]
+
+
+def one(stack: ExitStack, data: Path, address: str, rig: RigThread) -> Service:
+    """A service on that database with that rig."""
+    app = create_app(settings(data, address, rig.path), worker=STUB)
+    return Service(stack.enter_context(Server(app)), app, rig, data)
 
 
 @pytest.fixture
@@ -123,8 +126,7 @@ def test_what_a_killed_service_leaves_is_taken_up_by_the_other(
     with ExitStack() as stack:
         rig = stack.enter_context(RigThread(socket, tmp_path / "rig", speed=30.0 if when == "plays" else 2000.0))
         process, url = stack.enter_context(served(tmp_path / "a", **more))
-        app = create_app(settings(tmp_path / "b", address, socket), worker=STUB)
-        b = Service(stack.enter_context(Server(app)), app, rig, tmp_path / "b")
+        b = one(stack, tmp_path / "b", address, rig)
         at_b = stack.enter_context(b.client())
         assert at_b.post("/v1/participants", json={"code": "P1"}).status_code == 201
         header = {"Authorization": f"Bearer {TOKEN}"}
@@ -136,7 +138,7 @@ def test_what_a_killed_service_leaves_is_taken_up_by_the_other(
         process.wait(20)
         told = wait_done(at_b, test_id)
         assert told["state"] == "completed" and told["model_id"], told
-        assert len(app.state.context.store.all(Model)) == 1
+        assert len(b.app.state.context.store.all(Model)) == 1
         assert at_b.get("/v1/audit").json()["whole"]
 
 
@@ -145,16 +147,14 @@ def test_what_a_living_service_follows_is_left_to_it(tmp_path: Path, short_dir: 
     socket = short_dir / f"rig-{time.time_ns()}.sock"
     with ExitStack() as stack:
         rig = stack.enter_context(RigThread(socket, tmp_path / "rig", speed=12.0))
-        app = create_app(settings(tmp_path / "a", address, socket), worker=STUB)
-        a = Service(stack.enter_context(Server(app)), app, rig, tmp_path / "a")
+        a = one(stack, tmp_path / "a", address, rig)
         at_a = stack.enter_context(a.client())
         at_a.post("/v1/participants", json={"code": "P1"})
         test_id = at_a.post("/v1/tests", json={"participant": "P1"}).json()["id"]
-        other = create_app(settings(tmp_path / "b", address, socket), worker=STUB)
-        stack.enter_context(Server(other))
-        me = app.state.context.holds.me
+        one(stack, tmp_path / "b", address, rig)
+        context = a.app.state.context
         assert wait_done(at_a, test_id)["state"] == "completed"
-        assert app.state.context.store.get(Test, test_id).followed_by == me
+        assert context.store.get(Test, test_id).followed_by == context.holds.me
 
 
 @pytest.mark.slow
@@ -289,3 +289,29 @@ def test_a_stop_is_answered_while_the_database_is_frozen_and_all_goes_on_after_i
         assert soon(lambda: at_b.get("/v1/audit").status_code == 200)
         assert at_b.get("/v1/audit").json()["whole"]
         assert "frozen" in json.dumps(at_b.get("/v1/audit").json())
+
+
+def test_a_turn_that_is_given_up_is_let_go(cluster: Cluster, address: str) -> None:
+    del cluster
+    stores = [Store(address) for _ in range(2)]
+    one, other = (Among(store.engine) for store in stores)
+
+    async def wants() -> None:
+        async with one.turn("rig"):
+            pytest.fail("it was given up")
+
+    async def both() -> None:
+        async with other.turn("rig"):
+            waiting = asyncio.create_task(wants())
+            await asyncio.sleep(0.3)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+        await asyncio.sleep(0.3)  # it comes to who no longer wants it
+        async with other.turn("rig"):
+            pass
+
+    asyncio.run(both())
+    for held, store in zip((one, other), stores, strict=True):
+        held.close()
+        store.close()

@@ -38,10 +38,7 @@ def terminal() -> Iterator[tuple[int, int]]:
 
 
 def told(words: list[str], count: int = 1) -> list[str]:
-    end = time.monotonic() + 15
-    while len(words) < count:
-        assert time.monotonic() < end, words
-        time.sleep(0.02)
+    soon(lambda: len(words) >= count, 15)
     return words
 
 

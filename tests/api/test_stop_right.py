@@ -19,19 +19,12 @@ from api.clock import Clock
 from api.people.auth import Scope
 from api.sessions.stop_right import RIGHT_S, StopRights
 from api.store import Store, secrets
-from tests.api.conftest import TOKEN, Service
+from tests.api.conftest import TOKEN, Service, SetClock, soon
 from tests.api.test_people import standing_still
 
 HTML = {"Accept": "text/html,application/xhtml+xml"}
 PASSWORD = "correct horse battery"
 CONFIRMED = "The rig confirms that stimulation is off"
-
-
-class SetClock(Clock):
-    now_s = 1_000_000.0
-
-    def unix_s(self) -> float:
-        return self.now_s
 
 
 def person(service: Service, name: str = "Ada") -> httpx.Client:
@@ -61,14 +54,8 @@ def press(service: Service, right: str, **more: Any) -> httpx.Response:
 
 
 def stops_noted(client: httpx.Client) -> list[dict[str, Any]]:
-    """The stops in the audit trail; the entry may come after the answer."""
-    end = time.monotonic() + 60
-    while True:
-        entries = client.get("/v1/audit").json()["entries"]
-        found = [entry for entry in entries if entry["action"] == "stop"]
-        if found or time.monotonic() > end:
-            return found
-        time.sleep(0.05)
+    """The stops in the audit trail."""
+    return [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "stop"]
 
 
 def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) -> None:
@@ -136,8 +123,10 @@ def test_no_page_gives_a_right_to_a_key_or_to_who_was_told_no_since(
         assert 'action="/v1/stop"' not in stranger.get("/nowhere").text
 
 
-@pytest.mark.parametrize("end", [sign_out, run_out, new_password, remove, locked_out])
-@pytest.mark.parametrize("shown", ["test", "home"])
+@pytest.mark.parametrize(
+    ("end", "shown"),
+    [(sign_out, "test"), (run_out, "home"), (new_password, "test"), (remove, "home"), (locked_out, "test")],
+)
 def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
     service: Service, client: httpx.Client, participant: str, end: Callable[..., None], shown: str
 ) -> None:
@@ -149,14 +138,8 @@ def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
     answer = press(service, right, cookies=dict(browser.cookies))
     assert answer.status_code == 200 and CONFIRMED in answer.text
     assert service.rig.stopped_by == "Ada"
-    (entry,) = stops_noted(client)
+    (entry,) = soon(lambda: stops_noted(client))  # it may come after the answer
     assert (entry["who"], entry["subject"]) == ("Ada", test_id)
-
-
-def test_where_nothing_runs_a_stop_does_no_harm(service: Service) -> None:
-    browser = person(service)
-    right = right_on(browser.get("/").text)
-    assert [press(service, right).status_code for _ in range(3)] == [200] * 3
 
 
 def test_a_stop_waits_for_no_database(service: Service, participant: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +163,8 @@ def test_the_answer_to_a_stop_that_is_not_confirmed_has_the_button_still(service
     right = right_on(browser.get("/").text)
     service.rig.confirms_stop = False
     answer = press(service, right)
-    assert answer.status_code == 503 and "emergency switch" in answer.text and right_on(answer.text) == right
+    assert answer.status_code == 503 and "emergency switch" in answer.text and "confirms" not in answer.text
+    assert right_on(answer.text) == right
     service.rig.confirms_stop = True
     assert press(service, right_on(answer.text)).status_code == 200
 
@@ -218,13 +202,13 @@ def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
     clock = SetClock()
     rights = StopRights(b"k" * 32, clock)
     of_test, of_home = rights.give("Ada", "T1"), rights.give("Ada", None)
-    clock.now_s += RIGHT_S
+    clock.unix += RIGHT_S
     assert rights.holder(of_test) == rights.holder(of_home) == "Ada"
-    clock.now_s += 1
+    clock.unix += 1
     assert rights.holder(of_test, {"T1"}) == "Ada"
     assert rights.holder(of_test, {"T2", None}) is None
     assert rights.holder(of_home, {"T1", None}) is None
-    clock.now_s -= 3 * RIGHT_S
+    clock.unix -= 3 * RIGHT_S
     assert rights.holder(of_home) == "Ada", "a clock that is set back takes the right from nobody"
 
 
@@ -242,15 +226,6 @@ def test_the_upgrade_keeps_them_too(tmp_path: Path) -> None:
         assert secrets.shared(store, "stop-right", path) == bytes(range(32)) and not path.exists()
     assert len(set(secrets.shared(store, "another", path))) > 1
     store.close()
-
-
-def test_a_token_that_ran_out_in_a_test_still_stops(service: Service, client: httpx.Client) -> None:
-    late = client.post(
-        "/v1/tokens", json={"name": "late", "scopes": ["run-test"], "expires_utc": "2020-01-01T00:00:00Z"}
-    ).json()["token"]
-    with service.client(late) as program:
-        assert program.post("/v1/preview", json={"participant": "P1"}).status_code == 401
-        assert program.post("/v1/stop").status_code == 200
 
 
 def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Service) -> None:
@@ -321,16 +296,6 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
         assert browser.post("/rearm", data={"csrf": csrf}).status_code == 303
         assert program.post("/v1/tests", json=start).status_code == 202
-
-
-def test_a_program_rearms_only_where_it_was_asked_for_by_name(service: Service, client: httpx.Client) -> None:
-    for name, scopes, status in (
-        ("asked", ["rearm"], 200), ("not asked", ["run-test", "read-live", "read-model", "approve-model"], 403),
-    ):  # fmt: skip
-        client.post("/v1/stop")
-        assert service.client(service.token(name, *scopes)).post("/v1/rearm").status_code == status
-    key = client.post("/v1/controller-keys", json={"name": "ilc"}).json()["key"]
-    assert service.client(key).post("/v1/rearm").status_code == 403
 
 
 def test_a_person_who_runs_no_tests_does_not_rearm(service: Service, client: httpx.Client) -> None:

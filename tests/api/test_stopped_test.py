@@ -15,13 +15,15 @@ from api.charts import model_charts
 from api.workers.recorded_signals import recorded
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service
+from tests.api.test_access import signed_in
+from tests.api.test_stop_right import stops_noted
 
 service = shared_service(speed=0.5)
 
 
 def stops(service: Service) -> int:
     with service.client() as http:
-        return sum(entry["action"] == "stop" for entry in http.get("/v1/audit").json()["entries"])
+        return len(stops_noted(http))
 
 
 @pytest.mark.browser
@@ -49,19 +51,26 @@ def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service
         assert words in shown, words
     reason = tab.locator("#reason").inner_text()
     assert re.search(r"Stopped at \d\d:\d\d:\d\d, after \d+\.\d s\..*by Ada", reason), reason
+    tab.locator("#rig-state", has_text="needs re-arm").wait_for()
+    tab.get_by_role("button", name="I have checked: re-arm").click()
+    tab.locator("#rig-state", has_text="ready").wait_for()
+    assert tab.url == test_page and service.rig.state == "ready", "on the spot"
     assert tab.locator("canvas").count() == 0 and tab.get_by_text("What was planned", exact=True).count() == 0
 
 
 def test_an_unconfirmed_stop_keeps_its_warning_when_loaded_again(service: Service) -> None:
-    from tests.api.test_access import signed_in
-
     service.rig.confirms_stop = False
+    with service.client() as http:
+        answer = http.post("/v1/stop")
+    assert (answer.status_code, answer.json()["title"]) == (503, "The stop is not confirmed")
+    assert "emergency switch" in answer.json()["detail"]
     with signed_in(service) as browser:
         led = browser.post("/v1/stop", data={})
         assert led.status_code == 303
         for _ in range(2):
             told = browser.get(led.headers["location"])
             assert told.status_code == 503 and "emergency switch" in told.text
+            assert "<h1>The stop is not confirmed" in told.text and "confirms" not in told.text
         unknown = browser.get("/stopped/none")  # as after a restart of the service
         assert unknown.status_code == 404 and "The bar above shows what the rig does now" in unknown.text
         assert 'id="rig-state"' in unknown.text and 'action="/v1/stop"' in unknown.text

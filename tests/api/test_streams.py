@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from api.cli import streams as streams_module
-from api.cli.launcher import Services
+from api.cli.launcher import LAST_BYTES, Child, Services
 from api.cli.streams import Streams
 from api.settings import Settings
 from tests.harness.lsl_recorder import on_this_machine
@@ -115,3 +115,18 @@ def test_killed_beside_the_service_it_comes_back_and_the_service_goes_on(tmp_pat
         assert services.api.alive() and services.rig.alive()
     assert isinstance(services.lsl.child.process, subprocess.Popen)
     assert not services.lsl.child.alive()
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        (None, ""), ("", ""), ('{"message": "all went well"}\n', "all went well"),
+        ("outbox: no room\n", "outbox: no room"),
+        ('{"time": "2026-11-23T08:0', ""), ('{"level": "info"}\n', ""), ("{" * 100_000, ""),
+        ("x" * 3 * LAST_BYTES + "\noutbox: gone\n", "outbox: gone"),
+    ],
+)  # fmt: skip
+def test_whatever_its_log_is(tmp_path: Path, log: str | None, words: str) -> None:
+    if log is not None:
+        (tmp_path / "outbox.log").write_text(log)
+    assert Child("outbox", [], tmp_path / "outbox.log").last_words() == words

@@ -78,6 +78,8 @@ def test_an_uploads_model_page_says_what_was_left_out_of_its_structure(site: Ser
         page = browser.post(form, data={"csrf": token}, files={"file": ("a.csv", csv)}, follow_redirects=True)
         assert page.url.path.startswith("/models/") and html.escape(told) in page.text
         assert html.escape(told) in browser.get(page.url.path).text
+        exports = page.text.partition('aria-label="Export"')[2].partition("</div>")[0]
+        assert ">CSV<" in exports and ">HDF5<" not in exports, "it came as a table"
         assert html.escape(told) in browser.get(f"{page.url.path}/report").text
 
 

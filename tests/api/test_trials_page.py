@@ -14,9 +14,8 @@ from api.web.pages import tracking_form
 from api.web.responses.tracking import TrialOut
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
-from tests.api.test_tracked import approved, play, say, tracked
+from tests.api.test_tracked import play, say, tracked
 
-__all__ = ["approved"]
 PAGE = "/participants/P017"
 
 

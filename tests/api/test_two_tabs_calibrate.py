@@ -75,9 +75,9 @@ def test_a_page_that_is_out_of_date_finishes_nothing(
     browser, fields = tab
     for threshold in ("sensory", "motor", "comfort"):
         client.post(f"{WHERE}/mark", json={"threshold": threshold})
-    assert browser.post(f"{PAGE}/finish", data={**fields, **stale}).status_code == 409
-    if "calibration" in stale:
-        assert browser.post(f"{PAGE}/discard", data={**fields, **stale}).status_code == 409
+    for what in ("finish", *(("discard", "step/repeat", "mark/motor") if "calibration" in stale else ())):
+        assert browser.post(f"{PAGE}/{what}", data={**fields, **stale}).status_code == 409, what
+    assert trains(service) == 1
     assert service.rig.calibration is not None
     assert browser.post(f"{PAGE}/finish", data=fields).headers["location"] == "/participants/P017"
 

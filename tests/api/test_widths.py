@@ -71,6 +71,18 @@ def test_the_muscle_follows_what_was_asked_for(served: tuple[Service, str]) -> N
     assert trial["settings"]["pulse_width_us"] == found["pulse_width_us"]
 
 
+def test_foretold_torque_is_the_muscles(client: httpx.Client, served: tuple[Service, str]) -> None:
+    widths = [0.0] * 20 + [200.0] * 60 + [90.0] * 60 + [0.0] * 40
+    found = client.post(f"/v1/models/{served[1]}/prediction", json={"pulse_width_us": widths}).json()
+    truth = np.array(muscle(widths, 400.0)).reshape(-1, 10).mean(axis=1)
+    assert len(found["torque_nm"]) == len(widths)
+    assert np.sqrt(np.mean((np.array(found["torque_nm"]) - truth) ** 2)) < 0.15
+    assert max(abs(value) for value in found["torque_nm"][:18]) < 0.02, "no pulse, no torque"
+    for body in ({"pulse_width_us": []}, {"pulse_width_us": [-1]}, {"pulse_width_us": [1e9]}, {}):
+        assert client.post(f"/v1/models/{served[1]}/prediction", json=body).status_code == 422, body
+    assert client.post("/v1/models/none/prediction", json={"pulse_width_us": [1]}).status_code == 404
+
+
 def test_the_participants_limit_holds_and_what_is_beyond_is_named(
     client: httpx.Client, served: tuple[Service, str]
 ) -> None:
@@ -85,36 +97,28 @@ def test_the_participants_limit_holds_and_what_is_beyond_is_named(
     assert np.max(np.diff(slow["pulse_width_us"], prepend=0.0)) <= 5.0
 
 
-@pytest.mark.parametrize(
-    ("body", "words"),
-    [
-        ({}, "reference_torque_nm"),
-        ({"reference_torque_nm": []}, "reference_torque_nm"),
-        ({"reference_torque_nm": [True]}, "reference_torque_nm"),
-        ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.0]}, "one time for each torque"),
-        ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.5, 0.0]}, "must rise"),
-        ({"reference_torque_nm": [1e5]}, "mN·m"),
-        ({"reference_torque_nm": [0.0] * 12_001}, "at most 300 s"),
-        ({"reference_torque_nm": [1.0], "pulse_rate_hz": 20.0}, "40 pulses a second"),
-        ({"reference_torque_nm": [1.0], "max_pulse_width_us": 0.0}, "max_pulse_width_us"),
-        ({"reference_torque_nm": [1.0], "further": 1}, "further"),
-    ],
-)
-def test_a_senseless_reference_is_refused_in_words(
-    client: httpx.Client, served: tuple[Service, str], body: dict[str, object], words: str
-) -> None:
-    answer = client.post(f"/v1/models/{served[1]}/widths", json=body)
-    assert answer.status_code == 422
-    assert words in answer.text.replace("Give one time for each torque", "one time for each torque"), answer.text
+SENSELESS: list[tuple[dict[str, object], str]] = [
+    ({}, "reference_torque_nm"),
+    ({"reference_torque_nm": []}, "reference_torque_nm"),
+    ({"reference_torque_nm": [True]}, "reference_torque_nm"),
+    ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.0]}, "ne time for each torque"),
+    ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.5, 0.0]}, "must rise"),
+    ({"reference_torque_nm": [1e5]}, "mN·m"),
+    ({"reference_torque_nm": [0.0] * 12_001}, "at most 300 s"),
+    ({"reference_torque_nm": [1.0], "pulse_rate_hz": 20.0}, "40 pulses a second"),
+    ({"reference_torque_nm": [1.0], "max_pulse_width_us": 0.0}, "max_pulse_width_us"),
+    ({"reference_torque_nm": [1.0], "further": 1}, "further"),
+]
 
 
-def test_json_that_is_no_number_is_refused(client: httpx.Client, served: tuple[Service, str]) -> None:
+def test_a_senseless_reference_is_refused_in_words(client: httpx.Client, served: tuple[Service, str]) -> None:
+    where = f"/v1/models/{served[1]}/widths"
+    for body, words in SENSELESS:
+        answer = client.post(where, json=body)
+        assert answer.status_code == 422 and words in answer.text, (body, answer.text)
     for text in ("NaN", "Infinity", "1e999"):
-        answer = client.post(
-            f"/v1/models/{served[1]}/widths",
-            content=f'{{"reference_torque_nm": [{text}]}}',
-            headers={"content-type": "application/json"},
-        )
+        body = f'{{"reference_torque_nm": [{text}]}}'
+        answer = client.post(where, content=body, headers={"content-type": "application/json"})
         assert answer.status_code in (400, 422), answer.text
 
 

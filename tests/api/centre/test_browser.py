@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.api.browser import close, there
+from tests.api.browser import close, there, watched
 from tests.api.centre.conftest import Centre
 from tests.api.centre.told import AT, Teller
 from tests.api.conftest import TOKEN
@@ -22,18 +22,13 @@ HOSTILE = "<img src=x onerror=boom()>"
 
 @pytest.fixture
 def page(browser: Any, centre: Centre) -> Iterator[Any]:
-    """A tab of the administrator that takes down every request and error."""
-    context = browser.new_context(viewport={"width": 1366, "height": 768}, accept_downloads=True)
-    page = context.new_page()
-    page.requests, page.errors = [], []
-    page.on("request", lambda request: page.requests.append(request.url))
-    page.on("pageerror", lambda error: page.errors.append(str(error)))
-    page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
+    """A tab of the administrator."""
+    page = watched(browser, accept_downloads=True)
     page.goto(f"{centre.url}/sign-in#token={TOKEN}")
     page.get_by_role("button", name="Sign in with the token").click()
     there(page, "Rigs")
     yield page
-    close(context)
+    close(page.context)
 
 
 def looked_at(page: Any, what: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -22,7 +21,7 @@ from api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
 from api.store.centre_tables import CentreFile, CentreItem, CentreModel, CentreWanted
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller, sha256
-from tests.api.conftest import PATIENCE_S
+from tests.api.conftest import PATIENCE_S, soon
 
 
 class TroubledFiles(MemoryFileSystem):
@@ -310,31 +309,18 @@ def test_a_copy_that_is_cut_off_leaves_nothing_under_the_name(tmp_path: Path, mo
     assert not [path for path in (tmp_path / "files").rglob("*") if path.is_file() and path.name != "stimrig-centre"]
 
 
-def test_on_s3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
-    server.start()
-    host, port = server.get_host_and_port()
-    for name, value in (
-        ("AWS_ACCESS_KEY_ID", "testing"), ("AWS_SECRET_ACCESS_KEY", "testing"), ("AWS_DEFAULT_REGION", "us-east-1"),
-        ("AWS_ENDPOINT_URL", f"http://{host}:{port}"),
-    ):  # fmt: skip
-        monkeypatch.setenv(name, value)
-    try:
-        fs = fsspec.filesystem("s3", skip_instance_cache=True)
-        fs.mkdir("trial")
-        for centre in run_centre(tmp_path, files="s3://trial/centre"):
-            told = Teller()
-            data = told.session()
-            with centre.client(centre.key()) as rig, centre.client() as http:
-                told.push(rig)
-                [recording] = http.get("/v1/recordings").json()["recordings"]
-                assert http.get(recording["url"]).content == data
-                name = sha256(data)
-                with fs.open(f"trial/centre/{name[:2]}/{name}", "wb") as out:
-                    out.write(b"changed")
-                assert http.get(recording["url"]).json()["type"] == "/problems/file-damaged"
-    finally:
-        server.stop()
+def test_on_s3(tmp_path: Path, s3: Any) -> None:
+    s3.mkdir("trial")
+    for centre in run_centre(tmp_path, files="s3://trial/centre"):
+        told = Teller()
+        data = told.session()
+        with centre.client(centre.key()) as rig, centre.client() as http:
+            told.push(rig)
+            [recording] = http.get("/v1/recordings").json()["recordings"]
+            assert http.get(recording["url"]).content == data
+            name = sha256(data)
+            s3.pipe(f"trial/centre/{name[:2]}/{name}", b"changed")
+            assert http.get(recording["url"]).json()["type"] == "/problems/file-damaged"
 
 
 def test_a_bucket_that_does_not_answer_keeps_neither_items_nor_pages_waiting(
@@ -364,9 +350,7 @@ def test_a_bucket_that_does_not_answer_keeps_neither_items_nor_pages_waiting(
         sent = [threads.submit(send, of, file) for of in rigs for file in (0, 1, 0)]
         try:
             assert holding.acquire(timeout=PATIENCE_S)
-            end_s = time.monotonic() + PATIENCE_S
-            while sum(centre.context.putting.values()) < len(sent) and time.monotonic() < end_s:
-                time.sleep(0.05)
+            soon(lambda: sum(centre.context.putting.values()) >= len(sent))
             rig, told = rigs[0]
             assert rig.post("/v1/rig/hello", json=told.hello("2026-03-02T08:00:00Z")).status_code == 200
             assert send(rigs[0], 0) == 503, "three of this rig are under way"

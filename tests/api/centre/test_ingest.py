@@ -10,8 +10,10 @@ from pathlib import Path
 
 import httpx
 import pytest
+from sqlalchemy import update
 
-from api.store.centre_tables import CentreItem, CentreRecording
+from api.centre import warnings
+from api.store.centre_tables import CentreItem, CentreRecording, CentreWarning
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import AT, ZEROS, Teller, canonical, sha256
 
@@ -283,3 +285,23 @@ def test_a_centre_restored_from_its_backup_gets_again_what_it_lost(tmp_path: Pat
             listed = http.get("/v1/recordings").json()["recordings"]
             assert [http.get(one["url"]).content for one in listed] == [first, second]
         assert counts(centre) == (11, 2) and centre.warnings() == []
+
+
+def test_what_was_acknowledged_keeps_no_new_warning_back(
+    centre: Centre, rig: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(warnings, "MOST_OPEN", 3)
+    rig_id, now = centre.row().id, "2026-11-23T08:00:00.000Z"
+
+    def flap(times: int) -> None:
+        for _ in range(times):
+            with centre.context.store.write() as session:
+                warnings.tell(session, now, rig_id, "clock", difference_s=5.0)
+                warnings.end(session, now, rig_id, "clock")
+
+    flap(5)
+    assert len(centre.warnings()) == 3
+    with centre.context.store.write() as session:
+        session.execute(update(CentreWarning).values(acknowledged_by="Ada", acknowledged_utc=now))
+    flap(1)
+    assert centre.warnings() == [("Ward 1", "clock")]

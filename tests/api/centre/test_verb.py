@@ -137,14 +137,14 @@ def test_a_missing_extra_is_told(
 
 @pytest.mark.sqlite
 def test_a_database_of_another_version_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for centre in [tmp_path / "data"]:
-        assert run(["centre", "add-rig", "Ward 1", "--data", str(centre)]) == 0
-        with closing(sqlite3.connect(centre / "centre.db")) as database, database:
-            database.execute("UPDATE alembic_version SET version_num = '0900'")
-        capsys.readouterr()
-        assert run(["centre", "--port", "0", "--data", str(centre)]) == 2
-        said = capsys.readouterr().err
-        assert len(said.splitlines()) == 1 and "version 0900" in said
+    centre = tmp_path / "data"
+    assert run(["centre", "add-rig", "Ward 1", "--data", str(centre)]) == 0
+    with closing(sqlite3.connect(centre / "centre.db")) as database, database:
+        database.execute("UPDATE alembic_version SET version_num = '0900'")
+    capsys.readouterr()
+    assert run(["centre", "--port", "0", "--data", str(centre)]) == 2
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1 and "version 0900" in said
 
 
 def test_a_port_that_is_taken_is_told(centre: Centre, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

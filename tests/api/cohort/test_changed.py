@@ -97,16 +97,13 @@ def test_noise_is_no_change(tmp_path: Path, new: dict[str, Any]) -> None:
     assert of(tmp_path, row("a"), new) == ([], [])
 
 
-def test_errors_are_compared_by_their_kind(tmp_path: Path) -> None:
-    assert of(tmp_path, failed("a"), row("a"))[0] == ["error to ok"]
-
-
-def test_another_error_is_one(tmp_path: Path) -> None:
-    assert of(tmp_path, failed("a"), failed("a", "bad record"))[0] == ["other error"]
-
-
-def test_the_same_error_is_none(tmp_path: Path) -> None:
-    assert of(tmp_path, failed("a"), {**failed("a"), "error": "in other words"})[0] == []
+@pytest.mark.parametrize(
+    ("new", "kinds"),
+    [(row("a"), ["error to ok"]), (failed("a", "bad record"), ["other error"]),
+     ({**failed("a"), "error": "in other words"}, [])],
+)  # fmt: skip
+def test_errors_are_compared_by_their_kind(tmp_path: Path, new: dict[str, Any], kinds: list[str]) -> None:
+    assert of(tmp_path, failed("a"), new)[0] == kinds
 
 
 @pytest.mark.parametrize("shares", [1, 3])

@@ -21,6 +21,8 @@ import pytest
 from api import schemas
 from api.cli import main
 from api.cohort import cluster
+from api.cohort.cluster import Workers, connected
+from api.cohort.errors import CohortError
 from api.cohort.fields import FIELDS
 from tests.harness.cohort_records import cohort
 
@@ -143,19 +145,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def started(folder: Path, output: Path) -> subprocess.Popen[str]:
-    command = [
-        sys.executable,
-        "-c",
-        COMMAND,
-        "cohort",
-        "fit",
-        str(folder),
-        "-o",
-        str(output),
-        "--json",
-        "--renew",
-        "20",
-    ]
+    words = ["cohort", "fit", str(folder), "-o", str(output), "--json", "--renew", "20"]
+    command = [sys.executable, "-c", COMMAND, *words]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where the tests run behind `&`
@@ -296,3 +287,10 @@ def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
     said = [line for line in err.splitlines() if not line.startswith("dashboard")]
     assert run.returncode == 1 and len(said) == 1 and "the scheduler is gone" in said[0], err
     assert rows_in(tmp_path / "r.parquet.parts") >= 3
+
+
+def test_without_keys_no_scheduler_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "cryptography" else find(name))
+    with pytest.raises(CohortError, match="pip install cryptography"), connected(Workers(count=1)):
+        pass

@@ -21,7 +21,6 @@ import pytest
 import identify
 from api import schemas
 from api.cli import main
-from api.cohort.bids import Bids
 from api.cohort.errors import CohortError, CutOffError
 from api.cohort.export import Export
 from api.cohort.export_state import FOLDER, State
@@ -338,4 +337,3 @@ def test_records_are_read_from_a_bucket_too(data: Path, tmp_path: Path) -> None:
     files.pipe("/export/session.h5", (data / "session-0.h5").read_bytes())
     assert main.run(["export", "memory://export", "--bids", str(tmp_path / "out")]) == 0
     assert (tmp_path / "out" / "sub-P1" / "ses-20260105").is_dir()
-    assert Bids(Days()).name == "bids"

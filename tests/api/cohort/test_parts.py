@@ -16,8 +16,9 @@ from api.cohort import parts
 from api.cohort import read as read_tables
 from api.cohort.errors import CohortError
 from api.cohort.parts import Results
+from api.cohort.read import options_of
 from api.cohort.sources import Entry
-from api.cohort.table import SCHEMA, table_of
+from api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, table_of
 from api.cohort.tasks import Task
 from api.cohort.worker import COPY, LEFT_OUT
 
@@ -233,3 +234,23 @@ def test_nonsense_in_a_record_never_ends_a_run() -> None:
     )
     assert table["bytes"].to_pylist() == [3, None] and table["name"].to_pylist() == ["a", "b"]
     assert table["rate_hz"][1].as_py() is None
+
+
+EMPTY = SCHEMA.empty_table()
+TABLES = {
+    "other-columns": (pa.table({"a": [1]}), b"{}"),
+    "texts": (pa.table({name: ["x"] for name in SCHEMA.names}), b"{}"),
+    "numbers": (pa.table({name: [2**62] for name in SCHEMA.names}), b"{}"),
+    "deep": (EMPTY, b"[" * 100_000),
+    "no-object": (EMPTY, b"[1]"),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_it_is_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    table, options = TABLES[name]
+    about = {b"format": FORMAT.encode(), b"format_version": FORMAT_VERSION.encode(), b"options": options}
+    pq.write_table(table.replace_schema_metadata(about), tmp_path / "r.parquet")
+    with pytest.raises(CohortError, match=r"r\.parquet: ") as caught:
+        options_of(tmp_path / "r.parquet")
+    assert "\n" not in str(caught.value)
