@@ -58,6 +58,8 @@ class Clinic:
     asked: list[Asked] = field(default_factory=list)
     states: list[tuple[float, Process, str]] = field(default_factory=list)
     """Each state that the rig told, when, and which process."""
+    latched: list[str] = field(default_factory=list)
+    """Why it latched, each time."""
     finished: list[FinishedEvent] = field(default_factory=list)
     places: Iterator[int] = field(default_factory=count)
     loses: float = 0.0
@@ -80,6 +82,7 @@ class Clinic:
         if isinstance(event, StateEvent):
             state = event.status.state
             self.states.append((time_s, process, state))
+            self.latched += [event.status.reason] * (state == "latched")
             self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
             if process is self.process:
                 self.state = state
