@@ -102,6 +102,13 @@ class Score:
         self._reached = index
         return float(self.laid.pulse_width_us[index]) if index < len(self.laid) else None
 
+    def lowered(self, index: int, most_us: float) -> float:
+        """The width of a pulse, at most so much unless it may jump; whoever is told what is laid is told that width."""
+        laid = self.laid
+        if not laid.jumps[index] and laid.pulse_width_us[index] > most_us:
+            laid.pulse_width_us[index] = most_us
+        return float(laid.pulse_width_us[index])
+
     async def extend(self, after: int, chosen: Sequence[SegmentPlan]) -> None:
         """Lay segments behind everything that is laid: all of them, or none.
 

@@ -248,8 +248,8 @@ class TestRun:
             if wrong is not None:
                 self._fault(wrong)
                 return
-            if not self.score.laid.jumps[index]:  # after pulses that were left out it climbs back within the limit
-                width_us = min(width_us, felt_us + self._table["width_rise_us"].hi)
+            # after pulses that were left out the width climbs back within the limit
+            width_us = self.score.lowered(index, felt_us + self._table["width_rise_us"].hi)
             self._gate.feed()
             status = self._gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
             if status in (PulseStatus.UNACKNOWLEDGED, PulseStatus.REST):

@@ -139,7 +139,8 @@ class CanBus:
             stamp_s = message.timestamp if self._stamped else math.nan
             frame = Frame(message.arbitration_id, bytes(message.data), self._clock.now_s(), stamp_s)
             for gathering in self._listening:
-                if gathering.listener[:2] == (message.arbitration_id, message.is_extended_id):
+                listener = gathering.listener
+                if (listener.frame_id, listener.is_extended) == (message.arbitration_id, message.is_extended_id):
                     gathering.add(frame)
 
     def _count(self, damaged: int = 0, errors: int = 0) -> None:

@@ -129,6 +129,9 @@ def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: P
     assert np.sum(dropped) == result.dropped > 3
     planned_us, sent_us = (columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
     assert np.all(np.isnan(sent_us[dropped]))
+    assert np.max(np.abs((rig.run.score.laid.pulse_width_us - sent_us)[sent_us > 0])) < 1, (
+        "as clients are told, before the device rounds"
+    )
     climbed = np.flatnonzero(planned_us - sent_us > 1)
     assert len(climbed) == 0 if up_s == 2.0 else 0 < len(climbed) < 20
 

@@ -26,7 +26,8 @@ pytestmark = [pytest.mark.wire, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 TOKEN = "administrator-token-of-a-moving-joint"
-SPEED, PULSES = 2.0, 160
+SPEED, PULSES = 2.0, 260
+"""A machine that pauses for a second begins the movement two seconds late: it is still in the trial."""
 LOW_DEG, HIGH_DEG = 70.0, 110.0
 WAY = [[0, LOW_DEG], [0.1, LOW_DEG], [1.6, HIGH_DEG], [3.1, LOW_DEG], [3.2, LOW_DEG]]
 OUT_AND_BACK = {"cmd": "arm", "mode": "script", "points": WAY}
@@ -96,5 +97,4 @@ def test_the_joint_is_moved_in_each_trial_and_its_angle_is_learnt_from(tmp_path:
         for test in tests:
             with h5py.File(io.BytesIO(client.recording(test["recording_id"]))) as file:
                 time_s, angle_deg = file["angle/time_s"][:], np.degrees(file["angle/angle_rad"][:])
-            assert abs(angle_deg[time_s < 0.9] - LOW_DEG).max() < 2, "not before it"
-            assert angle_deg.max() > LOW_DEG + 10, "a machine that pauses begins the movement late"
+            assert angle_deg.max() > HIGH_DEG - 3 and abs(angle_deg[time_s < 0.9] - LOW_DEG).max() < 2, "not before it"
