@@ -52,6 +52,8 @@ class CanBus:
         self._arguments = dict(arguments)
         self._listening: tuple[_Gathering, ...] = ()
         self._stamped = arguments.get("interface") in STAMPING
+        self._tells_length = arguments.get("interface") != "socketcand"
+        """Whether a frame's length of identifier is sure; some gateways write all identifiers with eight digits."""
         # python-can warns about every frame that is split between two packets, which is normal
         logging.getLogger("can").setLevel(logging.CRITICAL)
         self.can = self._opened()
@@ -140,7 +142,8 @@ class CanBus:
             frame = Frame(message.arbitration_id, bytes(message.data), self._clock.now_s(), stamp_s)
             for gathering in self._listening:
                 listener = gathering.listener
-                if (listener.frame_id, listener.is_extended) == (message.arbitration_id, message.is_extended_id):
+                same_length = message.is_extended_id == listener.is_extended or not self._tells_length
+                if listener.frame_id == message.arbitration_id and same_length:
                     gathering.add(frame)
 
     def _count(self, damaged: int = 0, errors: int = 0) -> None:

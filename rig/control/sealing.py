@@ -28,6 +28,8 @@ MIN_FREE_BYTES = 64 * 2**20
 DOUBTFUL_ALIGNMENT_MS = 5.0
 DOUBTFUL_RATE = 0.02
 """Beyond these a recording's times are uncertain, and its finished event says so. A larger rate error is a fault."""
+ROUNDED_US = 1.0
+"""A width that is lower than planned by more was not only rounded to the device's step."""
 
 
 class RecordingStore:
@@ -255,7 +257,7 @@ def _of_sensor(recording: assembly.Recording) -> list[str]:
 
 
 def _disturbed_line(recording: assembly.Recording) -> list[str]:
-    """Warnings about late acknowledgements, acknowledgements of pulses that were not sent, and dropped pulses."""
+    """Warnings about late acknowledgements, acknowledgements of what was not sent, dropped pulses and what followed."""
     named = [event.get("event") for event in recording.events]
     late_s = [event["delay_s"] for event in recording.events if event.get("event") == "late_ack"]
     found = []
@@ -269,6 +271,12 @@ def _disturbed_line(recording: assembly.Recording) -> list[str]:
             f"stimulator: {len(late_s)} acknowledgements came late, up to {max(late_s) * 1e3:.0f} ms after the pulse "
             f"was sent; these pulses may have been felt that late; {named.count('dropped')} pulses that came due "
             "meanwhile were dropped"
+        )
+    planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
+    if weaker := int(np.count_nonzero(planned_us - sent_us > ROUNDED_US)):
+        found.append(
+            f"stimulator: {weaker} pulses were narrower than planned, since after dropped pulses the width climbs back "
+            "no faster than its limit"
         )
     return found
 

@@ -134,6 +134,9 @@ def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: P
     )
     climbed = np.flatnonzero(planned_us - sent_us > 1)
     assert len(climbed) == 0 if up_s == 2.0 else 0 < len(climbed) < 20
+    assert [f"{len(climbed)} pulses were narrower" in line for line in warnings(rig.recording())] == [True] * (
+        up_s == 0.2
+    )
 
 
 def test_a_damaged_answer_of_the_stimulator_ends_a_test_like_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
