@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import json
+import re
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,6 @@ STICKING_OUT = """() => [...document.querySelectorAll('body *')].filter((e) => !
   e.getBoundingClientRect().right > innerWidth + 1).slice(0, 5).map((e) => e.outerHTML.slice(0, 120))"""
 
 
-TURNS = itertools.cycle((WIDE[0], PHONE[0]))
 service = shared_service(speed=8.0)
 
 
@@ -51,8 +51,8 @@ def fits(page: Any, what: str) -> None:
 
 
 def examined(page: Any, what: str, stop: bool = True) -> None:
-    """Both widths are looked at; axe takes one of them, by turns: to run it is dear."""
-    look = next(TURNS)
+    """Both widths are looked at; axe takes one of them, chosen by the state's name: to run it is dear."""
+    look = (WIDE, PHONE)[zlib.crc32(re.sub(r"[0-9a-f-]{8,}|T[0-9-]+\w*", "", what).encode()) % 2][0]
     for width, height in (WIDE, PHONE):
         page.set_viewport_size({"width": width, "height": height})
         fits(page, f"{what} at {width}")

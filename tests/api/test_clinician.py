@@ -197,6 +197,7 @@ def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service) -> None:
     tab_to(blank, "To the participants")
     keys.press("Enter")
     blank.get_by_role("button", name="I have checked: re-arm").wait_for()
+    blank.get_by_text("stays stopped").wait_for()
     tab_to(blank, "I have checked: re-arm")
     keys.press("Enter")
     blank.get_by_role("heading", name="Participants").wait_for()

@@ -16,7 +16,7 @@ from hardware_sim.patients import hidden
 from hardware_sim.patients.hidden.draw import MOVING, Scenario, draw_scenario
 from hardware_sim.patients.hidden.live import HiddenMuscle
 from hardware_sim.patients.hidden.scenario import simulate
-from tests.hardware_sim.emulated import emulated
+from tests.hardware_sim.emulated import emulated, wait_for
 from tests.hardware_sim.test_hidden_patient import RATE_HZ, play
 
 pytestmark = pytest.mark.slow
@@ -75,7 +75,8 @@ def test_the_design_moves_the_arm_and_the_sensor_is_there() -> None:
         assert rig.ready["arm"] == "waves"
         assert rig.ready["angle_sensor"]["frame_id"] == 386
         assert "torque" not in json.dumps(rig.ready)
-        assert np.isfinite(rig.ask(cmd="state")["angle_deg"])
+        angle_deg = rig.ask(cmd="state")["angle_deg"]
+        wait_for(lambda: abs(rig.ask(cmd="state")["angle_deg"] - angle_deg) > 1.0)
         assert not rig.ask(cmd="arm", mode="free")["ok"]
         assert rig.ask(cmd="arm", mode="robot")["ok"]
 

@@ -97,7 +97,14 @@ class TestCells:
     def test_canopen_sends_between_start_and_stop(self) -> None:
         made = canopen.Cell()
         assert not made.running()
-        for message, running in ((b"\x01\x02", False), (b"\x01\x01", True), (b"\x80\x00", False), (b"\x01\x00", True)):
+        told = (
+            (b"\x01\x02", False),
+            (b"\x01\x01", True),
+            (b"\x80\x00", False),
+            (b"\x01\x00", True),
+            (b"\x02\x00", False),
+        )
+        for message, running in told:
             made.received(0, message)
             assert made.running() is running
 

@@ -126,7 +126,7 @@ def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None
     assert [(pulse["width_us"], pulse["current_ma"], pulse["delivered"]) for pulse in pulses] == [(300, 20, True)] * 12
     assert state["unbalanced_pulses"] == 0
 
-    assert {message.arbitration_id for message in messages} == {can_id}
+    assert {(message.arbitration_id, message.is_extended_id) for message in messages} == {(can_id, False)}
     decoded = [decode(bytes(message.data)) for message in messages]
     values = np.array([value for torques, _ in decoded for value in torques])
     assert values.size == samples_per_frame * len(messages)

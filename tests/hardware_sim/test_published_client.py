@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import time
-from typing import Any
 
 import pytest
 from science_mode_4 import (
@@ -31,19 +30,17 @@ def shape(width_us: int, current_ma: float) -> list[ChannelPoint]:
     return [ChannelPoint(width_us, current_ma), ChannelPoint(100, 0), ChannelPoint(width_us, -current_ma)]
 
 
-def pulsed(device: DeviceP24) -> Any:
-    """The ack of a pulse."""
-    device.get_layer_low_level().send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
-    found = list[Any]()
+def acks(device: DeviceP24, count: int) -> list:
+    found = []
 
     def read() -> bool:
         packet = device.packet_buffer.get_packet_from_buffer()
         if packet is not None:
             found.append(packet)
-        return bool(found)
+        return len(found) >= count
 
     wait_for(read)
-    return found[0]
+    return found
 
 
 async def opened(rig: Emulated) -> tuple[SerialPortConnection, DeviceP24]:
@@ -66,32 +63,42 @@ def test_low_level() -> None:
         assert time.monotonic() - started_s >= 0.040
         assert await general.get_stim_status() == (StimStatus.LOW_LEVEL_INITIALIZED, True)
         for _ in range(20):
-            ack = pulsed(device)
+            low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
+            (ack,) = acks(device, 1)
             assert (ack.result, ack.channel, ack.connector) == (ResultAndError.NO_ERROR, 0, 0)
             await asyncio.sleep(0.02)
         rig.ask(cmd="fault", name="electrode_error")
-        assert pulsed(device).result == ResultAndError.ELECTRODE_ERROR
-        rig.ask(cmd="fault", name="electrode_error", on=False)
+        low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
+        assert acks(device, 1)[0].result == ResultAndError.ELECTRODE_ERROR
         await low.stop()
         assert await general.get_stim_status() == (StimStatus.NO_LEVEL_INITIALIZED, False)
-        for _ in range(2):
-            connection.close()  # a client may leave and come back
-            connection, device = await opened(rig)
-            await device.get_layer_low_level().init(LowLevelMode.STIM_CURRENT, LowLevelHighVoltageSource.STANDARD)
-            ack = pulsed(device)
-            assert ack.mode == LowLevelMode.STIM_CURRENT
-            step_us = ack.sampling_time_in_microseconds
-            on_us = step_us * sum(sample == 20.0 for sample in ack.measurement_samples)
-            assert on_us == pytest.approx(500, abs=2 * step_us)
         connection.close()
 
     with emulated() as rig:
         asyncio.run(session(rig))
         pulses = rig.ask(cmd="pulses")["pulses"]
-        assert [(p["width_us"], p["current_ma"]) for p in pulses] == [PULSE] * 23
-        assert [p["delivered"] for p in pulses] == [True] * 20 + [False] + [True] * 2
+        assert [(p["width_us"], p["current_ma"]) for p in pulses] == [PULSE] * 21
+        assert [p["delivered"] for p in pulses] == [True] * 20 + [False]
         state = rig.ask(cmd="state")
-        assert (state["unbalanced_pulses"], state["corrupt_frames"]) == (0, 0)
+        assert (state["unbalanced_pulses"], state["corrupt_frames"], state["mode"]) == (0, 0, "none")
+        assert state["torque_nm"] > 0.5
+
+
+def test_measured_current_of_a_pulse() -> None:
+    async def session(rig: Emulated) -> None:
+        connection, device = await opened(rig)
+        low = device.get_layer_low_level()
+        await low.init(LowLevelMode.STIM_CURRENT, LowLevelHighVoltageSource.STANDARD)
+        low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
+        (ack,) = acks(device, 1)
+        assert ack.mode == LowLevelMode.STIM_CURRENT
+        step_us = ack.sampling_time_in_microseconds
+        on_us = step_us * sum(sample == 20.0 for sample in ack.measurement_samples)
+        assert on_us == pytest.approx(500, abs=2 * step_us)
+        connection.close()
+
+    with emulated() as rig:
+        asyncio.run(session(rig))
 
 
 def test_mid_level_pulses_by_itself_and_falls_silent_after_2_s() -> None:
@@ -119,3 +126,18 @@ def test_mid_level_pulses_by_itself_and_falls_silent_after_2_s() -> None:
         steps = [later - earlier for earlier, later in itertools.pairwise(times)]
         assert len(times) > 80
         assert steps == pytest.approx([0.025] * len(steps), abs=1e-9)
+
+
+def test_a_client_may_leave_and_come_back() -> None:
+    async def session(rig: Emulated) -> None:
+        for _ in range(3):
+            connection, device = await opened(rig)
+            low = device.get_layer_low_level()
+            await low.init(LowLevelMode.NO_MEASUREMENT, LowLevelHighVoltageSource.STANDARD)
+            low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
+            acks(device, 1)
+            connection.close()
+
+    with emulated() as rig:
+        asyncio.run(session(rig))
+        assert rig.ask(cmd="state")["pulses_delivered"] == 3

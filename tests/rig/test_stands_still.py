@@ -36,16 +36,17 @@ def test_a_cell_that_stays_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("at_s", "within_s", "ceiling_nm"),
-    [(3.7, 3.1, 5.0), (0.1, 0.55, 20.0), (0.9, 0.55, 20.0), (3.05, 0.55, 20.0)],
+    ("at_s", "within_s", "ceiling_nm", "words"),
+    [(3.7, 3.1, 5.0, "5.000 N·m"), *((at_s, 0.55, 20.0, "it is stuck") for at_s in (0.1, 0.9, 3.05))],
     ids=["at its ceiling", "rising", "high", "falling"],
 )
-def test_a_cell_that_dies_ends_the_test(tmp_path: Path, at_s: float, within_s: float, ceiling_nm: float):
+def test_a_cell_that_dies_ends_the_test(tmp_path: Path, at_s: float, within_s: float, ceiling_nm: float, words: str):
     rig = rig_with_noise(tmp_path, on_s=2.0, repeats=3, ceiling_nm=ceiling_nm)
     rig.at(at_s, lambda: setattr(rig.cell, "frozen", True))
     result = rig.execute()
     assert result.outcome == "fault"
-    assert ceiling_nm == 5.0 or "it is stuck" in result.reason
+    assert words in result.reason
+    assert rig.clock.now_s() - rig.stimulator.sent[0][0] < at_s + 4.0
     assert rig.stimulator.sent[-1][0] - rig.stimulator.sent[0][0] < at_s + within_s
 
 

@@ -81,8 +81,9 @@ class Clinic:
         time_s = process.computer.true_s
         if isinstance(event, StateEvent):
             state = event.status.state
+            if state == "latched" and any(one is process for _, one, _ in self.states):  # not told again by a new one
+                self.latched.append(event.status.reason)
             self.states.append((time_s, process, state))
-            self.latched += [event.status.reason] * (state == "latched")
             self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
             if process is self.process:
                 self.state = state
