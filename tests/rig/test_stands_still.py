@@ -46,7 +46,7 @@ def test_a_cell_that_dies_ends_the_test(tmp_path: Path, at_s: float, within_s: f
     result = rig.execute()
     assert result.outcome == "fault"
     assert words in result.reason
-    assert rig.clock.now_s() - rig.stimulator.sent[0][0] < at_s + 4.0
+    assert rig.clock.now_s() - rig.stimulator.sent[0][0] < at_s + within_s + 3.5
     assert rig.stimulator.sent[-1][0] - rig.stimulator.sent[0][0] < at_s + within_s
 
 
