@@ -125,7 +125,7 @@ def one_stop(services: Services, http: httpx.Client) -> tuple[float, float]:
     pulses = control(services.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
     while not http.get(test).json()["done"]:
         time.sleep(0.1)
-    reply = RigClient(services.socket).ask("rearm", by="bench")
+    reply = RigClient(services.socket).rearm("bench")
     assert reply["ok"], reply
     return answer_ms, 1e3 * (pulses[-1]["monotonic_s"] - asked_s) if pulses else float("nan")
 

@@ -222,9 +222,12 @@ class StopRequest(Message):
 
 
 class RearmRequest(Message):
+    """A person has looked. Refused with `latch-changed` unless `latch` is what the status tells now."""
+
     kind: Literal["rearm"] = "rearm"
     id: int = 0
     by: str
+    latch: str = Field(description="`Status.latch` that the person was shown")
 
 
 class CalibrateStartRequest(Message):
@@ -315,7 +318,8 @@ class Problem(Message):
     """Why a request was refused. `code` is stable; the text is for people and says how to correct it."""
 
     code: str = Field(
-        description="busy, late, latched, uncertain, refused, rest-needed, bad-plan, disconnected, internal, …"
+        description="busy, late, latched, latch-changed, uncertain, refused, rest-needed, bad-plan, disconnected, "
+        "internal, …"
     )
     title: str
     detail: str
@@ -413,7 +417,10 @@ class AngleStatus(Message):
 
 class Status(Message):
     state: RigState
-    reason: str = Field("", description="why the rig is latched, uncertain or disconnected")
+    reason: str = Field(
+        "", description="why the rig is latched, uncertain or disconnected; after several stops the newest first"
+    )
+    latch: str = Field("", description="changes with each stop, fault and lost device; a re-arm must give it back")
     test_id: str | None = None
     participant: str | None = None
     segment: str | None = None

@@ -26,10 +26,10 @@ class Calibrating(Playing):
         PlanError, RefusedError
             Wrong name or id; step, train, current or rate outside the limits, or too small to stimulate.
         """
-        stops = self._stops
+        latch = self.latch
         async with self._in_turn():
             following = self._trial.calibrate(request.participant)
-            self._refuse_unseen(stops)
+            self._refuse_unseen(latch)
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
             calibration = Calibration(request, self._table, self._clock.unix_s(), self._pair.steps)
             await self._tasks.work(self._store.check_room, f"{request.calibration_id}.001")

@@ -14,16 +14,16 @@ from rig.acquire.run import TestRun
 from rig.config import RigConfig
 from rig.control.angle_calibration import AngleCalibrating
 from rig.control.calibration import Calibration
-from rig.control.latch import Latch, Remembered
+from rig.control.latch import Latch
 from rig.control.live import finite, live_event
 from rig.control.pair import Pair
 from rig.control.rest import Rest
 from rig.control.sealing import RecordingStore
-from rig.errors import BusyError, DeviceError, RigError
+from rig.errors import BusyError, DeviceError, LatchChangedError, RigError
 from rig.machine import Machine
 from rig.messages import AngleStatus, Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
 from rig.tasks import Signal, Task, Turn
-from rig.trial import Trial
+from rig.trial import STOPPED, Trial
 
 log = logging.getLogger("rig")
 
@@ -65,8 +65,10 @@ class Core:
         self._evidence: StopEvidence | None = None
         self._evidence_ready = Signal()
         self._calibration: Calibration | None = None
-        self._stops = 0
-        """How often it was stopped, or a fault was reported: a re-arm that began before does not count."""
+        self._instance, self._stops = machine.new_id()[:8], 0
+        """How often it was stopped, a fault was reported, or why it is stopped became another reason."""
+        self._published = ""
+        """The latch that was told last."""
         self._born_s = self._clock.now_s()
         self.finished: FinishedEvent | None = None
 
@@ -85,6 +87,11 @@ class Core:
         """Whether a test is in progress."""
         return self._trial.busy
 
+    @property
+    def latch(self) -> str:
+        """What a person must have seen who re-arms: another one after each stop, and in each process."""
+        return f"{self._instance}-{self._stops}"
+
     def status(self) -> Status:
         """State, devices and limits now."""
         trial, run, receiver = self._trial, self._run, self._pair.receiver
@@ -97,7 +104,8 @@ class Core:
             cell["measured_rate_hz"] = round(measured_hz, 2)
         return Status(
             state=trial.state,
-            reason=trial.reason if trial.lost in trial.reason else f"{trial.reason}; {trial.lost}".lstrip("; "),
+            reason=trial.told,
+            latch=self.latch,
             test_id=trial.test_id,
             participant=trial.participant,
             segment=run.segment() if run else None,
@@ -188,10 +196,11 @@ class Core:
             finally:
                 self._turn_since_s = None
 
-    def _refuse_unseen(self, stops: int) -> None:
-        """Raise BusyError if the rig was stopped since `_stops` was so: who asked then has not seen it."""
-        if self._stops != stops:
-            raise BusyError("the rig was stopped while this waited; look at the participant, then ask again")
+    def _refuse_unseen(self, latch: str) -> None:
+        """Raise LatchChangedError if the rig was stopped since `latch` was told: who asks has not seen it."""
+        if latch != self.latch:
+            now, then = self._trial.told or f"it is {self._trial.state}", "re-arm" if self._trial.told else "ask again"
+            raise LatchChangedError(f"now: {now}; look at the participant and the rig, then {then}")
 
     def _fault(self, reason: str) -> None:
         """A device reports a fault."""
@@ -207,42 +216,43 @@ class Core:
     def _end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
         """End the running test, or latch; True if a test runs."""
         self._stops += 1
-        halt = self._halt
-        if self._trial.busy and halt is not None:
-            halt.set(cause, reason)
-            return True
-        if latch_idle:
+        halt, busy = self._halt, self._trial.busy
+        if busy and halt is not None:
+            if not halt.set(cause, reason):
+                self._halted(reason)  # it was ending: both reasons are told
+        elif latch_idle:
             self._halted(reason)
-        return False
+        return busy and halt is not None
 
-    async def _remember(self, state: Remembered, reason: str) -> None:
+    async def _remember(self, trial: Trial) -> None:
         """Write the latch file. If the disk fails, the rig stays stopped; a latch is written once the disk takes it.
 
         Until then the file holds "running" if a test had begun, so that the next process starts as uncertain.
         """
         try:
-            await self._latch.write(state, reason)
+            await self._latch.write("running" if trial.state == "uncertain" else "latched", trial.reason)
         except RigError as error:
             log.error("%s", error)
-            if state == "latched":
-                self._tasks.spawn(self._remember_later(), "latch file")
+            self._tasks.spawn(self._remember_later(), "latch file")
 
     async def _remember_later(self) -> None:
         await self._tasks.sleep(RETRY_S)
         async with self._turn:  # not while somebody re-arms
-            if self._trial.state == "latched":
-                await self._remember("latched", self._trial.reason)
+            if self._trial.state in STOPPED:
+                await self._remember(self._trial)
 
     def _halted(self, reason: str) -> None:
         following = self._trial.halted(reason)
-        if following.state == "latched" or (following.state == "sealing" and following.latch):
+        if following.state in STOPPED or following.state == "sealing":
             # behind whatever is being written: a clear that was under way does not come last
-            self._latching = self._tasks.spawn(self._remember("latched", following.reason), "latch file")
+            self._latching = self._tasks.spawn(self._remember(following), "latch file")
         self._change(following)
 
     def _change(self, trial: Trial) -> None:
-        changed = trial != self._trial
-        self._trial = trial
+        if trial.told not in ("", self._trial.told):
+            self._stops += 1
+        changed = trial != self._trial or self._published != self.latch
+        self._trial, self._published = trial, self.latch
         if not trial.calibrating:
             self._calibration = None  # a stop, a fault or a lost device closes it
         if changed:

@@ -56,7 +56,7 @@ async def _do(rig: Rig, request: Any) -> BaseModel:
         case "sequences":
             return await rig.library()
         case "rearm":
-            return await rig.rearm(request.by)
+            return await rig.rearm(request.by, request.latch)
         case "calibrate-start":
             return await rig.calibrate(request)
         case "calibrate-step":

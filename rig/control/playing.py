@@ -96,7 +96,7 @@ class Playing(Core):
             stored = self._trial
             following = stored.sealed()
             if following.state == "latched":
-                await self._remember("latched", following.reason)
+                await self._remember(following)
             else:
                 await self._latch.clear()
 
@@ -110,7 +110,7 @@ class Playing(Core):
         self._evidence_ready.set()
         self._run = None
         self._change(Trial("latched", reason, lost=reason))
-        await self._remember("running", reason)
+        await self._remember(Trial("uncertain", reason))
         await self._rest.pulse_at(self._clock.now_s(), ended=False)
 
     async def _announce(self, run: TestRun) -> None:

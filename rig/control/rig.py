@@ -11,7 +11,7 @@ from rig.control.calibration import check_profile
 from rig.control.extending import check_key
 from rig.control.playing import check_names
 from rig.control.posing import Posing
-from rig.errors import BusyError, ConfigError, DeviceError
+from rig.errors import ConfigError, DeviceError, LatchChangedError
 from rig.messages import PASSIVE, Sequences, Status, StopEvidence, TestPlan
 from rig.trial import Trial
 
@@ -98,11 +98,11 @@ class Rig(Posing):
             The journal or the latch file cannot be written.
         """
         self._trial.may_start()  # before its turn: a start that was asked for while stopped must not run later
-        stops = self._stops
+        latch = self.latch
         await self._await_angle(request)
         async with self._in_turn():
             self._trial.may_start()
-            self._refuse_unseen(stops)
+            self._refuse_unseen(latch)
             check_names("plan", test_id=request.test_id, participant=request.participant)
             check_key(request, key)
             table = limits.for_plan(self._table, request)
@@ -161,19 +161,20 @@ class Rig(Posing):
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
-    async def rearm(self, by: str) -> Status:
+    async def rearm(self, by: str, latch: str) -> Status:
         """A person has checked participant and rig: ask both devices again, then be ready.
 
         Raises
         ------
         BusyError
-            A test is in progress; or the rig was stopped once more meanwhile.
+            A test is in progress.
+        LatchChangedError
+            The rig was stopped since that person was shown `latch`, before this or meanwhile.
         DeviceError
             A device does not answer: the rig stays stopped.
         """
-        stops = self._stops
         async with self._in_turn():
-            self._refuse_unseen(stops)
+            self._refuse_unseen(latch)
             stopped = self._trial
             following = stopped.rearm()
             if stopped.lost or not await self._pair.both_answer():
@@ -186,15 +187,13 @@ class Rig(Posing):
                 self.finished = event
                 self._publish(event)
             await self._rest.settle()
-
-            def again() -> bool:
-                return self._stops != stops or self._trial.lost != stopped.lost
-
-            if not again():
-                await self._latch.clear()
-            if again():
-                await self._remember("latched", self._trial.reason)
-                raise BusyError("re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm")
+            self._refuse_unseen(latch)
+            await self._latch.clear()
+            try:
+                self._refuse_unseen(latch)
+            except LatchChangedError:
+                await self._remember(self._trial)
+                raise
             log.info("re-armed by %s after: %s", by, stopped.reason)
             self._change(following)
         return self.status()

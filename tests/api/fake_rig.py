@@ -83,6 +83,7 @@ class FakeRig:
     def __init__(self, path: Path, data: Path, speed: float = 12.0, rate_hz: float = 400.0) -> None:
         self.path, self.data, self.speed, self.rate_hz = path, data, speed, rate_hz
         self.state, self.reason = "ready", ""
+        self.stops = 0
         self.plan: m.TestPlan | None = None
         self.last_plan: m.TestPlan | None = None
         """Kept when the test has ended."""
@@ -121,7 +122,8 @@ class FakeRig:
 
     def status(self) -> m.Status:
         return m.Status(
-            state=self.state, reason=self.reason, test_id=self.plan.test_id if self.plan else None,
+            state=self.state, reason=self.reason, latch=f"fake-{self.stops}",
+            test_id=self.plan.test_id if self.plan else None,
             participant=self.plan.participant if self.plan else None, segment=self.segment,
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
             stimulator={"device": "fake P24", "firmware": "1.0"}, load_cell={"device": "fake cell", "rate_hz": 400.0},
@@ -150,6 +152,7 @@ class FakeRig:
     def become(self, state: Any, reason: str = "") -> None:
         """Another state, told at once."""
         self.state, self.reason = state, reason
+        self.stops += bool(reason)
         self._send(m.StateEvent(status=self.status()))
 
     async def close(self) -> None:
@@ -316,6 +319,7 @@ class FakeRig:
 
     async def _on_stop(self, request: Any, writer: Any) -> dict[str, Any]:
         self.stopped_by = request.by
+        self.stops += 1
         self._stop.set()
         if self.state != "running":
             self.state, self.reason = "latched", f"stopped by {request.by}"
@@ -328,6 +332,8 @@ class FakeRig:
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state == "running":  # as the rig does until its recording is sealed, also after a stop
             raise m_refusal("busy", "Not now", "a test is running; nothing to re-arm")
+        if request.latch != self.status().latch:
+            raise m_refusal("latch-changed", "The rig was stopped meanwhile", self.reason)
         if not self.device_back:
             raise m_refusal(
                 "disconnected",

@@ -178,7 +178,7 @@ class LiveRig:
         return self.ask(self.rig.stop(reason, by))
 
     def rearm(self, by: str = "nurse") -> Status:
-        return self.ask(self.rig.rearm(by))
+        return self.ask(self.rig.rearm(by, self.rig.latch))
 
     def close(self) -> None:
         self.ask(self.rig.close())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 from rig.control import desk
 from rig.control.replies import to_line
@@ -15,6 +15,7 @@ from rig.messages import (
     Event,
     ExtendRequest,
     FinishedEvent,
+    RearmRequest,
     Reply,
     SegmentPlan,
     StartRequest,
@@ -42,10 +43,21 @@ class Asked:
     """When the rig replied, also where the reply was lost."""
     reply: Reply | None = None
     about: str = ""
+    latch: str = ""
+    """Of a re-arm."""
     armed: bool = False
     """Whether the stimulator could stimulate as the rig replied."""
     then: Callable[[Asked], None] = lambda _: None
     """Called when the reply has come."""
+
+
+class Told(NamedTuple):
+    """A state that a rig's process told, and when."""
+
+    time_s: float
+    process: Process
+    state: str
+    latch: str
 
 
 @dataclass
@@ -56,8 +68,9 @@ class Clinic:
     device: Callable[[], dict[str, Any]]
     """What the devices are in."""
     asked: list[Asked] = field(default_factory=list)
-    states: list[tuple[float, Process, str]] = field(default_factory=list)
-    """Each state that the rig told, when, and which process."""
+    states: list[Told] = field(default_factory=list)
+    shown: dict[str, float] = field(default_factory=dict)
+    """Each latch that was told, and when first."""
     latched: list[str] = field(default_factory=list)
     """Why it latched, each time."""
     finished: list[FinishedEvent] = field(default_factory=list)
@@ -70,6 +83,8 @@ class Clinic:
     process: Process | None = None
     rig: Rig | None = None
     state: str = "disconnected"
+    latch: str = ""
+    """What a page shows now."""
     tests: int = 0
 
     def meet(self, process: Process, rig: Rig) -> None:
@@ -81,12 +96,14 @@ class Clinic:
         time_s = process.computer.true_s
         if isinstance(event, StateEvent):
             state = event.status.state
-            if state == "latched" and any(one is process for _, one, _ in self.states):  # not told again by a new one
+            # a new one only tells again
+            if state == "latched" and any(told.process is process for told in self.states):
                 self.latched.append(event.status.reason)
-            self.states.append((time_s, process, state))
+            self.states.append(Told(time_s, process, state, event.status.latch))
+            self.shown.setdefault(event.status.latch, time_s)
             self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
             if process is self.process:
-                self.state = state
+                self.state, self.latch = state, event.status.latch
         elif isinstance(event, FinishedEvent):
             self.finished.append(event)
             self.world.tell("rig", f"finished {event.test_id} {event.outcome} {event.reason}".rstrip(), time_s)
@@ -96,7 +113,8 @@ class Clinic:
         process, rig, chance = self.process, self.rig, self.world.chance
         assert process is not None
         assert rig is not None
-        asked = Asked(request.kind, self.world.now_s, process, about=about)
+        latch = request.latch if isinstance(request, RearmRequest) else ""
+        asked = Asked(request.kind, self.world.now_s, process, about=about, latch=latch)
         self.asked.append(asked)
         self.world.tell("people", f"{request.kind} {about}".rstrip())
         line, lost = to_line(request), chance.random() < self.loses

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.25
 """On average."""
+PATIENCE_S = 1.0
 KEY = "a key that only its maker knows"
 SEGMENTS = [
     SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.25}),
@@ -43,6 +44,8 @@ class People:
         """Whether a test that was started in the quiet time was completed."""
         self.jumping: set[str] = set()
         """Tests of widths that say of themselves that they jump on purpose."""
+        self._seen = ""
+        """The latch that they were shown as they last looked why the rig is stopped."""
         life.world.after(LOOK_S, self._look)
 
     def _look(self) -> None:
@@ -72,9 +75,19 @@ class People:
 
     def _rearm(self) -> None:
         if self.life.quiet or self.chance.random() < 0.5:
-            self._repeat(lambda: self.clinic.ask(RearmRequest(id=1, by="nurse")))
+            self._seen = self._seen or self.clinic.latch
+            self._repeat(lambda: self._ask_to_rearm(self._seen))
             if not self.life.quiet and self.chance.random() < 0.1:
                 self.clinic.stop()
+
+    def _ask_to_rearm(self, seen: str) -> None:
+        """Who was shown this some time before; who is refused, or obeyed, or hears nothing for long, looks again."""
+
+        def look_again(_: object = None) -> None:
+            self._seen = ""
+
+        self.clinic.ask(RearmRequest(id=1, by="nurse", latch=seen)).then = look_again
+        self.life.world.after(PATIENCE_S, look_again)
 
     def _start(self) -> None:
         if not self.life.quiet and self.chance.random() < 0.15:

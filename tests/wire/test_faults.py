@@ -85,7 +85,7 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     assert refused["problem"]["code"] == "latched"
     bench.fault(cmd="fault", name=fault, on=False)
     time.sleep(0.1)
-    rearmed = client.ask("rearm", by="nurse")
+    rearmed = client.rearm("nurse")
     assert rearmed["ok"], rearmed
     assert rearmed["body"]["state"] == "ready"
 
@@ -95,7 +95,7 @@ def test_a_load_cell_that_is_unplugged_and_comes_back_elsewhere(bench: Bench):
     assert bench.fault(cmd="fault", name="cell_unplugged", on=True)["ok"]
     check_kept(client.wait_finished("unplugged"), "fault")
     bench.fault(cmd="fault", name="cell_unplugged", on=False)  # under another port
-    assert client.ask("rearm", by="nurse")["problem"]["code"] == "disconnected"
+    assert client.rearm("nurse")["problem"]["code"] == "disconnected"
     assert client.ask("start", plan=short_plan("refused"))["problem"]["code"] == "latched"
 
 
@@ -114,7 +114,7 @@ def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient])
     time.sleep(0.2)
     assert state(bench)["pulses_received"] == count
     assert client.wait_state("latched")["reason"] == "participant asks (by nurse)"
-    assert client.ask("rearm", by="nurse")["body"]["state"] == "ready"
+    assert client.rearm("nurse")["body"]["state"] == "ready"
 
 
 def test_a_signal_stops_stimulation_first_and_seals(bench: Bench):
@@ -153,7 +153,7 @@ def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
         assert np.sum(np.isfinite(file["pulses/sent_pulse_width_us"][:]) & (file["pulses/status"][:] != 1)) >= count
     refused = client.ask("start", plan=short_plan("next"))
     assert refused["problem"]["code"] == "uncertain"
-    assert client.ask("rearm", by="nurse")["ok"]
+    assert client.rearm("nurse")["ok"]
     client.ask("subscribe")
     assert client.start(short_plan("next"))["ok"]
     assert client.wait_finished("next")["outcome"] == "completed"

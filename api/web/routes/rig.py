@@ -88,7 +88,8 @@ async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
             audit.write(session, context.clock.utc(), by, "re-arm", "rig")
 
     await asyncio.to_thread(note)
-    await context.rig.ask(RearmRequest(by=by))
+    shown = await context.rig.fresh_status()
+    await context.rig.ask(RearmRequest(by=by, latch=shown.latch))
     await context.rig.fresh_status()
     return rig_state(context)
 
