@@ -69,6 +69,13 @@ class LatchChangedError(RigError):
     title = "The rig was stopped meanwhile"
 
 
+class WithdrawnError(RigError):
+    """What the test was allowed on is no longer so: it does not begin."""
+
+    code = "withdrawn"
+    title = "The test was withdrawn"
+
+
 class UncertainError(RigError):
     """Started after a crash during a test, and no person has re-armed yet."""
 

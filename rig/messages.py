@@ -214,6 +214,19 @@ class EnoughRequest(Message):
     at_once: bool = Field(default=False, description="at the next pulse; else where the segment that plays ends")
 
 
+class WithdrawRequest(Message):
+    """What a test was allowed on is no longer so: it plays no pulse, and nothing latches. Reply: `Withdrawn`.
+
+    It waits for nothing, and holds for a test that the rig has not heard of yet: its start is refused (`withdrawn`).
+    """
+
+    kind: Literal["withdraw"] = "withdraw"
+    id: int = 0
+    test_id: str
+    reason: str
+    begun: bool = Field(False, description="end it also after its first pulse; else one that has begun plays on")
+
+
 class StopRequest(Message):
     kind: Literal["stop"] = "stop"
     id: int = 0
@@ -303,6 +316,7 @@ Request = Annotated[
     | StartRequest
     | ExtendRequest
     | EnoughRequest
+    | WithdrawRequest
     | StopRequest
     | RearmRequest
     | CalibrateStartRequest
@@ -318,8 +332,8 @@ class Problem(Message):
     """Why a request was refused. `code` is stable; the text is for people and says how to correct it."""
 
     code: str = Field(
-        description="busy, late, latched, latch-changed, uncertain, refused, rest-needed, bad-plan, disconnected, "
-        "internal, …"
+        description="busy, late, latched, latch-changed, withdrawn, uncertain, refused, rest-needed, bad-plan, "
+        "disconnected, internal, …"
     )
     title: str
     detail: str
@@ -331,8 +345,8 @@ class Reply(Message):
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
     """status, subscribe, start, rearm, calibrate-start, -step and -mark, angle_pose: a `Status`; preview: a `Preview`;
-    sequences: a `Sequences`; stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`; extend and enough: an
-    `Extended`."""
+    sequences: a `Sequences`; stop: a `StopEvidence`; withdraw: a `Withdrawn`; calibrate-finish: a `CalibrationResult`;
+    extend and enough: an `Extended`."""
 
 
 class CalibrationTrain(Message):
@@ -483,6 +497,10 @@ class StopEvidence(Message):
     pulse_may_follow: bool = Field(
         default=False, description="a pulse sent before the stop was not acknowledged and may still be felt"
     )
+
+
+class Withdrawn(Message):
+    withdrawn: bool = Field(description="False: it has sent a pulse already, or is over; nothing was done")
 
 
 class LaidSegment(Message):

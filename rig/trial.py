@@ -118,6 +118,11 @@ class Trial:
         state = "stopping" if self.state in ("arming", "running") else self.state
         return replace(self, state=state, reason=all_reasons, latch=self.busy)
 
+    def withdrawn(self) -> Trial:
+        """The test is ended without a latch: nothing is wrong."""
+        self._only("arming", "running")
+        return replace(self, state="stopping")
+
     def ended(self) -> Trial:
         """Stimulation is over; the recording is being sealed."""
         self._only("running", "stopping", "arming")

@@ -181,6 +181,11 @@ class TestRun:
         return len(self._gate.lateness_s)
 
     @property
+    def begun(self) -> bool:
+        """Whether a pulse was sent."""
+        return self.t0_s is not None and self.sent > 0
+
+    @property
     def charge_uc(self) -> float:
         """Charge of the pulses sent so far, one phase, µC."""
         return self._gate.charge_uc
@@ -192,7 +197,7 @@ class TestRun:
 
     @property
     def ended_by(self) -> str:
-        """What ended it: stopped, fault, or why nothing more was laid."""
+        """What ended it: stopped, fault, withdrawn, or why nothing more was laid."""
         return self.halt.cause or self.score.ended_by
 
     def elapsed_s(self) -> float:
@@ -268,14 +273,15 @@ class TestRun:
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         device = await stop_device(self._gate)
-        if cause is None and not device[0]:  # without the device's confirmation the end is a fault
+        well = cause in (None, "withdrawn")
+        if well and not device[0]:  # without the device's confirmation the end is a fault
             self._fault(f"the end of stimulation is not confirmed: {device[2] or device[1]}")
-        elif cause is None and (wrong := self._plausibility.fault_at_end() or self._angle.fault_at_end()):
+        elif well and (wrong := self._plausibility.fault_at_end() or self._angle.fault_at_end()):
             self._fault(wrong)
         cause = self.halt.cause
-        if cause is None:
+        if cause in (None, "withdrawn"):
             await self._tasks.sleep(AROUND_S)  # samples still in transit belong to the test
-            torque = True, "the test ended as planned"
+            torque = True, "the test was withdrawn" if cause else "the test ended as planned"
         else:
             torque = await watch_decay(self._gate, self._receiver, self._tasks, self._rest_nm, at_stop_nm)
         now_s, last_s = clock.now_s(), self._gate.last_pulse_s
@@ -286,7 +292,7 @@ class TestRun:
 
     def _end_journal(self, cause: Cause | None, end_s: float) -> None:
         self.score.shut()
-        self._outcome = cause or "completed"
+        self._outcome = "stopped" if cause == "withdrawn" else cause or "completed"
         stimulation_end_s = end_s if cause is None else self.halt.time_s
         if self.t0_s is not None:
             self._duration_s = max(0.0, stimulation_end_s - self.t0_s)

@@ -70,6 +70,8 @@ class Core:
         self._published = ""
         """The latch that was told last."""
         self._born_s = self._clock.now_s()
+        self._withdrawn: dict[str, str] = {}
+        """Tests that must not begin any more, and why: the newest ones."""
         self.finished: FinishedEvent | None = None
 
     @property

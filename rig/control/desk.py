@@ -49,6 +49,8 @@ async def _do(rig: Rig, request: Any) -> BaseModel:
             return await rig.start(request.plan, request.key)
         case "stop":
             return await rig.stop(request.reason, request.by)
+        case "withdraw":
+            return await rig.withdraw(request)
         case "extend":
             return await rig.extend(request)
         case "enough":

@@ -11,12 +11,16 @@ from rig import limits, plan
 from rig.acquire.halt import Halt
 from rig.acquire.run import RunResult, TestRun
 from rig.control.core import Core
-from rig.errors import DeviceError, PlanError, RigError
-from rig.messages import FinishedEvent, StopEvidence
+from rig.errors import DeviceError, PlanError, RigError, WithdrawnError
+from rig.messages import FinishedEvent, StopEvidence, Withdrawn, WithdrawRequest
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
 
+LONGEST_WORDS = 300
+"""Characters of the reason of a stop or a withdrawal that are kept: a longer one counts, too."""
+MOST_WITHDRAWN = 1000
+"""Tests whose withdrawal is remembered."""
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
 
 
@@ -29,7 +33,7 @@ class Playing(Core):
         From here on a stop ends this test, also while its files are being made. Raises RigError: it does not begin.
         """
         before, halt = self._trial, Halt(self._clock)
-        halt.on_set(lambda: self._halted(halt.reason))
+        halt.on_set(lambda: self._ending(halt))
         self._halt, self._evidence = halt, None
         self._evidence_ready.clear()
         self._change(following)
@@ -45,6 +49,33 @@ class Playing(Core):
         self._run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, angle)
         self._run.on_evidence = self._take_evidence
         self._playing = self._tasks.spawn(self._execute(self._run), "test")
+
+    def _ending(self, halt: Halt) -> None:
+        if halt.cause == "withdrawn":
+            self._change(self._trial.withdrawn())
+        else:
+            self._halted(halt.reason)
+
+    async def withdraw(self, request: WithdrawRequest) -> Withdrawn:
+        """See `WithdrawRequest`. Like a stop it waits for no turn, and for nothing else. Raises PlanError (its id)."""
+        test_id, reason = request.test_id, f"withdrawn: {request.reason:.{LONGEST_WORDS}}"
+        check_names("withdraw", test_id=test_id)
+        present, run = self._trial.test_id == test_id, self._run
+        ending = present and self._trial.state not in ("arming", "running")
+        begun = present and run is not None and run.begun
+        over = self.finished is not None and self.finished.test_id == test_id
+        if ending or over or (begun and not request.begun):
+            return Withdrawn(withdrawn=False)
+        self._withdrawn[test_id] = reason
+        if len(self._withdrawn) > MOST_WITHDRAWN:
+            del self._withdrawn[next(iter(self._withdrawn))]
+        if present and self._halt is not None:
+            self._halt.set("withdrawn", reason)
+        return Withdrawn(withdrawn=True)
+
+    def _refuse_withdrawn(self, test_id: str) -> None:
+        if test_id in self._withdrawn:
+            raise WithdrawnError(f"test {test_id}: {self._withdrawn[test_id]}; ask for a new test")
 
     async def _not_begun(self, before: Trial) -> None:
         """No pulse was sent. A stop that came meanwhile counts as one of an idle rig."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from rig import limits, plan
 from rig.control.calibration import check_profile
 from rig.control.extending import check_key
-from rig.control.playing import check_names
+from rig.control.playing import LONGEST_WORDS, check_names
 from rig.control.posing import Posing
 from rig.errors import ConfigError, DeviceError, LatchChangedError
 from rig.messages import PASSIVE, Sequences, Status, StopEvidence, TestPlan
@@ -21,8 +21,6 @@ STOP_TIMEOUT_S = 6.0
 STORED_S = 7.0
 """Real seconds after which a stop is answered although the disk has not taken its latch."""
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
-LONGEST_WORDS = 300
-"""Characters of a stop's reason that are kept: a longer one stops, too."""
 SEALED_WITHIN_S = 30.0
 """Real seconds within which a test that was stopped is sealed."""
 
@@ -94,6 +92,8 @@ class Rig(Posing):
             See `Trial.start`.
         PlanError, RefusedError
             The plan is wrong, or outside a limit.
+        LatchChangedError, WithdrawnError
+            The rig was stopped, or this test withdrawn, while this waited.
         JournalError, RigError
             The journal or the latch file cannot be written.
         """
@@ -116,6 +116,7 @@ class Rig(Posing):
             self._rest.check(test, table["rest_between_tests_s"])
             self._check_angle(request, table)
             self._key = key
+            self._refuse_withdrawn(request.test_id)  # nothing is waited for from here until it can be halted
             await self._launch(test, table, following)
         return self.status()
 

@@ -22,6 +22,7 @@ from rig.messages import (
     StateEvent,
     StopRequest,
     TestPlan,
+    WithdrawRequest,
 )
 from tests.simulator.host import Process
 from tests.simulator.world import World
@@ -152,6 +153,10 @@ class Clinic:
     def stop(self) -> Asked:
         """Press stop."""
         return self.ask(StopRequest(id=1, reason="somebody pressed", by="nurse"))
+
+    def withdraw(self, test_id: str, begun: bool) -> Asked:
+        """What a test was allowed on is no longer so."""
+        return self.ask(WithdrawRequest(id=1, test_id=test_id, reason="signed out", begun=begun), test_id)
 
     def extend(self, test_id: str, key: str, after: int) -> Asked:
         """Lay one more segment, as a client that chooses them."""

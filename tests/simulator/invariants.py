@@ -205,6 +205,17 @@ def a_stop_is_undone_only_by_who_was_shown_it(life: Life) -> Iterator[str]:
                 yield f"{time_s:.4f} s: {state}, and nobody re-armed who was shown the stop at {since_s:.4f} s"
 
 
+def nothing_of_a_withdrawn_test_is_written(life: Life) -> Iterator[str]:
+    """From the moment on at which the rig took a withdrawal to which it says yes."""
+    played_by = {asked.about: asked.process for asked in life.clinic.asked if asked.kind == "start"}
+    for asked in life.clinic.asked:
+        if asked.kind != "withdraw" or asked.reply is None or played_by[asked.about] is not asked.process:
+            continue
+        for pulse in _by_test(life).get(asked.about, []) if asked.reply.body.get("withdrawn") else []:
+            if pulse.written_s > (asked.obeyed_s or 0.0):
+                yield f"{pulse.time_s:.4f} s: {asked.about} was withdrawn at {asked.obeyed_s:.4f} s"
+
+
 def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
     """A line that held what was sent may let go of one pulse, never of several, whatever ended the test meanwhile."""
     late = [pulse for pulse in _true(life) if not (pulse.time_s - pulse.written_s <= ON_ITS_WAY_S)]
@@ -342,6 +353,7 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     a_torque_beyond_its_limit_ends_a_test,
     nothing_is_written_while_stopped,
     a_stop_is_undone_only_by_who_was_shown_it,
+    nothing_of_a_withdrawn_test_is_written,
     no_pulse_is_felt_late,
     a_stop_takes_back_what_has_not_left,
     a_confirmed_stop_is_true,

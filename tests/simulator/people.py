@@ -117,6 +117,14 @@ class People:
                 self._await_end(test_id)
 
         self.clinic.start(plan, KEY).then = then
+        if not quiet and self.chance.random() < 0.1:  # on its way beside the start, or at any time of the test
+            delay_s, begun = self.chance.choice((0.0, 0.01, 0.3, 1.0)), self.chance.random() < 0.5
+            life.world.after(delay_s, lambda: self._withdraw(test_id, begun))
+
+    def _withdraw(self, test_id: str, begun: bool) -> None:
+        process = self.clinic.process
+        if process is not None and process.alive:
+            self.clinic.withdraw(test_id, begun)
 
     def _nonsense_of_a_test(self, test_id: str) -> tuple[Profile, list[SegmentPlan], float]:
         """What a program with a mistake asks for: a list of widths that might pass but for one number, or two."""
