@@ -286,12 +286,25 @@ class CalibrateMarkRequest(Message):
 
 
 class CalibrateFinishRequest(Message):
-    """Close the calibration. Reply: `CalibrationResult`, with the profile unless `discard`."""
+    """Close the calibration. Reply: `CalibrationResult`, with the profile unless `discard`.
+
+    The result waits in `Status.calibrated` until it is stored (`CalibrateStoredRequest`), discarded, or its day ends.
+    Finishing that calibration again gives it again.
+    """
 
     kind: Literal["calibrate-finish"] = "calibrate-finish"
     id: int = 0
     by: str
     discard: bool = False
+    calibration_id: str = Field("", description="refused if another one is open; empty: whichever is open")
+
+
+class CalibrateStoredRequest(Message):
+    """The result of a calibration is stored: the rig lets it go, if it still waits. Reply: `Status`."""
+
+    kind: Literal["calibrate-stored"] = "calibrate-stored"
+    id: int = 0
+    calibration_id: str
 
 
 class AnglePoseRequest(Message):
@@ -323,6 +336,7 @@ Request = Annotated[
     | CalibrateStepRequest
     | CalibrateMarkRequest
     | CalibrateFinishRequest
+    | CalibrateStoredRequest
     | AnglePoseRequest,
     Field(discriminator="kind"),
 ]
@@ -344,9 +358,9 @@ class Reply(Message):
     ok: bool
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
-    """status, subscribe, start, rearm, calibrate-start, -step and -mark, angle_pose: a `Status`; preview: a `Preview`;
-    sequences: a `Sequences`; stop: a `StopEvidence`; withdraw: a `Withdrawn`; calibrate-finish: a `CalibrationResult`;
-    extend and enough: an `Extended`."""
+    """status, subscribe, start, rearm, calibrate-start, -step, -mark and -stored, angle_pose: a `Status`; preview: a
+    `Preview`; sequences: a `Sequences`; stop: a `StopEvidence`; withdraw: a `Withdrawn`; calibrate-finish: a
+    `CalibrationResult`; extend and enough: an `Extended`."""
 
 
 class CalibrationTrain(Message):
@@ -386,6 +400,15 @@ class CalibrationStatus(Message):
 class CalibrationResult(Message):
     profile: Profile | None = Field(None, description="valid until the end of the day; None: discarded")
     recordings: list[str] = Field(default_factory=list, description="one sealed recording per train")
+
+
+class Calibrated(Message):
+    """A calibration that is finished, and whose result waits to be stored."""
+
+    calibration_id: str
+    participant: str
+    by: str = Field(description="who began it")
+    result: CalibrationResult
 
 
 class Bound(Message):
@@ -446,6 +469,7 @@ class Status(Message):
     torque_nm: float | None = None
     angle: AngleStatus = Field(default_factory=AngleStatus)
     calibration: CalibrationStatus | None = Field(None, description="while a guided calibration is open")
+    calibrated: Calibrated | None = Field(None, description="newest result, until a client has stored it")
     limits: dict[str, Bound] = Field(default_factory=dict, description="limits of this rig by name")
     require_calibration: bool | None = Field(None, description="None: unknown")
     finished: FinishedEvent | None = Field(

@@ -18,6 +18,7 @@ from rig.control.latch import Latch
 from rig.control.live import finite, live_event
 from rig.control.pair import Pair
 from rig.control.rest import Rest
+from rig.control.result import Result
 from rig.control.sealing import RecordingStore
 from rig.errors import BusyError, DeviceError, LatchChangedError, RigError
 from rig.machine import Machine
@@ -65,6 +66,7 @@ class Core:
         self._evidence: StopEvidence | None = None
         self._evidence_ready = Signal()
         self._calibration: Calibration | None = None
+        self._result = Result(config.data_dir, machine)
         self._instance, self._stops = machine.new_id()[:8], 0
         """How often it was stopped, a fault was reported, or why it is stopped became another reason."""
         self._published = ""
@@ -119,6 +121,7 @@ class Core:
             torque_nm=finite(torque_nm),
             angle=self._angle_status(),
             calibration=calibration,
+            calibrated=self._result.waiting,
             limits=limits.bounds(self._table),
             require_calibration=self._require_calibration,
             finished=self.finished,

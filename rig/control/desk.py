@@ -66,7 +66,9 @@ async def _do(rig: Rig, request: Any) -> BaseModel:
         case "calibrate-mark":
             return await rig.calibrate_mark(request.threshold)
         case "calibrate-finish":
-            return await rig.calibrate_finish(request.by, request.discard)
+            return await rig.calibrate_finish(request)
+        case "calibrate-stored":
+            return await rig.calibrate_stored(request.calibration_id)
         case "angle_pose":
             return await rig.angle_pose(request)
         case _:

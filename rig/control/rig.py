@@ -49,6 +49,7 @@ class Rig(Posing):
         except OSError as error:
             raise ConfigError(f"data_dir: {error.filename or self._data_dir}: {error.strerror}") from None
         await self._poses.recall()
+        await self._result.recall()
         self._pair.rescale(self._poses.scale)
         remembered, reason = await self._latch.read()
         for event in await work(self._store.recover, "the rig process died during the test"):

@@ -46,6 +46,8 @@ class Asked:
     about: str = ""
     latch: str = ""
     """Of a re-arm."""
+    lets_go: bool = False
+    """Whether a calibration's result need not wait after it."""
     armed: bool = False
     """Whether the stimulator could stimulate as the rig replied."""
     then: Callable[[Asked], None] = lambda _: None
@@ -59,6 +61,8 @@ class Told(NamedTuple):
     process: Process
     state: str
     latch: str
+    calibrated: str
+    """The calibration whose result waits to be stored."""
 
 
 @dataclass
@@ -86,6 +90,8 @@ class Clinic:
     state: str = "disconnected"
     latch: str = ""
     """What a page shows now."""
+    calibrated: str = ""
+    """Whose result waits to be stored."""
     tests: int = 0
 
     def meet(self, process: Process, rig: Rig) -> None:
@@ -100,11 +106,13 @@ class Clinic:
             # a new one only tells again
             if state == "latched" and any(told.process is process for told in self.states):
                 self.latched.append(event.status.reason)
-            self.states.append(Told(time_s, process, state, event.status.latch))
+            waits = event.status.calibrated
+            calibrated = "" if waits is None else waits.calibration_id
+            self.states.append(Told(time_s, process, state, event.status.latch, calibrated))
             self.shown.setdefault(event.status.latch, time_s)
             self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
             if process is self.process:
-                self.state, self.latch = state, event.status.latch
+                self.state, self.latch, self.calibrated = state, event.status.latch, calibrated
         elif isinstance(event, FinishedEvent):
             self.finished.append(event)
             self.world.tell("rig", f"finished {event.test_id} {event.outcome} {event.reason}".rstrip(), time_s)
@@ -115,7 +123,8 @@ class Clinic:
         assert process is not None
         assert rig is not None
         latch = request.latch if isinstance(request, RearmRequest) else ""
-        asked = Asked(request.kind, self.world.now_s, process, about=about, latch=latch)
+        lets_go = request.kind == "calibrate-stored" or getattr(request, "discard", False)
+        asked = Asked(request.kind, self.world.now_s, process, about=about, latch=latch, lets_go=lets_go)
         self.asked.append(asked)
         self.world.tell("people", f"{request.kind} {about}".rstrip())
         line, lost = to_line(request), chance.random() < self.loses

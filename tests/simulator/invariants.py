@@ -199,7 +199,7 @@ def a_stop_is_undone_only_by_who_was_shown_it(life: Life) -> Iterator[str]:
     ]
     for since_s, told_s in _stops(life):
         until_s = _forgotten(life, since_s)
-        for time_s, _, state, _ in life.clinic.states:
+        for time_s, _, state, *_ in life.clinic.states:
             works = state in ("ready", "calibrating", "arming") and since_s < time_s <= until_s
             if works and not any(shown_s >= told_s and obeyed_s <= time_s for obeyed_s, shown_s in came):
                 yield f"{time_s:.4f} s: {state}, and nobody re-armed who was shown the stop at {since_s:.4f} s"
@@ -216,6 +216,21 @@ def nothing_of_a_withdrawn_test_is_written(life: Life) -> Iterator[str]:
                 yield f"{pulse.time_s:.4f} s: {asked.about} was withdrawn at {asked.obeyed_s:.4f} s"
 
 
+def a_calibrations_result_waits_until_it_is_stored(life: Life) -> Iterator[str]:
+    """From its answer on each status tells it, whichever process, until somebody says that it is stored, or discards
+    it: the first of such requests that came."""
+    asked = [one for one in life.clinic.asked if one.obeyed_s is not None]
+    for done in asked:
+        profile = done.reply is not None and done.reply.ok and done.reply.body.get("profile")
+        if done.kind != "calibrate-finish" or not profile:
+            continue
+        let_go_s = (one.obeyed_s for one in asked if one.lets_go and one.place > done.place)
+        until_s = min(let_go_s, default=np.inf)
+        for told in life.clinic.states:
+            if (done.replied_s or 0.0) < told.time_s < until_s and not told.calibrated and told.state != "disconnected":
+                yield f"{told.time_s:.4f} s: the result of {done.replied_s} s is told no more, and nobody stored it"
+
+
 def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
     """A line that held what was sent may let go of one pulse, never of several, whatever ended the test meanwhile."""
     late = [pulse for pulse in _true(life) if not (pulse.time_s - pulse.written_s <= ON_ITS_WAY_S)]
@@ -226,7 +241,7 @@ def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
 
 def a_stop_takes_back_what_has_not_left(life: Life) -> Iterator[str]:
     """A command that still waits in the computer as a test is ended is felt by nobody."""
-    ends = [time_s for time_s, _, state, _ in life.clinic.states if state == "stopping"]
+    ends = [time_s for time_s, _, state, *_ in life.clinic.states if state == "stopping"]
     stood = [*life.computer.pauses, *((death_s, np.inf) for death_s in life.deaths)]
     for pulse in _true(life):
         left_s = life.wires.to_device.left_late_s.get(pulse.written_s, 0.0)
@@ -354,6 +369,7 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     nothing_is_written_while_stopped,
     a_stop_is_undone_only_by_who_was_shown_it,
     nothing_of_a_withdrawn_test_is_written,
+    a_calibrations_result_waits_until_it_is_stored,
     no_pulse_is_felt_late,
     a_stop_takes_back_what_has_not_left,
     a_confirmed_stop_is_true,
@@ -391,7 +407,7 @@ def _barred(life: Life) -> list[tuple[float, float]]:
         for since_s, told_s in _stops(life)
     ]
     until = [(since_s, min(until_s, _forgotten(life, since_s))) for since_s, until_s in until]
-    born = [time_s for time_s, _, state, _ in life.clinic.states if state in STATES]
+    born = [time_s for time_s, _, state, *_ in life.clinic.states if state in STATES]
     return until + [(death_s, min((s for s in born if s > death_s), default=np.inf)) for death_s in life.deaths]
 
 
@@ -403,7 +419,7 @@ def _stops(life: Life) -> Iterator[tuple[float, float]]:
         if asked.kind == "stop" and asked.obeyed_s is not None:
             yield asked.obeyed_s, asked.obeyed_s
     before: tuple[Any, str] = (None, "")
-    for time_s, process, state, latch in life.clinic.states:
+    for time_s, process, state, latch, _ in life.clinic.states:
         if state in ("latched", "uncertain") and (process, state) != before:
             yield time_s, life.clinic.shown[latch]  # perhaps while its test was being ended
         before = process, state

@@ -13,6 +13,7 @@ from rig.messages import (
     CalibrateMarkRequest,
     CalibrateStartRequest,
     CalibrateStepRequest,
+    CalibrateStoredRequest,
     Profile,
     RearmRequest,
     SegmentPlan,
@@ -53,6 +54,8 @@ class People:
         process, state, quiet = self.clinic.process, self.clinic.state, self.life.quiet
         if process is None or not process.alive:
             return
+        if self.clinic.calibrated and self.chance.random() < 0.3:
+            self._take_the_result(self.clinic.calibrated)
         if state in ("latched", "uncertain", "disconnected"):
             self._rearm()
         elif state == "ready" and (quiet or self.chance.random() < 0.6):
@@ -177,6 +180,21 @@ class People:
         )  # fmt: skip
         self.clinic.ask(request, request.calibration_id)
 
+    def _all_is_marked(self) -> bool:
+        found = None if self.clinic.rig is None else self.clinic.rig.status().calibration
+        return found is not None and not found.missing
+
+    def _take_the_result(self, calibration_id: str) -> None:
+        """It is stored; or asked for once more, as its answer was lost; or not wanted."""
+        drawn = self.chance.random()
+        if self.life.quiet or drawn < 0.4:
+            self.clinic.ask(CalibrateStoredRequest(calibration_id=calibration_id), calibration_id)
+        elif drawn < 0.9:
+            self.clinic.ask(CalibrateFinishRequest(by="nurse", calibration_id=calibration_id), calibration_id)
+        else:
+            wanted = CalibrateFinishRequest(by="nurse", calibration_id=calibration_id, discard=True)
+            self.clinic.ask(wanted, calibration_id)
+
     def _calibrate(self) -> None:
         drawn = self.chance.random()
         if self.life.quiet or drawn < 0.05:
@@ -187,7 +205,7 @@ class People:
             self._repeat(lambda: self.clinic.ask(CalibrateStepRequest(direction=direction, shown_us=shown_us)))
         elif drawn < 0.8:
             self.clinic.ask(CalibrateMarkRequest(threshold=self.chance.choice(("sensory", "motor", "comfort"))))
-        elif drawn < 0.85:
+        elif drawn < 0.85 or self._all_is_marked():
             self.clinic.ask(CalibrateFinishRequest(by="nurse"))
         elif drawn < 0.9:
             self.clinic.stop()
