@@ -622,7 +622,8 @@ class FinishedEvent(Message):
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
         "ack_delay_ms {median, p99, max}, charge_uc, torque_time_nms, ended_by, alignment {method, error_ms}, "
         "sample_rate_hz, torque_peak_nm, angle (with a sensor: samples, lost_samples, range_rad, error_ms), "
-        "cpu_percent, warnings (sentences for people about possible errors)",
+        "cpu_percent, of a test whose process died dose_is_bound (true: charge_uc, duration_s and pulses may be too "
+        "high, never too low) and doubtful_pulses, warnings (sentences for people about possible errors)",
     )
 
 

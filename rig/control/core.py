@@ -223,7 +223,7 @@ class Core:
         self._stops += 1
         halt, busy = self._halt, self._trial.busy
         if busy and halt is not None:
-            if not halt.set(cause, reason):
+            if not halt.set(cause, reason) and latch_idle:
                 self._halted(reason)  # it was ending: both reasons are told
         elif latch_idle:
             self._halted(reason)

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from rig import archive, assembly, journal
+from rig.acquire.health import SYNC_PERIOD_S
 from rig.acquire.run import RunResult, spread_ms
 from rig.config import RigConfig
+from rig.control import dose
 from rig.errors import JournalError, PlanError, RecordingError
 from rig.journal import Journal
 from rig.machine import Log, Machine
@@ -81,6 +83,7 @@ class RecordingStore:
         book = Journal(self._create(self.journals / f"{test.plan.test_id}.journal"))
         header = {
             "recording_id": self._machine.new_id(),
+            "boot_id": self._machine.boot_id,
             "plan": test.plan.model_dump(mode="json"),
             "segments": [{"name": s.name, "start": s.start, "end": s.end, "by": "plan"} for s in certain],
             "current_ma": test.plan.profile.current_ma,
@@ -153,6 +156,13 @@ class RecordingStore:
                     self._disk.rename(path, path.with_suffix(".unsealed"))
         return events
 
+    def _unseen_s(self, contents: journal.JournalContents) -> float:
+        """Rig seconds before its end of which a journal may know nothing: what is not synced goes with the power."""
+        header = contents.first_json(journal.Kind.HEADER) or {}
+        if contents.ended or header.get("boot_id", "") in ("", self._machine.boot_id):
+            return 0.0
+        return (self._config.watch.watch().stale_disk_s + SYNC_PERIOD_S) * self._clock.speed
+
     def _seal(
         self, path: Path, test_id: str, outcome: str, reason: str, summary: dict[str, Any], unix_s: float | None
     ) -> FinishedEvent:
@@ -163,7 +173,10 @@ class RecordingStore:
         sealed = None
         try:
             contents = journal.parse(path, self._disk.read(path))
-            sealed = archive.seal(assembly.assemble(contents, outcome, reason), self.recordings, self._disk)
+            recording = assembly.assemble(contents, outcome, reason)
+            if summary.get("recovered"):
+                summary |= dose.of_recording(recording, contents, self._unseen_s(contents))
+            sealed = archive.seal(recording, self.recordings, self._disk)
             if contents.damaged:  # the readable part is sealed; the file is kept for inspection
                 self._disk.rename(path, path.with_suffix(".damaged"))
             else:
@@ -181,15 +194,15 @@ class RecordingStore:
             "recording_path": str(sealed.path),
             "recording_id": attributes["recording_id"],
             "file_sha256": sealed.file_sha256,
-            "summary": summary | _of_recording(sealed.recording, summary.get("angle", {})),
+            "summary": summary | _of_recording(sealed.recording, summary),
         }
         return FinishedEvent.model_validate(event)
 
 
-def _of_recording(recording: assembly.Recording, of_angle: dict[str, Any]) -> dict[str, Any]:
+def _of_recording(recording: assembly.Recording, counted: dict[str, Any]) -> dict[str, Any]:
     alignment = recording.alignment
     return {
-        **({"angle": of_angle | _of_angle(recording)} if recording.angle else {}),
+        **({"angle": counted.get("angle", {}) | _of_angle(recording)} if recording.angle else {}),
         "samples": len(recording.columns["torque/time_s"]),
         "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
         "alignment": {
@@ -198,7 +211,7 @@ def _of_recording(recording: assembly.Recording, of_angle: dict[str, Any]) -> di
             "delay_ms": alignment.delay_ms,
             "rate_ppm": alignment.rate_ppm,
         },
-        "warnings": warnings(recording),
+        "warnings": [*warnings(recording), *dose.warnings(counted)],
     }
 
 

@@ -45,6 +45,8 @@ class People:
         """Whether a test that was started in the quiet time was completed."""
         self.jumping: set[str] = set()
         """Tests of widths that say of themselves that they jump on purpose."""
+        self._calibrates = self.chance.random() < 0.2
+        """Whether they would rather calibrate, and to its end."""
         self._seen = ""
         """The latch that they were shown as they last looked why the rig is stopped."""
         life.world.after(LOOK_S, self._look)
@@ -93,7 +95,7 @@ class People:
         self.life.world.after(PATIENCE_S, look_again)
 
     def _start(self) -> None:
-        if not self.life.quiet and self.chance.random() < 0.15:
+        if not self.life.quiet and self.chance.random() < (0.8 if self._calibrates else 0.1):
             self._open_calibration()
         else:
             self._repeat(self._start_test)
@@ -180,10 +182,6 @@ class People:
         )  # fmt: skip
         self.clinic.ask(request, request.calibration_id)
 
-    def _all_is_marked(self) -> bool:
-        found = None if self.clinic.rig is None else self.clinic.rig.status().calibration
-        return found is not None and not found.missing
-
     def _take_the_result(self, calibration_id: str) -> None:
         """It is stored; or asked for once more, as its answer was lost; or not wanted."""
         drawn = self.chance.random()
@@ -197,7 +195,11 @@ class People:
 
     def _calibrate(self) -> None:
         drawn = self.chance.random()
-        if self.life.quiet or drawn < 0.05:
+        found = None if self.clinic.rig is None else self.clinic.rig.status().calibration
+        if found is not None and found.trains and self._calibrates and self.chance.random() < 0.5:
+            wanted = CalibrateMarkRequest(threshold=found.missing[0]) if found.missing else None
+            self.clinic.ask(wanted or CalibrateFinishRequest(by="nurse"))
+        elif self.life.quiet or drawn < 0.05:
             self.clinic.ask(CalibrateFinishRequest(by="nurse", discard=True))
         elif drawn < 0.6:
             direction = self.chance.choice(("up", "up", "up", "fine", "repeat", "down"))
@@ -205,7 +207,7 @@ class People:
             self._repeat(lambda: self.clinic.ask(CalibrateStepRequest(direction=direction, shown_us=shown_us)))
         elif drawn < 0.8:
             self.clinic.ask(CalibrateMarkRequest(threshold=self.chance.choice(("sensory", "motor", "comfort"))))
-        elif drawn < 0.85 or self._all_is_marked():
+        elif drawn < 0.85:
             self.clinic.ask(CalibrateFinishRequest(by="nurse"))
         elif drawn < 0.9:
             self.clinic.stop()

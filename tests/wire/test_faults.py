@@ -151,6 +151,16 @@ def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
         acknowledged = int(np.sum(file["pulses/status"][:] == 0))
         assert acknowledged >= count - 2  # the last ack may have been on its way
         assert np.sum(np.isfinite(file["pulses/sent_pulse_width_us"][:]) & (file["pulses/status"][:] != 1)) >= count
+    felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+    felt_uc = sum(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)
+    summary = event["summary"]
+    most_uc = max(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)
+    assert felt_uc - 1e-6 <= summary["charge_uc"] <= felt_uc + most_uc + 1e-6  # one may not have left
+    assert len(felt) <= summary["pulses"] <= len(felt) + 1
+    assert summary["duration_s"] >= felt[-1]["time_s"] - felt[0]["time_s"] > 0
+    assert summary["torque_time_nms"] > 0 and summary["torque_peak_nm"] > 0
+    assert summary["dose_is_bound"] == (summary["doubtful_pulses"] > 0)
+    assert summary["dose_is_bound"] == any(words.startswith("dose: ") for words in summary["warnings"])
     refused = client.ask("start", plan=short_plan("next"))
     assert refused["problem"]["code"] == "uncertain"
     assert client.rearm("nurse")["ok"]
