@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rig import align_angle, angle_velocity
 from rig.align_angle import Reference
 from rig.journal import JournalContents, Kind
-from rig.signals import ANGLE_SAMPLE
+from rig.signals import ANGLE_SAMPLE, TRUSTED
 
 LIKELY_RATE_HZ = 200.0
 LARGEST_RAD = 2 * np.pi
@@ -72,7 +72,7 @@ def of_journal(
 
 def _believable(samples: NDArray[Any]) -> NDArray[np.bool_]:
     """Which samples are the angle of a joint: others would spoil a test that did not need the sensor."""
-    return (np.abs(samples["angle_rad"]) <= LARGEST_RAD) & (samples["fault"] != 1)
+    return (np.abs(samples["angle_rad"]) <= LARGEST_RAD) & np.isin(samples["fault"], TRUSTED)
 
 
 def _rate_hz(samples: NDArray[Any]) -> float:

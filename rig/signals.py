@@ -82,7 +82,9 @@ ANGLE_SAMPLE = np.dtype(
     ]
 )
 """One angle sample: as `SAMPLE`, with the sensor's own value, the joint's angle in rad (from a device by the rig file,
-after the receiver by the calibration), and its fault bit (255: none)."""
+after the receiver by the calibration), and whether it reports a fault (0: no; 255: it has no such word;
+everything else: it does)."""
+TRUSTED = 0, 255
 
 
 @dataclass(frozen=True, slots=True)

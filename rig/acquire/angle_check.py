@@ -16,6 +16,7 @@ from rig.acquire.rate import RateCheck
 from rig.acquire.stream import steps_from
 from rig.limits import Limit
 from rig.messages import HELD, TestPlan
+from rig.signals import TRUSTED
 
 FASTEST_RAD_S = 20.0
 """The fastest voluntary flexion of an elbow: while samples are missing it may turn so far."""
@@ -151,7 +152,7 @@ class AngleCheck:
 
 
 def _unreliable(samples: NDArray[Any]) -> str | None:
-    if np.any(samples["fault"] == 1):
+    if not np.all(np.isin(samples["fault"], TRUSTED)):
         return "angle sensor: it reports a fault of its own; check the sensor and its mounting"
     if not np.all(np.isfinite(samples["angle_rad"])):
         return "angle sensor: sent an angle that is not a number (NaN); check its cable"

@@ -22,7 +22,7 @@ from rig.errors import DeviceError, RefusedError, RigError
 from rig.limits import Limit, check
 from rig.machine import Machine
 from rig.messages import AngleCalibration, AnglePose
-from rig.signals import AngleScale
+from rig.signals import TRUSTED, AngleScale
 
 log = logging.getLogger("rig")
 
@@ -206,7 +206,7 @@ def still_raw(receiver: AngleReceiver, speed: float) -> float:
     raw = samples["raw"]
     if len(samples) < max(3.0, LEAST_SHARE * POSE_S * speed * receiver.nominal_rate_hz):
         raise DeviceError(receiver.problem or "angle sensor: too few angles arrive; check its cable and supply")
-    if not np.all(np.isfinite(raw)) or np.any(samples["fault"] == 1):
+    if not (np.all(np.isfinite(raw)) and np.all(np.isin(samples["fault"], TRUSTED))):
         raise RefusedError("angle_pose: the sensor reports a fault of its own, or no number; check sensor and cable")
     moved_rad = _moved(samples, PART_S * speed) * receiver.sensor.scale.radians_per_unit
     if not (moved_rad < STILL_RAD):

@@ -203,9 +203,11 @@ class Core:
 
     def _refuse_unseen(self, latch: str) -> None:
         """Raise LatchChangedError if the rig was stopped since `latch` was told: who asks has not seen it."""
-        if latch != self.latch:
-            now, then = self._trial.told or f"it is {self._trial.state}", "re-arm" if self._trial.told else "ask again"
-            raise LatchChangedError(f"now: {now}; look at the participant and the rig, then {then}")
+        if latch == self.latch:
+            return
+        if self._trial.told:
+            raise LatchChangedError(f"now: {self._trial.told}; look at the participant and the rig, then re-arm")
+        raise LatchChangedError("the rig was stopped while this waited; look at the participant, then ask again")
 
     def _fault(self, reason: str) -> None:
         """A device reports a fault."""

@@ -33,7 +33,9 @@ class Settings(DeviceSettings):
     message: str | None = Field(None, description="message with the angle; default: the first one that has the signal")
     signal: str = Field("Angle_deg", description="angle signal")
     counter: str | None = Field("Counter", description="signal of the counter of frames; '' if there is none")
-    fault: str | None = Field("Fault", description="signal of the bit by which it reports a fault; '' if there is none")
+    fault: str | None = Field(
+        "Fault", description="signal of the word by which it reports a fault, 0: none; '': no word"
+    )
     sample_rate_hz: float = Field(200.0, gt=0, le=20_000)
     radians_per_unit: float = Field(math.pi / 180, gt=0, description="rad per unit of the signal")
     direction: Literal[-1, 1] = Field(1, description="-1: the signal falls when the joint is flexed")

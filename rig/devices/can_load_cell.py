@@ -18,6 +18,7 @@ from rig.errors import ConfigError, DeviceError
 from rig.machine import Bus, Frame, Listener, Machine
 from rig.signals import SAMPLE, TorqueBlock
 from rig.wire import dbc
+from rig.wire.dbc import CELL_FAULT
 
 KIND = "load_cell"
 
@@ -35,6 +36,9 @@ class Settings(DeviceSettings):
     scale_nm: float = Field(1.0, description="N·m per unit of the signal; a negative value reverses the sign")
     counter: str | None = Field("Counter", description="signal of the sample counter; '' if the cell has none")
     sync: str | None = Field("Sync", description="signal of the stimulator's sync line; '' if there is none")
+    fault: str | None = Field(
+        CELL_FAULT, description="signal of the word by which it reports a fault, 0: none; '' if there is none"
+    )
     sample_rate_hz: float = Field(1600.0, gt=0, le=20_000)
     start_frames: list[str] = Field(default_factory=list, description="sent on opening, as id#data in hex: 000#0100")
     stop_frames: list[str] = Field(default_factory=list, description="sent on closing")
@@ -72,7 +76,12 @@ class CanLoadCell:
         names = [settings.signal] if isinstance(settings.signal, str) else settings.signal
         try:
             self._frame = dbc.SampleFrame(
-                settings.dbc, settings.message, names, settings.counter or None, settings.sync or None
+                settings.dbc,
+                settings.message,
+                names,
+                settings.counter or None,
+                settings.sync or None,
+                fault=settings.fault or None,
             )
         except ConfigError as error:
             raise ConfigError(f"load_cell.{error}") from None

@@ -103,8 +103,9 @@ class P24:
             command + 1,
             self._settings.reply_timeout_s,
         )
-        if packet.data and packet.data[0] not in fine:
-            raise DeviceError(f"stimulator {self._settings.port}: {name}: {wire.result_text(packet.data[0])}")
+        result = packet.data[0] if packet.data else 1  # an answer without a result is none
+        if result not in fine:
+            raise DeviceError(f"stimulator {self._settings.port}: {name}: {wire.result_text(result)}")
         return packet
 
     def _take(self, packet: Packet, time_s: float) -> None:

@@ -33,7 +33,8 @@ class FakeSensor:
 
     def __init__(self, clock: VirtualClock, angle_rad: Callable[[float], float] = still) -> None:
         self.clock, self.angle_rad = clock, angle_rad
-        self.silent = self.fault = self.nan = self.repeating = False
+        self.silent = self.nan = self.repeating = False
+        self.fault: int = 0
         self.add_deg = 0.0
         self.rate = 1.0
         self.skip = 0

@@ -16,7 +16,7 @@ from rig.acquire.angle_receiver import AngleReceiver
 from rig.control import angle_calibration
 from rig.control.angle_calibration import AngleCalibrating
 from rig.devices import can_angle_sensor
-from rig.errors import BusyError, DeviceError, PlanError, RefusedError, RigError
+from rig.errors import BusyError, DeviceError, LatchChangedError, PlanError, RefusedError, RigError
 from rig.journal import Kind
 from rig.limits import HARD_LIMITS
 from rig.messages import AngleCalibration, AnglePlan, AnglePoseRequest, Status, TestPlan
@@ -203,10 +203,11 @@ def test_no_angle_of_an_elbow_is_no_pose(posed: Posed, told_rad: float):
 def test_without_good_angles_there_is_no_pose(posed: Posed):
     with pytest.raises(DeviceError, match="too few angles"):
         posed.pose(20.0)
-    posed.sensor.fault = True
-    posed.hold(20.0)
-    with pytest.raises(RefusedError, match="a fault of its own"):
-        posed.pose(20.0)
+    for word in (1, 2, 254):
+        posed.sensor.fault = word
+        posed.hold(20.0)
+        with pytest.raises(RefusedError, match="a fault of its own"):
+            posed.pose(20.0)
     posed.sensor.fault, posed.sensor.nan = False, True
     posed.hold(20.0)
     with pytest.raises(RefusedError, match="no number"):
@@ -310,7 +311,7 @@ def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle_nor_is_that
     assert live.rearm().state == "ready"
     live.sensor.gone = False
     live.until(starting.done.is_set)
-    assert isinstance(starting.error, BusyError)
+    assert isinstance(starting.error, LatchChangedError)
     live.machine.wait(8.0)
     assert live.stimulator.sent == []
 
