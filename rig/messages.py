@@ -85,6 +85,11 @@ class Profile(Message):
     angle_range_rad: Range | None = Field(
         default=None, description="joint angles that are comfortable today, rad; elbow: 0 is straight, flexion positive"
     )
+    angle_set_at_utc: str | None = Field(
+        default=None,
+        description="`set_at_utc` of the `AngleCalibration` under which that range was said; None: there was none. A "
+        "test with an angle is refused once the sensor was calibrated anew",
+    )
 
 
 class AnglePlan(Message):

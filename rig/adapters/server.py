@@ -175,7 +175,9 @@ class Server:
 
     async def _preview(self, line: bytes, writer: asyncio.StreamWriter) -> bytes:
         """Previews are built in order of request; none for a client that has disconnected."""
-        return b"" if writer.transport.is_closing() else await self._previews.reply(line)
+        if self.rig is None or writer.transport.is_closing():
+            return b""
+        return await self._previews.reply(line, self.rig.angle_set_at_utc)
 
     def _refuse_long(self, line: bytes, kind: str) -> None:
         assert self.rig is not None

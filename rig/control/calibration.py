@@ -309,6 +309,23 @@ def end_of_day_s(unix_s: float) -> float:
     return tomorrow.astimezone().timestamp()
 
 
+def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
+    """Raise RefusedError if a test with an angle would use a range that was said under another calibration.
+
+    `angle_set_at_utc` is of the angle sensor's present calibration; None: it has none.
+    """
+    profile = plan.profile
+    if plan.angle is None or profile.angle_range_rad is None or profile.angle_set_at_utc == angle_set_at_utc:
+        return
+    if angle_set_at_utc is None:
+        raise RefusedError(
+            "profile.angle_range_rad: the angle sensor has lost its calibration since; say the range again"
+        )
+    raise RefusedError(
+        f"profile.angle_range_rad: the angle sensor was calibrated anew at {angle_set_at_utc}; say the range again"
+    )
+
+
 def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: float = 0.0) -> None:
     """Check that a profile is consistent and still valid.
 

@@ -16,6 +16,12 @@ NO_SENSOR = "{}: this rig has no angle sensor; name one in its rig file (docs/ri
 class Posing(Extending):
     """Takes poses. Nothing is sent to a device meanwhile."""
 
+    @property
+    def angle_set_at_utc(self) -> str | None:
+        """When the angle sensor was calibrated; None: it was not. May be called from another thread."""
+        found = self._poses.calibration
+        return None if found is None else found.set_at_utc
+
     async def angle_pose(self, request: AnglePoseRequest) -> Status:
         """The goniometer's angle of a joint that is held still; the second one completes a calibration.
 

@@ -7,7 +7,7 @@ import math
 from dataclasses import replace
 
 from rig import limits, plan
-from rig.control.calibration import check_profile
+from rig.control.calibration import check_profile, check_range
 from rig.control.extending import check_key
 from rig.control.playing import LONGEST_WORDS, check_names
 from rig.control.posing import Posing
@@ -113,6 +113,7 @@ class Rig(Posing):
             now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
             needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
             check_profile(request.profile, now_s, needs_widths, longest_s)
+            check_range(request, self.angle_set_at_utc)
             plan.check_steps(test, self._pair.steps)
             self._rest.check(test, table["rest_between_tests_s"])
             self._check_angle(request, table)
