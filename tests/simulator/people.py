@@ -173,7 +173,7 @@ class People:
 
     def _open_calibration(self) -> None:
         self.clinic.tests += 1
-        wild = self.chance.random() < 0.3
+        wild = self.chance.random() < (0.05 if self._calibrates else 0.3)
         request = CalibrateStartRequest(
             calibration_id=f"c{self.clinic.tests}", participant="P1", by="nurse",
             train_s=self._nonsense(2.0) if wild else 0.3, step_us=self._nonsense(25.0) if wild else 10.0,
@@ -196,7 +196,7 @@ class People:
     def _calibrate(self) -> None:
         drawn = self.chance.random()
         found = None if self.clinic.rig is None else self.clinic.rig.status().calibration
-        if found is not None and found.trains and self._calibrates and self.chance.random() < 0.5:
+        if found is not None and found.trains and self._calibrates and self.chance.random() < 0.9:
             wanted = CalibrateMarkRequest(threshold=found.missing[0]) if found.missing else None
             self.clinic.ask(wanted or CalibrateFinishRequest(by="nurse"))
         elif self.life.quiet or drawn < 0.05:
