@@ -229,7 +229,9 @@ class WithdrawRequest(Message):
     id: int = 0
     test_id: str
     reason: str
-    begun: bool = Field(False, description="end it also after its first pulse; else one that has begun plays on")
+    begun: bool = Field(
+        default=False, description="end it also after its first pulse; else one that has begun plays on"
+    )
 
 
 class StopRequest(Message):
@@ -301,7 +303,7 @@ class CalibrateFinishRequest(Message):
     id: int = 0
     by: str
     discard: bool = False
-    calibration_id: str = Field("", description="refused if another one is open; empty: whichever is open")
+    calibration_id: str = Field(default="", description="refused if another one is open; empty: whichever is open")
 
 
 class CalibrateStoredRequest(Message):
