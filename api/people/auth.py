@@ -22,9 +22,9 @@ from api.errors import ApiError
 from api.people.idle_lock import IdleLock
 from api.people.pace import Guesses, place_of
 from api.store import Store, audit
+from api.store.secrets import shared
 from api.store.tables import Confirmation, PageSession, Token
 
-COOKIE = "stimrig_session"
 LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
 MOST_SEEN = 1000
@@ -104,6 +104,8 @@ class Auth:
     ) -> None:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
         self.idle = idle
+        self.cookie_name = f"stimrig_session_{shared(store, 'session-cookie').hex()[:8]}"
+        """Browsers tell hosts apart, not ports: another service on this host has another name."""
         self._seen: OrderedDict[str, str] = OrderedDict()
         self._remembering = threading.Lock()
         self._threads = ThreadPoolExecutor(8, "who-asks")
@@ -312,18 +314,18 @@ class Auth:
 
     def _remember(self, connection: HTTPConnection, name: str) -> None:
         with self._remembering:  # many threads ask
-            self._seen[_credential(connection)] = name
-            self._seen.move_to_end(_credential(connection))
+            self._seen[self._credential(connection)] = name
+            self._seen.move_to_end(self._credential(connection))
             while len(self._seen) > MOST_SEEN:
                 self._seen.popitem(last=False)
 
     def _forget(self, connection: HTTPConnection) -> None:
         with self._remembering:
-            self._seen.pop(_credential(connection), None)
+            self._seen.pop(self._credential(connection), None)
 
     def seen(self, connection: HTTPConnection) -> str | None:
         """Who was behind this token or session when the database was last asked: good for a stop, and nothing else."""
-        return self._seen.get(_credential(connection))
+        return self._seen.get(self._credential(connection))
 
     def seen_on_page(self, connection: HTTPConnection) -> str | None:
         """`seen`, for a page's session only: a controller's key opens no page, so no page gives it a right."""
@@ -337,15 +339,14 @@ class Auth:
                 raise unauthorized("Send `Authorization: Bearer <token>`.")
             address = connection.client.host if connection.client else ""
             return self.bearer(text.strip(), address, forgive_age=forgive_age)
-        cookie = connection.cookies.get(COOKIE)
+        cookie = connection.cookies.get(self.cookie_name)
         if cookie:
             return self.cookie(cookie, forgive_age=forgive_age, forgive_lock=forgive_lock)
         raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
 
-
-def _credential(connection: HTTPConnection) -> str:
-    header = connection.headers.get("authorization", "")
-    return digest(f"header {header}" if header else f"cookie {connection.cookies.get(COOKIE, '')}")
+    def _credential(self, connection: HTTPConnection) -> str:
+        header = connection.headers.get("authorization", "")
+        return digest(f"header {header}" if header else f"cookie {connection.cookies.get(self.cookie_name, '')}")
 
 
 def digest(text: str) -> str:

@@ -208,7 +208,7 @@ PROBLEM: dict[int | str, dict[str, Any]] = {
     for code, text in {
         401: "not signed in", 403: "the scope or the form's token is missing", 404: "not there",
         409: "in conflict with what is", 422: "does not hold: `errors` names the fields",
-        429: "too many wrong tries: `Retry-After`", 503: "the rig cannot be reached, or too much at once",
+        503: "the rig cannot be reached, or too much at once",
     }.items()
 }  # fmt: skip
 """Problems of every route that asks who comes."""

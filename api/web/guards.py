@@ -11,7 +11,7 @@ from fastapi import Request, Security
 from fastapi.security import APIKeyCookie, HTTPBearer
 
 from api.errors import ApiError
-from api.people.auth import COOKIE, Principal, Scope
+from api.people.auth import Principal, Scope
 from api.web.key_guard import refuse_outside
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
@@ -19,12 +19,12 @@ POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")
 """What pages ask for again and again by themselves."""
 BEARER = HTTPBearer(scheme_name="token", description="a token, or a controller's key", auto_error=False)
 SESSION = APIKeyCookie(
-    name=COOKIE, scheme_name="session", auto_error=False,
+    name="stimrig_session", scheme_name="session", auto_error=False,
     description="set by `POST /v1/sessions`; everything but GET sends its `csrf` as `X-CSRF-Token`, too",
 )  # fmt: skip
 Token = Annotated[object, Security(BEARER)]
 Session = Annotated[object, Security(SESSION)]
-"""For the OpenAPI document; `Auth.identify` reads both."""
+"""For the OpenAPI document, which is given the name of its service's cookie; `Auth.identify` reads both."""
 
 
 def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:

@@ -34,6 +34,12 @@ def problem(description: str) -> dict[str, Any]:
     return {"description": description, "content": PROBLEM_CONTENT}
 
 
+TOO_MANY = problem("too many wrong tries, or too much at once") | {
+    "headers": {"Retry-After": {"description": "s to wait", "required": True, "schema": {"type": "integer"}}}
+}
+"""Of every operation that asks who comes: a guess is held to a pace, whatever it was to open."""
+
+
 def describe(app: FastAPI) -> None:
     """Have the application's document made complete, once."""
     plain = app.openapi
@@ -43,6 +49,8 @@ def describe(app: FastAPI) -> None:
         document = plain()
         if not made:
             _complete(document)
+            schemes = document["components"]["securitySchemes"]
+            schemes["session"]["name"] = app.state.context.auth.cookie_name
         return document
 
     app.openapi = openapi
@@ -60,6 +68,8 @@ def _complete(document: dict[str, Any]) -> None:
         for operation in methods.values():
             ways = operation.get("security", [])
             needed = sorted({scope for way in ways for scopes in way.values() for scope in scopes})
+            if ways:
+                operation["responses"]["429"] = TOO_MANY
             if needed:
                 operation["description"] = f"{operation.get('description', '')}\n\nScope: `{'`, `'.join(needed)}`."
             if "HTTPValidationError" in str(operation["responses"].get("422")):
