@@ -7,8 +7,9 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from api.outbox.chain import GENESIS, Position
+from api.outbox.chain import Position
 from api.outbox.errors import WrongAnswerError
+from api.store.hashes import GENESIS
 
 SHA256 = re.compile(r"[0-9a-f]{64}")
 LONGEST_TEXT = 200

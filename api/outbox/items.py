@@ -12,8 +12,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from api.outbox.chain import Telling, canonical
+from api.outbox.chain import Telling
 from api.store import uploads
+from api.store.hashes import canonical
 from api.store.tables import OPEN_STATES, Approval, AuditEntry, Model, Participant, Recording, Table, Test, Tracked
 
 TABLES: dict[type[Table], str] = {

@@ -13,10 +13,11 @@ from sqlalchemy.orm import Session
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.people import names
-from api.people.auth import Auth, Principal, Scope, digest, unauthorized
+from api.people.auth import Auth, Principal, Scope, unauthorized
 from api.people.pace import Guesses, place_of
 from api.people.passwords import Passwords
 from api.store import Store, audit
+from api.store.hashes import digest
 from api.store.tables import Confirmation, KnownPlace, Token, User
 
 CONFIRMED_S = 120.0

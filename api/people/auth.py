@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import secrets
 import threading
 from collections import OrderedDict
@@ -22,6 +21,7 @@ from api.errors import ApiError
 from api.people.idle_lock import IdleLock
 from api.people.pace import Guesses, place_of
 from api.store import Store, audit
+from api.store.hashes import digest
 from api.store.secrets import shared
 from api.store.tables import Confirmation, PageSession, Token
 
@@ -97,7 +97,7 @@ class Principal:
 
 
 class Auth:
-    """Issues and checks tokens and sessions; keeps only hashes."""
+    """Issues and checks tokens and sessions; keeps only hashes: of 256 random bits, so no slow hash is needed."""
 
     def __init__(
         self, store: Store, clock: Clock, guesses: Guesses, idle: IdleLock, session_hours: float = 12.0
@@ -347,11 +347,6 @@ class Auth:
     def _credential(self, connection: HTTPConnection) -> str:
         header = connection.headers.get("authorization", "")
         return digest(f"header {header}" if header else f"cookie {connection.cookies.get(self.cookie_name, '')}")
-
-
-def digest(text: str) -> str:
-    """SHA-256 in hex; the tokens are drawn from 256 random bits, so no slow hash is needed."""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def unauthorized(detail: str, code: str = "unauthorized", title: str = "Not signed in") -> ApiError:

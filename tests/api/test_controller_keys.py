@@ -15,7 +15,7 @@ from sqlalchemy import select
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from api.people.auth import digest
+from api.store.hashes import digest
 from api.store.tables import AuditEntry, Test, Token
 from api.web.key_guard import OPEN
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done

@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from api.people.auth import digest
+from api.store.hashes import digest
 from api.store.tables import PageSession, Token
 from api.web.routes.tests import _next
 from tests.api.browser import PASSWORD
