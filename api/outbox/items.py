@@ -1,7 +1,7 @@
 """What a centre is told of a row: codes and figures.
 
 What a person typed freely stays at the rig: notes, and the reason of a decision. So do paths. The audit trail stays,
-too; the centre gets the hash of its newest entry, by which it can be told later whether the trail was changed.
+too; the centre gets the hash of each entry, by which it can be told later whether the trail was changed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def telling(row: Table) -> Telling | None:
     if isinstance(row, Model | Tracked):
         return _with_document(row)
     if isinstance(row, AuditEntry):
-        body = {"seq": row.seq, "hash": row.hash, "at_utc": row.at_utc}
+        body = {"seq": row.seq, "hash": row.hash, "previous_hash": row.previous_hash, "at_utc": row.at_utc}
         return Telling("audit", str(row.seq), body)
     if isinstance(row, Approval):
         return Telling("decision", str(row.id), _bounded(_without(row, "reason")))

@@ -22,6 +22,7 @@ from api.models.registry import Versions
 from api.models.tracked import TrackedVersions
 from api.models.trend import Trend
 from api.outbox.feed import Feed
+from api.outbox.receipts import note_hourly
 from api.people.accounts import People
 from api.people.auth import Auth, Principal, Scope
 from api.people.idle_lock import FLUSH_S, IdleLock
@@ -94,8 +95,10 @@ class Context:
             await asyncio.sleep(FLUSH_S)
             try:
                 await asyncio.to_thread(self.auth.idle.flush)
-            except SQLAlchemyError:  # the next time has it all
-                log.exception("the times of people's last actions could not be written down")
+                if self.settings.heads_file is not None:
+                    await asyncio.to_thread(note_hourly, self.store, self.clock, self.settings.heads_file)
+            except (SQLAlchemyError, OSError):  # the next time has it all
+                log.exception("people's last actions, or the audit trail's head, could not be written down")
 
     async def close(self) -> None:
         """Let everything go."""
