@@ -90,6 +90,7 @@ def trail(
     tmp_path: Path, centre: Centre, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Iterator[Trail]:
     made = Trail(tmp_path / "rig", centre, centre.key(), lambda: capsys.readouterr().out)
+    monkeypatch.setenv("STIMRIG_DATABASE_URL", made.rig.store.engine.url.render_as_string(hide_password=False))
     made.work(10)
     made.push()
     capsys.readouterr()
