@@ -26,6 +26,10 @@ DataDir = Annotated[Path | None, typer.Option("--data", help="data folder; defau
 
 NO_HEAD = "no entry has this hash; the trail was cut short or written anew"
 
+HeadsFiles = Annotated[
+    list[Path] | None, typer.Option(help="file written by `stimrig audit heads`, or one of receipts")
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the verb and what it can do."""
@@ -40,9 +44,7 @@ def verify(
     data: DataDir = None,
     file: Annotated[Path | None, typer.Option(help="an exported file instead of the database")] = None,
     head: Annotated[str, typer.Option(help="hash that was noted elsewhere: it must be in the chain")] = "",
-    heads: Annotated[
-        list[Path] | None, typer.Option(help="file written by `stimrig audit heads`, or one of receipts")
-    ] = None,
+    heads: HeadsFiles = None,
     ask: Annotated[bool, typer.Option("--centre/--no-centre", help="ask the centre for what it countersigned")] = True,
     restored: Annotated[int, typer.Option(help="entry since which a restored database is known to lack some")] = 0,
     as_json: Json = False,

@@ -76,6 +76,7 @@ GET    /administration/audit.jsonl                administrator  200
 POST   /v1/rig/hello                              rig            400
 POST   /v1/rig/items                              rig            400
 GET    /v1/rig/files                              rig            200
+GET    /v1/rig/heads                              rig            200
 PUT    /v1/rig/files/{zeros}                      rig            404
 """
 """Method, path, who may, and what they are answered, where nothing of the name x is there and no body is sent."""
