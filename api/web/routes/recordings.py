@@ -51,8 +51,6 @@ async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> F
     """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
     _row, source = await asyncio.to_thread(held, context, recording_id)
     name = f"{recording_id}.csv"
-    if source.suffix == ".csv":
-        return FileResponse(source, media_type="text/csv", filename=name)
     out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
     gone = BackgroundTask(out.unlink, missing_ok=True)
     try:
