@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 RIG_STATUS = {
     "busy": 409,
     "latched": 409,
+    "latch-changed": 409,
+    "withdrawn": 409,
     "uncertain": 409,
     "refused": 422,
     "rest-needed": 422,

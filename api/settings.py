@@ -59,6 +59,9 @@ class Settings(BaseSettings):
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
     )
+    heads_file: Path | None = Field(
+        default=None, description="file, best on another machine's disk, to which the audit trail's head goes hourly"
+    )
     centre_url: str | None = Field(default=None, description="where the centre answers; default: there is none")
     centre_key: SecretStr | None = Field(
         default=None, validate_default=True, description="this rig's key, as the centre has made it"

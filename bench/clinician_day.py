@@ -22,6 +22,7 @@ from typing import Any
 import httpx
 from playwright.sync_api import Locator, Page, sync_playwright
 
+from api.client.connection import SendsVersions
 from tests.api.browser import ARGUMENTS, CHROMIUM, PASSWORD
 
 TOKEN = "administrator-token-of-the-bench"
@@ -168,7 +169,7 @@ def served(emulate: str = "") -> Iterator[str]:
 
 def sign_in(page: Page, url: str) -> None:
     """As the clinician Ada."""
-    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30) as http:
+    with httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=30) as http:
         http.post("/v1/users", json={"name": "Ada", "password": PASSWORD}).raise_for_status()
     page.goto(f"{url}/")
     page.get_by_label("Name", exact=True).fill("Ada")

@@ -21,6 +21,7 @@ import httpx
 import numpy as np
 
 from api.cli.launcher import Child
+from api.client.connection import SendsVersions
 from api.settings import Settings
 from tests.harness.patients import Patient, make_record
 
@@ -99,7 +100,9 @@ def main() -> None:
         ready = api.start()
         url = ready["url"]
         try:
-            with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=120) as admin:
+            with httpx.Client(
+                base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=120
+            ) as admin:
                 admin.post("/v1/participants", json={"code": "P1"}).raise_for_status()
                 made = admin.post("/v1/participants/P1/recordings", content=csv_of_a_muscle()).raise_for_status().json()
                 admin.post(f"/v1/models/{made['model']['id']}/approve", json={"reason": "bench"}).raise_for_status()

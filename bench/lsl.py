@@ -49,7 +49,7 @@ def one(client: RigClient, test_id: str) -> tuple[Path, np.ndarray, int]:
         raise SystemExit(reply["problem"]["detail"])
     event = client.wait_finished(test_id)
     if event["outcome"] != "completed":
-        client.ask("rearm", by="bench")
+        client.rearm("bench")
         raise Ended(event["reason"])
     with h5py.File(event["recording_path"]) as file:
         late_s = file["pulses/written_time_s"][:] - file["pulses/planned_time_s"][:]

@@ -18,6 +18,7 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 from api.cli.launcher import Services
+from api.client.connection import SendsVersions
 from api.settings import Settings
 from bench.moving_joint import as_record, guided_tests, joined
 from hardware_sim import hidden_records
@@ -61,7 +62,7 @@ def prepared_joint(url: str, folder: Path) -> str:
 
 def client(url: str) -> httpx.Client:
     """The administrator's."""
-    return httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=180)
+    return httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=180)
 
 
 def taken(http: httpx.Client, code: str, path: Path) -> dict[str, Any]:

@@ -26,6 +26,7 @@ import httpx
 import numpy as np
 
 from api.cli.launcher import Services
+from api.client.connection import SendsVersions
 from api.settings import Settings
 from rig.messages import stop_socket
 from tests.harness.processes import RigClient, control
@@ -69,7 +70,7 @@ class Crowd:
 
 def client(url: str) -> httpx.Client:
     """The administrator's."""
-    return httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30)
+    return httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=30)
 
 
 @contextlib.contextmanager
@@ -125,7 +126,7 @@ def one_stop(services: Services, http: httpx.Client) -> tuple[float, float]:
     pulses = control(services.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
     while not http.get(test).json()["done"]:
         time.sleep(0.1)
-    reply = RigClient(services.socket).ask("rearm", by="bench")
+    reply = RigClient(services.socket).rearm("bench")
     assert reply["ok"], reply
     return answer_ms, 1e3 * (pulses[-1]["monotonic_s"] - asked_s) if pulses else float("nan")
 

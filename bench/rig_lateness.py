@@ -36,7 +36,7 @@ def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = Fals
             events.append(client.wait_finished(f"bench{number}"))
             if events[-1]["outcome"] != "completed":
                 print(f"test {number} ended: {events[-1]['reason']}")
-                client.ask("rearm", by="bench")
+                client.rearm("bench")
         return [event["summary"] for event in events]
 
 

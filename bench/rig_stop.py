@@ -48,7 +48,7 @@ def measure(busy: int, stops: int, fit: bool = False) -> tuple[list[float], list
             last_pulse_ms.append(1e3 * (pulses[-1]["monotonic_s"] - asked_s))
             client.wait_finished(f"stop{number}")
             client.wait_state("latched")
-            assert client.ask("rearm", by="bench")["ok"]
+            assert client.rearm("bench")["ok"]
     return last_pulse_ms, answer_ms
 
 

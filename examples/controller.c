@@ -15,6 +15,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <strings.h>
 #include <time.h>
 
 struct body {
@@ -36,8 +37,18 @@ static size_t keep(char *part, size_t size, size_t count, void *into)
 }
 
 static const char *url, *key;
+static char planned_with[80]; /* ETag of the model: a trial says with which one it was planned */
 static int playing; /* a trial of ours may be playing */
 static volatile sig_atomic_t interrupted;
+
+/* The first ETag that comes is the model's. */
+static size_t tag(char *line, size_t size, size_t count, void *unused)
+{
+    (void)unused;
+    if (planned_with[0] == '\0' && size * count > 6 && strncasecmp(line, "etag:", 5) == 0)
+        sscanf(line + 5, " %79[^\r\n]", planned_with);
+    return size * count;
+}
 
 static void interrupt(int number)
 {
@@ -55,7 +66,7 @@ static int given_up(void *unused, curl_off_t a, curl_off_t b, curl_off_t c, curl
 /* One request, whatever comes of it; `sent` is JSON, or NULL for GET. What comes is the caller's to free. */
 static CURLcode send_to(const char *path, const char *sent, long seconds, struct body *got, long *status)
 {
-    size_t size = strlen(url) + strlen(path) + strlen(key) + 32;
+    size_t size = strlen(url) + strlen(path) + strlen(key) + sizeof planned_with + 32;
     char *text = malloc(size);
     CURL *curl = curl_easy_init();
     if (curl == NULL || text == NULL)
@@ -63,11 +74,15 @@ static CURLcode send_to(const char *path, const char *sent, long seconds, struct
     snprintf(text, size, "Authorization: Bearer %s", key);
     struct curl_slist *head = curl_slist_append(NULL, text);
     head = curl_slist_append(head, "Content-Type: application/json");
+    snprintf(text, size, "If-Match: %s", planned_with);
+    if (sent != NULL && planned_with[0] != '\0')
+        head = curl_slist_append(head, text);
     snprintf(text, size, "%s%s", url, path);
     curl_easy_setopt(curl, CURLOPT_URL, text);
     curl_easy_setopt(curl, CURLOPT_HTTPHEADER, head);
     curl_easy_setopt(curl, CURLOPT_WRITEFUNCTION, keep);
     curl_easy_setopt(curl, CURLOPT_WRITEDATA, got);
+    curl_easy_setopt(curl, CURLOPT_HEADERFUNCTION, tag);
     curl_easy_setopt(curl, CURLOPT_TIMEOUT, seconds);
     curl_easy_setopt(curl, CURLOPT_XFERINFOFUNCTION, given_up);
     curl_easy_setopt(curl, CURLOPT_NOPROGRESS, 0L);

@@ -8,12 +8,13 @@ early. This fit cannot see the shortest delay of the transport itself, which sta
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Method = Literal["sync", "regression", "cell", "stamps", "order"]
 
 MIN_EDGES = 8
 MEDIAN_EFFICIENCY = 1.2533
@@ -33,15 +34,18 @@ class Alignment:
 
     Attributes
     ----------
+    method
+        Of a load cell: sync or regression; of an angle sensor: see `rig.align_angle`.
     error_ms
-        Standard error of the offset, ms; NaN if there were too few samples to estimate it.
+        Standard error of the offset, ms; NaN if there were too few samples to estimate it. Of an angle sensor it
+        contains that of the torque, through which it was obtained.
     delay_ms
         Median time from a sample's aligned time to its arrival at the host, ms.
     rate_ppm
         How much slower (+) the cell's clock runs than the host's.
     """
 
-    method: Literal["sync", "regression"]
+    method: Method
     error_ms: float
     delay_ms: float
     rate_ppm: float
@@ -68,6 +72,13 @@ def cell_time(counter: NDArray[np.int64], stamp_s: Array, sample_rate_hz: float)
     if len(stamp_s) and np.all(np.isfinite(stamp_s)):
         return stamp_s - stamp_s[0]
     return np.arange(len(counter)) / sample_rate_hz
+
+
+def counted_rate_hz(samples: NDArray[Any]) -> float:
+    """Samples per second of these two or more, by their counter, else by counting them; times are the host's."""
+    first, last = samples[0], samples[-1]
+    counted = int(last["counter"] - first["counter"]) if first["counter"] >= 0 else len(samples) - 1
+    return round(counted / max(float(last["host_time_s"] - first["host_time_s"]), 1e-9), 3)
 
 
 def align(

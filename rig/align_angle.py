@@ -10,31 +10,19 @@ sample can come late, never early.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig import align
-from rig.align import Array, Line
-
-Method = Literal["cell", "stamps", "order", "regression"]
+from rig.align import Alignment, Array, Line, Method
 
 ONE_CLOCK_S = 5e-4
 """Stamps that give other times than the order of the frames do are not of one clock: a device stamps itself."""
 LONGEST_PERIOD_S = 0.002
 """The order of frames tells enough only where the cell's follow one another at least so soon."""
 LEAST_ORDERED = 20
-
-
-@dataclass(frozen=True, slots=True)
-class AngleAlignment:
-    """As `align.Alignment`; `error_ms` contains that of the torque, through which it was obtained."""
-
-    method: Method
-    error_ms: float
-    delay_ms: float
-    rate_ppm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +49,7 @@ class Reference:
 
 def beside(
     samples: NDArray[Any], rate_hz: float, torque: Reference, of_the_cell: bool, one_bus: bool
-) -> tuple[Array, AngleAlignment]:
+) -> tuple[Array, Alignment]:
     """Time of each angle sample on the test's clock.
 
     Parameters
@@ -77,7 +65,7 @@ def beside(
     """
     host_s = samples["host_time_s"] - torque.t0_s
     if len(samples) < 2:
-        return host_s, AngleAlignment("regression", float("nan"), 0.0, 0.0)
+        return host_s, Alignment("regression", float("nan"), 0.0, 0.0)
     sensor_s = align.cell_time(samples["counter"].astype(np.int64), samples["stamp_s"], rate_hz)
     if of_the_cell and (same := _of_same_frames(samples, torque)) is not None:
         which, known_s = same
@@ -97,8 +85,8 @@ def beside(
     return time_s, _told(method, error_ms, host_s, time_s, found.rate)
 
 
-def _told(method: Method, error_ms: float, host_s: Array, time_s: Array, rate: float) -> AngleAlignment:
-    return AngleAlignment(method, error_ms, float(np.median(host_s - time_s)) * 1e3, (rate - 1) * 1e6)
+def _told(method: Method, error_ms: float, host_s: Array, time_s: Array, rate: float) -> Alignment:
+    return Alignment(method, error_ms, float(np.median(host_s - time_s)) * 1e3, (rate - 1) * 1e6)
 
 
 def _of_same_frames(samples: NDArray[Any], torque: Reference) -> tuple[NDArray[np.bool_], Array] | None:

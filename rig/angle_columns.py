@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig import align_angle, angle_velocity
+from rig.align import counted_rate_hz
 from rig.align_angle import Reference
 from rig.journal import JournalContents, Kind
-from rig.signals import ANGLE_SAMPLE
+from rig.signals import ANGLE_SAMPLE, TRUSTED
 
 LIKELY_RATE_HZ = 200.0
+"""Assumed if the header is lost, and there are too few samples to measure it."""
 LARGEST_RAD = 2 * np.pi
 """No joint turns farther, however its sensor is mounted."""
 
@@ -38,7 +40,7 @@ def of_journal(
     if not blocks and not told:
         return {}, {}
     samples = np.concatenate(blocks) if blocks else np.empty(0, ANGLE_SAMPLE)
-    rate_hz = float(told.get("sample_rate_hz") or _rate_hz(samples))
+    rate_hz = float(told.get("sample_rate_hz") or (len(samples) > 1 and counted_rate_hz(samples)) or LIKELY_RATE_HZ)
     time_s, alignment = align_angle.beside(
         samples, rate_hz, torque, bool(told.get("of_the_cell")), bool(told.get("one_bus"))
     )
@@ -72,16 +74,7 @@ def of_journal(
 
 def _believable(samples: NDArray[Any]) -> NDArray[np.bool_]:
     """Which samples are the angle of a joint: others would spoil a test that did not need the sensor."""
-    return (np.abs(samples["angle_rad"]) <= LARGEST_RAD) & (samples["fault"] != 1)
-
-
-def _rate_hz(samples: NDArray[Any]) -> float:
-    """Samples per second, measured, where the header is lost."""
-    if len(samples) < 2:
-        return LIKELY_RATE_HZ
-    first, last = samples[0], samples[-1]
-    counted = int(last["counter"] - first["counter"]) if first["counter"] >= 0 else len(samples) - 1
-    return round(counted / max(float(last["host_time_s"] - first["host_time_s"]), 1e-9), 3) or LIKELY_RATE_HZ
+    return (np.abs(samples["angle_rad"]) <= LARGEST_RAD) & np.isin(samples["fault"], TRUSTED)
 
 
 def _numbers(samples: NDArray[Any], time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.int64]:

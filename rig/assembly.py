@@ -158,15 +158,14 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
         "both copies of the header are lost: participant, limits, segments and devices are unknown; so is the time of "
         "the test, if its start is lost, too"
     )
-    plan = {
-        "test_id": contents.path.stem,
-        "participant": "unknown",
-        "kind": "recovered",
-        "pulse_rate_hz": rate_hz,
-    }
     return {
         "recording_id": hashlib.sha256(b"".join(payload for _, payload in contents.blocks)).hexdigest()[:32],
-        "plan": plan,
+        "plan": {
+            "test_id": contents.path.stem,
+            "participant": "unknown",
+            "kind": "recovered",
+            "pulse_rate_hz": rate_hz,
+        },
         "segments": [],
         "current_ma": max((intent[4] for intent in intents), default=0.0),
         "sample_rate_hz": _sample_rate(contents),
@@ -192,11 +191,7 @@ def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) ->
 def _sample_rate(contents: JournalContents) -> float:
     """Torque samples per second, measured."""
     blocks = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE and len(p)]
-    if len(blocks) < 2:
-        return 1.0
-    first, last = blocks[0][0], blocks[-1][-1]
-    counted = int(last["counter"] - first["counter"]) if first["counter"] >= 0 else sum(map(len, blocks)) - 1
-    return round(counted / max(float(last["host_time_s"] - first["host_time_s"]), 1e-9), 3) or 1.0
+    return (len(blocks) > 1 and align.counted_rate_hz(np.concatenate(blocks))) or 1.0
 
 
 def _first_time(contents: JournalContents) -> float:

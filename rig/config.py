@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
 from rig import devices, limits
-from rig.acquire.health import Watch
+from rig.acquire.health import DEFAULT_WATCH, Watch
 from rig.devices import DeviceSettings, Kind
 from rig.errors import ConfigError, RefusedError
 from rig.limits import Limit
@@ -26,14 +26,10 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class _Numbers(_Table):
-    """Types are strict: `true` is not a number."""
+class LimitSettings(_Table):
+    """Tighter limits for this rig; a value beyond the hard limit has no effect. `true` is not a number."""
 
     model_config = ConfigDict(strict=True)
-
-
-class LimitSettings(_Numbers):
-    """Tighter limits for this rig; a value beyond the hard limit has no effect."""
 
     pulse_width_us: float | None = Field(None, ge=0)
     current_ma: float | None = Field(None, ge=0)
@@ -56,26 +52,10 @@ class LimitSettings(_Numbers):
         for name, value in self.model_dump(exclude_none=True).items():
             if name.startswith("rest_"):
                 table = limits.at_least(table, name, value, "rig file")
-                continue
-            lo, hi = value if name == "angle_rad" else (-value if name == "torque_nm" else None, value)
-            table = limits.tightened(table, name, hi, "rig file", lo)
+            else:
+                lo, hi = value if name == "angle_rad" else (-value if name == "torque_nm" else None, value)
+                table = limits.tightened(table, name, hi, "rig file", lo)
         return table
-
-
-class WatchSettings(_Numbers):
-    """When silence counts as a fault, real seconds; may be tighter or slightly looser than the defaults."""
-
-    stale_torque_s: float = Field(0.1, gt=0, le=0.5)
-    missing_ack_s: float = Field(0.1, gt=0, le=0.5)
-    late_pulse_periods: float = Field(0.4, gt=0, le=0.6)
-    stuck_torque_s: float = Field(0.5, gt=0.05, le=10)
-    clipped_torque_s: float = Field(3.0, gt=0.05, le=10)
-    stale_disk_s: float = Field(3.0, gt=0.5, le=10)
-    stale_angle_s: float = Field(0.1, gt=0, le=0.5)
-
-    def watch(self) -> Watch:
-        """As `rig.acquire` takes it."""
-        return Watch(**self.model_dump())
 
 
 class RigConfig(_Table):
@@ -93,7 +73,7 @@ class RigConfig(_Table):
     load_cell: DeviceSettings
     angle_sensor: DeviceSettings | None = None
     limits: LimitSettings = LimitSettings.model_validate({})
-    watch: WatchSettings = WatchSettings.model_validate({})
+    watch: Watch = DEFAULT_WATCH
 
     def public(self) -> dict[str, Any]:
         """The configuration as stored in every recording."""

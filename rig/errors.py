@@ -62,6 +62,20 @@ class LatchedError(RigError):
     title = "The rig is stopped until a person re-arms it"
 
 
+class LatchChangedError(RigError):
+    """The rig was stopped since who asks has looked: says what the stop is now."""
+
+    code = "latch-changed"
+    title = "The rig was stopped meanwhile"
+
+
+class WithdrawnError(RigError):
+    """What the test was allowed on is no longer so: it does not begin."""
+
+    code = "withdrawn"
+    title = "The test was withdrawn"
+
+
 class UncertainError(RigError):
     """Started after a crash during a test, and no person has re-armed yet."""
 

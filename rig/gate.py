@@ -63,7 +63,8 @@ class Gate:
         self._clock = clock
         self._on_fault = on_fault
         self._journal: Journal | None = None
-        self._passing = False
+        self.is_open = False
+        """Whether a test may send pulses now."""
         self._table: dict[str, Limit] = {}
         self.on_its_way: OnItsWay | None = None
         self._recent: deque[tuple[float, float]] = deque()
@@ -78,11 +79,6 @@ class Gate:
         self.late: list[tuple[int, float]] = []
         """Indices of the pulses that were written more than `LATE_S` late, and by how much, s."""
         stimulator.listen(self._acknowledged, on_lost)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether a test may send pulses now."""
-        return self._passing
 
     async def identify(self) -> dict[str, object]:
         """Open the line and ask the device for its identity. Raises DeviceError."""
@@ -111,7 +107,7 @@ class Gate:
         self._table = table
         self.on_its_way = None  # the device has answered since, so the line is empty
         self._journal = journal
-        self._passing = not halted()
+        self.is_open = not halted()
 
     def fire(self, index: int, pulse: Pulse, due_s: float, latest_s: float) -> PulseStatus:
         """Let one pulse through, or record why not.
@@ -129,7 +125,7 @@ class Gate:
             No pulse may follow. The caller must stop the test.
         """
         journal = self._journal
-        if journal is None or not self._passing:
+        if journal is None or not self.is_open:
             return PulseStatus.REFUSED
         if pulse.pulse_width_us == 0:
             return PulseStatus.REST
@@ -151,16 +147,16 @@ class Gate:
 
     def feed(self) -> None:
         """Feed the device's watchdog after a health check; does nothing unless a test runs. Raises DeviceError."""
-        if self._passing:
+        if self.is_open:
             self._stimulator.feed()
 
     def shut(self) -> None:
         """Write nothing more to the line. A pulse that it already holds stays in `on_its_way`."""
-        self._passing = False
+        self.is_open = False
 
     def release(self) -> None:
         """Shut, and release the test's journal: later acks are not recorded."""
-        self._passing = False
+        self.is_open = False
         self._journal = None
 
     async def stop(self) -> None:
@@ -241,7 +237,7 @@ class Gate:
 
     def _acknowledged(self, ack: Ack) -> None:
         pulse, index = self.on_its_way, -1
-        unasked = ack.number >= 0 and ack.error is None and self._passing
+        unasked = ack.number >= 0 and ack.error is None and self.is_open
         if pulse is not None and pulse.number == ack.number:
             index, unasked = pulse.index, False
             self._settle(pulse, ack)

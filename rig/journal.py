@@ -89,9 +89,7 @@ class LaidBlock:
 
     def described(self) -> dict[str, Any]:
         """All but the widths."""
-        return {
-            **self.segment._asdict(), "sequence": self.sequence, "settings": self.settings, "time_s": self.time_s
-        }  # fmt: skip
+        return {**self.segment._asdict(), "sequence": self.sequence, "settings": self.settings, "time_s": self.time_s}
 
     def to_bytes(self) -> bytes:
         """Payload of a `Kind.LAID` block."""

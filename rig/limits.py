@@ -13,9 +13,6 @@ from rig.errors import RefusedError
 from rig.messages import PASSIVE, Bound, Profile, TestPlan
 from rig.signals import Pulse
 
-STEP_PULSE_WIDTH_US = 1.0
-STEP_CURRENT_MA = 0.5
-
 
 @dataclass(frozen=True, slots=True)
 class Limit:
@@ -143,9 +140,9 @@ HARD_LIMITS: dict[str, Limit] = {
 class Steps:
     """A stimulator's resolution: pulses are rounded toward zero to it; below `shortest_us` nothing is sent."""
 
-    pulse_width_us: float = STEP_PULSE_WIDTH_US
-    current_ma: float = STEP_CURRENT_MA
-    shortest_us: float = STEP_PULSE_WIDTH_US
+    pulse_width_us: float = 1.0
+    current_ma: float = 0.5
+    shortest_us: float = 1.0
 
     def width_us(self, asked_us: float) -> int:
         """Width that is sent for the width asked for, µs; 0: no pulse."""
@@ -162,26 +159,18 @@ FINEST = Steps()
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a pulse was not admitted: the limit, the value, the bounds, and who set them."""
+    """Why a pulse was not admitted."""
 
-    limit: str
+    limit: Limit
     value: float
-    lo: float
-    hi: float
-    unit: str
-    owner: str
-    reason: str
 
     def __str__(self) -> str:
-        if math.isfinite(self.value) and self.value > self.hi:
-            by = f", over by {self.value - self.hi:g}"
-        elif math.isfinite(self.value):
-            by = f", under by {self.lo - self.value:g}"
-        else:
-            by = ""
+        row, by = self.limit, ""
+        if math.isfinite(self.value):
+            above = self.value > row.hi
+            by = f", over by {self.value - row.hi:g}" if above else f", under by {row.lo - self.value:g}"
         return (
-            f"{self.limit} {self.value:g} {self.unit} is outside {self.lo:g} … {self.hi:g} "
-            f"({self.owner}{by}): {self.reason}"
+            f"{row.name} {self.value:g} {row.unit} is outside {row.lo:g} … {row.hi:g} ({row.owner}{by}): {row.reason}"
         )
 
 
@@ -217,8 +206,15 @@ def bounds(table: dict[str, Limit]) -> dict[str, Bound]:
 def check(limit: Limit, value: float) -> Refusal | None:
     """None if `value` is within the limit, else the refusal. A NaN is refused."""
     if not (limit.lo <= value <= limit.hi):
-        return Refusal(limit.name, value, limit.lo, limit.hi, limit.unit, limit.owner, limit.reason)
+        return Refusal(limit, value)
     return None
+
+
+def refuse(limit: Limit, value: float, place: str) -> None:
+    """Raise RefusedError, with its place, unless `value` is within the limit."""
+    refusal = check(limit, value)
+    if refusal is not None:
+        raise RefusedError(f"{place}: {refusal}")
 
 
 def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: float | None = None) -> dict[str, Limit]:
@@ -242,12 +238,7 @@ def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: flo
 
 def at_least(table: dict[str, Limit], name: str, lo: float, owner: str) -> dict[str, Limit]:
     """The table with one row's lower bound raised, never lowered. Raises RefusedError if it is not a number."""
-    row = table[name]
-    if not (lo <= row.hi):
-        raise RefusedError(f"{owner}: {name} {lo:g} {row.unit} must be at most {row.hi:g} {row.unit}")
-    if lo <= row.lo:
-        return table
-    return {**table, name: replace(row, lo=lo, owner=owner)}
+    return tightened(table, name, math.inf, owner, lo)
 
 
 def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "participant's profile") -> dict[str, Limit]:
@@ -260,14 +251,19 @@ def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "partici
     """
     table = tightened(table, "pulse_width_us", profile.max_pulse_width_us, owner)
     table = tightened(table, "current_ma", profile.current_ma, owner)
-    if not (profile.max_torque_nm > 0):
-        raise RefusedError(f"{owner}: max_torque_nm {profile.max_torque_nm:g} N·m must be above 0")
+    table = _for_torque(table, profile.max_torque_nm, owner)
     if profile.angle_range_rad is not None:
         lo_rad, hi_rad = profile.angle_range_rad
         table = tightened(table, "angle_rad", hi_rad, owner, lo_rad)
     if profile.rest_between_tests_s is not None:
         table = at_least(table, "rest_between_tests_s", profile.rest_between_tests_s, owner)
-    return tightened(table, "torque_nm", profile.max_torque_nm, owner, lo=-profile.max_torque_nm)
+    return table
+
+
+def _for_torque(table: dict[str, Limit], max_torque_nm: float, owner: str) -> dict[str, Limit]:
+    if not (max_torque_nm > 0):
+        raise RefusedError(f"{owner}: max_torque_nm {max_torque_nm:g} N·m must be above 0")
+    return tightened(table, "torque_nm", max_torque_nm, owner, lo=-max_torque_nm)
 
 
 def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
@@ -283,9 +279,7 @@ def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
     if request.max_pulse_width_us is not None:
         table = tightened(table, "pulse_width_us", request.max_pulse_width_us, owner)
     if request.max_torque_nm is not None:
-        if not (request.max_torque_nm > 0):
-            raise RefusedError(f"{owner}: max_torque_nm {request.max_torque_nm:g} N·m must be above 0")
-        table = tightened(table, "torque_nm", request.max_torque_nm, owner, lo=-request.max_torque_nm)
+        table = _for_torque(table, request.max_torque_nm, owner)
     if request.angle is not None:
         lo_rad, hi_rad = request.angle.range_rad
         table = tightened(table, "angle_rad", hi_rad, owner, lo_rad)

@@ -85,6 +85,11 @@ class Profile(Message):
     angle_range_rad: Range | None = Field(
         default=None, description="joint angles that are comfortable today, rad; elbow: 0 is straight, flexion positive"
     )
+    angle_set_at_utc: str | None = Field(
+        default=None,
+        description="`set_at_utc` of the `AngleCalibration` under which that range was said; None: there was none. A "
+        "test with an angle is refused once the sensor was calibrated anew",
+    )
 
 
 class AnglePlan(Message):
@@ -214,6 +219,21 @@ class EnoughRequest(Message):
     at_once: bool = Field(default=False, description="at the next pulse; else where the segment that plays ends")
 
 
+class WithdrawRequest(Message):
+    """What a test was allowed on is no longer so: it plays no pulse, and nothing latches. Reply: `Withdrawn`.
+
+    It waits for nothing, and holds for a test that the rig has not heard of yet: its start is refused (`withdrawn`).
+    """
+
+    kind: Literal["withdraw"] = "withdraw"
+    id: int = 0
+    test_id: str
+    reason: str
+    begun: bool = Field(
+        default=False, description="end it also after its first pulse; else one that has begun plays on"
+    )
+
+
 class StopRequest(Message):
     kind: Literal["stop"] = "stop"
     id: int = 0
@@ -222,9 +242,12 @@ class StopRequest(Message):
 
 
 class RearmRequest(Message):
+    """A person has looked. Refused with `latch-changed` unless `latch` is what the status tells now."""
+
     kind: Literal["rearm"] = "rearm"
     id: int = 0
     by: str
+    latch: str = Field(description="`Status.latch` that the person was shown")
 
 
 class CalibrateStartRequest(Message):
@@ -270,12 +293,25 @@ class CalibrateMarkRequest(Message):
 
 
 class CalibrateFinishRequest(Message):
-    """Close the calibration. Reply: `CalibrationResult`, with the profile unless `discard`."""
+    """Close the calibration. Reply: `CalibrationResult`, with the profile unless `discard`.
+
+    The result waits in `Status.calibrated` until it is stored (`CalibrateStoredRequest`), discarded, or its day ends.
+    Finishing that calibration again gives it again.
+    """
 
     kind: Literal["calibrate-finish"] = "calibrate-finish"
     id: int = 0
     by: str
     discard: bool = False
+    calibration_id: str = Field(default="", description="refused if another one is open; empty: whichever is open")
+
+
+class CalibrateStoredRequest(Message):
+    """The result of a calibration is stored: the rig lets it go, if it still waits. Reply: `Status`."""
+
+    kind: Literal["calibrate-stored"] = "calibrate-stored"
+    id: int = 0
+    calibration_id: str
 
 
 class AnglePoseRequest(Message):
@@ -300,12 +336,14 @@ Request = Annotated[
     | StartRequest
     | ExtendRequest
     | EnoughRequest
+    | WithdrawRequest
     | StopRequest
     | RearmRequest
     | CalibrateStartRequest
     | CalibrateStepRequest
     | CalibrateMarkRequest
     | CalibrateFinishRequest
+    | CalibrateStoredRequest
     | AnglePoseRequest,
     Field(discriminator="kind"),
 ]
@@ -315,7 +353,8 @@ class Problem(Message):
     """Why a request was refused. `code` is stable; the text is for people and says how to correct it."""
 
     code: str = Field(
-        description="busy, late, latched, uncertain, refused, rest-needed, bad-plan, disconnected, internal, …"
+        description="busy, late, latched, latch-changed, withdrawn, uncertain, refused, rest-needed, bad-plan, "
+        "disconnected, internal, …"
     )
     title: str
     detail: str
@@ -326,9 +365,9 @@ class Reply(Message):
     ok: bool
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
-    """status, subscribe, start, rearm, calibrate-start, -step and -mark, angle_pose: a `Status`; preview: a `Preview`;
-    sequences: a `Sequences`; stop: a `StopEvidence`; calibrate-finish: a `CalibrationResult`; extend and enough: an
-    `Extended`."""
+    """status, subscribe, start, rearm, calibrate-start, -step, -mark and -stored, angle_pose: a `Status`; preview: a
+    `Preview`; sequences: a `Sequences`; stop: a `StopEvidence`; withdraw: a `Withdrawn`; calibrate-finish: a
+    `CalibrationResult`; extend and enough: an `Extended`."""
 
 
 class CalibrationTrain(Message):
@@ -368,6 +407,15 @@ class CalibrationStatus(Message):
 class CalibrationResult(Message):
     profile: Profile | None = Field(None, description="valid until the end of the day; None: discarded")
     recordings: list[str] = Field(default_factory=list, description="one sealed recording per train")
+
+
+class Calibrated(Message):
+    """A calibration that is finished, and whose result waits to be stored."""
+
+    calibration_id: str
+    participant: str
+    by: str = Field(description="who began it")
+    result: CalibrationResult
 
 
 class Bound(Message):
@@ -413,7 +461,10 @@ class AngleStatus(Message):
 
 class Status(Message):
     state: RigState
-    reason: str = Field("", description="why the rig is latched, uncertain or disconnected")
+    reason: str = Field(
+        "", description="why the rig is latched, uncertain or disconnected; after several stops the newest first"
+    )
+    latch: str = Field("", description="changes with each stop, fault and lost device; a re-arm must give it back")
     test_id: str | None = None
     participant: str | None = None
     segment: str | None = None
@@ -425,6 +476,7 @@ class Status(Message):
     torque_nm: float | None = None
     angle: AngleStatus = Field(default_factory=AngleStatus)
     calibration: CalibrationStatus | None = Field(None, description="while a guided calibration is open")
+    calibrated: Calibrated | None = Field(None, description="newest result, until a client has stored it")
     limits: dict[str, Bound] = Field(default_factory=dict, description="limits of this rig by name")
     require_calibration: bool | None = Field(None, description="None: unknown")
     finished: FinishedEvent | None = Field(
@@ -476,6 +528,10 @@ class StopEvidence(Message):
     pulse_may_follow: bool = Field(
         default=False, description="a pulse sent before the stop was not acknowledged and may still be felt"
     )
+
+
+class Withdrawn(Message):
+    withdrawn: bool = Field(description="False: it has sent a pulse already, or is over; nothing was done")
 
 
 class LaidSegment(Message):
@@ -573,7 +629,8 @@ class FinishedEvent(Message):
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
         "ack_delay_ms {median, p99, max}, charge_uc, torque_time_nms, ended_by, alignment {method, error_ms}, "
         "sample_rate_hz, torque_peak_nm, angle (with a sensor: samples, lost_samples, range_rad, error_ms), "
-        "cpu_percent, warnings (sentences for people about possible errors)",
+        "cpu_percent, of a test whose process died dose_is_bound (true: charge_uc, duration_s and pulses may be too "
+        "high, never too low) and doubtful_pulses, warnings (sentences for people about possible errors)",
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rig import sequences
 from rig.errors import PlanError, RefusedError
-from rig.limits import Limit, Refusal, admit, check
+from rig.limits import Limit, Refusal, admit, refuse
 from rig.messages import SAFE_END_S, SegmentPlan, TestPlan
 from rig.signals import Pulse
 
@@ -64,7 +64,7 @@ def build(chosen: Sequence[SegmentPlan], plan: TestPlan, longest: Limit, before:
             if count < 1:
                 raise PlanError(f"too short for one pulse at {plan.pulse_rate_hz:g} pulses/s; lengthen it")
         reached += count
-        refuse(check(longest, reached / plan.pulse_rate_hz), f"plan, up to segment {number}")
+        refuse(longest, reached / plan.pulse_rate_hz, f"plan, up to segment {number}")
     return tuple(_built(number, segment, plan) for number, segment in enumerate(chosen, start=1))
 
 
@@ -115,10 +115,10 @@ def check_all(
     window = min(max(1, round(rate_hz)), whole)
     charge_uc = np.concatenate([before_us[max(0, len(before_us) - window + 1) :], added_us]) * current_ma * 1e-3
     worst_uc = float(np.max(np.convolve(charge_uc, np.ones(window), "valid")))
-    refuse(check(table["charge_per_second_uc"], worst_uc), "plan")
+    refuse(table["charge_per_second_uc"], worst_uc, "plan")
     whole_uc = sequences.dose_uc(before_us, current_ma) + sequences.dose_uc(added_us, current_ma)
-    refuse(check(table["charge_per_test_uc"], whole_uc), "plan")
-    refuse(check(table["duration_s"], whole / rate_hz), "plan")
+    refuse(table["charge_per_test_uc"], whole_uc, "plan")
+    refuse(table["duration_s"], whole / rate_hz, "plan")
     last_us = float(before_us[-1]) if len(before_us) else 0.0
     for piece in pieces:
         _check_rise(piece, last_us, table)
@@ -140,7 +140,7 @@ def _check_rise(piece: Piece, before_us: float, table: dict[str, Limit]) -> None
         return
     rises_us = np.diff(piece.pulse_width_us, prepend=before_us)
     first = int(np.argmax(rises_us))
-    refuse(check(table["width_rise_us"], float(rises_us[first])), f"segment {piece.of.name}, pulse {first + 1}")
+    refuse(table["width_rise_us"], float(rises_us[first]), f"segment {piece.of.name}, pulse {first + 1}")
 
 
 def safe_end(widths_us: NDArray[np.float64], pulse_rate_hz: float) -> int:
@@ -148,9 +148,3 @@ def safe_end(widths_us: NDArray[np.float64], pulse_rate_hz: float) -> int:
     played = np.flatnonzero(widths_us)
     resting = len(widths_us) - (int(played[-1]) + 1 if len(played) else 0)
     return max(0, round(SAFE_END_S * pulse_rate_hz) - resting)
-
-
-def refuse(refusal: Refusal | None, place: str) -> None:
-    """Raise the refusal, if there is one, with its place."""
-    if refusal is not None:
-        raise RefusedError(f"{place}: {refusal}")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rig import pieces, protocols, sequences
 from rig.errors import PlanError
-from rig.limits import Limit, Steps, check
+from rig.limits import Limit, Steps, refuse
 from rig.messages import HELD, MOVING, PASSIVE, Preview, ProtocolInfo, RecruitmentTable, Sequences, TestPlan
 from rig.pieces import MAX_SEGMENTS, MAX_WIDTH_SETTING, Piece
 
@@ -105,7 +105,7 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     RefusedError
         The plan would break a limit: names the limit, the pulse and the excess.
     """
-    pieces.refuse(check(table["pulse_rate_hz"], plan.pulse_rate_hz), "plan")
+    refuse(table["pulse_rate_hz"], plan.pulse_rate_hz, "plan")
     _check_angle(plan, table)
     chosen = plan.segments
     if chosen is None:
@@ -119,7 +119,9 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     widths_us = np.concatenate([piece.pulse_width_us for piece in built])
     longest_s = len(widths_us) / plan.pulse_rate_hz
     if plan.adaptive is not None:
-        _check_end(widths_us, plan, table)
+        # it plays if nobody extends: it must fit into its bounds with its safe end
+        whole = len(widths_us) + pieces.safe_end(widths_us, plan.pulse_rate_hz)
+        refuse(table["duration_s"], whole / plan.pulse_rate_hz, "plan, with its safe end")
         longest_s = table["duration_s"].hi
     return PlannedTest(plan, widths_us, laid_out(built), built, longest_s)
 
@@ -134,13 +136,7 @@ def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:
     if plan.kind == HELD and target_rad is None:
         raise PlanError("plan.angle.target_rad: a held test needs the angle at which the joint is held")
     if target_rad is not None:
-        pieces.refuse(check(table["angle_rad"], target_rad), "plan.angle.target_rad")
-
-
-def _check_end(widths_us: NDArray[np.float64], plan: TestPlan, table: dict[str, Limit]) -> None:
-    """The fixed plan of an adaptive test must fit into its bounds with its safe end: it plays if nobody extends."""
-    whole = len(widths_us) + pieces.safe_end(widths_us, plan.pulse_rate_hz)
-    pieces.refuse(check(table["duration_s"], whole / plan.pulse_rate_hz), "plan, with its safe end")
+        refuse(table["angle_rad"], target_rad, "plan.angle.target_rad")
 
 
 def laid_out(built: Sequence[Piece]) -> tuple[PlannedSegment, ...]:

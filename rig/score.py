@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rig import journal as jn
 from rig import pieces
 from rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from rig.journal import Journal, Kind
-from rig.laid import Laid
-from rig.limits import Limit, check, tightened
+from rig.limits import Limit, refuse, tightened
 from rig.messages import AHEAD, Extended, LaidSegment, SegmentPlan
 from rig.pieces import Piece
 from rig.plan import PlannedTest
@@ -30,6 +31,33 @@ MAX_CHECKED = 20
 """Extensions that are checked while the test plays towards one boundary; each takes time beside the sender."""
 MAX_NAME = 60
 SAFE_END = SegmentPlan(name="rest", sequence="rest", settings={})
+
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """Everything that is laid: widths in µs and whether each may jump there, shape (n,), and the segments."""
+
+    pulse_width_us: NDArray[np.float64]
+    jumps: NDArray[np.bool_]
+    segments: tuple[jn.Segment, ...]
+
+    def __len__(self) -> int:
+        return len(self.pulse_width_us)
+
+    def cut(self, end: int) -> Laid:
+        """The part before pulse `end`."""
+        kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
+        return Laid(self.pulse_width_us[:end], self.jumps[:end], tuple(kept))
+
+    def with_piece(self, piece: Piece, by: jn.LaidBy) -> Laid:
+        """It, and a piece after it."""
+        end = len(self) + len(piece.pulse_width_us)
+        added = jn.Segment(piece.of.name, len(self), end, by)
+        return Laid(
+            np.concatenate([self.pulse_width_us, piece.pulse_width_us]),
+            np.concatenate([self.jumps, np.full(len(piece.pulse_width_us), piece.jumps)]),
+            (*self.segments, added),
+        )
 
 
 class Score:
@@ -192,11 +220,6 @@ class Score:
 
     def _built_and_checked(self, laid: Laid, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
         """Behind what is laid; changes nothing, since it runs beside the sender."""
-        built = self._built(laid, chosen)
-        self._check(laid, built)
-        return built
-
-    def _built(self, laid: Laid, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
         before = len(laid)
         most = min(MAX_EXTENSION_SEGMENTS, pieces.MAX_SEGMENTS - len(laid.segments) - len(self._fixed) - 1)
         if not (1 <= len(chosen) <= most):
@@ -206,7 +229,9 @@ class Score:
                 raise PlanError(f"extend.segments: name {number} must have 1 to {MAX_NAME} printable characters")
         longest_s = before / self.plan.pulse_rate_hz + MAX_EXTENSION_S
         table = tightened(self._table, "duration_s", longest_s, f"at most {MAX_EXTENSION_S:g} s an extension")
-        return pieces.build(chosen, self.plan, table["duration_s"], before)
+        built = pieces.build(chosen, self.plan, table["duration_s"], before)
+        self._check(laid, built)
+        return built
 
     def _check(self, laid: Laid, added: Sequence[Piece]) -> None:
         """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
@@ -215,7 +240,7 @@ class Score:
         whole_us = np.concatenate([before_us, *(piece.pulse_width_us for piece in added)])
         rate_hz = self.plan.pulse_rate_hz
         whole_s = (len(whole_us) + pieces.safe_end(whole_us, rate_hz)) / rate_hz
-        pieces.refuse(check(self._table["duration_s"], whole_s), "plan, with its safe end")
+        refuse(self._table["duration_s"], whole_s, "plan, with its safe end")
 
     def _go_on(self) -> None:
         """Lay the fixed plan's next segment, or end."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -59,18 +59,6 @@ SAMPLE = np.dtype(
 cell's counter (raw from a device, unwrapped after the receiver; −1: none), sync line (255: none)."""
 
 
-@dataclass(frozen=True, slots=True)
-class TorqueBlock:
-    """Torque samples in the order of arrival, dtype `SAMPLE`, shape (n,); n may be 0."""
-
-    samples: NDArray[np.void]
-    malformed: int = 0
-    error_frames: int = 0
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-
 ANGLE_SAMPLE = np.dtype(
     [
         ("host_time_s", "<f8"),
@@ -82,12 +70,14 @@ ANGLE_SAMPLE = np.dtype(
     ]
 )
 """One angle sample: as `SAMPLE`, with the sensor's own value, the joint's angle in rad (from a device by the rig file,
-after the receiver by the calibration), and its fault bit (255: none)."""
+after the receiver by the calibration), and whether it reports a fault (0: no; 255: it has no such word;
+everything else: it does)."""
+TRUSTED = 0, 255
 
 
 @dataclass(frozen=True, slots=True)
-class AngleBlock:
-    """Angle samples in the order of arrival, dtype `ANGLE_SAMPLE`, shape (n,); n may be 0."""
+class Block:
+    """Samples in the order of arrival, dtype `SAMPLE` or `ANGLE_SAMPLE`, shape (n,); n may be 0."""
 
     samples: NDArray[np.void]
     malformed: int = 0
@@ -120,4 +110,3 @@ class Recorded:
     disordered_samples: int = 0
     malformed_frames: int = 0
     error_frames: int = 0
-    gaps: list[tuple[int, int]] = field(default_factory=list)

@@ -17,6 +17,11 @@ from rig.errors import BusyError, DeviceError, LatchedError, RigError, Uncertain
 from rig.messages import RigState
 
 BUSY: tuple[RigState, ...] = ("arming", "running", "sealing", "stopping")
+STOPPED: tuple[RigState, ...] = ("latched", "uncertain")
+BEFORE = "; before: "
+"""Between the reasons of several stops, the newest first."""
+LONGEST_REASON = 2000
+"""Characters that are kept of all of them: the newest stop's words are never cut."""
 
 
 class TransitionError(RigError):
@@ -36,6 +41,11 @@ class Trial:
     calibrating: bool = False
 
     @property
+    def told(self) -> str:
+        """Why it is stopped, and which device is gone, in words."""
+        return self.reason if self.lost in self.reason else f"{self.reason}; {self.lost}".lstrip("; ")
+
+    @property
     def busy(self) -> bool:
         """Whether a test is in progress: its devices and files are in use."""
         return self.state in BUSY
@@ -51,7 +61,7 @@ class Trial:
 
     def disconnected(self, reason: str) -> Trial:
         """A device is gone: takes effect at once when idle, else after the test; a latch stays."""
-        if self.busy or self.state in ("latched", "uncertain"):
+        if self.busy or self.state in STOPPED:
             return replace(self, lost=reason)
         return Trial("disconnected", reason)
 
@@ -95,16 +105,23 @@ class Trial:
         return replace(self, state="running")
 
     def halted(self, reason: str) -> Trial:
-        """A stop or a fault, at any time: an idle rig latches at once, also without devices; a test is ended first."""
-        if self.state in ("arming", "running"):
-            return replace(self, state="stopping", reason=reason, latch=True)
-        if self.busy:
-            return replace(self, reason=self.reason or reason, latch=True)
+        """A stop or a fault, at any time: an idle rig latches at once, also without devices; a test is ended first.
+
+        Where it is stopped already, both reasons are told: the later one may be the one that matters.
+        """
         if self.state in ("ready", "calibrating"):
             return Trial("latched", reason)
         if self.state == "disconnected":
             return Trial("latched", reason, lost=self.reason)
-        return self
+        earlier = (one for one in self.reason.split(BEFORE) if one not in ("", reason))
+        all_reasons = BEFORE.join((reason, *earlier))[:LONGEST_REASON]
+        state = "stopping" if self.state in ("arming", "running") else self.state
+        return replace(self, state=state, reason=all_reasons, latch=self.busy)
+
+    def withdrawn(self) -> Trial:
+        """The test is ended without a latch: nothing is wrong."""
+        self._only("arming", "running")
+        return replace(self, state="stopping")
 
     def ended(self) -> Trial:
         """Stimulation is over; the recording is being sealed."""

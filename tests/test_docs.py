@@ -23,7 +23,8 @@ from identify.effects import registry
 from identify.estimation.prepare import prepare
 from identify.paper.table1 import simulate
 from rig import sequences
-from rig.config import LimitSettings, WatchSettings
+from rig.acquire.health import Watch
+from rig.config import LimitSettings
 from rig.limits import HARD_LIMITS
 
 ROOT = Path(__file__).parents[1]
@@ -245,7 +246,7 @@ def test_limits_and_watches_of_the_rig_file() -> None:
         stated = float(limits[name].removeprefix("at least ").split(",")[0].split(" a ")[0].replace(" ", ""))
         assert stated == (HARD_LIMITS[name].lo if at_least else HARD_LIMITS[name].hi), name
     watches = {row[0]: row[1] for row in table(DOCS / "rig-file.md", "## `[watch]`")}
-    assert watches == {name: f"{field.default:g}" for name, field in WatchSettings.model_fields.items()}
+    assert watches == {name: f"{field.default:g}" for name, field in Watch.model_fields.items()}
 
 
 def test_the_method_that_is_shown_works() -> None:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from api.errors import ApiError
+from api.outbox.chain import BEGIN, item_hash
+from api.store.hashes import canonical, digest
 from identify.strict_json import BadJson, parse
 
-GENESIS = "0" * 64
-BEGIN = "begin"
 MOST_ITEMS = 500
 MOST_ITEM_BYTES = 4_000_000
 DEEPEST = 40
 """Brackets within one another, of a batch: an item's body is in its third."""
 LARGEST = 2**53
-HASHED = ("seq", "kind", "key", "sha256", "file", "file_bytes", "at_utc", "previous")
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 ChainId = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
@@ -70,36 +67,11 @@ class HelloIn(_In):
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a chain stands."""
-
-    seq: int = 0
-    hash: str = GENESIS
-
-
-@dataclass(frozen=True)
 class Item:
     """An item whose hashes hold; `text` is its body's canonical text."""
 
     sent: ItemIn
     text: str
-
-
-def canonical(value: Any) -> str:
-    """JSON with sorted keys, no spaces, in UTF-8. Raises ValueError for what has no such text."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    text.encode()
-    return text
-
-
-def digest(text: str) -> str:
-    """SHA-256 of a text."""
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def item_hash(fields: dict[str, Any]) -> str:
-    """The hash that an item must have."""
-    return digest(canonical({name: fields[name] for name in HASHED}))
 
 
 def read(model: type[BaseModel], raw: bytes) -> Any:

@@ -20,6 +20,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from api import owner_only
 from api.centre import warnings, watch
 from api.centre.bucket import Bucket, BucketError
+from api.centre.heads import Heads
 from api.centre.ingest import Ingest
 from api.centre.rigs import Rigs
 from api.centre.settings import CentreSettings
@@ -32,6 +33,7 @@ from api.people.auth import Auth
 from api.people.idle_lock import FLUSH_S, IdleLock
 from api.people.pace import Guesses
 from api.store import Store
+from api.store.secrets import shared
 
 log = logging.getLogger("stimrig.centre")
 MOST_DOWNLOADS, MOST_PUTS, MOST_PUTS_OF_A_RIG = 4, 8, 3
@@ -48,6 +50,7 @@ class Context:
     people: People
     rigs: Rigs
     ingest: Ingest
+    heads: Heads
     bucket: Bucket
     spool: Spool
     versions: Versions
@@ -146,7 +149,7 @@ def build(settings: CentreSettings, clock: Clock | None = None) -> Context:
     drawn = auth.first_administrator(settings.admin_token.get_secret_value() if settings.admin_token else None)
     return Context(
         settings, clock, store, auth, People(store, clock, auth, guesses), Rigs(store, clock, guesses),
-        Ingest(store, clock, int(settings.max_file_mb * 1e6)), bucket,
+        Ingest(store, clock, int(settings.max_file_mb * 1e6)), Heads(store, shared(store, "receipts")), bucket,
         Spool(settings.spool_dir, store, clock, bucket), Versions(store, clock), drawn,
     )  # fmt: skip
 

@@ -8,10 +8,11 @@ from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
 from api.centre import clean, rigs, warnings
-from api.centre.chain import GENESIS, BatchIn, HelloIn, Item, ItemIn, Place, checked
+from api.centre.chain import BatchIn, HelloIn, Item, ItemIn, checked
 from api.centre.project import Projector
 from api.clock import Clock, unix_of
 from api.errors import ApiError
+from api.outbox.chain import NOWHERE, Position
 from api.store import Store
 from api.store.centre_tables import CentreChain, CentreItem, CentreRig
 from api.store.texts import storable
@@ -68,7 +69,7 @@ class Ingest:
         warnings.holds(session, now, row.id, "disk", full, free_gb=round((free or 0) / 1e9, 2))
         warnings.end(session, now, row.id, "unseen")
 
-    def take(self, rig: CentreRig, batch: BatchIn) -> Place:
+    def take(self, rig: CentreRig, batch: BatchIn) -> Position:
         """All items of a batch, or none; where the chain stands then.
 
         Raises
@@ -89,9 +90,9 @@ class Ingest:
                 f"Item {fork.seq} is known with another hash. Begin a new chain.", seq=fork.at.seq, hash=fork.at.hash,
             ) from None  # fmt: skip
 
-    def _take(self, session: Session, rig: CentreRig, chain: str, items: list[Item], now: str) -> Place:
+    def _take(self, session: Session, rig: CentreRig, chain: str, items: list[Item], now: str) -> Position:
         row = session.get(CentreChain, (rig.id, chain))
-        place = Place(row.seq, row.hash) if row else Place()
+        place = Position(row.seq, row.hash) if row else NOWHERE
         begun = place
         new = []
         for item in items:
@@ -105,7 +106,7 @@ class Ingest:
                 raise out_of_order(begun)
             if sent.previous != place.hash or (sent.seq == 1 and sent.key != chain):
                 raise _Forked(sent.seq, begun)
-            place = Place(sent.seq, sent.hash)
+            place = Position(sent.seq, sent.hash)
             new.append(item)
         if not new:
             return place
@@ -139,21 +140,21 @@ class Ingest:
 class _Forked(Exception):
     """An item is known with another hash, or does not follow the one before."""
 
-    def __init__(self, seq: int, at: Place) -> None:
+    def __init__(self, seq: int, at: Position) -> None:
         super().__init__(seq)
         self.seq, self.at = seq, at
 
 
-def out_of_order(place: Place) -> ApiError:
+def out_of_order(place: Position) -> ApiError:
     """409: where to go on from."""
     detail = f"The centre stands at item {place.seq}. Go on with the next one."
     return ApiError(409, "out-of-order", "Items are missing", detail, seq=place.seq, hash=place.hash)
 
 
-def at(session: Session, rig_id: int, chain: str) -> Place:
+def at(session: Session, rig_id: int, chain: str) -> Position:
     """Where a rig's chain stands."""
     row = session.get(CentreChain, (rig_id, chain))
-    return Place(row.seq, row.hash) if row else Place(0, GENESIS)
+    return Position(row.seq, row.hash) if row else NOWHERE
 
 
 def _told(session: Session, rig_id: int, sent: list[ItemIn]) -> set[tuple[str, str, str]]:

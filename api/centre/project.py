@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from api.centre import clean, warnings
+from api.centre import clean, heads, warnings
 from api.centre.chain import Item
 from api.clock import local_day
 from api.store.centre_tables import (
@@ -161,12 +161,11 @@ class Projector:
         return True
 
     def _audit(self, _item: Item, body: dict[str, Any]) -> bool:
-        seq, told = body.get("seq"), body.get("hash")
-        if isinstance(seq, bool) or not isinstance(seq, int) or not 0 <= seq < 2**53 or not isinstance(told, str):
+        if not heads.readable(body):
             return False
-        if seq == self.rig.audit_seq and told[:64] != self.rig.audit_hash:
-            self._tell("audit", str(seq), seq=seq)
-        self.rig.audit_seq, self.rig.audit_hash = seq, clean.text(told, 64)
+        heads.compare(self.session, self.now_utc, self.rig, body)
+        if body["seq"] >= (self.rig.audit_seq or 0):
+            self.rig.audit_seq, self.rig.audit_hash = body["seq"], body["hash"]
         return True
 
     def _want(self, sha256: str, length: int) -> None:

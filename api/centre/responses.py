@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, JsonValue
 
+from api.outbox.receipts import Receipt
 from api.web.responses.base import Document
 
 
@@ -32,6 +33,12 @@ class LackingFilesOut(Document):
     """Files that the centre lacks, oldest first."""
 
     files: list[LackingOut]
+
+
+class HeadsOut(Document):
+    """Heads of the rig's audit trail, as the centre countersigned them, in the order in which they were told."""
+
+    heads: list[Receipt]
 
 
 class PieceOut(Document):

@@ -11,10 +11,11 @@ from starlette.requests import HTTPConnection
 
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
-from api.people.auth import digest, unauthorized
+from api.people.auth import unauthorized
 from api.people.pace import Guesses, place_of
 from api.store import Store, audit
 from api.store.centre_tables import CentreRig
+from api.store.hashes import digest
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,59}")
 KEY_BEGINS = "stimrig_rig_"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-import signal
 import socket
 import sys
 import threading
@@ -17,7 +16,7 @@ from api.centre.postgres import Cluster
 from api.centre.rigs import Rigs
 from api.centre.settings import CentreSettings
 from api.cli.errors import LaunchError
-from api.cli.launcher import Child
+from api.cli.launcher import Child, Ended, Endings
 from api.cli.terminal import say
 from api.client.errors import ServiceError
 from api.client.rest import Client
@@ -28,10 +27,6 @@ RIGS = (("Ward 1", "paper", "P001"), ("Ward 2", "calcium", "P002"))
 """Name, emulated muscle and participant of each rig."""
 BETWEEN_S = 5.0
 WATCH_S = 0.5
-
-
-class Ended(Exception):
-    """Ctrl-C or SIGTERM."""
 
 
 class EmulatedRig:
@@ -84,11 +79,9 @@ def play(folder: Path, port: int) -> None:
     SettingsError
         PostgreSQL is not installed, or cannot be set up.
     """
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _end)
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True, mode=0o711)  # PostgreSQL's user passes through it
-    with contextlib.ExitStack() as stack, contextlib.suppress(Ended):
+    with contextlib.suppress(Ended), Endings(), contextlib.ExitStack() as stack:
         cluster = Cluster(folder / "postgres", free_port())
         stack.callback(cluster.stop)
         say("starting PostgreSQL, the centre and two emulated rigs")
@@ -154,7 +147,3 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
-
-
-def _end(_number: int, _frame: object) -> None:
-    raise Ended

@@ -196,7 +196,8 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "ok", "not there yet; the first start makes it")
         return
     from api.errors import ApiError
-    from api.store import Store, audit
+    from api.outbox import receipts
+    from api.store import Store
     from api.store.tables import AuditEntry
 
     try:
@@ -205,7 +206,7 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "fails", str(error), "restore it from the backup (docs/install.md)")
         return
     entries = store.all(AuditEntry, order=AuditEntry.seq)
-    broken = audit.first_broken(entries)
+    broken = receipts.of_folder(entries, settings.data_dir).first_broken
     store.close()
     if broken is None:
         yield Finding("database", "ok", f"opens; the chain of the audit trail's {len(entries)} entries is complete")

@@ -1,6 +1,8 @@
 """Emulator, rig and service as separate processes that live and die together.
 
-The rig is started again when it dies (it comes up uncertain and waits for a person), the service too.
+The rig is started again when it dies (it comes up uncertain and waits for a person), the service too. From the first
+one on, none outlives the launcher, however it ends: SIGTERM and Ctrl-C end them in order, and the kernel ends those
+that are left when the launcher is no more.
 """
 
 from __future__ import annotations
@@ -15,8 +17,11 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +43,33 @@ STEADY_S = 600.0
 """What ran for so long is started again at once."""
 LIBC = ctypes.CDLL(None, use_errno=True)
 PR_SET_PDEATHSIG = 1
+ENDINGS = (signal.SIGTERM, signal.SIGINT)
+
+
+class Ended(KeyboardInterrupt):
+    """SIGTERM or Ctrl-C: what was started is to end."""
+
+
+class Endings:
+    """Within it SIGTERM and Ctrl-C raise `Ended`, once; further ones do not interrupt the ending."""
+
+    def __init__(self) -> None:
+        self.deaf = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Endings:
+        if threading.current_thread() is threading.main_thread():  # no other one may set what a signal does
+            self._before = {number: signal.signal(number, self._end) for number in ENDINGS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+
+    def _end(self, _number: int, _frame: object) -> None:
+        if not self.deaf:
+            self.deaf = True
+            raise Ended
 
 
 @dataclass
@@ -62,19 +94,7 @@ class Child:
         LaunchError
             It ended instead, or said nothing: its own last line is the message.
         """
-        self._log_start = self.log.stat().st_size if self.log.exists() else 0
-        self.started_s = time.monotonic()
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                self.command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env={**os.environ, **self.environment},
-                start_new_session=True,  # Ctrl-C reaches the launcher only, which ends them in order
-                preexec_fn=die_with_parent,
-            )
-        line = read_line(self.process, READY_S)
+        line = read_line(self._launch(subprocess.PIPE), READY_S)
         try:
             self.ready = json.loads(line)
         except ValueError:
@@ -83,18 +103,28 @@ class Child:
 
     def start_unheard(self) -> None:
         """Start it and wait for nothing; one that cannot be started is found to have ended."""
+        with contextlib.suppress(OSError):
+            self._launch(subprocess.DEVNULL)
+
+    def _launch(self, stdout: int) -> subprocess.Popen[bytes]:
         self.started_s = time.monotonic()
-        with contextlib.suppress(OSError), self.log.open("ab") as log:
+        with self.log.open("ab") as log:
             self._log_start = log.tell()
-            self.process = subprocess.Popen(
-                self.command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=log,
-                env={**os.environ, **self.environment},
-                start_new_session=True,
-                preexec_fn=die_with_parent,
-            )
+            # A signal comes before there is a process, or when it is known: never between.
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
+            try:
+                self.process = subprocess.Popen(
+                    self.command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=stdout,
+                    stderr=log,
+                    env={**os.environ, **self.environment},
+                    start_new_session=True,  # Ctrl-C reaches the launcher only, which ends them in order
+                    preexec_fn=partial(die_with_parent, os.getpid(), mask),
+                )
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        return self.process
 
     def failure(self) -> LaunchError:
         """Why it is not there, in its own words."""
@@ -181,6 +211,7 @@ class Services:
         attach: Path | None = None,
     ) -> None:
         self.settings, self.attached = settings, attach is not None
+        self._endings = Endings()
         owner_only.folder(owner_only.folder(settings.data_dir) / settings.logs_dir.name)
         self.runtime = Path(tempfile.mkdtemp(prefix="stimrig-"))  # a Unix socket's path holds 107 characters only
         self.socket = attach.absolute() if attach else self.runtime / "rig.sock"
@@ -198,15 +229,15 @@ class Services:
         return Child(name, [sys.executable, "-m", *module], self.settings.logs_dir / f"{name}.log")
 
     def __enter__(self) -> Services:
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(self._endings)
+            stack.callback(self.stop)
             self.start()
-        except BaseException:
-            self.stop()
-            raise
+            self._at_the_end = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
+        self._at_the_end.close()
 
     @property
     def emulated(self) -> bool:
@@ -317,6 +348,7 @@ class Services:
 
     def stop(self) -> None:
         """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""
+        self._endings.deaf = True
         self.rig.end(SEAL_S)
         self.api.end()
         if self.outbox is not None:
@@ -328,9 +360,17 @@ class Services:
         shutil.rmtree(self.runtime, ignore_errors=True)
 
 
-def die_with_parent() -> None:
-    """In the child, before it becomes another program: end when the launcher does."""
+def die_with_parent(parent: int, mask: Iterable[int]) -> None:
+    """In the child, before it becomes another program: end when the launcher does, and at once if it has ended.
+
+    Until here a signal would have been taken by the launcher's handler, of which the other program knows nothing.
+    """
+    for number in ENDINGS:
+        signal.signal(number, signal.SIG_DFL)
     LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:
+        os._exit(1)
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def read_line(process: subprocess.Popen[bytes], limit_s: float) -> str:

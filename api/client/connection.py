@@ -3,14 +3,75 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Any, Self
 
 import httpx
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
+from api import decisions
 from api.client.errors import Unreachable, refused
+
+
+class SendsVersions(httpx.Auth):
+    """Sends with each decision the version of what it is made on: the one that was last seen, or that of now.
+
+    A program that has read a participant, a model or the rig, and decides on it, is so refused (409) if that has
+    changed meanwhile. One that has not read it decides on what is there now.
+
+    Parameters
+    ----------
+    headers : dict
+        Sent with each request.
+    """
+
+    requires_response_body = False
+
+    def __init__(self, headers: dict[str, str]) -> None:
+        self._headers, self.seen = headers, dict[str, str]()
+
+    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
+        """As httpx asks for it."""
+        request.headers.update(self._headers)
+        for document in [] if "if-match" in request.headers else self._documents(request):
+            if document not in self.seen:
+                looking = httpx.Request("GET", request.url.copy_with(path=document, query=None), headers=self._headers)
+                self._keep(document, (yield looking))
+            if tag := self.seen.get(document):
+                request.headers["if-match"] = tag
+                break
+        answer = yield request
+        self._keep(request.url.path, answer)
+
+    def _documents(self, request: httpx.Request) -> list[str]:
+        """Whose version may be sent with a request; none: it decides nothing.
+
+        A trial is planned with the participant's model, where that was read; a controller's key reads nothing else.
+        """
+        found = decisions.find(request.method, request.url.path)
+        if found is None:
+            return []
+        decision, names = found
+        if decision.path != "/v1/tests":
+            return [decision.document.format(**names)]
+        try:
+            body = json.loads(request.read())
+            person = decision.document.format(code=body["participant"])
+        except (ValueError, KeyError, TypeError):  # the service says what is wrong with it
+            return []
+        model = f"{person}/model"
+        return [model] if model in self.seen and body.get("kind") == "sequence" else [person, model]
+
+    def _keep(self, path: str, answer: httpx.Response) -> None:
+        if answer.request.method == "GET":
+            self.seen.pop(path, None)
+            if "etag" in answer.headers:  # of a calibration that waits to be stored with a 404, too
+                self.seen[path] = answer.headers["etag"]
+        elif answer.is_success and (path == "/v1/stop" or decisions.find(answer.request.method, path)):
+            about = "/v1/rig" if path == "/v1/stop" else "/".join(path.split("/")[:4])
+            # what was decided on has another version now
+            self.seen = {kept: tag for kept, tag in self.seen.items() if not kept.startswith(about)}
 
 
 class Connection:
@@ -29,7 +90,7 @@ class Connection:
     def __init__(self, url: str, token: str = "", timeout_s: float = 60.0) -> None:
         self.url, self._headers = url.rstrip("/"), {"Authorization": f"Bearer {token}"} if token else {}
         try:
-            self.http = httpx.Client(base_url=self.url, headers=self._headers, timeout=timeout_s)
+            self.http = httpx.Client(base_url=self.url, auth=SendsVersions(self._headers), timeout=timeout_s)
         except httpx.InvalidURL as error:
             raise self._unreachable(error) from error
 

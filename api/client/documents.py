@@ -18,6 +18,7 @@ class Participant(TypedDict):
     created_by: str
     side: Literal["left", "right"] | None
     muscle: str | None
+    placement: str | None
     archived_utc: str | None
 
 

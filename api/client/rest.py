@@ -71,8 +71,9 @@ class Client(Models):
         return self.get(f"/v1/participants/{code}")
 
     def make_participant(
-        self, code: str, profile: dict[str, float] | None = None, side: str | None = None, muscle: str | None = None
-    ) -> Participant:
+        self, code: str, profile: dict[str, float] | None = None, side: str | None = None, muscle: str | None = None,
+        placement: str | None = None,
+    ) -> Participant:  # fmt: skip
         """Make a participant: a code, never a name.
 
         Parameters
@@ -85,15 +86,20 @@ class Client(Models):
             "left" or "right".
         muscle : str, optional
             As "biceps brachii".
+        placement : str, optional
+            Of the electrodes; with side and muscle the site, to which models belong.
         """
-        more = {"profile": profile, "side": side, "muscle": muscle}
+        more = {"profile": profile, "side": side, "muscle": muscle, "placement": placement}
         return self.post(
             "/v1/participants", json={"code": code, **{key: value for key, value in more.items() if value}}
         )
 
-    def set_muscle(self, code: str, side: str | None, muscle: str | None) -> Participant:
-        """Say which side and which muscle is stimulated; refused where a calibration would be lost by it."""
-        return self.request("PUT", f"/v1/participants/{code}/muscle", json={"side": side, "muscle": muscle}).json()
+    def set_muscle(
+        self, code: str, side: str | None, muscle: str | None, placement: str | None = None
+    ) -> Participant:  # fmt: skip
+        """Say which site is stimulated; refused where a calibration would be lost by it."""
+        site = {"side": side, "muscle": muscle, "placement": placement}
+        return self.request("PUT", f"/v1/participants/{code}/muscle", json=site).json()
 
     def archive(self, code: str) -> Participant:
         """Put a participant into the archive: no test starts any more, and nothing is deleted."""

@@ -20,6 +20,7 @@ from api.cohort.handed_on import ERRORS, Days, NoExport, Put, Who, hidden
 from api.cohort.opened import Opened
 from api.cohort.parquet_files import STATUS, record_row, segment_at
 from api.version import software_version
+from identify.records.cells import told
 
 MOST_ROWS = 20_000_000
 EVEN_S = 1e-6
@@ -166,12 +167,12 @@ def events(record: Opened) -> list[dict[str, Any]]:
 
 
 def cell(value: Any) -> str:
-    """A value as BIDS writes it; numbers as short as they can be read back unchanged."""
+    """A value as BIDS writes it; numbers as short as they can be read back unchanged; texts as texts."""
     if value is None or value != value:
         return "n/a"
     if isinstance(value, float):
         return repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
-    return " ".join(str(value).split()) or "n/a"
+    return told(" ".join(str(value).split())) or "n/a"
 
 
 def tsv(columns: Iterable[str], rows: Iterable[dict[str, Any]]) -> Iterator[str]:

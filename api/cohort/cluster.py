@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import logging
 import platform
 import signal
@@ -139,17 +138,7 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 def _keys() -> Any:
-    """Keys for this run alone: whoever reaches an open scheduler's port runs programs as its user.
-
-    Raises
-    ------
-    CohortError
-        They cannot be made.
-    """
-    if importlib.util.find_spec("cryptography") is None:
-        raise CohortError(
-            "Without keys every user of this machine could run programs as you. Make them: pip install cryptography"
-        )
+    """Keys for this run alone: whoever reaches an open scheduler's port runs programs as its user."""
     from distributed.security import Security
 
     return Security.temporary()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
+
+from identify.records.cells import lines
 
 Kind = Literal["text", "number", "integer", "true or false", "time"]
 
@@ -129,12 +129,9 @@ def as_json(title: str) -> str:
 
 def as_csv() -> str:
     """The dictionary as a table, for a spreadsheet."""
-    text = io.StringIO()
     names = [field.name for field in fields(Column)]
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(column) for name in COLUMNS for column in columns(name))
-    return text.getvalue()
+    rows = (asdict(column).values() for name in COLUMNS for column in columns(name))
+    return "".join(lines([names, *rows]))
 
 
 def _described(column: Column) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import os
 import secrets
@@ -10,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import IO
 
@@ -21,6 +21,7 @@ from api.cohort.select import Selection
 from api.cohort.sources import Entry, Source, SourceError
 from identify.errors import IdentifyError
 from identify.records.bounds import LARGEST_FILE_BYTES
+from identify.records.cells import lines
 
 UNKNOWN = "unknown"
 
@@ -187,9 +188,8 @@ class Export:
 
     def _write_errors(self) -> None:
         with self.put(ERRORS) as file:
-            lines = csv.writer(_Text(file), lineterminator="\n")
-            lines.writerow(("address", "kind", "reason"))
-            lines.writerows(self._state.failures())
+            rows = chain([("address", "kind", "reason")], self._state.failures())
+            file.writelines(line.encode("utf-8", "replace") for line in lines(rows))
 
     @contextmanager
     def _on_the_disk(self) -> Iterator[None]:
@@ -200,14 +200,3 @@ class Export:
                 f"{self._state.folder}: {error.strerror or error}; what is done is kept, and the same command goes on "
                 "with it."
             ) from None
-
-
-class _Text:
-    """Takes text, writes UTF-8."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-
-    def write(self, text: str) -> int:
-        """Write a text."""
-        return self._file.write(text.encode("utf-8", "replace"))

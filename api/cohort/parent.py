@@ -19,7 +19,7 @@ from multiprocessing.util import Finalize
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
-from api.cohort.sources import Entry
+from api.cohort.sources import SUFFIXES, Entry
 from api.cohort.tasks import Task
 from api.workers.process import environment
 from identify.strict_json import BadJson, parse
@@ -33,7 +33,6 @@ LONGEST_BYTES, DEEPEST = 16 * 2**20, 20
 """Of an answer: a process that a record has taken over could talk without an end."""
 NO_ANSWER = {"status": "error", "error_kind": "unexpected", "error": "its process gave an answer that cannot be read."}
 PREFIX, LOCK = "stimrig-cohort-", "lock"
-KINDS = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 
 
 class Computing:
@@ -60,7 +59,7 @@ class Computing:
     def compute(self, content: bytes, entry: Entry, task: Task, limit_s: float) -> dict[str, Any]:
         """The row of a record, `{"left_out": True}` where it is not meant; how the process ended is a row, too."""
         suffix = PurePosixPath(entry.name).suffix.lower()
-        file = self._folder / f"record{suffix if suffix in KINDS else ''}"
+        file = self._folder / f"record{suffix if suffix in SUFFIXES else ''}"
         file.write_bytes(content)
         call = {"file": file.name, "name": entry.name, "known": entry.known, "task": asdict(task), "limit_s": limit_s}
         try:

@@ -11,14 +11,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.models import effect_evidence, stored
 from api.models.carried_structure import CarriedStructure
+from api.models.places import Site, site_of_recording
 from api.models.registry import Versions
 from api.settings import Settings
 from api.store import Store, audit, uploads
-from api.store.tables import Analysis, Model, Recording
+from api.store.tables import Analysis, Model, Recording, Test
 from api.workers.pool import Call, Pool
 
 log = logging.getLogger("stimrig.analyses")
@@ -286,11 +290,23 @@ class Analyses:
         stored = asyncio.to_thread(self._store_joined, kept, digest, participant, list(parts))
         return await asyncio.shield(stored)
 
+    def _one_site(self, session: Session, parts: list[str]) -> Site | None:
+        """Where all parts stimulated; 409 where that was not one site."""
+        tests = {test.recording_id: test for test in session.scalars(select(Test).where(Test.recording_id.in_(parts)))}
+        rows = session.scalars(select(Recording).where(Recording.id.in_(parts)))
+        sites = [site_of_recording(row, tests.get(row.id)) for row in rows]
+        if any(site != sites[0] for site in sites):
+            detail = "The recordings were made at different sites; what was learnt at one says nothing of another."
+            raise ApiError(409, "other-site", "These recordings are of several sites", detail)
+        return sites[0]
+
     def _store_joined(self, kept: Path, digest: str, participant: str, parts: list[str]) -> Recording:
         now, identity = self.clock.utc(), kept.stem
         row = Recording(id=identity, participant=participant, path=str(kept), file_sha256=digest, origin="joined")
         row.test_id, row.created_utc = None, now
         with uploads.taken_in(kept), self.store.write() as session:
+            site = self._one_site(session, parts)
+            row.site = None if site is None else list(site)
             session.add(row)
             session.flush()
             audit.write(session, now, "service", "join recordings", identity, parts=parts, sha256=digest)

@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
-from api.store.tables import Test
+from api.store.tables import Participant, Recording, Test
 
-Place = tuple[str | None, str | None, float | None]
-"""Side, muscle, and current, mA; None: not known."""
+Site = tuple[str | None, str | None, str | None]
+"""Side, muscle and where the electrodes are; None: nobody has said. Models, approvals and keys belong to one."""
+Place = tuple[str | None, str | None, str | None, float | None]
+"""A site, and the current, mA; None: not known."""
+
+
+def site_of(row: Participant) -> Site:
+    """Where a participant is stimulated now."""
+    return row.side, row.muscle, row.placement
+
+
+def site_of_recording(recording: Recording, test: Test | None) -> Site | None:
+    """Where a recording's test stimulated; None: it was uploaded before that was kept."""
+    if test is not None:
+        return test.plan.get("side"), test.plan.get("muscle"), test.plan.get("placement")
+    return kept(recording.site)
+
+
+def kept(site: list[str | None] | None) -> Site | None:
+    """A site as it was written down."""
+    return None if site is None else (site[0], site[1], site[2])
+
+
+def in_words(site: Site) -> str:
+    """As a person says it: left biceps brachii."""
+    return " ".join(part for part in site if part) or "a side and muscle that nobody has said"
 
 
 def place_of(row: Test) -> Place:
     """Where a test stimulated, and with what current, mA."""
-    return row.plan.get("side"), row.plan.get("muscle"), row.plan.get("profile", {}).get("current_ma")
+    plan = row.plan
+    return plan.get("side"), plan.get("muscle"), plan.get("placement"), plan.get("profile", {}).get("current_ma")
 
 
 def differ(one: Place, other: Place) -> bool:

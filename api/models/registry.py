@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import select
-from sqlalchemy.orm import defer
+from sqlalchemy.orm import Session, defer
 
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.models import headline, reasons, stored, summary
+from api.models.places import Site, in_words, kept, site_of, site_of_recording
 from api.models.tracking import Limits
-from api.store import Store, audit
-from api.store.tables import Approval, Model
+from api.store import Store, audit, seen
+from api.store.tables import Approval, Model, Participant, Recording, Test
 
 log = logging.getLogger("stimrig.models")
 
@@ -148,12 +149,15 @@ class Versions:
         if row.parent_id is None:
             detail = f"{model_id} is the first version. Reject it instead."
             raise ApiError(409, "nothing-to-undo", "There is no version before this one", detail)
-        holding = self.approved(row.participant)
         words = f"undone: {reason}" if reason else "undone"
-        self.decide(row.id, False, by, words)
         parent = self.get(row.parent_id)
-        if holding is not None and holding.model_id == row.id and self.quality(parent)["verdict"] not in reasons.POOR:
-            self.decide(parent.id, True, by, words, Limits(**holding.tracking) if holding.tracking else None)
+        with self.store.write() as session:
+            seen.check(session, seen.decisions(row.participant))
+            holding = self.approved(row.participant)
+            self._decide(session, row, False, by, words)
+            usable = self.quality(parent)["verdict"] not in reasons.POOR
+            if holding is not None and holding.model_id == row.id and usable:
+                self._decide(session, parent, True, by, words, holding.tracking)
         return parent
 
     def decide(self, model_id: str, approved: bool, by: str, reason: str, tracking: Limits | None = None) -> Approval:
@@ -168,21 +172,49 @@ class Versions:
         ------
         ApiError
             422: it is not usable, and nobody says why the controller may have it all the same. 500: it is damaged.
+            409: another decision came since it was shown, or it was measured at another site than the present one.
         """
         row = self.get(model_id)
         if approved:
             stored.whole(row)
             reasons.refuse_without(self.quality(row)["verdict"], reason)
+        with self.store.write() as session:
+            if approved:  # a rejection only takes away
+                seen.check(session, seen.decisions(row.participant))
+            return self._decide(session, row, approved, by, reason, tracking.to_dict() if tracking else None)
+
+    def _decide(
+        self, session: Session, row: Model, approved: bool, by: str, reason: str,
+        tracking: dict[str, float] | None = None,
+    ) -> Approval:  # fmt: skip
+        """Write a decision and its entry, with what the person was shown of the model."""
         now = self.clock.utc()
         decision = Approval(model_id=row.id, participant=row.participant, approved=approved, reason=reason)
         decision.by, decision.at_utc = by, now
+        decision.site = list(self._site(session, row, approved))
         decision.expires_utc = self.clock.end_of_day_utc() if approved else None
-        decision.tracking = tracking.to_dict() if approved and tracking else None
-        allowed = {"tracking": decision.tracking} if decision.tracking else {}
-        with self.store.write() as session:
-            session.add(decision)
-            audit.write(session, now, by, "approve" if approved else "reject", row.id, reason=reason, **allowed)
+        decision.tracking = tracking if approved else None
+        session.add(decision)
+        shown = {name: value for name, value in row.fit.items() if name != "figures"}
+        detail: dict[str, Any] = {"reason": reason, "shown": {**shown, **self.quality(row)}}
+        detail |= {"tracking": decision.tracking} if decision.tracking else {}
+        audit.write(session, now, by, "approve" if approved else "reject", row.id, **detail)
         return decision
+
+    def _site(self, session: Session, row: Model, approved: bool) -> Site:
+        """The participant's site; 409 where a model is to be approved that was measured at another one."""
+        participant, recording = session.get(Participant, row.participant), session.get(Recording, row.recording_id)
+        assert participant is not None and recording is not None
+        here = site_of(participant)
+        test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
+        there = site_of_recording(recording, test)
+        if approved and there not in (None, here):
+            detail = (
+                f"{row.id} was measured at {in_words(there)}. {row.participant} is now stimulated at {in_words(here)}. "
+                "Test anew there, or set the site back on the participant's page. Nothing was decided."
+            )
+            raise ApiError(409, "other-site", "This model is of another site", detail)
+        return here
 
     def decision(self, model_id: str) -> Approval | None:
         """The newest decision on a version."""
@@ -213,10 +245,12 @@ class Versions:
         rejected: set[str] = set()
         newest: dict[str, Approval] = {}
         with self.store.read() as session:
+            of = session.scalars(select(Participant).where(Participant.code.in_(participants)))
+            sites = {row.code: site_of(row) for row in of}
             for decision in session.scalars(query):
                 if not decision.approved:
                     rejected.add(decision.model_id)
-                elif decision.model_id not in rejected:
+                elif decision.model_id not in rejected and kept(decision.site) == sites[decision.participant]:
                     newest.setdefault(decision.participant, decision)
         return newest
 

@@ -7,8 +7,10 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from api.outbox.chain import GENESIS, Position
+from api.outbox.chain import Position
 from api.outbox.errors import WrongAnswerError
+from api.outbox.receipts import Receipt
+from api.store.hashes import GENESIS
 
 SHA256 = re.compile(r"[0-9a-f]{64}")
 LONGEST_TEXT = 200
@@ -59,6 +61,17 @@ def wanted(found: dict[str, Any], limit: int) -> list[Wanted]:
     return [
         Wanted(hash_of(each, "sha256"), whole_number(each, "bytes"), whole_number(each, "have_bytes")) for each in files
     ]
+
+
+def receipts(found: dict[str, Any]) -> list[Receipt]:
+    """`heads`: what it countersigned."""
+    try:
+        given = [Receipt.model_validate(each) for each in found["heads"]]
+    except (KeyError, TypeError, ValueError):
+        raise WrongAnswerError("the answer's `heads` are no receipts") from None
+    if not all(one.key and one.holds for one in given):
+        raise WrongAnswerError("the answer's `heads` are not as the centre signed them")
+    return given
 
 
 def progress(found: dict[str, Any]) -> Progress:

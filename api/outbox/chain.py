@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import secrets
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,9 +10,9 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from api.store.hashes import GENESIS, canonical, digest
 from api.store.tables import OutboxItem
 
-GENESIS = "0" * 64
 BEGIN = "begin"
 HASHED = ("seq", "kind", "key", "sha256", "file", "file_bytes", "at_utc", "previous")
 AT_ONCE = 200
@@ -62,16 +60,6 @@ class Telling:
     body: dict[str, Any]
     file: str | None = None
     file_bytes: int | None = None
-
-
-def canonical(value: Any) -> str:
-    """JSON with sorted keys and no spaces: what is hashed."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-
-
-def digest(text: str) -> str:
-    """SHA-256 of a text."""
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def item_hash(fields: dict[str, Any]) -> str:

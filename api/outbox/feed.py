@@ -52,13 +52,9 @@ class Feed:
 
 
 def told(rows: Iterable[Table]) -> Iterator[Telling]:
-    """What is told of a transaction's rows; of the audit trail its newest entry."""
+    """What is told of a transaction's rows."""
     order = list(items.TABLES)
-    rows = sorted(rows, key=lambda row: order.index(type(row)))
-    entries = [row.seq for row in rows if isinstance(row, AuditEntry)]
-    for row in rows:
-        if isinstance(row, AuditEntry) and row.seq != max(entries):
-            continue
+    for row in sorted(rows, key=lambda row: (order.index(type(row)), row.seq if isinstance(row, AuditEntry) else 0)):
         try:
             telling = items.telling(row)
         except UNTELLABLE:  # a row that cannot be told keeps nobody from working

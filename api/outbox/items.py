@@ -1,7 +1,7 @@
 """What a centre is told of a row: codes and figures.
 
 What a person typed freely stays at the rig: notes, and the reason of a decision. So do paths. The audit trail stays,
-too; the centre gets the hash of its newest entry, by which it can be told later whether the trail was changed.
+too; the centre gets the hash of each entry, by which it can be told later whether the trail was changed.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from api.outbox.chain import Telling, canonical
+from api.outbox.chain import Telling
 from api.store import uploads
+from api.store.hashes import canonical
 from api.store.tables import OPEN_STATES, Approval, AuditEntry, Model, Participant, Recording, Table, Test, Tracked
 
 TABLES: dict[type[Table], str] = {
@@ -38,12 +39,12 @@ def telling(row: Table) -> Telling | None:
     if isinstance(row, Model | Tracked):
         return _with_document(row)
     if isinstance(row, AuditEntry):
-        body = {"seq": row.seq, "hash": row.hash, "at_utc": row.at_utc}
+        body = {"seq": row.seq, "hash": row.hash, "previous_hash": row.previous_hash, "at_utc": row.at_utc}
         return Telling("audit", str(row.seq), body)
     if isinstance(row, Approval):
-        return Telling("decision", str(row.id), _bounded(_without(row, "reason")))
+        return Telling("decision", str(row.id), _bounded(_without(row, "reason", "site")))
     if isinstance(row, Participant):
-        return Telling("participant", row.code, _bounded(row.as_dict()))
+        return Telling("participant", row.code, _bounded(_without(row, "placement")))
     return None
 
 
@@ -57,7 +58,7 @@ def _test(row: Test) -> dict[str, Any]:
 
 
 def _recording(row: Recording) -> Telling:
-    body = _bounded({**_without(row, "path"), "name": Path(row.path).name})
+    body = _bounded({**_without(row, "path", "site"), "name": Path(row.path).name})
     if not SHA256.fullmatch(row.file_sha256):
         return Telling("recording", row.id, body)
     return Telling("recording", row.id, body, row.file_sha256, length_of(Path(row.path)))
@@ -81,9 +82,9 @@ def _with_document(row: Model | Tracked) -> Telling:
     return Telling(kind, key, body, row.etag, len(row.document))
 
 
-def _without(row: Table, column: str) -> dict[str, Any]:
-    """The row as a plain object but for one column."""
-    return {each.name: getattr(row, each.name) for each in row.__table__.columns if each.name != column}
+def _without(row: Table, *columns: str) -> dict[str, Any]:
+    """The row as a plain object but for some columns."""
+    return {name: value for name, value in row.as_dict().items() if name not in columns}
 
 
 def _bounded(body: dict[str, Any]) -> dict[str, Any]:

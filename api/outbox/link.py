@@ -1,4 +1,4 @@
-"""The line to the centre: four requests, each answered with little JSON, or with one line about what is wrong."""
+"""The line to the centre: five requests, each answered with little JSON, or with one line about what is wrong."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from api.outbox import answers
 from api.outbox.answers import Progress, Wanted
 from api.outbox.chain import Position
 from api.outbox.errors import BucketError, KeyRefusedError, RefusedError, UnreachableError, WrongAnswerError
+from api.outbox.receipts import Receipt
 from api.settings import loopback
 
 LONGEST_ANSWER = 1_000_000
@@ -57,6 +58,10 @@ class Link:
     def items(self, chain: str, items: list[dict[str, Any]]) -> Position:
         """Send items; where the centre stands after them."""
         return answers.position(self._ask("POST", "/v1/rig/items", json={"chain": chain, "items": items}))
+
+    def heads(self, chain: str, item: int) -> list[Receipt]:
+        """What the centre countersigned of the audit trail, after the receipt of an item."""
+        return answers.receipts(self._ask("GET", "/v1/rig/heads", params={"chain": chain, "item": item}))
 
     def wanted(self, limit: int) -> list[Wanted]:
         """The files that the centre lacks."""

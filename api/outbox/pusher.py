@@ -18,6 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from api.clock import Clock, utc_label
 from api.outbox import reconcile, rig_state, status
 from api.outbox.backoff import Backoff
+from api.outbox.collecting import Collecting
 from api.outbox.errors import KeyRefusedError, PushError, UnreachableError
 from api.outbox.files import Files
 from api.outbox.link import Link
@@ -60,6 +61,7 @@ class Pusher:
         self.files = Files(store)
         self.telling = Telling(store, clock, link, self._about)
         self.sending = Sending(link, self.files)
+        self.collecting = Collecting(store, settings, link)
         self.line, self.bucket, self.database = Backoff(chance), Backoff(chance), Backoff(chance)
         self.share = 1.0
         """Of the largest batch or chunk: less on a line that breaks."""
@@ -137,7 +139,9 @@ class Pusher:
             return True
         if self.telling.send(self.share):
             self._went_well()
-            self.sending.asked = False
+            self.sending.asked = self.collecting.asked = False
+            return True
+        if self._missing is None and self.collecting.step():  # once all is told its receipts have no holes
             return True
         busy = self._step_files()
         if busy or not self.sending.queue:

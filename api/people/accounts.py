@@ -13,10 +13,11 @@ from sqlalchemy.orm import Session
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.people import names
-from api.people.auth import Auth, Principal, Scope, digest, unauthorized
+from api.people.auth import Auth, Principal, Scope, unauthorized
 from api.people.pace import Guesses, place_of
 from api.people.passwords import Passwords
-from api.store import Store, audit
+from api.store import Store, audit, seen
+from api.store.hashes import digest
 from api.store.tables import Confirmation, KnownPlace, Token, User
 
 CONFIRMED_S = 120.0
@@ -202,10 +203,11 @@ class People:
     def _change_password(self, name: str, hashed: str, who: Principal) -> str | None:
         with self.store.write() as session:
             row = _found(session, name)
+            seen.check(session, seen.account(row.name))
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             cookie = self.auth.end_sessions(session, row.token_hash, but=who.session_hash)
-            audit.write(session, self.clock.utc(), who.name, "change password", "page", of=row.name)
+            audit.write(session, self.clock.utc(), who.name, "change password", row.name)
         return cookie
 
     def remove(self, name: str, by: str) -> None:
@@ -214,7 +216,7 @@ class People:
             row = _found(session, name)
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             self.auth.end_sessions(session, row.token_hash)
-        self.auth.revoke(row.token_hash[:16], by)
+            self.auth.revoke_within(session, row.token_hash[:16], by)
 
     def documents(self) -> list[dict[str, Any]]:
         """All users, without their hashes."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import secrets
 import threading
 from collections import OrderedDict
@@ -21,10 +20,11 @@ from api.clock import Clock
 from api.errors import ApiError
 from api.people.idle_lock import IdleLock
 from api.people.pace import Guesses, place_of
-from api.store import Store, audit
+from api.store import Store, audit, seen
+from api.store.hashes import digest
+from api.store.secrets import shared
 from api.store.tables import Confirmation, PageSession, Token
 
-COOKIE = "stimrig_session"
 LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
 MOST_SEEN = 1000
@@ -97,13 +97,15 @@ class Principal:
 
 
 class Auth:
-    """Issues and checks tokens and sessions; keeps only hashes."""
+    """Issues and checks tokens and sessions; keeps only hashes: of 256 random bits, so no slow hash is needed."""
 
     def __init__(
         self, store: Store, clock: Clock, guesses: Guesses, idle: IdleLock, session_hours: float = 12.0
     ) -> None:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
         self.idle = idle
+        self.cookie_name = f"stimrig_session_{shared(store, 'session-cookie').hex()[:8]}"
+        """Browsers tell hosts apart, not ports: another service on this host has another name."""
         self._seen: OrderedDict[str, str] = OrderedDict()
         self._remembering = threading.Lock()
         self._threads = ThreadPoolExecutor(8, "who-asks")
@@ -118,6 +120,8 @@ class Auth:
         text = text or f"stimrig_{secrets.token_urlsafe(32)}"
         now = self.clock.utc()
         with self.store.write() as session:
+            if participant is not None:
+                seen.check(session, seen.participant(participant), seen.decisions(participant))
             row = Token(hash=digest(text), prefix=text[:12] if origin == "issued" else "(set)", name=name)
             row.scopes, row.created_utc, row.origin = [str(scope) for scope in scopes], now, origin
             row.expires_utc, row.revoked, row.participant, row.plan = expires_utc, False, participant, plan
@@ -130,10 +134,14 @@ class Auth:
     def revoke(self, token_id: str, by: str) -> bool:
         """Revoke a token by its public id; False where there is none."""
         with self.store.write() as session:
-            found = [row for row in session.scalars(select(Token)) if row.hash[:16] == token_id]
-            for row in found:
-                row.revoked = True
-                audit.write(session, self.clock.utc(), by, "revoke token", row.name)
+            return self.revoke_within(session, token_id, by)
+
+    def revoke_within(self, session: Session, token_id: str, by: str) -> bool:
+        """The same in a transaction that does more."""
+        found = [row for row in session.scalars(select(Token)) if row.hash[:16] == token_id]
+        for row in found:
+            row.revoked = True
+            audit.write(session, self.clock.utc(), by, "revoke token", row.name, token=row.hash[:16])
         return bool(found)
 
     def close(self) -> None:
@@ -156,8 +164,9 @@ class Auth:
 
     def _revoke_set_tokens(self, keep: str) -> None:
         with self.store.write() as session:
-            for token in session.scalars(select(Token).where(Token.origin == "settings", Token.hash != keep)):
-                token.revoked = True
+            old = select(Token).where(Token.origin == "settings", Token.hash != keep, Token.revoked.is_(False))
+            for token in session.scalars(old).all():
+                self.revoke_within(session, token.hash[:16], "settings")
 
     def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
         """The holder of a bearer token; `forgive_age`: one that ran out, or a revoked key, presses stop.
@@ -312,18 +321,18 @@ class Auth:
 
     def _remember(self, connection: HTTPConnection, name: str) -> None:
         with self._remembering:  # many threads ask
-            self._seen[_credential(connection)] = name
-            self._seen.move_to_end(_credential(connection))
+            self._seen[self._credential(connection)] = name
+            self._seen.move_to_end(self._credential(connection))
             while len(self._seen) > MOST_SEEN:
                 self._seen.popitem(last=False)
 
     def _forget(self, connection: HTTPConnection) -> None:
         with self._remembering:
-            self._seen.pop(_credential(connection), None)
+            self._seen.pop(self._credential(connection), None)
 
     def seen(self, connection: HTTPConnection) -> str | None:
         """Who was behind this token or session when the database was last asked: good for a stop, and nothing else."""
-        return self._seen.get(_credential(connection))
+        return self._seen.get(self._credential(connection))
 
     def seen_on_page(self, connection: HTTPConnection) -> str | None:
         """`seen`, for a page's session only: a controller's key opens no page, so no page gives it a right."""
@@ -337,20 +346,14 @@ class Auth:
                 raise unauthorized("Send `Authorization: Bearer <token>`.")
             address = connection.client.host if connection.client else ""
             return self.bearer(text.strip(), address, forgive_age=forgive_age)
-        cookie = connection.cookies.get(COOKIE)
+        cookie = connection.cookies.get(self.cookie_name)
         if cookie:
             return self.cookie(cookie, forgive_age=forgive_age, forgive_lock=forgive_lock)
         raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
 
-
-def _credential(connection: HTTPConnection) -> str:
-    header = connection.headers.get("authorization", "")
-    return digest(f"header {header}" if header else f"cookie {connection.cookies.get(COOKIE, '')}")
-
-
-def digest(text: str) -> str:
-    """SHA-256 in hex; the tokens are drawn from 256 random bits, so no slow hash is needed."""
-    return hashlib.sha256(text.encode()).hexdigest()
+    def _credential(self, connection: HTTPConnection) -> str:
+        header = connection.headers.get("authorization", "")
+        return digest(f"header {header}" if header else f"cookie {connection.cookies.get(self.cookie_name, '')}")
 
 
 def unauthorized(detail: str, code: str = "unauthorized", title: str = "Not signed in") -> ApiError:

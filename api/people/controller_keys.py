@@ -8,7 +8,8 @@ from typing import Any
 from sqlalchemy import select
 
 from api.errors import ApiError
-from api.people.auth import Auth, Principal, Scope, digest
+from api.people.auth import Auth, Principal, Scope
+from api.store.hashes import digest
 from api.store.tables import Token
 
 SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]

@@ -13,7 +13,7 @@ from typing import Any
 from api.clock import Clock
 from api.errors import ApiError
 from api.models import stored
-from api.models.places import Place, differ, place_of
+from api.models.places import Place, differ, place_of, site_of
 from api.models.registry import Versions
 from api.sessions import adaptive_plan
 from api.sessions.adaptive import Follower, Told
@@ -94,7 +94,7 @@ class AdaptiveTests:
 
     def _models_for(self, plan: TestPlan) -> list[str]:
         person = self.versions.store.get(Participant, plan.participant)
-        return self._models(plan.participant, (person.side, person.muscle, plan.profile.current_ma))
+        return self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
 
     def _models(self, participant: str, place: Place) -> list[str]:
         """The participant's approved models, oldest first.

@@ -11,6 +11,8 @@ from typing import Any
 
 RANGE = "angle_range_rad"
 """In a profile: lowest and highest angle that is comfortable today."""
+SET_AT = "angle_set_at_utc"
+"""In a profile: when the sensor was calibrated under which the range was said."""
 LEAST_RAD, MOST_RAD = -math.pi, math.pi
 NARROWEST_RAD = math.radians(10)
 TOLERANCE_RAD = 0.09
@@ -31,6 +33,11 @@ def of(profile: Profile) -> tuple[float, float] | None:
     """The participant's range, rad; None where there is none."""
     found = profile.get(RANGE)
     return None if found is None else (float(found[0]), float(found[1]))
+
+
+def outdated(profile: Profile, set_at_utc: str | None) -> bool:
+    """Whether the range was said under another calibration of the angle sensor than that of `set_at_utc`."""
+    return of(profile) is not None and profile.get(SET_AT) != set_at_utc
 
 
 def within(inner: Sequence[float], outer: Sequence[float] | None) -> bool:

@@ -8,13 +8,15 @@ from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat
 
+from api.decisions import MODEL_TAG
 from api.errors import ApiError
+from api.models.places import site_of
 from api.people.auth import Principal, outside
 from api.sessions.profiles import LIMITS
 from api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from api.sessions.runner import Runner
 from api.sessions.trials import SEQUENCE
-from api.store import Store
+from api.store import Store, seen
 from api.store.holds import Turn
 from api.store.tables import Participant, Test
 
@@ -54,7 +56,7 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
             unit = LIMITS[name].unit
             detail = f"{LIMITS[name].words}: {asked:g} {unit} is above the limit of today, {own or 0:g} {unit}."
             raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
-    return plan.model_dump()
+    return {**plan.model_dump(), "site": site_of(participant)}
 
 
 async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: TestIn) -> Test:
@@ -66,12 +68,20 @@ async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: 
         403: outside the key or its plan, and by how much; 409: no model of its participant is approved; else as
         `Runner.start`.
     """
+    with_model = len(seen.sent.get()) == MODEL_TAG
+    if who.participant is None and not with_model:
+        return await runner.start(body, who.name, holder=who.token_hash)
+    seen.shown.set(await asyncio.to_thread(store.seen, runner.clock))
     if who.participant is None:
-        return await runner.start(body, who.name)
+        await asyncio.to_thread(_refuse_other_model, runner, body.participant)
+        return await runner.start(body, who.name, holder=who.token_hash)
     async with turn:  # no two trials share the last one that is left
         try:
+            _refuse_kind(who, body)
             body = await _within_plan(runner, store, who, body)
-            return await runner.start(body, who.name)
+            return await runner.start(body, who.name, holder=who.token_hash)
+        except seen.ChangedError:
+            raise changed() from None
         except ApiError as error:
             if error.code not in NEUTRAL:
                 raise
@@ -82,8 +92,8 @@ async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: 
 async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestIn) -> TestIn:
     """The test with the plan's limits, where the plan allows it."""
     plan = who.plan or {}
-    _refuse_kind(who, body)
     await asyncio.to_thread(_refuse_other_rate, runner, body)
+    await asyncio.to_thread(_refuse_other_model, runner, body.participant)
     played = await asyncio.to_thread(_played, store, who.name)
     if played >= plan["trials"]:
         raise beyond(f"All {plan['trials']} trials of this key are played. A person can make another key")
@@ -121,6 +131,13 @@ def _refuse_kind(who: Principal, body: TestIn) -> None:
         raise beyond(f"A key sends no {wrong[0]}. Leave it out")
 
 
+def _refuse_other_model(runner: Runner, participant: str) -> None:
+    """The trial was computed with the model that is served now: the approved one, or what was tracked from it."""
+    served = [runner.versions.served(participant), runner.trials.tracked.served(participant)]
+    if seen.sent.get() not in [one.etag.strip('"') for one in served if one is not None]:
+        raise changed()
+
+
 def _refuse_other_rate(runner: Runner, body: TestIn) -> None:
     """A key plays at the rate of the approved model: a person who made the key chose no other."""
     served = runner.versions.served(body.participant)
@@ -144,6 +161,12 @@ def unapproved(participant: str) -> ApiError:
         "or when the model is rejected."
     )
     return ApiError(409, "no-approved-model", "No approved model", detail)
+
+
+def changed() -> ApiError:
+    """409: the trial was planned on what is no longer so; a key learns no more of it."""
+    detail = "Fetch the model anew, compute the trial with it, and send its ETag as If-Match."
+    return ApiError(409, "changed-meanwhile", "What the trial was planned with was changed", detail)
 
 
 def beyond(why: str) -> ApiError:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -41,20 +39,6 @@ JUMP = 1.25
 """More than a quarter above the last value is a jump: a slip of the keyboard is mostly a factor of two or ten."""
 
 
-def version(profile: Profile) -> str:
-    """A short name of exactly these limits: the same limits have the same one."""
-    text = json.dumps(dict(profile), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def of_calibration(calibration_id: str) -> str:
-    """The version of the limits that a calibration was begun with.
-
-    It ends the calibration's id, and so is kept by the rig, which may outlive this service.
-    """
-    return calibration_id.rpartition("-")[2]
-
-
 def calibration(profile: Profile, now_utc: str) -> Literal["none", "valid", "expired"]:
     """How the calibration stands."""
     if all(profile.get(name) is None for name in FOUND):
@@ -80,6 +64,7 @@ def changed(profile: Profile, asked: Mapping[str, Any]) -> tuple[dict[str, Any],
     new = {**profile, **asked}
     if angles.RANGE in asked and asked[angles.RANGE] is None:
         del new[angles.RANGE]
+        new.pop(angles.SET_AT, None)
     if all(profile.get(name) is None for name in FOUND):
         return new, ""
     voids = next((_above(name, new[name], profile[name]) for name in LIMITS if not (new[name] <= profile[name])), "")

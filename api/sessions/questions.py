@@ -11,9 +11,10 @@ import secrets
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
-from api.clock import Clock
+from api.clock import Clock, local_day
 from api.errors import ApiError
 from api.people.auth import Principal
+from api.store import seen
 
 LIFE_S = 300.0
 """How long what was seen may be confirmed."""
@@ -66,6 +67,7 @@ class Question:
     back: str = ""
     at_deg: tuple[float, float] | None = None
     asker: tuple[str, str | None] = ("", None)
+    seen: seen.Seen | None = None
     asked_s: float = 0.0
     asked_unix_s: float = 0.0
     answer: asyncio.Future[str] | None = None
@@ -80,7 +82,7 @@ class Questions:
 
     def ask(self, question: Question, who: Principal) -> str:
         """Keep it; the address at which it is shown and answered."""
-        question.asker = (who.name, who.csrf)
+        question.asker, question.seen = (who.name, who.csrf), seen.looked.get()
         question.asked_s, question.asked_unix_s = self.clock.monotonic_s(), self.clock.unix_s()
         self._forget(question)
         number = secrets.token_urlsafe(16)
@@ -117,6 +119,10 @@ class Questions:
     async def yes(self, question: Question) -> str:
         """Do it, once; who says yes again comes to what came of it."""
         if question.answer is None:
+            if question.seen is not None and question.seen.day != local_day(self.clock.utc()):
+                raise seen.another_day(question.seen)
+            seen.shown.set(question.seen)
+            seen.sent.set(str(question.seen or ""))
             question.answer = asyncio.ensure_future(question.action())
         return await asyncio.shield(question.answer)
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 from api.errors import ApiError
 from api.people import names
-from api.store.tables import Participant
+from api.store import seen
+from api.store.tables import AuditEntry, Participant
 
 
 @dataclass
@@ -23,6 +24,15 @@ class Current:
     """The rig has said that it plays."""
     ending: bool = False
     """Its end has been heard."""
+    tokens: list[str] = field(default_factory=list)
+    """Hashes of the tokens by whose right it is played."""
+    rests_on: tuple[seen.About, ...] = ()
+    """Entries of the audit trail with which it would not have been begun."""
+    since: seen.Seen | None = None
+    """The trail's place at its intent, or at the last change that was found; None: not written yet."""
+    overtaken: list[AuditEntry] = field(default_factory=list)
+    """Changes that have withdrawn it."""
+    looking: asyncio.Lock = field(default_factory=asyncio.Lock)
     missed: int = 0
     """How often in a row the rig, asked for its state, did not name it."""
     let_go: asyncio.Event = field(default_factory=asyncio.Event)
@@ -44,11 +54,10 @@ def refuse_archived(participant: Participant) -> None:
         raise ApiError(409, "archived", "This participant is archived", detail)
 
 
-def not_what_was_seen(why: str) -> ApiError:
+def not_what_was_seen() -> ApiError:
     """409: a person said yes to something else."""
-    return ApiError(
-        409, "not-what-was-seen", "This page is out of date", f"{why} Nothing was started. Go back and check."
-    )
+    detail = "The rig would now play something else: it was set up anew. Nothing was started. Go back and check."
+    return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
 
 
 def busy(current: Current) -> ApiError:

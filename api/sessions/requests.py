@@ -317,10 +317,11 @@ class NoteIn(Body):
 
 
 class MuscleIn(Body):
-    """Which side and which muscle is stimulated; null where nobody has said."""
+    """The site: which side and muscle is stimulated, and where the electrodes are; null where nobody has said."""
 
     side: Side | None = None
     muscle: Muscle | None = None
+    placement: Muscle | None = Field(None, description="of the electrodes; a model belongs to one site", examples=["A"])
 
 
 class StopIn(Body):

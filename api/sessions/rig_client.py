@@ -29,6 +29,7 @@ from rig.messages import (
     StatusRequest,
     StopRequest,
     SubscribeRequest,
+    WithdrawRequest,
     stop_socket,
 )
 
@@ -37,6 +38,7 @@ log = logging.getLogger("stimrig.rig_client")
 LINE_LIMIT = 32 * 1024 * 1024
 RECONNECT_S = 0.25
 STATUS_EVERY_S = 1.0
+MOST_LATCHES = 100
 
 M = TypeVar("M", bound=BaseModel)
 AnyEvent = StateEvent | LiveEvent | FinishedEvent
@@ -57,7 +59,9 @@ class RigClient:
     def __init__(self, path: Path | None, clock: Clock) -> None:
         self.path, self.clock = path, clock
         self.patience_s = 5.0
-        self.status: Status | None = None
+        self.latches: dict[str, dict[str, Any]] = {}
+        """Why the rig was stopped, by the version that a re-arm names; as entries of the audit trail are told."""
+        self._status: Status | None = None
         self.connected = False
         self.listeners: list[Callable[[AnyEvent], None]] = []
         self.link_listeners: list[Callable[[bool], None]] = []
@@ -67,6 +71,25 @@ class RigClient:
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
+
+    @property
+    def latch_known(self) -> bool:
+        """Whether the rig names the stop that it stands at; an older program does not."""
+        return self._status is None or bool(self._status.latch)
+
+    @property
+    def status(self) -> Status | None:
+        """The newest state."""
+        return self._status
+
+    @status.setter
+    def status(self, status: Status) -> None:
+        self._status = status
+        if status.latch not in self.latches:
+            while len(self.latches) >= MOST_LATCHES:
+                self.latches.pop(next(iter(self.latches)))
+            told = {"at_utc": self.clock.utc(), "who": "", "action": "latched", "subject": "rig"}
+            self.latches[status.latch] = {**told, "detail": {"state": status.state, "reason": status.reason}}
 
     def start(self) -> None:
         """Begin to connect, in the background."""
@@ -94,7 +117,7 @@ class RigClient:
             503: no rig, or it does not answer in time. 422: longer than the rig hears out.
         """
         timeout_s = self.patience_s if timeout_s is None else timeout_s
-        if isinstance(message, StopRequest) or self._writer is None:
+        if isinstance(message, StopRequest | WithdrawRequest) or self._writer is None:  # neither waits behind a start
             return await self._request_apart(message, timeout_s)
         if isinstance(message, PreviewRequest):  # long, both ways: the lasting connection carries a test's live signals
             return await self._request_apart(message, timeout_s)
@@ -130,8 +153,8 @@ class RigClient:
 
     async def fresh_status(self) -> Status:
         """Ask for the state now."""
-        self.status = await self.ask_for(Status, StatusRequest())
-        return self.status
+        self.status = status = await self.ask_for(Status, StatusRequest())
+        return status
 
     async def _request_apart(self, message: Any, timeout_s: float) -> Reply:
         """Ask on a connection of its own; a stop at the rig's own door for stops, which nothing else can fill."""

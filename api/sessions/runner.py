@@ -9,7 +9,6 @@ import secrets
 from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,9 @@ from api.clock import Clock, asked_s
 from api.errors import ApiError, NotFoundError
 from api.logs import current_test
 from api.models.analyses import Analyses
+from api.models.places import site_of
 from api.models.registry import Versions
-from api.sessions import document, profiles
+from api.sessions import document
 from api.sessions.adaptive_plan import ADAPTIVE
 from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.following import Follower
@@ -34,9 +34,9 @@ from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, 
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
 from api.sessions.trials import SEQUENCE, Trials
-from api.store import Store, audit
+from api.store import Store, audit, seen
 from api.store.holds import LIMITS_TURN
-from api.store.tables import Participant, Test
+from api.store.tables import AuditEntry, Participant, Test, Token
 from api.workers.adviser import Adviser
 from api.workers.pool import Pool
 from rig.messages import (
@@ -52,6 +52,7 @@ from rig.messages import (
     StopEvidence,
     StopRequest,
     TestPlan,
+    WithdrawRequest,
 )
 
 log = logging.getLogger("stimrig.trials")
@@ -72,18 +73,19 @@ NOTE_S = 0.3
 EMERGENCY = "Use the stimulator's own emergency switch now."
 
 
-@dataclass(frozen=True)
-class Seen:
-    """What a person was shown before saying yes; a test that would be another one is not started."""
+LOOK_AGAIN_S = 0.25
+"""How often it is looked whether a test may still be played: another service's changes are seen so late at most."""
 
-    profile_version: str
-    preview: dict[str, Any]
-    side: str | None = None
-    muscle: str | None = None
 
-    def same(self, preview: dict[str, Any]) -> bool:
-        """Whether the rig would play what was shown; the torque it is estimated to give may be known better by now."""
-        return {**self.preview, **preview, "torque_time_nms": None} == {**self.preview, "torque_time_nms": None}
+def rests_of(participant: str, kind: str, tokens: list[str]) -> tuple[seen.About, ...]:
+    """Entries of the trail with which a test would not be begun; a controller's trial rests on the models, too."""
+    models = (seen.decisions(participant),) if kind == SEQUENCE else ()
+    return (seen.participant(participant), seen.revoked(*tokens), *models)
+
+
+def same(confirmed: dict[str, Any], preview: dict[str, Any]) -> bool:
+    """Whether the rig would play what was shown; the torque it is estimated to give may be known better by now."""
+    return {**confirmed, **preview, "torque_time_nms": None} == {**confirmed, "torque_time_nms": None}
 
 
 class Runner:
@@ -123,7 +125,9 @@ class Runner:
 
     # ---- start and stop -------------------------------------------------------------------------------------
 
-    async def start(self, body: TestIn, by: str, seen: Seen | None = None) -> Test:
+    async def start(
+        self, body: TestIn, by: str, confirmed: dict[str, Any] | None = None, holder: str = ""
+    ) -> Test:  # fmt: skip
         """Begin a test.
 
         Parameters
@@ -132,8 +136,10 @@ class Runner:
             The test.
         by : str
             Who answers for it.
-        seen : Seen, optional
-            What a person has confirmed; None: a program's request, which nobody was shown.
+        confirmed : dict, optional
+            The preview that a person has said yes to; None: a program's request, which nobody was shown.
+        holder : str
+            Hash of the token by whose right it is begun.
 
         Raises
         ------
@@ -141,6 +147,9 @@ class Runner:
             404 no such participant; 409 another test runs, the holder named; 409 it would not be what was seen, or a
             stop came since it was asked for; 503 that was too long ago; what the rig refuses.
         """
+        if seen.shown.get() is None:  # then it rests on what is read from here on
+            seen.shown.set(await asyncio.to_thread(self.store.seen, self.clock))
+        tokens = await asyncio.to_thread(self._tokens, holder)
         await self._let_end()
         self.refuse_second()
         if body.kind == ADAPTIVE:  # what it can reach is computed now, and not while others wait, and then remembered
@@ -148,7 +157,8 @@ class Runner:
         async with self.follower.rig_turn():
             self.refuse_second()
             await self._refuse_beside_another_service()
-            return await self._start(body, await self._participant(body), by, seen)
+            participant = await self._participant(body)
+            return await self._start(body, participant, by, confirmed, tokens)
 
     def plays(self, test_id: str | None) -> bool:
         """Whether the rig plays this test now."""
@@ -178,26 +188,29 @@ class Runner:
         refuse_archived(participant)
         return participant
 
-    async def _start(self, body: TestIn, participant: Participant, by: str, seen: Seen | None) -> Test:
-        if seen is not None and seen.profile_version != profiles.version(participant.profile):
-            raise not_what_was_seen(f"The limits of {participant.code} were changed meanwhile.")
-        if seen is not None and (seen.side, seen.muscle) != (participant.side, participant.muscle):
-            raise not_what_was_seen(f"Side or muscle of {participant.code} was changed meanwhile.")
+    async def _start(
+        self, body: TestIn, participant: Participant, by: str, confirmed: dict[str, Any] | None,
+        tokens: list[str],
+    ) -> Test:  # fmt: skip
+        rests_on = rests_of(body.participant, body.kind, tokens)
+        await asyncio.to_thread(self.store.refuse_changed, *rests_on)  # then the preview may differ for no other reason
         planned = await self._planned(body, participant)
         plan = planned.plan
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
-        current = self.current = Current(plan.test_id, plan.participant, by, plan.kind)
+        how: dict[str, Any] = {"tokens": tokens, "rests_on": rests_on}
+        current = self.current = Current(plan.test_id, plan.participant, by, plan.kind, **how)
         current_test.set(plan.test_id)
         self.pool.cancel_background()
         try:
             preview = await self._previewed(plan)
-            if seen is not None and not seen.same(preview):
-                raise not_what_was_seen("The rig would now play something else: it was set up anew.")
+            if confirmed is not None and not same(confirmed, preview):
+                raise not_what_was_seen()
             row = await asyncio.to_thread(self._write_intent, planned, preview, by, body, participant)
             self.hub.begin(plan.test_id)
-            await self._command(planned, body, profiles.version(participant.profile))
+            await self._command(planned, current)
             current.started = True
+            self._keep(self._look_again_and_again(current))
         except BaseException:
             self.current = None
             self._leave()
@@ -208,12 +221,12 @@ class Runner:
             await self._stop_quietly(f"start of {plan.test_id} could not be written down")
             raise
 
-    async def _command(self, planned: Planned, body: TestIn, version: str) -> None:
+    async def _command(self, planned: Planned, current: Current) -> None:
         plan = planned.plan
         try:
             async with self.follower.holds.turn(LIMITS_TURN):
-                if profiles.version((await self._participant(body)).profile) != version:
-                    raise not_what_was_seen(f"The limits of {plan.participant} were changed meanwhile.")
+                if changed := current.overtaken or await asyncio.to_thread(self._overtaking, current):
+                    raise seen.ChangedError([{"now": seen.told(entry), "seen": None} for entry in changed], None)
                 self._refuse_overtaken(
                     asked_s.get(self.clock.monotonic_s())
                 )  # nothing is waited for between this and the command
@@ -242,6 +255,51 @@ class Runner:
         if not (self.clock.monotonic_s() - since_s <= START_S):
             detail = f"It could not begin within {START_S:g} s. Nothing was sent. Start again."
             raise ApiError(503, "too-late", "The start took too long", detail)
+
+    # ---- whether it may still be played ---------------------------------------------------------------------
+
+    def _overtaking(self, current: Current) -> list[AuditEntry]:
+        """What was changed since its intent was written, with which it would not have been begun."""
+        with self.store.read() as session:
+            return [] if current.since is None else seen.since(session, current.since, *current.rests_on)
+
+    async def look_again(self) -> None:
+        """Withdraw the test if what it rests on was changed: called before each change is answered.
+
+        A test that has not begun plays no pulse; a controller's trial whose right has ended ends at once. Where the rig
+        does not take that, it is stopped, and asked again.
+        """
+        current = self.current
+        if current is None:
+            return
+        async with current.looking:
+            changed = await asyncio.to_thread(self._overtaking, current)
+            if not changed:
+                return
+            current.overtaken, last = changed, changed[-1]
+            begun = current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed)
+            reason = f"{last.action}, after this test was asked for"
+            try:
+                await self.rig.ask(WithdrawRequest(test_id=current.test_id, reason=reason, begun=begun))
+            except ApiError as error:
+                log.error("%s could not be withdrawn: %s", current.test_id, error)
+                await self._stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
+            else:
+                current.since = seen.Seen(last.seq, last.hash[:8], "")
+
+    def _tokens(self, holder: str) -> list[str]:
+        """Hashes of the tokens by whose right a test is played: the asker's, and that of who made a key."""
+        row: Token | None = self.store.get(Token, holder) if holder else None
+        return [token for token in (holder, row.made_by if row else None) if token]
+
+    async def _look_again_and_again(self, current: Current) -> None:
+        """Other services change things, too."""
+        while self.current is current and not current.ending:
+            await asyncio.sleep(LOOK_AGAIN_S)
+            try:
+                await self.look_again()
+            except SQLAlchemyError:
+                log.warning("whether %s may still be played could not be read", current.test_id)
 
     async def _stop_quietly(self, reason: str) -> None:
         try:
@@ -291,14 +349,27 @@ class Runner:
     ) -> Test:
         now, plan = self.clock.utc(), planned.plan
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
-        kept = {"joins": body.joins, "side": participant.side, "muscle": participant.muscle}  # as they are now
-        kept |= planned.kept() | self.trials.kept(body, len(preview["pulse_width_us"]))
+        kept: dict[str, Any] = {
+            "joins": body.joins,
+            **dict(zip(("side", "muscle", "placement"), site_of(participant), strict=True)),
+        }
+        kept |= (
+            {"tokens": self.current.tokens if self.current else []}
+            | planned.kept()
+            | self.trials.kept(body, len(preview["pulse_width_us"]))
+        )
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         self.follower.mark(row)
+        dose = {name: preview.get(name) for name in ("duration_s", "charge_uc", "torque_time_nms")}
+        current = self.current
+        assert current is not None
         with self.store.write() as session:
+            seen.check(session, *current.rests_on)
             session.add(row)
-            audit.write(session, now, by, "start test", plan.test_id, participant=plan.participant, kind=plan.kind)
+            said = {"participant": plan.participant, "kind": plan.kind, "shown": dose}
+            audit.write(session, now, by, "start test", plan.test_id, **said)
+            current.since = seen.newest(session, "")
         log.info("test requested, kind %s", plan.kind, extra={"test_id": plan.test_id})
         return row
 
@@ -403,7 +474,10 @@ class Runner:
 
     def _follow(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
         """Do what leads a test to its last state, in the background and under the one guard."""
-        task = asyncio.create_task(self._guarded(test_id, work))
+        self._keep(self._guarded(test_id, work))
+
+    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)
 
@@ -470,10 +544,19 @@ class Runner:
                 and status.test_id == row.id
                 and status.state not in ("ready", "latched", "uncertain")
             ):
-                self.current = Current(row.id, row.participant, row.requested_by, row.kind, started=True)
+                tokens = row.plan.get("tokens") or []
+                how: dict[str, Any] = {"tokens": tokens, "rests_on": rests_of(row.participant, row.kind, tokens)}
+                self.current = Current(row.id, row.participant, row.requested_by, row.kind, started=True, **how)
                 self.hub.begin(row.id)
+                self._keep(self._look_from_its_intent(self.current))
             else:
                 self._follow(row.id, self._recover(row.id, "the service was restarted during the test"))
+
+    async def _look_from_its_intent(self, current: Current) -> None:
+        """A test plays although this service was restarted: what it rests on may have changed meanwhile."""
+        asked = seen.of(current.test_id, "start test")
+        current.since = await asyncio.to_thread(self.store.seen, self.clock, asked)
+        await self._look_again_and_again(current)
 
     async def _recover(self, test_id: str, why: str) -> None:
         """A test whose end was not heard: its recording, if the rig sealed one, is adopted."""

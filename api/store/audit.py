@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from api.store import seen
+from api.store.hashes import GENESIS, digest
 from api.store.tables import AuditEntry
 from api.store.texts import storable
-
-GENESIS = "0" * 64
 
 
 def entry_hash(entry: dict[str, Any]) -> str:
     """SHA-256 of an entry's canonical JSON, its own hash left out."""
     held = {key: value for key, value in entry.items() if key != "hash"}
-    return hashlib.sha256(json.dumps(held, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return digest(json.dumps(held, sort_keys=True, separators=(",", ":")))
 
 
 def write(session: Session, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> None:
-    """Append an entry in the caller's transaction, so that action and entry stand or fall together."""
+    """Append an entry in the caller's transaction, so that action and entry stand or fall together.
+
+    What the person had seen is kept with it (`api.store.seen`).
+    """
+    if tag := seen.sent.get():
+        detail["seen"] = tag
     last = session.scalars(select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)).first()
     fields = {
         "seq": last.seq + 1 if last else 1,

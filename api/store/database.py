@@ -15,8 +15,10 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
 
+from api.clock import Clock, local_day
 from api.errors import ApiError
 from api.store import engines, migrations
+from api.store.seen import About, Seen, check, newest
 
 
 class Store:
@@ -77,6 +79,16 @@ class Store:
             query = query.limit(limit)
         with self.read() as session:
             return list(session.scalars(query))
+
+    def seen(self, clock: Clock, *about: About) -> Seen:
+        """The version of what rests on these entries of the audit trail; without `about`, on any."""
+        with self.read() as session:
+            return newest(session, local_day(clock.utc()), *about)
+
+    def refuse_changed(self, *about: About) -> None:
+        """Refuse to ask a question about what has changed since the page was shown. Raises ChangedError."""
+        with self.read() as session:
+            check(session, *about)
 
     def listen(self, event_name: str, heard: Callable[..., None]) -> None:
         """Hear an event of every session that writes, e.g. `before_commit`."""

@@ -27,6 +27,8 @@ class Participant(Table):
     created_by: Mapped[str] = mapped_column(String)
     side: Mapped[str | None] = mapped_column(String, default=None)
     muscle: Mapped[str | None] = mapped_column(String, default=None)
+    placement: Mapped[str | None] = mapped_column(String, default=None)
+    """Where the electrodes are: with side and muscle the site, to which models and keys belong."""
     archived_utc: Mapped[str | None] = mapped_column(String, default=None)
 
 
@@ -83,6 +85,8 @@ class Recording(Table):
     created_utc: Mapped[str] = mapped_column(String)
     warnings: Mapped[list[str] | None] = mapped_column(JSON, default=None)
     """What is in doubt about an upload; a test's doubts stand in its summary."""
+    site: Mapped[list[str | None] | None] = mapped_column(JSON(none_as_null=True), default=None)
+    """Side, muscle and placement that were stimulated; None: from before they were kept."""
 
 
 class Model(Table):
@@ -119,6 +123,8 @@ class Approval(Table):
     by: Mapped[str] = mapped_column(String)
     at_utc: Mapped[str] = mapped_column(String)
     expires_utc: Mapped[str | None] = mapped_column(String, default=None)
+    site: Mapped[list[str | None] | None] = mapped_column(JSON(none_as_null=True), default=None)
+    """The participant's site then: at another one it does not hold."""
     tracking: Mapped[dict[str, float] | None] = mapped_column(JSON(none_as_null=True), default=None)
     """How far the model may be tracked, in percent (`api.models.tracking.Limits`); None: nobody has allowed it."""
 
@@ -241,7 +247,7 @@ class AuditEntry(Table):
     at_utc: Mapped[str] = mapped_column(String)
     who: Mapped[str] = mapped_column(String)
     action: Mapped[str] = mapped_column(String)
-    subject: Mapped[str] = mapped_column(String)
+    subject: Mapped[str] = mapped_column(String, index=True)
     detail: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
     previous_hash: Mapped[str] = mapped_column(String)
     hash: Mapped[str] = mapped_column(String)

@@ -18,6 +18,7 @@ from api.web import openapi, pages, problems, routes, strict_body
 from api.web.body_limit import BodyLimit
 from api.web.dependencies import Context, build
 from api.web.headers import Headers
+from api.web.look_again import LookAgain
 from api.web.page_language import PageLanguage
 from api.workers.pool import WORKER
 
@@ -67,6 +68,7 @@ def create_app(
         routes=list(_routes()),
     )
     app.state.context = context
+    app.add_middleware(LookAgain, context=context)
     app.add_middleware(strict_body.StrictBody)
     app.add_middleware(BodyLimit, context=context)  # the last one added stands outside
     problems.install(app)

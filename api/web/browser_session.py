@@ -8,7 +8,6 @@ from fastapi import Request
 from fastapi.responses import Response
 
 from api.errors import ApiError
-from api.people.auth import COOKIE
 from api.web.dependencies import Context
 
 
@@ -22,15 +21,11 @@ def same_origin(request: Request) -> None:
 def set_cookie(context: Context, answer: Response, cookie: str) -> None:
     """The session's cookie: not for scripts, not for other sites."""
     age_s, secure = int(context.auth.session_s), context.settings.secure_cookies
-    answer.set_cookie(COOKIE, cookie, max_age=age_s, httponly=True, samesite="strict", secure=secure)
+    name = context.auth.cookie_name
+    answer.set_cookie(name, cookie, max_age=age_s, httponly=True, samesite="strict", secure=secure)
 
 
 def local(target: str) -> str:
     """An address on this host, or the first page."""
     plain = target.startswith("/") and not target.startswith("//") and target.isprintable() and "\\" not in target
     return target if plain else "/"
-
-
-def wants_html(request: Request) -> bool:
-    """Whether a browser's navigation or form asked, not a program."""
-    return "text/html" in request.headers.get("accept", "")

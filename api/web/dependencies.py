@@ -22,6 +22,7 @@ from api.models.registry import Versions
 from api.models.tracked import TrackedVersions
 from api.models.trend import Trend
 from api.outbox.feed import Feed
+from api.outbox.receipts import note_hourly
 from api.people.accounts import People
 from api.people.auth import Auth, Principal, Scope
 from api.people.idle_lock import FLUSH_S, IdleLock
@@ -94,8 +95,10 @@ class Context:
             await asyncio.sleep(FLUSH_S)
             try:
                 await asyncio.to_thread(self.auth.idle.flush)
-            except SQLAlchemyError:  # the next time has it all
-                log.exception("the times of people's last actions could not be written down")
+                if self.settings.heads_file is not None:
+                    await asyncio.to_thread(note_hourly, self.store, self.clock, self.settings.heads_file)
+            except (SQLAlchemyError, OSError):  # the next time has it all
+                log.exception("people's last actions, or the audit trail's head, could not be written down")
 
     async def close(self) -> None:
         """Let everything go."""
@@ -208,7 +211,7 @@ PROBLEM: dict[int | str, dict[str, Any]] = {
     for code, text in {
         401: "not signed in", 403: "the scope or the form's token is missing", 404: "not there",
         409: "in conflict with what is", 422: "does not hold: `errors` names the fields",
-        429: "too many wrong tries: `Retry-After`", 503: "the rig cannot be reached, or too much at once",
+        503: "the rig cannot be reached, or too much at once",
     }.items()
 }  # fmt: skip
 """Problems of every route that asks who comes."""

@@ -11,7 +11,10 @@ from fastapi import Request, Security
 from fastapi.security import APIKeyCookie, HTTPBearer
 
 from api.errors import ApiError
-from api.people.auth import COOKIE, Principal, Scope
+from api.people.auth import Principal, Scope
+from api.store import seen
+from api.web import decisions
+from api.web.headers import wants_html
 from api.web.key_guard import refuse_outside
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
@@ -19,12 +22,12 @@ POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")
 """What pages ask for again and again by themselves."""
 BEARER = HTTPBearer(scheme_name="token", description="a token, or a controller's key", auto_error=False)
 SESSION = APIKeyCookie(
-    name=COOKIE, scheme_name="session", auto_error=False,
+    name="stimrig_session", scheme_name="session", auto_error=False,
     description="set by `POST /v1/sessions`; everything but GET sends its `csrf` as `X-CSRF-Token`, too",
 )  # fmt: skip
 Token = Annotated[object, Security(BEARER)]
 Session = Annotated[object, Security(SESSION)]
-"""For the OpenAPI document; `Auth.identify` reads both."""
+"""For the OpenAPI document, which is given the name of its service's cookie; `Auth.identify` reads both."""
 
 
 def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
@@ -36,6 +39,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
             detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
             raise ApiError(403, "forbidden", "Not allowed", detail)
         await check_csrf(request, principal)
+        await decisions.take(request)
         if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
             await request.app.state.context.people.confirmed(request, principal)
         return principal
@@ -53,6 +57,9 @@ async def identified(request: Request) -> Principal:
     request.state.who = principal
     if principal.page_session is not None and by_a_person(request):
         auth.idle.acted(principal.page_session.hash)
+    if wants_html(request) or not request.url.path.startswith("/v1/"):
+        # before anything of the page is read: what it shows is not older
+        seen.looked.set(await asyncio.to_thread(context.store.seen, context.clock))
     return principal
 
 

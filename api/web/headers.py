@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api import language
@@ -35,6 +36,11 @@ def entity_tags(field: str) -> list[str]:
     one means the same.
     """
     return [tag.strip().removeprefix("W/") for tag in field.split(",")]
+
+
+def wants_html(request: HTTPConnection) -> bool:
+    """Whether a browser's navigation or form asked, not a program."""
+    return "text/html" in request.headers.get("accept", "")
 
 
 class Headers:

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import re
 
+from api.errors import ApiError
+from api.models.places import kept, site_of
 from api.models.registry import Versions
 from api.people.auth import Principal, outside
 from api.sessions.controller_trials import unapproved
-from api.store.tables import Model, Recording, Test
+from api.store.tables import Model, Participant, Recording, Test
 
 STOP = "/v1/stop"
 OPEN = [
@@ -38,11 +40,17 @@ def refuse_outside(versions: Versions, who: Principal, method: str, path: str) -
     Raises
     ------
     ApiError
-        403, the same for what is another participant's, for what is not there, and for routes that no key opens; 409:
-        a model is asked, and none of the key's participant is approved.
+        403: the key is of another site; or, the same for what is another participant's, for what is not there, and for
+        routes that no key opens. 409: a model is asked, and none of the key's participant is approved.
     """
-    if who.participant is not None and not _opens(versions, who.participant, method, path):
+    if who.participant is None:
+        return
+    if not _opens(versions, who.participant, method, path):
         raise outside(who.participant)
+    row: Participant = versions.store.get(Participant, who.participant)
+    if kept((who.plan or {}).get("site")) != site_of(row):
+        detail = "The participant is stimulated at another site now. A person makes a key for it."
+        raise ApiError(403, "other-site", "This key is of another site", detail)
 
 
 def _opens(versions: Versions, participant: str, method: str, path: str) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 from fastapi import FastAPI
 
 from api import schemas
+from api.decisions import DECISIONS
 from api.web.responses.base import Problem
 from api.web.strict_body import REFUSALS
 
@@ -29,9 +30,18 @@ The same facts as JSON Schemas: `GET /v1/schemas`.
 """
 
 
+ETAG = {"description": "its version: send it as `If-Match` with what is decided on it", "schema": {"type": "string"}}
+
+
 def problem(description: str) -> dict[str, Any]:
     """An error's answer."""
     return {"description": description, "content": PROBLEM_CONTENT}
+
+
+TOO_MANY = problem("too many wrong tries, or too much at once") | {
+    "headers": {"Retry-After": {"description": "s to wait", "required": True, "schema": {"type": "integer"}}}
+}
+"""Of every operation that asks who comes: a guess is held to a pace, whatever it was to open."""
 
 
 def describe(app: FastAPI) -> None:
@@ -43,6 +53,8 @@ def describe(app: FastAPI) -> None:
         document = plain()
         if not made:
             _complete(document)
+            schemes = document["components"]["securitySchemes"]
+            schemes["session"]["name"] = app.state.context.auth.cookie_name
         return document
 
     app.openapi = openapi
@@ -56,10 +68,13 @@ def _complete(document: dict[str, Any]) -> None:
     for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own words; ours are a Problem
         components.pop(name, None)
     components.update({schemas.component_name(name): schemas.component(name) for name in EMBEDDED})
+    _tell_of_decisions(document)
     for methods in document["paths"].values():
         for operation in methods.values():
             ways = operation.get("security", [])
             needed = sorted({scope for way in ways for scopes in way.values() for scope in scopes})
+            if ways:
+                operation["responses"]["429"] = TOO_MANY
             if needed:
                 operation["description"] = f"{operation.get('description', '')}\n\nScope: `{'`, `'.join(needed)}`."
             if "HTTPValidationError" in str(operation["responses"].get("422")):
@@ -67,3 +82,17 @@ def _complete(document: dict[str, Any]) -> None:
             if "requestBody" in operation:
                 for code, words in REFUSALS.items():
                     operation["responses"].setdefault(code, problem(words))
+
+
+def _tell_of_decisions(document: dict[str, Any]) -> None:
+    """`If-Match` with what decides, and the `ETag` of what it is decided on."""
+    for decision in DECISIONS:
+        operation = document["paths"].get(decision.path, {}).get(decision.method.lower())
+        if operation is None:
+            continue
+        words = f"the `ETag` of `GET {decision.document}` on which this is decided"
+        given = {"name": "If-Match", "in": "header", "required": True, "description": words}
+        operation.setdefault("parameters", []).append(given | {"schema": {"type": "string"}})
+        operation["responses"]["428"] = problem("`If-Match` is missing")
+        shown = document["paths"][decision.document]["get"]["responses"]["200"]
+        shown.setdefault("headers", {})["ETag"] = ETAG

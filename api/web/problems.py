@@ -14,7 +14,10 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
 from api.errors import ApiError, not_answering
-from api.web.browser_session import wants_html
+from api.store import seen
+from api.store.seen import ChangedError
+from api.web.headers import wants_html
+from api.web.pages import changes
 from api.web.pages.render import look, problem_page
 
 log = logging.getLogger("stimrig.api")
@@ -52,9 +55,15 @@ def _http_detail(error: HTTPException) -> str:
 
 async def respond(request: Request, problem: ApiError) -> Response:
     """The problem as JSON, or as a page where a browser's form asked."""
+    if isinstance(problem, ChangedError):
+        problem.extra["changes"] = changes.for_reader(problem.extra["changes"], getattr(request.state, "who", None))
     if wants_html(request):
         await look(request)
-        return problem_page(request, problem)
+        again = None
+        if isinstance(problem, ChangedError):
+            seen.shown.set(None)  # the page tells all that has changed
+            again = await changes.again(request, problem)
+        return problem_page(request, problem, again)
     return JSONResponse(
         problem.body(str(request.url.path)),
         status_code=problem.status,

@@ -7,16 +7,14 @@ from typing import Annotated
 from pydantic import Field, FiniteFloat, StringConstraints
 
 from api.models.tracking import USUAL_PERCENT, Limits
-from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, Muscle, PersonName, Side
+from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, MuscleIn, PersonName
 
 
-class ParticipantIn(Body):
-    """A new participant."""
+class ParticipantIn(MuscleIn):
+    """A new participant, and its site."""
 
     code: Code
     profile: FirstProfileIn = Field(default=FIRST_PROFILE)
-    side: Side | None = None
-    muscle: Muscle | None = None
 
 
 class RanByIn(Body):

@@ -1,7 +1,7 @@
 """A worker process: one call at a time from standard input, one JSON object a line each way.
 
 ``{"call": 1, "verb": "fit", "arguments": {…}}`` in; ``progress``, then ``result`` or ``error`` out.
-It ends when its input closes, so it never outlives the service; a cancelled call's worker is killed. Before the first
+It ends with the service, also in the middle of a call; a cancelled call's worker is killed. Before the first
 call it shuts itself in (`api.workers.confinement`): what it reads, others may have made. ``--reads`` and ``--writes``
 name the folders that stay open.
 """
@@ -24,6 +24,7 @@ PROCESSOR_S = 900.0
 
 def main() -> None:
     """Serve calls until the input closes."""
+    confinement.end_with_parent()
     out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # whatever a library prints must not fall into the protocol
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second

@@ -5,7 +5,6 @@ Imported by the worker only; the web process never loads numpy, and never fits.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -48,7 +47,12 @@ def fit(
     if earlier := adaptive_verbs.known(models).get("earlier"):
         options["earlier"] = earlier
     model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further, **options)
-    return {"json": model.to_json(), "model": model.to_dict(), "notes": list(record.notes)}
+    return {
+        "json": model.to_json(),
+        "model": model.to_dict(),
+        "notes": list(record.notes),
+        "of": record.source.participant,
+    }
 
 
 def figures(progress: Progress, model_json: str) -> dict[str, Any]:
@@ -191,18 +195,18 @@ def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> di
     record = identify.read(Path(data), map=columns)
     progress(0.7, "writing")
     parts_csv.write(record, Path(out))
-    return {"notes": list(record.notes)}
+    return {"notes": list(record.notes), "of": record.source.participant}
 
 
 def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     """A recording as a CSV file in the layout that `identify.read` takes in (docs/recording.md's times and widths)."""
     import identify
+    from identify.records import parts_csv
+    from identify.records.cells import quoted
 
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     if len(record.parts) > 1:
-        from identify.records import parts_csv
-
         progress(0.7, "writing")
         parts_csv.write(record, Path(out))
         return {"rows": int(record.time_s.size)}
@@ -212,14 +216,14 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     names = ["time_s", "pulse_width_us", "torque_nm"]
     also = record.columns()
     columns = [column.tolist() for column in (*(getattr(record, name) for name in names), *also.values())]
-    segments = [record.segment_names[index] for index in record.segment.tolist()]
+    told = [quoted(name) for name in record.segment_names]
+    segments = [told[index] for index in record.segment.tolist()]
     progress(0.7, "writing")
     with Path(out).open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow([*names, "segment", *also])
-        for seconds, width, torque, segment, *more in zip(*columns[:3], segments, *columns[3:], strict=True):
-            values = [f"{value:.8g}" for value in (width, torque, *more)]
-            table.writerow([f"{seconds:.6f}", *values[:2], segment, *values[2:]])
+        file.write(",".join([*names, "segment", *also]) + "\n")
+        for seconds, *values, segment in zip(*columns, segments, strict=True):
+            width, torque, *more = [f"{value:.8g}" for value in values]
+            file.write(",".join([f"{seconds:.6f}", width, torque, segment, *more]) + "\n")
     return {"rows": len(segments)}
 
 

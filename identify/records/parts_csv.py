@@ -6,8 +6,6 @@ they jump.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
+from identify.records.cells import quoted
 from identify.records.record import OPTIONAL, Part, Record, Source
 
 CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "recording_id", "sha256")
@@ -74,10 +73,7 @@ def _descriptions(record: Record) -> list[str]:
 
 def _cell(text: str) -> str:
     """A text as a cell, without what cannot be printed."""
-    cell = io.StringIO()
-    shown = "".join(sign for sign in text if sign.isprintable())[:LONGEST_TEXT]
-    csv.writer(cell, lineterminator="").writerow([shown, ""])
-    return cell.getvalue()[:-1]
+    return quoted("".join(sign for sign in text if sign.isprintable())[:LONGEST_TEXT])
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ class Source:
     sha256: str = ""
     parts: tuple[Source, ...] = ()
     notes: tuple[str, ...] = ()
+    participant: str = ""
+    """Whose it is, as a sealed recording says; empty where the file does not say."""
 
 
 def joined_source(parts: Sequence[Source], name: str = "joined", sha256: str = "") -> Source:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,8 +62,8 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     if angle is not None:
         doubts = doubts | angle.unknown
     bounds.check_span(time_s[inside], f"{name}, /torque/time_s")
-    source = Source(path.name, file.text("recording_id", ""), file.text("content_sha256", ""))
-    source = replace(source, notes=(note,)) if note else source
+    identity, digest, whose = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
+    source = Source(path.name, identity, digest, notes=(note,) if note else (), participant=whose)
     return Record.from_arrays(
         time_s[inside], width[inside], torque[inside], code[inside], segment_names=names, pulse_rate_hz=rate,
         source=source, pulses=pulses,

@@ -10,6 +10,7 @@ import numpy as np
 
 from identify.errors import BadRecord
 from identify.records import bounds
+from identify.records.cells import as_written
 from identify.records.columns import MAY_LACK, Column
 from identify.records.text import Row, is_number
 
@@ -71,7 +72,7 @@ class Table:
         for row, line in zip(rows, lines, strict=True):
             if len(row) <= at:
                 raise self._short(row, line, "segment")
-            text = row[at].strip()
+            text = as_written(row[at].strip())
             code = self.names.get(text)
             self.segment.append(self._new_name(text, line) if code is None else code)
 
@@ -84,7 +85,7 @@ class Table:
             row = rows[index]
             if len(row) <= max(self.cells.values()):
                 raise self._short(row, lines[index], "pause_s")
-            self.parts[before + index] = {column: row[at].strip() for column, at in self.cells.items()}
+            self.parts[before + index] = {column: as_written(row[at].strip()) for column, at in self.cells.items()}
             if len(self.parts) > bounds.MOST_PARTS:
                 fix = f"At most {bounds.MOST_PARTS} in one record."
                 raise BadRecord("too many parts", place=self.at(lines[index], "part"), fix=fix)

@@ -6,7 +6,6 @@ A sensor that slipped by less than the limit on a jump cannot be detected here, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from rig.acquire.rate import RateCheck
 from rig.acquire.stream import steps_from
 from rig.limits import Limit
 from rig.messages import HELD, TestPlan
+from rig.signals import TRUSTED
 
 FASTEST_RAD_S = 20.0
 """The fastest voluntary flexion of an elbow: while samples are missing it may turn so far."""
@@ -25,58 +25,28 @@ LEAVING = 2.0
 """Tolerances by which a joint may leave its target before the test stops."""
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What the angle of one test must be, rad; None: nothing is asked.
-
-    Attributes
-    ----------
-    range
-        The tightest of rig file, profile and plan.
-    target_rad, tolerance_rad
-        Of a held test.
-    still_s
-        Rig seconds that it may stand still.
-    """
-
-    range: Limit | None = None
-    target_rad: float | None = None
-    tolerance_rad: float = math.inf
-    still_s: float | None = None
-
-
-def asked_of(plan: TestPlan, table: dict[str, Limit]) -> Asked:
-    """What a plan asks."""
-    wanted = plan.angle
-    if wanted is None:
-        return Asked()
-    still_s = None if plan.kind == HELD else wanted.still_s
-    return Asked(table["angle_rad"], wanted.target_rad, wanted.tolerance_rad, still_s)
-
-
 class AngleCheck:
     """Checks the samples of one test, block by block.
 
     Parameters
     ----------
-    jump_rad
-        Largest change from one sample to the next.
+    plan
+        What is asked of the angle; of a plan that asks nothing only whether the sensor can be believed.
+    table
+        The tightest of rig file, profile and plan.
     rate_hz
         Nominal.
     speed
         Rig seconds per real second.
     """
 
-    def __init__(self, asked: Asked, jump_rad: float, rate_hz: float, speed: float) -> None:
-        self._asked, self._jump_rad, self._rate_hz = asked, jump_rad, rate_hz
-        self._rate = RateCheck("angle sensor", rate_hz, speed)
+    def __init__(self, plan: TestPlan, table: dict[str, Limit], rate_hz: float, speed: float) -> None:
+        self._wanted, self._is_held = plan.angle, plan.kind == HELD
+        self._range, self._jump_rad, self._rate_hz = table["angle_rad"], table["angle_jump_rad"].hi, rate_hz
+        self.rate = RateCheck("angle sensor", rate_hz, speed)
         self._last: tuple[float, int, float] | None = None
         self._still: tuple[float, float] | None = None
         self._moving = False
-
-    def begin(self) -> None:
-        """Start to measure the rate: what waited in buffers has been read. From any thread."""
-        self._rate.begin()
 
     def started(self) -> None:
         """The test has begun: from now on it may not stand still for long. From any thread."""
@@ -91,14 +61,10 @@ class AngleCheck:
             or self._outside(angle_rad)
             or self._away(angle_rad)
             or self._stands(angle_rad, now_s)
-            or self._rate.fault(len(samples), int(samples["counter"][-1]), now_s)
+            or self.rate.fault(len(samples), int(samples["counter"][-1]), now_s)
         )
         self._last = float(angle_rad[-1]), int(samples["counter"][-1]), now_s
         return found
-
-    def fault_at_end(self) -> str | None:
-        """Whether the rate over the whole test differs from the rig file's."""
-        return self._rate.fault_at_end()
 
     def _jumped(self, samples: NDArray[Any]) -> str | None:
         """More than the limit between two samples; what could have happened while samples were missing is allowed."""
@@ -118,16 +84,16 @@ class AngleCheck:
         )
 
     def _outside(self, angle_rad: NDArray[np.float64]) -> str | None:
-        bound = self._asked.range
-        if bound is None:
+        if self._wanted is None:
             return None
+        bound = self._range
         within = (angle_rad >= bound.lo) & (angle_rad <= bound.hi)
         return None if np.all(within) else f"angle sensor: {outside(float(angle_rad[np.argmin(within)]), bound)}"
 
     def _away(self, angle_rad: NDArray[np.float64]) -> str | None:
-        target_rad, most_rad = self._asked.target_rad, LEAVING * self._asked.tolerance_rad
-        if target_rad is None:
+        if self._wanted is None or self._wanted.target_rad is None:
             return None
+        target_rad, most_rad = self._wanted.target_rad, LEAVING * self._wanted.tolerance_rad
         near = np.abs(angle_rad - target_rad) <= most_rad
         if np.all(near):
             return None
@@ -137,7 +103,7 @@ class AngleCheck:
         )
 
     def _stands(self, angle_rad: NDArray[np.float64], now_s: float) -> str | None:
-        still_s = self._asked.still_s
+        still_s = None if self._wanted is None or self._is_held else self._wanted.still_s
         if still_s is None or not self._moving:
             return None
         if self._still is None or np.any(np.abs(angle_rad - self._still[1]) >= MOVED_RAD):
@@ -151,7 +117,7 @@ class AngleCheck:
 
 
 def _unreliable(samples: NDArray[Any]) -> str | None:
-    if np.any(samples["fault"] == 1):
+    if not np.all(np.isin(samples["fault"], TRUSTED)):
         return "angle sensor: it reports a fault of its own; check the sensor and its mounting"
     if not np.all(np.isfinite(samples["angle_rad"])):
         return "angle sensor: sent an angle that is not a number (NaN); check its cable"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rig.acquire.angle_check import AngleCheck, asked_of, degrees, outside
+from rig.acquire.angle_check import AngleCheck, degrees, outside
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.acquire.health import Watch
 from rig.clock import Clock
@@ -43,8 +43,7 @@ class AngleGuard:
         self._noted = False
         self._check: AngleCheck | None = None
         if receiver is not None:
-            jump_rad = table["angle_jump_rad"].hi
-            self._check = AngleCheck(asked_of(plan, table), jump_rad, receiver.nominal_rate_hz, clock.speed)
+            self._check = AngleCheck(plan, table, receiver.nominal_rate_hz, clock.speed)
 
     def record(self, journal: Journal, on_fault: Callable[[str], None]) -> None:
         """Write every sample from now on; `on_fault` gets what must end the test."""
@@ -63,7 +62,7 @@ class AngleGuard:
     def begin(self) -> None:
         """What waited in buffers has been read."""
         if self._check is not None:
-            self._check.begin()
+            self._check.rate.begin()
 
     def started(self) -> None:
         """The test's clock runs."""
@@ -72,14 +71,14 @@ class AngleGuard:
 
     def fault(self) -> str | None:
         """What must end the test; asked before each pulse, rests included. None: nothing."""
-        stale = self._stale()
-        if stale is not None and not self.needed:
-            self._note(stale)
-        return stale if self.needed else None
+        return self._ending(self._stale())
 
     def fault_at_end(self) -> str | None:
         """What only the whole test shows, and must make it a fault."""
-        found = None if self._check is None else self._check.fault_at_end()
+        return self._ending(None if self._check is None else self._check.rate.fault_at_end())
+
+    def _ending(self, found: str | None) -> str | None:
+        """What was found, if this test needs the sensor; else it is noted."""
         if found is not None and not self.needed:
             self._note(found)
         return found if self.needed else None
@@ -117,7 +116,7 @@ async def await_angle(receiver: AngleReceiver, tasks: Tasks) -> None:
         await tasks.sleep(0.02)
 
 
-def check_start(receiver: AngleReceiver | None, plan: TestPlan, table: dict[str, Limit], clock: Clock) -> None:
+def check_start(receiver: AngleReceiver, plan: TestPlan, table: dict[str, Limit], clock: Clock) -> None:
     """Check where the joint is before a test that asks for its angle.
 
     Raises
@@ -129,7 +128,6 @@ def check_start(receiver: AngleReceiver | None, plan: TestPlan, table: dict[str,
     """
     if plan.angle is None:
         return
-    assert receiver is not None
     now_rad = receiver.angle_around(AROUND_S * clock.speed)
     if now_rad is None:
         raise DeviceError(_worded(receiver))

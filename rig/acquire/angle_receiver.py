@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,9 @@ from rig.acquire.stream import Stream
 from rig.align import RATE_TOLERANCE
 from rig.angle_velocity import LiveSlope
 from rig.devices import AngleSensor
-from rig.errors import DeviceError, JournalError
+from rig.errors import DeviceError
 from rig.journal import Journal, Kind
-from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale, Recorded
+from rig.signals import ANGLE_SAMPLE, AngleScale
 from rig.tasks import Tasks
 
 NAME = "angle sensor"
@@ -35,7 +34,7 @@ RECENT_S = 1.0
 """Real seconds of angles that are kept for a pose, and for where the joint is."""
 
 
-class AngleReceiver(Stream[AngleBlock]):
+class AngleReceiver(Stream):
     """The angle sensor's, which opens it, too.
 
     Parameters
@@ -63,9 +62,6 @@ class AngleReceiver(Stream[AngleBlock]):
         """Whether the next sample is the first one since it was opened."""
         self._slope = LiveSlope(sensor.sample_rate_hz)
         self._recent: deque[NDArray[Any]] = deque()
-        self._journal: Journal | None = None
-        self._check: AngleCheck | None = None
-        self._on_broken: Callable[[str], None] = lambda _: None
 
     def rescale(self, scale: AngleScale) -> None:
         """From now on the joint's angle by this calibration."""
@@ -74,11 +70,7 @@ class AngleReceiver(Stream[AngleBlock]):
         self._recent = deque(self._scaled(samples) for samples in self._recent)
 
     def record(
-        self,
-        journal: Journal,
-        check: AngleCheck,
-        on_fault: Callable[[str], None],
-        on_broken: Callable[[str], None],
+        self, journal: Journal, check: AngleCheck, on_fault: Callable[[str], None], on_broken: Callable[[str], None]
     ) -> None:
         """From now on write every sample and check it.
 
@@ -89,15 +81,7 @@ class AngleReceiver(Stream[AngleBlock]):
         on_broken
             Called if the journal cannot be written.
         """
-        self._journal, self._check = journal, check
-        self._on_fault, self._on_broken = on_fault, on_broken
-        self.counts = Recorded()
-
-    def release(self) -> Recorded:
-        """Stop recording; returns the counts since `record`."""
-        self._journal = self._check = None
-        self._on_fault = self._on_broken = lambda _: None
-        return replace(self.counts)
+        self._record(journal, on_fault, on_broken, check.fault)
 
     def data_age_s(self, now_s: float) -> float:
         """How old the newest angle is: since its arrival, and what it came late."""
@@ -132,16 +116,10 @@ class AngleReceiver(Stream[AngleBlock]):
 
     def _keep(self, samples: NDArray[Any]) -> None:
         samples = self._scaled(samples)
-        if self._journal is not None:
-            self.counts.samples += len(samples)
-            try:
-                self._journal.append(Kind.ANGLE, samples.tobytes())
-            except JournalError as error:
-                self._on_broken(str(error))
+        self._write(Kind.ANGLE, samples)
         self.problem = ""
         self._remember(samples)
-        if self._check is not None and (fault := self._check.fault(samples)):
-            self._on_fault(fault)
+        self._check(samples)
 
     def _remember(self, samples: NDArray[Any]) -> None:
         now_s, _, delay_s = self._rate[-1]

@@ -7,7 +7,6 @@ import math
 from rig.acquire.receiver import Receiver
 from rig.errors import DeviceError
 from rig.gate import Gate
-from rig.messages import StopEvidence
 from rig.tasks import Tasks
 
 DECAY_S = 3.0
@@ -85,21 +84,3 @@ def _near_rest(at_stop_nm: float | None, above_nm: float, now_nm: float) -> str:
     if above_nm <= NEAR_REST_NM:
         return f"torque was near rest and still is, {now_nm:.2f} N·m: too small to show a fall"
     return f"torque fell from {at_stop_nm:.2f} to {now_nm:.2f} N·m"
-
-
-def evidence(
-    device: tuple[bool, str | None, str],
-    torque: tuple[bool, str],
-    last_pulse_age_s: float | None,
-    pulse_may_follow: bool,
-) -> StopEvidence:
-    """Both findings as one message."""
-    safe, state, said = device
-    falling, words = torque
-    return StopEvidence(
-        confirmed=safe and falling,
-        detail="; ".join(part for part in (f"device: {state or 'did not answer'}", said, words) if part),
-        last_pulse_age_s=last_pulse_age_s,
-        pulse_may_follow=pulse_may_follow,
-        device_state=state,
-    )

@@ -8,11 +8,12 @@ from typing import Literal
 from rig.clock import Clock
 from rig.tasks import Signal
 
-Cause = Literal["stopped", "fault"]
+Cause = Literal["stopped", "fault", "withdrawn"]
+"""`withdrawn`: nothing is wrong, so nothing latches. A stop or a fault that comes later outranks it."""
 
 
 class Halt:
-    """Set once; `signal` wakes all who wait."""
+    """Set once, or once more after a withdrawal; `signal` wakes all who wait."""
 
     def __init__(self, clock: Clock) -> None:
         self.signal = Signal()
@@ -28,9 +29,10 @@ class Halt:
 
     def set(self, cause: Cause, reason: str) -> bool:
         """End the test; False if it was already ending."""
-        if self.cause is not None:
+        if self.cause not in (None, "withdrawn") or cause == self.cause:
             return False
-        self.cause, self.reason, self.time_s = cause, reason, self._clock.now_s()
+        self.time_s = self._clock.now_s() if self.cause is None else self.time_s
+        self.cause, self.reason = cause, reason
         self.signal.set()
         for action in self._heard:
             action()

@@ -7,7 +7,8 @@ feeds the watchdog, or stops. A sender that hangs does not ask, so it neither se
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from rig.acquire.receiver import Receiver
 from rig.clock import Clock
@@ -24,20 +25,24 @@ MIN_FREE_BYTES = 8 * 2**20
 """With less than this a running test ends, while its recording can still be sealed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Watch:
-    """When silence counts as a fault, real seconds, and when a pulse is too late, as a share of the pulse period."""
+class Watch(BaseModel):
+    """When silence counts as a fault, real seconds, and when a pulse is too late, as a share of the pulse period.
 
-    stale_torque_s: float = 0.1
-    missing_ack_s: float = 0.1
-    late_pulse_periods: float = 0.4
-    stale_disk_s: float = 3.0
-    stuck_torque_s: float = 0.5
-    clipped_torque_s: float = 3.0
-    stale_angle_s: float = 0.1
+    A rig file may make it tighter or slightly looser than the defaults. Types are strict: `true` is not a number.
+    """
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True, frozen=True)
+
+    stale_torque_s: float = Field(0.1, gt=0, le=0.5)
+    missing_ack_s: float = Field(0.1, gt=0, le=0.5)
+    late_pulse_periods: float = Field(0.4, gt=0, le=0.6)
+    stuck_torque_s: float = Field(0.5, gt=0.05, le=10)
+    clipped_torque_s: float = Field(3.0, gt=0.05, le=10)
+    stale_disk_s: float = Field(3.0, gt=0.5, le=10)
+    stale_angle_s: float = Field(0.1, gt=0, le=0.5)
 
 
-DEFAULT_WATCH = Watch()
+DEFAULT_WATCH = Watch.model_validate({})
 
 
 class DiskWatch:
@@ -88,7 +93,7 @@ class Health:
         disk: DiskWatch,
         clock: Clock,
         watch: Watch,
-        angle: Callable[[], str | None] = lambda: None,
+        angle: Callable[[], str | None],
     ) -> None:
         self._gate, self._receiver, self._disk, self._clock, self._watch = gate, receiver, disk, clock, watch
         self._angle = angle

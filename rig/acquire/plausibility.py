@@ -52,7 +52,7 @@ class PlausibilityCheck:
         self._jump_nm, self._stuck_s, self._clipped_s = jump_nm, stuck_s, clipped_s
         self._rails = _Rail(1), _Rail(-1)
         self._first_nm: float | None = None
-        self._rate = RateCheck("load cell", rate_hz, speed)
+        self.rate = RateCheck("load cell", rate_hz, speed)
         self._last: tuple[float, float] | None = None
         self._noisy = noisy
         self._same_since_s: float | None = None
@@ -61,17 +61,9 @@ class PlausibilityCheck:
         """What is wrong with this block; None: nothing."""
         torque_nm, now_s = samples["torque_nm"], float(samples["host_time_s"][-1])
         found = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s)
-        found = found or self._rate.fault(len(samples), int(samples["counter"][-1]), now_s)
+        found = found or self.rate.fault(len(samples), int(samples["counter"][-1]), now_s)
         self._last = float(torque_nm[-1]), now_s
         return found
-
-    def begin(self) -> None:
-        """Start the measurement of the rate again, since an old backlog may have been read. From any thread."""
-        self._rate.begin()
-
-    def fault_at_end(self) -> str | None:
-        """Whether the rate over the whole test differs from the rig file's (see `RateCheck.fault_at_end`)."""
-        return self._rate.fault_at_end()
 
     def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm, before_s = self._last or (float(torque_nm[0]), now_s)

@@ -7,19 +7,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.plausibility import PlausibilityCheck
 from rig.acquire.stream import Stream
 from rig.acquire.torque_time import TorqueTime
 from rig.devices import LoadCell
-from rig.errors import JournalError
 from rig.journal import Journal, Kind
-from rig.signals import Recorded, TorqueBlock
+from rig.signals import Recorded
 from rig.tasks import Tasks
 
 LIVE_BLOCKS = 4000
@@ -27,7 +24,7 @@ RANGE_MEAN_S = 0.01
 """Seconds of torque of which one mean counts for the range: less noise than in single samples."""
 
 
-class Receiver(Stream[TorqueBlock]):
+class Receiver(Stream):
     """The load cell's.
 
     Parameters
@@ -40,9 +37,7 @@ class Receiver(Stream[TorqueBlock]):
 
     def __init__(self, cell: LoadCell, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
         super().__init__("load cell", cell, tasks, on_lost)
-        self._journal: Journal | None = None
         self._limits_nm = (-np.inf, np.inf)
-        self._plausibility: PlausibilityCheck | None = None
         self.last_torque_nm: float | None = None
         self.peak_nm = 0.0
         self.range_nm = (np.inf, -np.inf)
@@ -56,26 +51,20 @@ class Receiver(Stream[TorqueBlock]):
         journal: Journal,
         limits_nm: tuple[float, float],
         on_fault: Callable[[str], None],
-        plausibility: PlausibilityCheck | None = None,
+        wrong: Callable[[NDArray[Any]], str | None] = lambda _: None,
     ) -> None:
         """From now on write every sample to the journal and check it; faults are reported at once."""
-        self._plausibility, self.torque_time = plausibility, TorqueTime()
-        self._journal, self._limits_nm, self._on_fault = journal, limits_nm, on_fault
-        self.counts, self.peak_nm = Recorded(), 0.0
-        self._begin_range()
+        self._record(journal, on_fault, on_fault, wrong)
+        self._limits_nm, self.torque_time, self.peak_nm = limits_nm, TorqueTime(), 0.0
+        self.begin_range()
 
     def begin_range(self) -> None:
         """Forget the range until now: the limb may have moved before the first pulse."""
-        self._begin_range()
-
-    def _begin_range(self) -> None:
         self.range_nm, self._unaveraged_nm = (np.inf, -np.inf), np.empty(0)
 
     def release(self) -> Recorded:
-        """Stop recording; returns the counts since `record`."""
-        self._journal = self._plausibility = None
-        self._limits_nm, self._on_fault = (-np.inf, np.inf), lambda _: None
-        return replace(self.counts)
+        self._limits_nm = (-np.inf, np.inf)
+        return super().release()
 
     def torque_around(self, duration_s: float) -> float | None:
         """Median of the torque over the last `duration_s`, N·m; None if there is none."""
@@ -90,15 +79,9 @@ class Receiver(Stream[TorqueBlock]):
 
     def _keep(self, samples: NDArray[Any]) -> None:
         self._remember(samples)
-        if self._journal is not None:
-            self.counts.samples += len(samples)
-            try:
-                self._journal.append(Kind.TORQUE, samples.tobytes())
-            except JournalError as error:
-                self._on_fault(str(error))
-        self._check(samples["torque_nm"])
-        if self._plausibility is not None and (fault := self._plausibility.fault(samples)):
-            self._on_fault(fault)
+        self._write(Kind.TORQUE, samples)
+        self._check_limits(samples["torque_nm"])
+        self._check(samples)
 
     def _remember(self, samples: NDArray[Any]) -> None:
         now_s, mean_nm = float(samples["host_time_s"][-1]), float(samples["torque_nm"].mean())
@@ -107,7 +90,7 @@ class Receiver(Stream[TorqueBlock]):
         self.torque_time.add(now_s, mean_nm)
         self.live.append(samples)
 
-    def _check(self, torque_nm: NDArray[np.float64]) -> None:
+    def _check_limits(self, torque_nm: NDArray[np.float64]) -> None:
         lo, hi = self._limits_nm
         within = (torque_nm >= lo) & (torque_nm <= hi)
         if not within.all():

@@ -9,14 +9,14 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from rig.acquire.angle_guard import AngleGuard
 from rig.acquire.angle_receiver import AngleReceiver
-from rig.acquire.evidence import AROUND_S, evidence, stop_device, watch_decay
+from rig.acquire.evidence import AROUND_S, stop_device, watch_decay
 from rig.acquire.halt import Cause, Halt
 from rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
 from rig.acquire.plausibility import PlausibilityCheck
@@ -44,25 +44,16 @@ FRESH_S = 0.5
 
 @dataclass(slots=True)
 class RunResult:
-    """Result of a test; lateness of the written pulses and delay of their acks in s."""
+    """Result of a test."""
 
     outcome: TestOutcome
     reason: str
     evidence: StopEvidence
-    counts: Recorded = field(default_factory=Recorded)
-    lateness_s: list[float] = field(default_factory=list)
-    ack_delay_s: list[float] = field(default_factory=list)
-    dropped: int = 0
-    charge_uc: float = 0.0
-    peak_nm: float = 0.0
-    rise_nm: float | None = None
-    last_pulse_s: float | None = None
-    cpu_percent: float = 0.0
-    duration_s: float = 0.0
-    torque_time_nms: float = 0.0
-    ended_by: str = ""
-    last_sample_unix_s: float | None = None
-    angle_counts: Recorded | None = None
+    summary: dict[str, Any]
+    """Of `FinishedEvent`, as far as it is known without the recording."""
+    rise_nm: float | None
+    last_pulse_s: float | None
+    last_sample_unix_s: float | None
 
 
 class TestRun:
@@ -104,8 +95,8 @@ class TestRun:
         self.told_pulses = 0
         """How many pulses earlier live events contained; who makes these events counts here, in a thread of its own."""
         self._table = table
-        self._journal = journal
-        self._gate = gate
+        self.journal = journal
+        self.gate = gate
         self._receiver = receiver
         self._machine, self._tasks, self._clock = machine, machine.tasks, machine.tasks.clock
         self._watch = watch
@@ -121,7 +112,7 @@ class TestRun:
     async def execute(self) -> RunResult:
         """Play the test to its end or its halt; never raises for a fault, the result says it."""
         cpu_s, began_s = self._machine.cpu_s(), self._clock.now_s()
-        self._gate.reset()
+        self.gate.reset()
         torque = self._table["torque_nm"]
         self._plausibility = PlausibilityCheck(
             self._table["torque_jump_nm"].hi,
@@ -131,10 +122,10 @@ class TestRun:
             self._clock.speed,
             self._receiver.changes_lately(),
         )
-        self._receiver.record(self._journal, (torque.lo, torque.hi), self._fault, self._plausibility)
-        self._angle.record(self._journal, self._fault)
-        disk = DiskWatch(self._journal, self._machine)
-        self._health = Health(self._gate, self._receiver, disk, self._clock, self._watch, self._angle.fault)
+        self._receiver.record(self.journal, (torque.lo, torque.hi), self._fault, self._plausibility.fault)
+        self._angle.record(self.journal, self._fault)
+        disk = DiskWatch(self.journal, self._machine)
+        self._health = Health(self.gate, self._receiver, disk, self._clock, self._watch, self._angle.fault)
         try:
             if await self._arm():
                 with self._machine.undisturbed():
@@ -151,39 +142,19 @@ class TestRun:
         await disk.end()
         return await self._result(found, cpu_percent)
 
-    @property
-    def journal_path(self) -> Path:
-        """Path of its journal."""
-        return self._journal.path
-
     def segment(self) -> str | None:
         """Name of the current segment; None before the start and after the end."""
         return None if self.t0_s is None else self.score.segment_at(self.elapsed_s())
 
     @property
-    def dropped(self) -> int:
-        """Number of pulses dropped so far."""
-        return self._gate.dropped
-
-    @property
-    def not_sent(self) -> list[int]:
-        """Indices of the pulses that were dropped or refused so far."""
-        return list(self._gate.not_sent)
-
-    @property
-    def late(self) -> list[tuple[int, float]]:
-        """Indices of the pulses that were sent late so far, and by how much, s."""
-        return list(self._gate.late)
-
-    @property
     def sent(self) -> int:
         """Number of pulses sent so far."""
-        return len(self._gate.lateness_s)
+        return len(self.gate.lateness_s)
 
     @property
-    def charge_uc(self) -> float:
-        """Charge of the pulses sent so far, one phase, µC."""
-        return self._gate.charge_uc
+    def begun(self) -> bool:
+        """Whether a pulse was sent."""
+        return self.t0_s is not None and self.sent > 0
 
     @property
     def torque_time_nms(self) -> float:
@@ -192,7 +163,7 @@ class TestRun:
 
     @property
     def ended_by(self) -> str:
-        """What ended it: stopped, fault, or why nothing more was laid."""
+        """What ended it: stopped, fault, withdrawn, or why nothing more was laid."""
         return self.halt.cause or self.score.ended_by
 
     def elapsed_s(self) -> float:
@@ -221,17 +192,17 @@ class TestRun:
         return False
 
     async def _open_gate(self) -> bool:
-        self._plausibility.begin()
+        self._plausibility.rate.begin()
         self._angle.begin()
         self._rest_nm = self._receiver.torque_around(0.1 * self._clock.speed)
-        await self._gate.open(self._journal, self._table, self.halt.signal.is_set)
-        return self._gate.is_open
+        await self.gate.open(self.journal, self._table, self.halt.signal.is_set)
+        return self.gate.is_open
 
     async def _play(self) -> None:
         clock, current_ma = self._clock, self.plan.profile.current_ma
         period_s = 1 / self.plan.pulse_rate_hz
         t0_s = clock.now_s() + LEAD_S * clock.speed
-        self._journal.append_json(Kind.START, {"t0_s": t0_s, "unix_s": clock.unix_s() + LEAD_S})
+        self.journal.append_json(Kind.START, {"t0_s": t0_s, "unix_s": clock.unix_s() + LEAD_S})
         self.t0_s = t0_s
         self._angle.started()
         self.started.set()
@@ -250,8 +221,8 @@ class TestRun:
                 return
             # after pulses that were left out the width climbs back within the limit
             width_us = self.score.lowered(index, felt_us + self._table["width_rise_us"].hi)
-            self._gate.feed()
-            status = self._gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
+            self.gate.feed()
+            status = self.gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
             if status in (PulseStatus.UNACKNOWLEDGED, PulseStatus.REST):
                 felt_us = width_us
             index += 1
@@ -267,26 +238,32 @@ class TestRun:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
-        device = await stop_device(self._gate)
-        if cause is None and not device[0]:  # without the device's confirmation the end is a fault
-            self._fault(f"the end of stimulation is not confirmed: {device[2] or device[1]}")
-        elif cause is None and (wrong := self._plausibility.fault_at_end() or self._angle.fault_at_end()):
+        safe, state, said = await stop_device(self.gate)
+        well = cause in (None, "withdrawn")
+        if well and not safe:  # without the device's confirmation the end is a fault
+            self._fault(f"the end of stimulation is not confirmed: {said or state}")
+        elif well and (wrong := self._plausibility.rate.fault_at_end() or self._angle.fault_at_end()):
             self._fault(wrong)
         cause = self.halt.cause
-        if cause is None:
+        if cause in (None, "withdrawn"):
             await self._tasks.sleep(AROUND_S)  # samples still in transit belong to the test
-            torque = True, "the test ended as planned"
+            falling, words = True, "the test was withdrawn" if cause else "the test ended as planned"
         else:
-            torque = await watch_decay(self._gate, self._receiver, self._tasks, self._rest_nm, at_stop_nm)
-        now_s, last_s = clock.now_s(), self._gate.last_pulse_s
+            falling, words = await watch_decay(self.gate, self._receiver, self._tasks, self._rest_nm, at_stop_nm)
+        now_s, last_s = clock.now_s(), self.gate.last_pulse_s
         planned_end_s = (self.t0_s or now_s) + self.score.duration_s
         self._end_journal(cause, planned_end_s if cause is None else now_s)
-        may_follow = self._gate.on_its_way is not None
-        return evidence(device, torque, None if last_s is None else now_s - last_s, may_follow)
+        return StopEvidence(
+            confirmed=safe and falling,
+            detail="; ".join(part for part in (f"device: {state or 'did not answer'}", said, words) if part),
+            last_pulse_age_s=None if last_s is None else now_s - last_s,
+            pulse_may_follow=self.gate.on_its_way is not None,
+            device_state=state,
+        )
 
     def _end_journal(self, cause: Cause | None, end_s: float) -> None:
         self.score.shut()
-        self._outcome = cause or "completed"
+        self._outcome = "stopped" if cause == "withdrawn" else cause or "completed"
         stimulation_end_s = end_s if cause is None else self.halt.time_s
         if self.t0_s is not None:
             self._duration_s = max(0.0, stimulation_end_s - self.t0_s)
@@ -297,36 +274,38 @@ class TestRun:
             "stimulation_end_s": stimulation_end_s,
             "ended_by": self.ended_by,
         }
-        self._gate.release()
+        self.gate.release()
         self._counts, self._angle_counts = self._receiver.release(), self._angle.release()
         # If the end cannot be written, the journal is recovered later as one without an end.
         with contextlib.suppress(JournalError):
             if cause is not None:
                 event = {"event": cause, "reason": self.halt.reason, "time_s": self.halt.time_s}
-                self._journal.append_json(Kind.EVENT, event)
-            self._journal.append_json(Kind.END, content)
+                self.journal.append_json(Kind.EVENT, event)
+            self.journal.append_json(Kind.END, content)
 
     async def _result(self, found: StopEvidence, cpu_percent: float) -> RunResult:
-        await self._tasks.work(self._journal.close)
-        return RunResult(
-            outcome=self._outcome,
-            reason=self.halt.reason if self._outcome != "completed" else "",
-            evidence=found,
-            counts=self._counts,
-            lateness_s=list(self._gate.lateness_s),
-            ack_delay_s=list(self._gate.ack_delay_s),
-            dropped=self._gate.dropped,
-            charge_uc=self._gate.charge_uc,
-            peak_nm=self._receiver.peak_nm,
-            rise_nm=self._rise_nm(),
-            last_pulse_s=self._gate.last_pulse_s,
-            cpu_percent=cpu_percent,
-            duration_s=self._duration_s,
-            torque_time_nms=self.torque_time_nms,
-            ended_by=self.ended_by,
-            last_sample_unix_s=self._receiver.last_unix_s,
-            angle_counts=self._angle_counts,
-        )
+        await self._tasks.work(self.journal.close)
+        gate, speed, angle = self.gate, self._clock.speed, self._angle_counts
+        summary: dict[str, Any] = {
+            "duration_s": self._duration_s,
+            **asdict(self._counts),
+            "pulses": self.sent,
+            "dropped_pulses": gate.dropped,
+            "lateness_ms": spread_ms([s / speed for s in gate.lateness_s]),
+            "ack_delay_ms": spread_ms([s / speed for s in gate.ack_delay_s]),
+            "charge_uc": gate.charge_uc,
+            "torque_time_nms": self.torque_time_nms,
+            "torque_peak_nm": self._receiver.peak_nm,
+            "ended_by": self.ended_by,
+            "cpu_percent": round(cpu_percent, 2),
+            "stop": found.model_dump(),
+        }
+        if angle is not None:
+            counts = asdict(angle)
+            summary["angle"] = {name: counts[name] for name in ("samples", "lost_samples", "duplicate_samples")}
+        reason = self.halt.reason if self._outcome != "completed" else ""
+        last_s, last_unix_s = gate.last_pulse_s, self._receiver.last_unix_s
+        return RunResult(self._outcome, reason, found, summary, self._rise_nm(), last_s, last_unix_s)
 
     def _rise_nm(self) -> float | None:
         """Largest change of the torque from rest since the first pulse, N·m; None if that is not known."""

@@ -10,14 +10,17 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Generic, Protocol, TypeVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.align import RATE_TOLERANCE
 from rig.devices import Sensor
-from rig.signals import Recorded
+from rig.errors import JournalError
+from rig.journal import Journal, Kind
+from rig.signals import Block, Recorded
 from rig.tasks import Signal, Task, Tasks
 
 log = logging.getLogger("rig.receiver")
@@ -40,23 +43,6 @@ JUMP_ALLOWANCE_S = 0.5
 
 STAMPS_BACK_S = 0.1
 """An adapter's stamp that is further back than this is of a clock that was set, not of a frame that came late."""
-
-BlockT = TypeVar("BlockT", bound="Block")
-
-
-class Block(Protocol):
-    """Samples as a device gives them; they have a `host_time_s` and a `counter`."""
-
-    @property
-    def samples(self) -> NDArray[Any]: ...
-
-    @property
-    def malformed(self) -> int: ...
-
-    @property
-    def error_frames(self) -> int: ...
-
-    def __len__(self) -> int: ...
 
 
 class CounterUnwrapper:
@@ -99,7 +85,7 @@ def steps_from(before: float, values: NDArray[Any]) -> NDArray[Any]:
     return steps
 
 
-class Stream(Generic[BlockT]):
+class Stream:
     """Base of the receivers.
 
     Parameters
@@ -112,7 +98,7 @@ class Stream(Generic[BlockT]):
         Called once, with the reason, when the device is gone.
     """
 
-    def __init__(self, name: str, source: Sensor[BlockT], tasks: Tasks, on_lost: Callable[[str], None]) -> None:
+    def __init__(self, name: str, source: Sensor, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
         self._name, self._source, self._on_lost = name, source, on_lost
         self._tasks, self._clock = tasks, tasks.clock
         self._closing = Signal()
@@ -121,7 +107,10 @@ class Stream(Generic[BlockT]):
         self._ending: Task[None] | None = None
         """Closes the device after it was lost."""
         self._unwrapper = CounterUnwrapper(source.counter_modulus) if source.counter_modulus else None
+        self._journal: Journal | None = None
         self._on_fault: Callable[[str], None] = lambda _: None
+        self._on_broken: Callable[[str], None] = lambda _: None
+        self._wrong: Callable[[NDArray[Any]], str | None] = lambda _: None
         self._previous: tuple[int, float] | None = None
         self._newest_stamp_s = -np.inf
         self._rate: deque[tuple[float, int, float]] = deque(maxlen=2000)
@@ -194,7 +183,7 @@ class Stream(Generic[BlockT]):
             return None
         return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0])
 
-    def take(self, block: BlockT) -> None:
+    def take(self, block: Block) -> None:
         """Process one block from the device: unwrap, record, check."""
         self.counts.malformed_frames += block.malformed
         self.counts.error_frames += block.error_frames
@@ -208,6 +197,36 @@ class Stream(Generic[BlockT]):
     def _keep(self, samples: NDArray[Any]) -> None:
         """Record and check samples that have their place."""
         raise NotImplementedError
+
+    def _record(
+        self,
+        journal: Journal,
+        on_fault: Callable[[str], None],
+        on_broken: Callable[[str], None],
+        wrong: Callable[[NDArray[Any]], str | None],
+    ) -> None:
+        """From now on write and check every sample; `wrong` says of a block what is wrong with it, None: nothing."""
+        self._journal, self._on_fault, self._on_broken, self._wrong = journal, on_fault, on_broken, wrong
+        self.counts = Recorded()
+
+    def release(self) -> Recorded:
+        """Stop recording; returns the counts since it began."""
+        self._journal, self._wrong = None, lambda _: None
+        self._on_fault = self._on_broken = lambda _: None
+        return replace(self.counts)
+
+    def _write(self, kind: Kind, samples: NDArray[Any]) -> None:
+        """Write samples to the journal while a test runs."""
+        if self._journal is not None:
+            self.counts.samples += len(samples)
+            try:
+                self._journal.append(kind, samples.tobytes())
+            except JournalError as error:
+                self._on_broken(str(error))
+
+    def _check(self, samples: NDArray[Any]) -> None:
+        if (fault := self._wrong(samples)) is not None:
+            self._on_fault(fault)
 
     def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
         """The samples with unwrapped counters, without repeated and late ones; counts the lost ones."""
@@ -255,7 +274,7 @@ class Stream(Generic[BlockT]):
         number = self._total if self._unwrapper is None else int(samples["counter"][-1])
         self._rate.append((self.last_s, self._total, self.last_s - number / self.nominal_rate_hz))
 
-    def _receive(self, block: BlockT) -> None:
+    def _receive(self, block: Block) -> None:
         if self._closing.is_set() or self._lost.is_set():
             return
         try:

@@ -48,8 +48,8 @@ class Previews:
         async with self._one:
             await self._begin()
 
-    async def reply(self, line: bytes) -> bytes:
-        """Reply to a preview request; both are one line of JSON.
+    async def reply(self, line: bytes, angle_set_at_utc: str | None = None) -> bytes:
+        """Reply to a preview request; both are one line of JSON. `angle_set_at_utc`: see `check_range`.
 
         Raises
         ------
@@ -63,7 +63,7 @@ class Previews:
         self._waiting += 1
         try:
             async with self._one:
-                return await asyncio.wait_for(self._ask(line), MAX_BUILD_S)
+                return await asyncio.wait_for(self._ask(line, angle_set_at_utc), MAX_BUILD_S)
         except TimeoutError:
             await self.close()
             raise BusyError(f"preview: not built within {MAX_BUILD_S:g} s, the computer is busy; try again") from None
@@ -92,11 +92,11 @@ class Previews:
             self._process.stdin.write(self._settings)
         return self._process
 
-    async def _ask(self, line: bytes) -> bytes:
+    async def _ask(self, line: bytes, angle_set_at_utc: str | None) -> bytes:
         process = await self._begin()
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(line.rstrip(b"\n") + b"\n")
+        process.stdin.write(json.dumps(angle_set_at_utc).encode() + b"\n" + line.rstrip(b"\n") + b"\n")
         await process.stdin.drain()
         reply = await process.stdout.readline()
         if not reply.endswith(b"\n"):

@@ -44,7 +44,7 @@ class Server:
     """Serves any number of clients."""
 
     def __init__(self) -> None:
-        self.rig: Rig | None = None
+        self.rig: Rig
         self._ask: Ask
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: dict[asyncio.StreamWriter, bool] = {}
@@ -53,7 +53,7 @@ class Server:
         self._connections = Connections(MAX_SILENT, MAX_ACTIVE)
         self._server: asyncio.Server | None = None
         self._stop_server: StopServer | None = None
-        self._previews: Previews
+        self._previews: Previews | None = None
 
     def publish(self, event: Event) -> None:
         """Send an event to all subscribers; may be called from any thread."""
@@ -93,7 +93,7 @@ class Server:
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        if self.rig is not None:
+        if self._previews is not None:
             await self._previews.close()
 
     def _keep(self, task: asyncio.Task[None]) -> None:
@@ -101,7 +101,6 @@ class Server:
         task.add_done_callback(self._tasks.discard)
 
     async def _live(self) -> None:
-        assert self.rig is not None
         while True:
             await asyncio.sleep(LIVE_PERIOD_S)
             event = self.rig.live(samples=any(self._subscribers.values()))
@@ -175,10 +174,11 @@ class Server:
 
     async def _preview(self, line: bytes, writer: asyncio.StreamWriter) -> bytes:
         """Previews are built in order of request; none for a client that has disconnected."""
-        return b"" if writer.transport.is_closing() else await self._previews.reply(line)
+        if self._previews is None or writer.transport.is_closing():
+            return b""
+        return await self._previews.reply(line, self.rig.angle_set_at_utc)
 
     def _refuse_long(self, line: bytes, kind: str) -> None:
-        assert self.rig is not None
         if len(line) > LONG_LINE_BYTES and kind == "":
             raise PlanError(f"request: if over {LONG_LINE_BYTES // 1000} kB, it must begin with its kind and its id")
         if len(line) > LONG_LINE_BYTES and self.rig.busy:
@@ -188,7 +188,6 @@ class Server:
         if request.kind in ("preview", "stop"):  # it does not begin with its kind and id
             await self._answer(to_line(request), writer, crowded=False)
             return
-        assert self.rig is not None
         rig = self.rig
         reply = await asyncio.wrap_future(self._ask(lambda: desk.obey(rig, request)))
         _write(writer, to_line(reply))
@@ -197,7 +196,6 @@ class Server:
             _write(writer, to_line(StateEvent(status=await asyncio.wrap_future(self._ask(self._status)))))
 
     async def _status(self) -> Status:
-        assert self.rig is not None
         return self.rig.status()
 
 

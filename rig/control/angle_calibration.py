@@ -5,24 +5,24 @@ It is kept in the data folder, for the sensor that it was made with. Another sen
 
 from __future__ import annotations
 
-import json
 import logging
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from rig.acquire.angle_check import degrees
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.clock import utc_text
+from rig.control.small_file import SmallFile
 from rig.devices import DeviceSettings
-from rig.errors import DeviceError, RefusedError, RigError
-from rig.limits import Limit, check
+from rig.errors import DeviceError, RefusedError
+from rig.limits import Limit, refuse
 from rig.machine import Machine
 from rig.messages import AngleCalibration, AnglePose
-from rig.signals import AngleScale
+from rig.signals import TRUSTED, AngleScale
 
 log = logging.getLogger("rig")
 
@@ -54,8 +54,8 @@ class AngleCalibrating:
     """
 
     def __init__(self, folder: Path, sensor: DeviceSettings | None, machine: Machine) -> None:
-        self._path = folder / "angle-calibration.json"
-        self._machine, self._clock = machine, machine.tasks.clock
+        self._file = SmallFile(folder / "angle-calibration.json", "angle_pose", machine)
+        self._clock = machine.tasks.clock
         content = {} if sensor is None else sensor.model_dump(mode="json")
         self._sensor = {name: content[name] for name in SENSOR if name in content}
         self._first: tuple[AnglePose, float] | None = None
@@ -63,8 +63,16 @@ class AngleCalibrating:
 
     async def recall(self) -> None:
         """Read the calibration that was stored for this sensor."""
-        if self._sensor:
-            self.calibration = await self._machine.tasks.work(self._read)
+        try:
+            content = await self._file.read() if self._sensor else None
+            if content is None:
+                return
+            if content["sensor"] == self._sensor:
+                self.calibration = _of_its_poses(AngleCalibration.model_validate(content["calibration"]))
+            else:
+                log.warning("%s: made with another sensor; take two poses again", self._file.path)
+        except (OSError, ValueError, KeyError) as error:
+            log.error("%s: not readable (%s); take two poses again", self._file.path, " ".join(str(error).split()))
 
     @property
     def first(self) -> AnglePose | None:
@@ -84,14 +92,7 @@ class AngleCalibrating:
         """What holds now, for journals and recordings: the calibration, else what the rig file says."""
         if self.calibration is not None:
             return self.calibration.model_dump(mode="json")
-        return {
-            "poses": [],
-            "offset": rig_file.offset,
-            "direction": rig_file.direction,
-            "radians_per_unit": rig_file.radians_per_unit,
-            "by": "rig file",
-            "set_at_utc": "",
-        }
+        return {"poses": [], **asdict(rig_file), "by": "rig file", "set_at_utc": ""}
 
     async def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit, first: bool = False) -> bool:
         """Take a pose; True if it completed a calibration. `first`: it begins anew, whichever one waits.
@@ -105,16 +106,14 @@ class AngleCalibrating:
         RigError
             The calibration could not be stored: the old one holds.
         """
-        refusal = check(bound, angle_rad)
-        if refusal is not None:
-            raise RefusedError(f"angle_pose: {refusal}")
+        refuse(bound, angle_rad, "angle_pose")
         pose = AnglePose(angle_rad=angle_rad, raw=still_raw(receiver, self._clock.speed))
         before = None if first else self.first
         if before is None:
             self._first = pose, self._clock.now_s()
             return False
         found = self._of_two(before, pose, by, receiver.sensor.scale)
-        await self._machine.tasks.work(self._write, found)
+        await self._file.write({"sensor": self._sensor, "calibration": found.model_dump(mode="json")})
         self._first, self.calibration = None, found
         log.info("angle sensor calibrated by %s: %s", by, found.model_dump_json())
         return True
@@ -143,26 +142,6 @@ class AngleCalibrating:
             by=by,
             set_at_utc=utc_text(self._clock.unix_s()),
         )
-
-    def _read(self) -> AngleCalibration | None:
-        try:
-            content = json.loads(self._machine.disk.read(self._path))
-            if content["sensor"] != self._sensor:
-                log.warning("%s: made with another sensor; take two poses again", self._path)
-                return None
-            return _of_its_poses(AngleCalibration.model_validate(content["calibration"]))
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError) as error:
-            log.error("%s: not readable (%s); take two poses again", self._path, " ".join(str(error).split()))
-            return None
-
-    def _write(self, found: AngleCalibration) -> None:
-        content = {"sensor": self._sensor, "calibration": found.model_dump(mode="json")}
-        try:
-            self._machine.disk.replace(self._path, json.dumps(content).encode())
-        except OSError as error:
-            raise RigError(f"angle_pose: {self._path}: {error.strerror}; free some disk space") from None
 
 
 def _slope(first: AnglePose, second: AnglePose) -> float:
@@ -206,7 +185,7 @@ def still_raw(receiver: AngleReceiver, speed: float) -> float:
     raw = samples["raw"]
     if len(samples) < max(3.0, LEAST_SHARE * POSE_S * speed * receiver.nominal_rate_hz):
         raise DeviceError(receiver.problem or "angle sensor: too few angles arrive; check its cable and supply")
-    if not np.all(np.isfinite(raw)) or np.any(samples["fault"] == 1):
+    if not (np.all(np.isfinite(raw)) and np.all(np.isin(samples["fault"], TRUSTED))):
         raise RefusedError("angle_pose: the sensor reports a fault of its own, or no number; check sensor and cable")
     moved_rad = _moved(samples, PART_S * speed) * receiver.sensor.scale.radians_per_unit
     if not (moved_rad < STILL_RAD):

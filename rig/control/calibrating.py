@@ -8,7 +8,15 @@ from rig import plan
 from rig.control.calibration import Calibration
 from rig.control.playing import Playing, check_names
 from rig.errors import BusyError, PlanError
-from rig.messages import CalibrateStartRequest, CalibrationResult, StateEvent, Status, Threshold
+from rig.messages import (
+    Calibrated,
+    CalibrateFinishRequest,
+    CalibrateStartRequest,
+    CalibrationResult,
+    StateEvent,
+    Status,
+    Threshold,
+)
 
 log = logging.getLogger("rig")
 
@@ -26,10 +34,11 @@ class Calibrating(Playing):
         PlanError, RefusedError
             Wrong name or id; step, train, current or rate outside the limits, or too small to stimulate.
         """
-        stops = self._stops
+        latch = self.latch
         async with self._in_turn():
             following = self._trial.calibrate(request.participant)
-            self._refuse_unseen(stops)
+            self._refuse_unseen(latch)
+            self._result.refuse_waiting()
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
             calibration = Calibration(request, self._table, self._clock.unix_s(), self._pair.steps)
             await self._tasks.work(self._store.check_room, f"{request.calibration_id}.001")
@@ -69,23 +78,48 @@ class Calibrating(Playing):
             self._publish(StateEvent(status=self.status()))
         return self.status()
 
-    async def calibrate_finish(self, by: str, discard: bool) -> CalibrationResult:
-        """Close the calibration and give its profile.
+    async def calibrate_finish(self, request: CalibrateFinishRequest) -> CalibrationResult:
+        """Close the calibration and give its profile; of one that is closed, what was kept of it.
 
-        Raises PlanError (a threshold is missing), BusyError, RefusedError (its day is over).
+        Raises PlanError (a threshold is missing, none or another is open), BusyError, RefusedError (its day is over),
+        RigError (the result could not be written: it stays open).
         """
         async with self._in_turn():
-            calibration = self._open_calibration()
-            profile = None if discard else calibration.profile(self._clock.unix_s())
-            log.info(
-                "calibration %s %s by %s", calibration.request.calibration_id, "discarded" if discard else "done", by
-            )
-            self._change(self._trial.calibrated())
-        return CalibrationResult(profile=profile, recordings=calibration.recordings)
+            if self._calibration is None and (kept := self._result.of(request.calibration_id)) is not None:
+                result = kept.result
+                if request.discard:
+                    await self._result.let_go(kept.calibration_id)
+                    result = result.model_copy(update={"profile": None})
+            else:
+                result = await self._close_calibration(self._open_calibration(request.calibration_id), request.discard)
+            log.info("calibration %s by %s", "discarded" if request.discard else "done", request.by)
+            self._publish(StateEvent(status=self.status()))
+        return result
 
-    def _open_calibration(self) -> Calibration:
+    async def _close_calibration(self, calibration: Calibration, discard: bool) -> CalibrationResult:
+        of = calibration.request
+        profile = None if discard else calibration.profile(self._clock.unix_s())
+        result = CalibrationResult(profile=profile, recordings=calibration.recordings)
+        if not discard:
+            found = {"calibration_id": of.calibration_id, "participant": of.participant, "by": of.by, "result": result}
+            await self._result.keep(Calibrated.model_validate(found))
+        if self._trial.state == "calibrating":  # a stop may have come meanwhile: it takes no result back
+            self._change(self._trial.calibrated())
+        return result
+
+    async def calibrate_stored(self, calibration_id: str) -> Status:
+        """A client has stored that result. Raises RigError: the file could not be removed, so it waits still."""
+        async with self._in_turn():
+            await self._result.let_go(calibration_id)
+            self._publish(StateEvent(status=self.status()))
+        return self.status()
+
+    def _open_calibration(self, calibration_id: str = "") -> Calibration:
         if self._calibration is None:
             raise PlanError("calibration: none is open (a stop or a fault closes it); start a new one")
+        open_id = self._calibration.request.calibration_id
+        if calibration_id not in ("", open_id):
+            raise PlanError(f"calibration: {calibration_id!r} is not open; {open_id} is")
         if self._trial.state != "calibrating":
             raise BusyError(f"calibration: train {self._trial.test_id} is {self._trial.state}; wait or stop it")
         return self._calibration

@@ -74,9 +74,7 @@ class Calibration:
             ("calibration_train_s", request.train_s),
             ("pulse_rate_hz", request.pulse_rate_hz),
         ):
-            refusal = limits.check(table[name], value)
-            if refusal is not None:
-                raise RefusedError(f"calibration: {refusal}")
+            limits.refuse(table[name], value, "calibration")
         if steps.current(request.current_ma) == 0:
             raise RefusedError(
                 f"calibration: current_ma {request.current_ma:g} mA would stimulate nothing; the smallest current is "
@@ -127,9 +125,7 @@ class Calibration:
             width_us = self._up_to(width_us, ceiling.hi)
         if self._steps.width_us(width_us) == 0:
             raise PlanError(f"calibration: no step below {self._width_us:g} µs; step up instead")
-        refusal = limits.check(ceiling, width_us)
-        if refusal is not None:
-            raise RefusedError(f"calibration: {refusal}")
+        limits.refuse(ceiling, width_us, "calibration")
         return float(self._steps.width_us(width_us))
 
     def check_shown(self, width_us: float, shown_us: float | None) -> None:
@@ -181,9 +177,7 @@ class Calibration:
         """Plan of one train of that width. Raises RefusedError if the calibration's total charge would be too high."""
         request = self.request
         dose_uc = self._charge_uc + self._pulses() * width_us * request.current_ma * 1e-3
-        refusal = limits.check(self.table["charge_per_test_uc"], dose_uc)
-        if refusal is not None:
-            raise RefusedError(f"calibration, all trains together: {refusal}")
+        limits.refuse(self.table["charge_per_test_uc"], dose_uc, "calibration, all trains together")
         rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": REST_S})
         steps = {"max_pulse_width_us": width_us, "on_s": request.train_s, "off_s": 0.0, "repeats": 1}
         return TestPlan(
@@ -307,6 +301,23 @@ def end_of_day_s(unix_s: float) -> float:
     here = datetime.fromtimestamp(unix_s, UTC).astimezone()
     tomorrow = (here.replace(tzinfo=None) + timedelta(days=1)).replace(hour=0, minute=0, second=0, microsecond=0)
     return tomorrow.astimezone().timestamp()
+
+
+def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
+    """Raise RefusedError if a test with an angle would use a range that was said under another calibration.
+
+    `angle_set_at_utc` is of the angle sensor's present calibration; None: it has none.
+    """
+    profile = plan.profile
+    if plan.angle is None or profile.angle_range_rad is None or profile.angle_set_at_utc == angle_set_at_utc:
+        return
+    if angle_set_at_utc is None:
+        raise RefusedError(
+            "profile.angle_range_rad: the angle sensor has lost its calibration since; say the range again"
+        )
+    raise RefusedError(
+        f"profile.angle_range_rad: the angle sensor was calibrated anew at {angle_set_at_utc}; say the range again"
+    )
 
 
 def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: float = 0.0) -> None:

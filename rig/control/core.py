@@ -14,16 +14,17 @@ from rig.acquire.run import TestRun
 from rig.config import RigConfig
 from rig.control.angle_calibration import AngleCalibrating
 from rig.control.calibration import Calibration
-from rig.control.latch import Latch, Remembered
+from rig.control.latch import Latch
 from rig.control.live import finite, live_event
 from rig.control.pair import Pair
 from rig.control.rest import Rest
+from rig.control.result import Result
 from rig.control.sealing import RecordingStore
-from rig.errors import BusyError, DeviceError, RigError
+from rig.errors import BusyError, DeviceError, LatchChangedError, RigError
 from rig.machine import Machine
 from rig.messages import AngleStatus, Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
 from rig.tasks import Signal, Task, Turn
-from rig.trial import Trial
+from rig.trial import STOPPED, Trial
 
 log = logging.getLogger("rig")
 
@@ -41,7 +42,7 @@ class Core:
     """
 
     def __init__(self, config: RigConfig, machine: Machine, publish: Callable[[Event], None]) -> None:
-        self._watch = config.watch.watch()
+        self._watch = config.watch
         self._data_dir = config.data_dir
         self._machine, self._tasks, self._clock = machine, machine.tasks, machine.tasks.clock
         self._publish = publish
@@ -65,9 +66,14 @@ class Core:
         self._evidence: StopEvidence | None = None
         self._evidence_ready = Signal()
         self._calibration: Calibration | None = None
-        self._stops = 0
-        """How often it was stopped, or a fault was reported: a re-arm that began before does not count."""
+        self._result = Result(config.data_dir, machine)
+        self._instance, self._stops = machine.new_id()[:8], 0
+        """How often it was stopped, a fault was reported, or why it is stopped became another reason."""
+        self._published = ""
+        """The latch that was told last."""
         self._born_s = self._clock.now_s()
+        self._withdrawn: dict[str, str] = {}
+        """Tests that must not begin any more, and why: the newest ones."""
         self.finished: FinishedEvent | None = None
 
     @property
@@ -85,6 +91,11 @@ class Core:
         """Whether a test is in progress."""
         return self._trial.busy
 
+    @property
+    def latch(self) -> str:
+        """What a person must have seen who re-arms: another one after each stop, and in each process."""
+        return f"{self._instance}-{self._stops}"
+
     def status(self) -> Status:
         """State, devices and limits now."""
         trial, run, receiver = self._trial, self._run, self._pair.receiver
@@ -97,7 +108,8 @@ class Core:
             cell["measured_rate_hz"] = round(measured_hz, 2)
         return Status(
             state=trial.state,
-            reason=trial.reason if trial.lost in trial.reason else f"{trial.reason}; {trial.lost}".lstrip("; "),
+            reason=trial.told,
+            latch=self.latch,
             test_id=trial.test_id,
             participant=trial.participant,
             segment=run.segment() if run else None,
@@ -109,6 +121,7 @@ class Core:
             torque_nm=finite(torque_nm),
             angle=self._angle_status(),
             calibration=calibration,
+            calibrated=self._result.waiting,
             limits=limits.bounds(self._table),
             require_calibration=self._require_calibration,
             finished=self.finished,
@@ -170,8 +183,7 @@ class Core:
         if receiver is None:
             return None
         origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-        told = run.told_pulses if run else 0
-        event = live_event(receiver, run, origin_s, now_s, told, samples, self._pair.angle)
+        event = live_event(receiver, run, origin_s, now_s, samples, self._pair.angle)
         if event is not None and run is not None:
             run.told_pulses += len(event.pulse_time_s)
         return event
@@ -188,10 +200,13 @@ class Core:
             finally:
                 self._turn_since_s = None
 
-    def _refuse_unseen(self, stops: int) -> None:
-        """Raise BusyError if the rig was stopped since `_stops` was so: who asked then has not seen it."""
-        if self._stops != stops:
-            raise BusyError("the rig was stopped while this waited; look at the participant, then ask again")
+    def _refuse_unseen(self, latch: str) -> None:
+        """Raise LatchChangedError if the rig was stopped since `latch` was told: who asks has not seen it."""
+        if latch == self.latch:
+            return
+        if self._trial.told:
+            raise LatchChangedError(f"now: {self._trial.told}; look at the participant and the rig, then re-arm")
+        raise LatchChangedError("the rig was stopped while this waited; look at the participant, then ask again")
 
     def _fault(self, reason: str) -> None:
         """A device reports a fault."""
@@ -207,42 +222,43 @@ class Core:
     def _end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
         """End the running test, or latch; True if a test runs."""
         self._stops += 1
-        halt = self._halt
-        if self._trial.busy and halt is not None:
-            halt.set(cause, reason)
-            return True
-        if latch_idle:
+        halt, busy = self._halt, self._trial.busy
+        if busy and halt is not None:
+            if not halt.set(cause, reason) and latch_idle:
+                self._halted(reason)  # it was ending: both reasons are told
+        elif latch_idle:
             self._halted(reason)
-        return False
+        return busy and halt is not None
 
-    async def _remember(self, state: Remembered, reason: str) -> None:
+    async def _remember(self, trial: Trial) -> None:
         """Write the latch file. If the disk fails, the rig stays stopped; a latch is written once the disk takes it.
 
         Until then the file holds "running" if a test had begun, so that the next process starts as uncertain.
         """
         try:
-            await self._latch.write(state, reason)
+            await self._latch.write("running" if trial.state == "uncertain" else "latched", trial.reason)
         except RigError as error:
             log.error("%s", error)
-            if state == "latched":
-                self._tasks.spawn(self._remember_later(), "latch file")
+            self._tasks.spawn(self._remember_later(), "latch file")
 
     async def _remember_later(self) -> None:
         await self._tasks.sleep(RETRY_S)
         async with self._turn:  # not while somebody re-arms
-            if self._trial.state == "latched":
-                await self._remember("latched", self._trial.reason)
+            if self._trial.state in STOPPED:
+                await self._remember(self._trial)
 
     def _halted(self, reason: str) -> None:
         following = self._trial.halted(reason)
-        if following.state == "latched" or (following.state == "sealing" and following.latch):
+        if following.state in STOPPED or following.state == "sealing":
             # behind whatever is being written: a clear that was under way does not come last
-            self._latching = self._tasks.spawn(self._remember("latched", following.reason), "latch file")
+            self._latching = self._tasks.spawn(self._remember(following), "latch file")
         self._change(following)
 
     def _change(self, trial: Trial) -> None:
-        changed = trial != self._trial
-        self._trial = trial
+        if trial.told not in ("", self._trial.told):
+            self._stops += 1
+        changed = trial != self._trial or self._published != self.latch
+        self._trial, self._published = trial, self.latch
         if not trial.calibrating:
             self._calibration = None  # a stop, a fault or a lost device closes it
         if changed:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Awaitable, Callable
 from typing import Any
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter
 
-from rig.control.replies import id_of, internal_error, invalid_request, refusal
+from rig.control.replies import internal_error, refusal
 from rig.control.rig import Rig
 from rig.errors import RigError
 from rig.messages import Reply, Request
@@ -16,56 +17,37 @@ log = logging.getLogger("rig.desk")
 
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
+_DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel]]] = {
+    "start": lambda rig, asked: rig.start(asked.plan, asked.key),
+    "stop": lambda rig, asked: rig.stop(asked.reason, asked.by),
+    "withdraw": Rig.withdraw,
+    "extend": Rig.extend,
+    "enough": Rig.enough,
+    "sequences": lambda rig, _: rig.library(),
+    "rearm": lambda rig, asked: rig.rearm(asked.by, asked.latch),
+    "calibrate-start": Rig.calibrate,
+    "calibrate-step": lambda rig, asked: rig.calibrate_step(asked.direction, asked.shown_us),
+    "calibrate-mark": lambda rig, asked: rig.calibrate_mark(asked.threshold),
+    "calibrate-finish": Rig.calibrate_finish,
+    "calibrate-stored": lambda rig, asked: rig.calibrate_stored(asked.calibration_id),
+    "angle_pose": Rig.angle_pose,
+}
+"""All others are answered by the status."""
+
 
 def read(line: bytes) -> Any:
     """The request of a line of JSON. Raises ValidationError."""
     return _REQUEST.validate_json(line)
 
 
-async def answer(rig: Rig, line: bytes) -> Reply:
-    """Obey a line of JSON."""
-    try:
-        request = read(line)
-    except ValidationError as error:
-        return invalid_request(id_of(line), error)
-    return await obey(rig, request)
-
-
 async def obey(rig: Rig, request: Any) -> Reply:
     """Obey a request; errors become part of the reply."""
     try:
-        body = (await _do(rig, request)).model_dump(mode="json")
+        do = _DO.get(request.kind)
+        body = (rig.status() if do is None else await do(rig, request)).model_dump(mode="json")
     except RigError as error:
         return refusal(request.id, error)
     except Exception as error:
         log.exception("request %s failed", request.kind)
         return internal_error(request.id, error)
     return Reply(id=request.id, ok=True, body=body)
-
-
-async def _do(rig: Rig, request: Any) -> BaseModel:
-    match request.kind:
-        case "start":
-            return await rig.start(request.plan, request.key)
-        case "stop":
-            return await rig.stop(request.reason, request.by)
-        case "extend":
-            return await rig.extend(request)
-        case "enough":
-            return await rig.enough(request)
-        case "sequences":
-            return await rig.library()
-        case "rearm":
-            return await rig.rearm(request.by)
-        case "calibrate-start":
-            return await rig.calibrate(request)
-        case "calibrate-step":
-            return await rig.calibrate_step(request.direction, request.shown_us)
-        case "calibrate-mark":
-            return await rig.calibrate_mark(request.threshold)
-        case "calibrate-finish":
-            return await rig.calibrate_finish(request.by, request.discard)
-        case "angle_pose":
-            return await rig.angle_pose(request)
-        case _:
-            return rig.status()

@@ -2,56 +2,33 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
-from rig.errors import RigError
+from rig.control.small_file import SmallFile
 from rig.machine import Machine
-from rig.tasks import Turn
 
 Remembered = Literal["running", "latched"]
 
 
 class Latch:
-    """A small file in the data folder, synced to the disk before the event that it describes.
-
-    What is asked for first is written first.
-    """
+    """Stored before the event that it describes."""
 
     def __init__(self, folder: Path, machine: Machine) -> None:
-        self._path = folder / "latch.json"
-        self._disk, self._work, self._turn = machine.disk, machine.tasks.work, Turn(machine.tasks)
-        self._stored: bytes | None = None
+        self._file = SmallFile(folder / "latch.json", "latch file", machine)
+        self.clear = self._file.remove
+        """Remove the state: a person has re-armed, or a test has ended well. Raises RigError."""
 
     async def read(self) -> tuple[Remembered | None, str]:
         """The stored state and its reason; an unreadable file counts as a running test."""
         try:
-            content = json.loads(await self._work(self._disk.read, self._path))
+            content = await self._file.read()
+            if content is None:
+                return None, ""
             return ("latched" if content["state"] == "latched" else "running"), str(content["reason"])
-        except FileNotFoundError:
-            return None, ""
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError):
             return "running", "the latch file could not be read"
 
     async def write(self, state: Remembered, reason: str) -> None:
         """Store a state. Raises RigError if the disk fails: then nothing may start."""
-        data = json.dumps({"state": state, "reason": reason}).encode()
-        async with self._turn:
-            if data == self._stored:
-                return
-            self._stored = None
-            try:
-                await self._work(self._disk.replace, self._path, data)
-            except OSError as error:
-                raise RigError(f"latch file: {self._path}: {error.strerror}; free some disk space") from None
-            self._stored = data
-
-    async def clear(self) -> None:
-        """Remove the state: a person has re-armed, or a test has ended well. Raises RigError."""
-        async with self._turn:
-            self._stored = None
-            try:
-                await self._work(self._disk.remove, self._path)
-            except OSError as error:
-                raise RigError(f"latch file: {self._path}: {error.strerror}; free some disk space") from None
+        await self._file.write({"state": state, "reason": reason})

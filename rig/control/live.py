@@ -17,13 +17,7 @@ BIN_S = 0.01
 
 
 def live_event(
-    receiver: Receiver,
-    run: TestRun | None,
-    origin_s: float,
-    now_s: float,
-    first_pulse: int,
-    samples: bool = False,
-    angle: AngleReceiver | None = None,
+    receiver: Receiver, run: TestRun | None, origin_s: float, now_s: float, samples: bool, angle: AngleReceiver | None
 ) -> LiveEvent | None:
     """The newest torque as minimum and maximum of bins of 10 ms, or None if there is none.
 
@@ -33,8 +27,6 @@ def live_event(
         The test in progress; None when idle.
     origin_s
         Rig time that counts as zero: the test's start, or the rig's when idle.
-    first_pulse
-        Index of the first pulse that earlier events did not contain.
     samples
         Whether every sample is wanted, too.
     angle
@@ -57,7 +49,7 @@ def live_event(
         lost_samples=receiver.counts.lost_samples,
         samples=_samples(found, origin_s) if samples else None,
         **({} if angle is None else _of_angle(angle, origin_s, samples)),
-        **(_idle() if run is None else _of_run(run, now_s, first_pulse, samples)),
+        **(_idle() if run is None else _of_run(run, now_s, samples)),
     )
 
 
@@ -68,11 +60,11 @@ def _idle() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _of_run(run: TestRun, now_s: float, first_pulse: int, samples: bool) -> dict[str, Any]:
+def _of_run(run: TestRun, now_s: float, samples: bool) -> dict[str, Any]:
     """What the test has sent, and what is laid of it."""
     rate_hz, laid = run.plan.pulse_rate_hz, run.score.laid
     reached = 0 if run.t0_s is None else int(np.floor((now_s - run.t0_s) * rate_hz)) + 1
-    pulses = range(first_pulse, max(first_pulse, min(reached, len(laid))))
+    pulses = range(run.told_pulses, max(run.told_pulses, min(reached, len(laid))))
     return {
         "test_id": run.plan.test_id,
         "segment": run.segment(),
@@ -80,9 +72,9 @@ def _of_run(run: TestRun, now_s: float, first_pulse: int, samples: bool) -> dict
         "duration_s": run.score.longest_s,
         "pulse_time_s": [index / rate_hz for index in pulses],
         "pulse_width_us": laid.pulse_width_us[pulses.start : pulses.stop].tolist(),
-        "dropped_pulses": run.dropped,
+        "dropped_pulses": run.gate.dropped,
         "sent_pulses": run.sent,
-        "charge_uc": run.charge_uc,
+        "charge_uc": run.gate.charge_uc,
         "torque_time_nms": float(np.nan_to_num(run.torque_time_nms)),
         "laid": len(laid),
         "boundary_s": len(laid) / rate_hz,
@@ -93,8 +85,8 @@ def _of_run(run: TestRun, now_s: float, first_pulse: int, samples: bool) -> dict
 
 def _of_adaptive(run: TestRun, chooses: bool) -> dict[str, Any]:
     """What whoever chooses its pieces needs. The segments last: they hold every pulse that is told before."""
-    late = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in run.late] if chooses else []
-    return {"not_sent": run.not_sent, "late": late, "laid_segments": run.score.segments()}
+    late = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in tuple(run.gate.late)] if chooses else []
+    return {"not_sent": list(run.gate.not_sent), "late": late, "laid_segments": run.score.segments()}
 
 
 def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:

@@ -9,14 +9,14 @@ may be longer than asked for, never shorter.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 from pathlib import Path
 
 from rig import limits
 from rig.acquire.run import LEAD_S
 from rig.clock import utc_text
-from rig.errors import RestError
+from rig.control.small_file import SmallFile
+from rig.errors import RestError, RigError
 from rig.machine import Machine
 from rig.plan import PlannedTest
 
@@ -27,15 +27,14 @@ class Rest:
     """Time of the last pulse on the rig's clock; None: there was none with this data folder."""
 
     def __init__(self, folder: Path, machine: Machine) -> None:
-        self._folder, self._machine = folder, machine
-        self._clock, self._work = machine.tasks.clock, machine.tasks.work
-        self._path = folder / "last-pulse.json"
+        self._folder, self._machine, self._clock = folder, machine, machine.tasks.clock
+        self._file = SmallFile(folder / "last-pulse.json", "the last pulse's time could not be written", machine)
         self.last_pulse_s: float | None = None
         self._ended = True
 
     async def recall(self, in_doubt: bool) -> None:
         """Read what the last process stored. `in_doubt`: it crashed, so the time of its last pulse is unknown."""
-        remembered_s, used = await self._work(self._read)
+        remembered_s, used = await self._read()
         if remembered_s is not None and not in_doubt:
             self.last_pulse_s = remembered_s
         elif in_doubt or used:
@@ -53,16 +52,12 @@ class Rest:
             "monotonic_s": time_s / self._clock.speed,
             "written_utc": utc_text(self._clock.unix_s()),
         }
-        await self._work(self._write, json.dumps(content).encode())
-
-    def _write(self, data: bytes) -> None:
-        disk = self._machine.disk
         try:
-            disk.replace(self._path, data)
-        except OSError as error:
-            log.error("the last pulse's time could not be written: %s: %s", self._path, error.strerror)
-            with contextlib.suppress(OSError):  # the disk is read-only now: the latch file still says that a test ran
-                disk.remove(self._path)
+            await self._file.write(content)
+        except RigError as error:
+            log.error("%s", error)
+            with contextlib.suppress(RigError):  # the disk is read-only now: the latch file still says that a test ran
+                await self._file.remove()
 
     def doubt(self) -> str:
         """A sentence if the line may still hold a pulse that was sent before; empty if not."""
@@ -84,23 +79,18 @@ class Rest:
         if refusal is not None:
             raise RestError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
 
-    def _read(self) -> tuple[float | None, bool]:
+    async def _read(self) -> tuple[float | None, bool]:
         """The stored time, if it certainly belongs to this boot; whether any test was ever played with this folder.
 
         Older versions stored no time of the last pulse.
         """
-        disk, boot_id = self._machine.disk, self._machine.boot_id
-        used = any(disk.names(self._folder / name) for name in ("recordings", "journals"))
+        work, names, boot_id = self._machine.tasks.work, self._machine.disk.names, self._machine.boot_id
         try:
-            data = disk.read(self._path)
-        except FileNotFoundError:
-            return None, used
-        except OSError:
-            return None, True
-        try:
-            content = json.loads(data)
+            content = await self._file.read()
+            if content is None:
+                return None, any([await work(names, self._folder / name) for name in ("recordings", "journals")])
             time_s = float(content["monotonic_s"]) * self._clock.speed
             certain = bool(boot_id) and content["boot_id"] == boot_id and content["ended"] is True
-        except (ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError):
             return None, True
         return (time_s if certain and 0 <= time_s <= self._clock.now_s() else None), True

@@ -7,27 +7,38 @@ import math
 from dataclasses import replace
 
 from rig import limits, plan
-from rig.control.calibration import check_profile
-from rig.control.extending import check_key
-from rig.control.playing import check_names
-from rig.control.posing import Posing
-from rig.errors import BusyError, ConfigError, DeviceError
-from rig.messages import PASSIVE, Sequences, Status, StopEvidence, TestPlan
+from rig.acquire.angle_check import degrees
+from rig.acquire.angle_guard import await_angle, check_start
+from rig.control.angle_calibration import APART_RAD
+from rig.control.calibrating import Calibrating
+from rig.control.calibration import check_profile, check_range
+from rig.control.playing import LONGEST_WORDS, check_names
+from rig.errors import (
+    BusyError,
+    ConfigError,
+    DeviceError,
+    LatchChangedError,
+    PlanError,
+    RefusedError,
+    WithdrawnError,
+)
+from rig.limits import Limit
+from rig.messages import PASSIVE, AnglePoseRequest, Sequences, StateEvent, Status, StopEvidence, TestPlan
 from rig.trial import Trial
 
 log = logging.getLogger("rig")
 
+MIN_KEY = 16
+NO_SENSOR = "{}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)"
 STOP_TIMEOUT_S = 6.0
+"""Real seconds to wait for the evidence of a stop, including the fall of the torque."""
 STORED_S = 7.0
 """Real seconds after which a stop is answered although the disk has not taken its latch."""
-"""Real seconds to wait for the evidence of a stop, including the fall of the torque."""
-LONGEST_WORDS = 300
-"""Characters of a stop's reason that are kept: a longer one stops, too."""
 SEALED_WITHIN_S = 30.0
 """Real seconds within which a test that was stopped is sealed."""
 
 
-class Rig(Posing):
+class Rig(Calibrating):
     """Owns the devices. All but `status`, `trouble` and `live` are tasks of the machine.
 
     Parameters
@@ -51,6 +62,7 @@ class Rig(Posing):
         except OSError as error:
             raise ConfigError(f"data_dir: {error.filename or self._data_dir}: {error.strerror}") from None
         await self._poses.recall()
+        await self._result.recall()
         self._pair.rescale(self._poses.scale)
         remembered, reason = await self._latch.read()
         for event in await work(self._store.recover, "the rig process died during the test"):
@@ -94,17 +106,23 @@ class Rig(Posing):
             See `Trial.start`.
         PlanError, RefusedError
             The plan is wrong, or outside a limit.
+        LatchChangedError, WithdrawnError
+            The rig was stopped, or this test withdrawn, while this waited.
         JournalError, RigError
             The journal or the latch file cannot be written.
         """
         self._trial.may_start()  # before its turn: a start that was asked for while stopped must not run later
-        stops = self._stops
-        await self._await_angle(request)
+        latch = self.latch
+        if request.angle is not None and self._has_angle:
+            await await_angle(self._angle_receiver(), self._tasks)
         async with self._in_turn():
             self._trial.may_start()
-            self._refuse_unseen(stops)
+            self._refuse_unseen(latch)
             check_names("plan", test_id=request.test_id, participant=request.participant)
-            check_key(request, key)
+            if request.adaptive is not None and len(key) < MIN_KEY:  # only who started it extends it
+                raise PlanError(
+                    f"start.key: an adaptive test needs one of at least {MIN_KEY} characters; make a random one"
+                )
             table = limits.for_plan(self._table, request)
             test = await self._tasks.work(plan.build, request, table)
             await self._tasks.work(self._store.check_room, request.test_id)
@@ -112,12 +130,59 @@ class Rig(Posing):
             now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
             needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
             check_profile(request.profile, now_s, needs_widths, longest_s)
+            check_range(request, self.angle_set_at_utc)
             plan.check_steps(test, self._pair.steps)
             self._rest.check(test, table["rest_between_tests_s"])
             self._check_angle(request, table)
             self._key = key
+            if (withdrawn := self._withdrawn.get(request.test_id)) is not None:
+                raise WithdrawnError(f"test {request.test_id}: {withdrawn}; ask for a new test")
+            # nothing is waited for from here until it can be halted
             await self._launch(test, table, following)
         return self.status()
+
+    @property
+    def angle_set_at_utc(self) -> str | None:
+        """When the angle sensor was calibrated; None: it was not. May be called from another thread."""
+        found = self._poses.calibration
+        return None if found is None else found.set_at_utc
+
+    async def angle_pose(self, request: AnglePoseRequest) -> Status:
+        """The goniometer's angle of a joint that is held still; the second one completes a calibration.
+
+        Raises
+        ------
+        PlanError
+            This rig has no angle sensor.
+        BusyError
+            A test is in progress.
+        DeviceError, RefusedError, RigError
+            See `AngleCalibrating.pose`.
+        """
+        async with self._in_turn():
+            if not self._has_angle:
+                raise PlanError(NO_SENSOR.format("angle_pose"))
+            if self._trial.busy:
+                raise BusyError(f"test {self._trial.test_id} is {self._trial.state}; take the pose afterwards")
+            await self._poses.pose(
+                request.angle_rad, request.by, self._angle_receiver(), self._table["angle_rad"], request.first
+            )
+            self._pair.rescale(self._poses.scale)
+            self._publish(StateEvent(status=self.status()))
+        return self.status()
+
+    def _check_angle(self, plan: TestPlan, table: dict[str, Limit]) -> None:
+        """Refuse a test that asks for an angle that this rig cannot give, or where the joint is elsewhere."""
+        if plan.angle is None:
+            return
+        if not self._has_angle:
+            raise PlanError(NO_SENSOR.format("plan.angle"))
+        if self._require_calibration and self._poses.calibration is None:
+            raise RefusedError(
+                "plan.angle: the angle sensor is not calibrated; take two poses with a goniometer, "
+                f"{degrees(APART_RAD)} or more apart"
+            )
+        check_start(self._angle_receiver(), plan, table, self._clock)
 
     async def library(self) -> Sequences:
         """All sequences and protocols that a plan may name."""
@@ -161,19 +226,20 @@ class Rig(Posing):
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
-    async def rearm(self, by: str) -> Status:
+    async def rearm(self, by: str, latch: str) -> Status:
         """A person has checked participant and rig: ask both devices again, then be ready.
 
         Raises
         ------
         BusyError
-            A test is in progress; or the rig was stopped once more meanwhile.
+            A test is in progress.
+        LatchChangedError
+            The rig was stopped since that person was shown `latch`, before this or meanwhile.
         DeviceError
             A device does not answer: the rig stays stopped.
         """
-        stops = self._stops
         async with self._in_turn():
-            self._refuse_unseen(stops)
+            self._refuse_unseen(latch)
             stopped = self._trial
             following = stopped.rearm()
             if stopped.lost or not await self._pair.both_answer():
@@ -186,15 +252,13 @@ class Rig(Posing):
                 self.finished = event
                 self._publish(event)
             await self._rest.settle()
-
-            def again() -> bool:
-                return self._stops != stops or self._trial.lost != stopped.lost
-
-            if not again():
-                await self._latch.clear()
-            if again():
-                await self._remember("latched", self._trial.reason)
-                raise BusyError("re-arm: the rig was stopped again meanwhile; look at the participant, then re-arm")
+            self._refuse_unseen(latch)
+            await self._latch.clear()
+            try:
+                self._refuse_unseen(latch)
+            except LatchChangedError:
+                await self._remember(self._trial)
+                raise
             log.info("re-armed by %s after: %s", by, stopped.reason)
             self._change(following)
         return self.status()

@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from rig import archive, assembly, journal
-from rig.acquire.run import RunResult, spread_ms
+from rig.acquire.health import SYNC_PERIOD_S
+from rig.acquire.run import RunResult
 from rig.config import RigConfig
+from rig.control import dose
+from rig.control.live import finite
 from rig.errors import JournalError, PlanError, RecordingError
 from rig.journal import Journal
 from rig.machine import Log, Machine
@@ -81,6 +84,7 @@ class RecordingStore:
         book = Journal(self._create(self.journals / f"{test.plan.test_id}.journal"))
         header = {
             "recording_id": self._machine.new_id(),
+            "boot_id": self._machine.boot_id,
             "plan": test.plan.model_dump(mode="json"),
             "segments": [{"name": s.name, "start": s.start, "end": s.end, "by": "plan"} for s in certain],
             "current_ma": test.plan.profile.current_ma,
@@ -108,29 +112,7 @@ class RecordingStore:
 
     def finish(self, path: Path, test_id: str, result: RunResult) -> FinishedEvent:
         """Seal a test that has just ended."""
-        summary: dict[str, Any] = {
-            "duration_s": result.duration_s,
-            "samples": result.counts.samples,
-            "lost_samples": result.counts.lost_samples,
-            "duplicate_samples": result.counts.duplicate_samples,
-            "disordered_samples": result.counts.disordered_samples,
-            "malformed_frames": result.counts.malformed_frames,
-            "error_frames": result.counts.error_frames,
-            "pulses": len(result.lateness_s),
-            "dropped_pulses": result.dropped,
-            "lateness_ms": spread_ms([s / self._clock.speed for s in result.lateness_s]),
-            "ack_delay_ms": spread_ms([s / self._clock.speed for s in result.ack_delay_s]),
-            "charge_uc": result.charge_uc,
-            "torque_time_nms": result.torque_time_nms,
-            "torque_peak_nm": result.peak_nm,
-            "ended_by": result.ended_by,
-            "cpu_percent": round(result.cpu_percent, 2),
-            "stop": result.evidence.model_dump(),
-        }
-        if result.angle_counts is not None:
-            counts = asdict(result.angle_counts)
-            summary["angle"] = {name: counts[name] for name in ("samples", "lost_samples", "duplicate_samples")}
-        return self._seal(path, test_id, result.outcome, result.reason, summary, result.last_sample_unix_s)
+        return self._seal(path, test_id, result.outcome, result.reason, result.summary, result.last_sample_unix_s)
 
     def recover(self, reason: str) -> list[FinishedEvent]:
         """Seal the journals that a crash or a full disk left; a journal with nothing to seal is renamed, never deleted.
@@ -153,6 +135,13 @@ class RecordingStore:
                     self._disk.rename(path, path.with_suffix(".unsealed"))
         return events
 
+    def _unseen_s(self, contents: journal.JournalContents) -> float:
+        """Rig seconds before its end of which a journal may know nothing: what is not synced goes with the power."""
+        header = contents.first_json(journal.Kind.HEADER) or {}
+        if contents.ended or header.get("boot_id", "") in ("", self._machine.boot_id):
+            return 0.0
+        return (self._config.watch.stale_disk_s + SYNC_PERIOD_S) * self._clock.speed
+
     def _seal(
         self, path: Path, test_id: str, outcome: str, reason: str, summary: dict[str, Any], unix_s: float | None
     ) -> FinishedEvent:
@@ -163,7 +152,10 @@ class RecordingStore:
         sealed = None
         try:
             contents = journal.parse(path, self._disk.read(path))
-            sealed = archive.seal(assembly.assemble(contents, outcome, reason), self.recordings, self._disk)
+            recording = assembly.assemble(contents, outcome, reason)
+            if summary.get("recovered"):
+                summary |= dose.of_recording(recording, contents, self._unseen_s(contents))
+            sealed = archive.seal(recording, self.recordings, self._disk)
             if contents.damaged:  # the readable part is sealed; the file is kept for inspection
                 self._disk.rename(path, path.with_suffix(".damaged"))
             else:
@@ -171,34 +163,23 @@ class RecordingStore:
         except (RecordingError, OSError) as error:
             log.error("%s", error, extra={"test_id": test_id})
             reason = "; ".join(part for part in (reason, str(error)) if part)
-        event = {"test_id": test_id, "outcome": outcome, "reason": reason, "last_sample_unix_s": unix_s}
-        if sealed is None:
-            return FinishedEvent.model_validate({**event, "summary": summary})
-        attributes = sealed.recording.attributes
-        event |= {
-            "outcome": attributes["outcome"],
-            "reason": attributes["reason"],
-            "recording_path": str(sealed.path),
-            "recording_id": attributes["recording_id"],
-            "file_sha256": sealed.file_sha256,
-            "summary": summary | _of_recording(sealed.recording, summary.get("angle", {})),
-        }
+        event: dict[str, Any] = {"outcome": outcome, "reason": reason, "summary": summary}
+        if sealed is not None:
+            event = {name: sealed.recording.attributes[name] for name in ("outcome", "reason", "recording_id")}
+            event |= {"recording_path": str(sealed.path), "file_sha256": sealed.file_sha256}
+            event["summary"] = summary | _of_recording(sealed.recording, summary)
+        event |= {"test_id": test_id, "last_sample_unix_s": unix_s}
         return FinishedEvent.model_validate(event)
 
 
-def _of_recording(recording: assembly.Recording, of_angle: dict[str, Any]) -> dict[str, Any]:
+def _of_recording(recording: assembly.Recording, counted: dict[str, Any]) -> dict[str, Any]:
     alignment = recording.alignment
     return {
-        **({"angle": of_angle | _of_angle(recording)} if recording.angle else {}),
+        **({"angle": counted.get("angle", {}) | _of_angle(recording)} if recording.angle else {}),
         "samples": len(recording.columns["torque/time_s"]),
         "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
-        "alignment": {
-            "method": alignment.method,
-            "error_ms": None if alignment.error_ms != alignment.error_ms else alignment.error_ms,
-            "delay_ms": alignment.delay_ms,
-            "rate_ppm": alignment.rate_ppm,
-        },
-        "warnings": warnings(recording),
+        "alignment": {**asdict(alignment), "error_ms": finite(alignment.error_ms)},
+        "warnings": [*warnings(recording), *dose.warnings(counted)],
     }
 
 
@@ -208,7 +189,7 @@ def _of_angle(recording: assembly.Recording) -> dict[str, Any]:
         "samples": len(angle_rad),
         "range_rad": [float(angle_rad.min()), float(angle_rad.max())] if len(angle_rad) else None,
         "method": recording.angle["method"],
-        "error_ms": None if error_ms != error_ms else error_ms,
+        "error_ms": finite(error_ms),
     }
 
 

@@ -1,7 +1,8 @@
 """Devices behind three small Protocols; each device is one file here, found by its id (the file's name).
 
 A device module has `KIND` ("stimulator", "load_cell" or "angle_sensor"), `Settings` (a pydantic model, the device's
-part of the rig file) and `create(settings, machine)`. To add a device, add a file.
+part of the rig file) and `create(settings, machine)`: the device, not yet opened; it raises ConfigError where a DBC
+file lacks the message or signal. To add a device, add a file.
 """
 
 from __future__ import annotations
@@ -11,16 +12,15 @@ import pkgutil
 from collections.abc import Callable
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal, Protocol, Self, TypeVar
+from typing import Any, Literal, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict
 
 from rig.errors import ConfigError
 from rig.limits import Admitted, Steps
-from rig.signals import Ack, AngleBlock, AngleScale, TorqueBlock
+from rig.signals import Ack, AngleScale, Block
 
 Kind = Literal["stimulator", "load_cell", "angle_sensor"]
-BlockT = TypeVar("BlockT", contravariant=True)
 
 
 class DeviceSettings(BaseModel):
@@ -40,8 +40,6 @@ class Stimulator(Protocol):
 
     steps: Steps
     """Its resolution; the gate rounds to it."""
-    silence_s: float
-    """Device seconds for which it may continue to pulse after the host's last command; 0: one command per pulse."""
 
     async def open(self) -> dict[str, Any]:
         """Open the line; returns the identity to display (device, serial number, firmware, port).
@@ -88,14 +86,14 @@ class Stimulator(Protocol):
         ...
 
 
-class Sensor(Protocol[BlockT]):
+class Sensor(Protocol):
     """Gives blocks of samples as they arrive."""
 
     sample_rate_hz: float
     counter_modulus: int
     """Value at which the raw counter wraps, in samples; 0: it has no counter."""
 
-    async def open(self, on_block: Callable[[BlockT], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         """Open the bus and start the sensor; returns the identity to display. Raises DeviceError.
 
         From now on each block goes to `on_block`, soon after its first sample arrived; a block may be empty. `on_lost`
@@ -108,11 +106,11 @@ class Sensor(Protocol[BlockT]):
         ...
 
 
-class LoadCell(Sensor[TorqueBlock], Protocol):
+class LoadCell(Sensor, Protocol):
     """Gives torque."""
 
 
-class AngleSensor(Sensor[AngleBlock], Protocol):
+class AngleSensor(Sensor, Protocol):
     """Gives the joint's angle. Opened after the load cell, closed before it."""
 
     scale: AngleScale

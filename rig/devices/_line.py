@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from rig.errors import DeviceError, WireError
 from rig.machine import Machine, Port
-from rig.signals import LateError
+from rig.signals import Ack, LateError
 from rig.tasks import Signal
 from rig.wire.framing import FrameReader, Packet
 
@@ -48,11 +48,12 @@ class PacketLine:
         self._on_packet = on_packet
         self._waiting: dict[int, tuple[Signal, list[Packet]]] = {}
         self._open, self._lost = False, "not opened"
+        self.on_ack: Callable[[Ack], None] = lambda _: None
         self._on_lost: Callable[[str], None] = lambda _: None
 
-    def on_lost(self, action: Callable[[str], None]) -> None:
-        """Register a callback for the loss of the line."""
-        self._on_lost = action
+    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
+        """Register callbacks: for the acks of pulses, which the driver finds among the packets, and for the loss."""
+        self.on_ack, self._on_lost = on_ack, on_lost
 
     async def open(self) -> None:
         """Open the port and start reading. Raises DeviceError, which names the port and says how to correct it."""

@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from rig.devices import DeviceSettings
-from rig.errors import ConfigError, DeviceError
+from rig.errors import DeviceError
 from rig.machine import Bus, Frame, Listener, Machine
-from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
+from rig.signals import ANGLE_SAMPLE, AngleScale, Block
 from rig.wire import dbc
 
 KIND = "angle_sensor"
@@ -33,7 +33,9 @@ class Settings(DeviceSettings):
     message: str | None = Field(None, description="message with the angle; default: the first one that has the signal")
     signal: str = Field("Angle_deg", description="angle signal")
     counter: str | None = Field("Counter", description="signal of the counter of frames; '' if there is none")
-    fault: str | None = Field("Fault", description="signal of the bit by which it reports a fault; '' if there is none")
+    fault: str | None = Field(
+        "Fault", description="signal of the word by which it reports a fault, 0: none; '': no word"
+    )
     sample_rate_hz: float = Field(200.0, gt=0, le=20_000)
     radians_per_unit: float = Field(math.pi / 180, gt=0, description="rad per unit of the signal")
     direction: Literal[-1, 1] = Field(1, description="-1: the signal falls when the joint is flexed")
@@ -57,17 +59,10 @@ class CanAngleSensor:
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings, self._machine = settings, machine
-        try:
+        with dbc.of_table(KIND):
             self._frame = dbc.SampleFrame(
-                settings.dbc,
-                settings.message,
-                [settings.signal],
-                settings.counter or None,
-                settings.fault or None,
-                "fault",
+                settings.dbc, settings.message, [settings.signal], settings.counter, settings.fault, "fault"
             )
-        except ConfigError as error:
-            raise ConfigError(f"{KIND}.{error}") from None
         self.sample_rate_hz, self.counter_modulus = settings.sample_rate_hz, self._frame.counter_modulus
         self.scale = AngleScale(settings.offset, settings.direction, settings.radians_per_unit)
         self.of_the_cell = settings.of_the_cell
@@ -75,7 +70,7 @@ class CanAngleSensor:
         self._bus: Bus | None = None
         self._listener: Listener | None = None
 
-    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         arguments, frame_id = self._settings.bus, self._frame.frame_id
         bus = self._machine.shared_bus(arguments, NAME)
         self.on_the_cells_bus = bus is not None
@@ -102,7 +97,7 @@ class CanAngleSensor:
         else:
             await self._machine.tasks.work(bus.close)
 
-    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> AngleBlock:
+    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> Block:
         """The samples of frames, in their order; damaged ones are counted. Pure."""
         rows: list[tuple[float, float, float, float, int, int]] = []
         readable, unreadable = self._frame.decode_all(frames)
@@ -110,15 +105,7 @@ class CanAngleSensor:
             rows.append((frame.host_time_s, frame.stamp_s, found.values[0], math.nan, found.counter, found.flag))
         samples = np.array(rows, dtype=ANGLE_SAMPLE)
         samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
-        return AngleBlock(samples, damaged + unreadable, errors)
+        return Block(samples, damaged + unreadable, errors)
 
 
-def create(settings: Settings, machine: Machine) -> CanAngleSensor:
-    """The device, not yet opened.
-
-    Raises
-    ------
-    ConfigError
-        The DBC lacks the message or signal.
-    """
-    return CanAngleSensor(settings, machine)
+create = CanAngleSensor

@@ -14,10 +14,11 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from rig.devices import DeviceSettings
-from rig.errors import ConfigError, DeviceError
+from rig.errors import DeviceError
 from rig.machine import Bus, Frame, Listener, Machine
-from rig.signals import SAMPLE, TorqueBlock
+from rig.signals import SAMPLE, Block
 from rig.wire import dbc
+from rig.wire.dbc import CELL_FAULT
 
 KIND = "load_cell"
 
@@ -35,6 +36,9 @@ class Settings(DeviceSettings):
     scale_nm: float = Field(1.0, description="N·m per unit of the signal; a negative value reverses the sign")
     counter: str | None = Field("Counter", description="signal of the sample counter; '' if the cell has none")
     sync: str | None = Field("Sync", description="signal of the stimulator's sync line; '' if there is none")
+    fault: str | None = Field(
+        CELL_FAULT, description="signal of the word by which it reports a fault, 0: none; '' if there is none"
+    )
     sample_rate_hz: float = Field(1600.0, gt=0, le=20_000)
     start_frames: list[str] = Field(default_factory=list, description="sent on opening, as id#data in hex: 000#0100")
     stop_frames: list[str] = Field(default_factory=list, description="sent on closing")
@@ -70,17 +74,15 @@ class CanLoadCell:
         self._settings = settings
         self._machine = machine
         names = [settings.signal] if isinstance(settings.signal, str) else settings.signal
-        try:
+        with dbc.of_table(KIND):
             self._frame = dbc.SampleFrame(
-                settings.dbc, settings.message, names, settings.counter or None, settings.sync or None
+                settings.dbc, settings.message, names, settings.counter, settings.sync, fault=settings.fault
             )
-        except ConfigError as error:
-            raise ConfigError(f"load_cell.{error}") from None
         self.sample_rate_hz = settings.sample_rate_hz
         self.counter_modulus = self._frame.counter_modulus * self._frame.samples_per_frame
         self._bus: Bus | None = None
 
-    async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         work = self._machine.tasks.work
         bus = self._bus = await work(self._machine.open_bus, self._settings.bus, "load cell")
         listener = Listener(*self._frame.identifier, self.decode, on_block, on_lost, GATHER_S)
@@ -108,7 +110,7 @@ class CanLoadCell:
             await work(bus.send, [message_of(frame) for frame in self._settings.stop_frames])
         await work(bus.close)
 
-    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> TorqueBlock:
+    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> Block:
         """The samples of frames, in their order; damaged ones are counted. Pure."""
         rows: list[tuple[float, float, float, int, int]] = []
         readable, unreadable = self._frame.decode_all(frames)
@@ -118,15 +120,7 @@ class CanLoadCell:
                 counter = found.counter * n + i if found.counter >= 0 else -1
                 stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
                 rows.append((frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag))
-        return TorqueBlock(np.array(rows, dtype=SAMPLE), damaged + unreadable, errors)
+        return Block(np.array(rows, dtype=SAMPLE), damaged + unreadable, errors)
 
 
-def create(settings: Settings, machine: Machine) -> CanLoadCell:
-    """The device, not yet opened.
-
-    Raises
-    ------
-    ConfigError
-        The DBC lacks the message or signal.
-    """
-    return CanLoadCell(settings, machine)
+create = CanLoadCell

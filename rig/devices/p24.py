@@ -5,7 +5,6 @@ The driver takes only width and current and makes the symmetric biphasic pulse i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from pydantic import Field
@@ -37,17 +36,12 @@ class P24:
     """Driver of one P24 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
 
     steps = Steps(pulse_width_us=1.0, current_ma=0.5, shortest_us=1.0)
-    silence_s = 0.0
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
         port = machine.port(settings.port, baudrate=BAUD_RATE, stopbits=2, rtscts=True)
         self._line = PacketLine(machine, port, settings.port, wire.NUMBERS, wire.FRAMING.reader, self._take)
-        self._on_ack: Callable[[Ack], None] = lambda _: None
-
-    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
-        self._on_ack = on_ack
-        self._line.on_lost(on_lost)
+        self.listen, self.close = self._line.listen, self._line.close
 
     async def open(self) -> dict[str, Any]:
         await self._line.open()
@@ -91,9 +85,6 @@ class P24:
             raise DeviceError(f"stimulator {self._settings.port} answered its state with {wire.result_text(result)}")
         return level == 0, wire.LEVELS.get(level, f"level {level}")
 
-    def close(self) -> None:
-        self._line.close()
-
     async def _ask(self, command: Command, fine: tuple[int, ...] = (0,)) -> Packet:
         data = bytes((0,)) if command == Command.LL_INIT else b""
         name = command.name.lower().replace("_", " ")
@@ -103,20 +94,19 @@ class P24:
             command + 1,
             self._settings.reply_timeout_s,
         )
-        if packet.data and packet.data[0] not in fine:
-            raise DeviceError(f"stimulator {self._settings.port}: {name}: {wire.result_text(packet.data[0])}")
+        result = packet.data[0] if packet.data else 1  # an answer without a result is none
+        if result not in fine:
+            raise DeviceError(f"stimulator {self._settings.port}: {name}: {wire.result_text(result)}")
         return packet
 
     def _take(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.LL_CHANNEL_CONFIG + 1:
             result = packet.data[0] if packet.data else 1
-            self._on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
+            self._line.on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
         elif packet.command in (Command.GENERAL_ERROR, Command.UNKNOWN_COMMAND):
             result = packet.data[0] if packet.data else 0
             words = wire.result_text(result) if result else "unknown command"
-            self._on_ack(Ack(packet.number, time_s, words))
+            self._line.on_ack(Ack(packet.number, time_s, words))
 
 
-def create(settings: Settings, machine: Machine) -> P24:
-    """The device, not yet opened."""
-    return P24(settings, machine)
+create = P24

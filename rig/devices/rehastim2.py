@@ -7,7 +7,6 @@ a new one. Only `feed` keeps it alive, which the rig calls after a health check:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from pydantic import Field
@@ -43,7 +42,6 @@ class RehaStim2:
     """Driver of one RehaStim 2 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
 
     steps = Steps(pulse_width_us=1.0, current_ma=2.0, shortest_us=20.0)
-    silence_s = 0.0
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
@@ -53,11 +51,7 @@ class RehaStim2:
         self._armed = False
         self._offered = Signal()
         self._offer: Packet | None = None
-        self._on_ack: Callable[[Ack], None] = lambda _: None
-
-    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
-        self._on_ack = on_ack
-        self._line.on_lost(on_lost)
+        self.listen = self._line.listen
 
     async def open(self) -> dict[str, Any]:
         self._offer = None
@@ -144,12 +138,12 @@ class RehaStim2:
     def _take(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.SINGLE_PULSE + 1:
             result = wire.result_of(packet.data)
-            self._on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
+            self._line.on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
         elif packet.command == Command.STIMULATION_ERROR:
             error = wire.result_of(packet.data)
-            self._on_ack(Ack(-1, time_s, wire.ERRORS.get(error, f"stimulation error {error}")))
+            self._line.on_ack(Ack(-1, time_s, wire.ERRORS.get(error, f"stimulation error {error}")))
         elif packet.command == Command.UNKNOWN:
-            self._on_ack(Ack(packet.number, time_s, "unknown command"))
+            self._line.on_ack(Ack(packet.number, time_s, "unknown command"))
         elif packet.command == Command.INIT:
             self._take_init(packet, time_s)
 
@@ -157,9 +151,7 @@ class RehaStim2:
         self._offer = packet
         self._offered.set()
         if self._armed:
-            self._on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
+            self._line.on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
 
 
-def create(settings: Settings, machine: Machine) -> RehaStim2:
-    """The device, not yet opened."""
-    return RehaStim2(settings, machine)
+create = RehaStim2

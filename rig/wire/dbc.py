@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -18,6 +19,8 @@ from cantools.database.namedsignalvalue import NamedSignalValue
 from rig.errors import ConfigError, WireError
 from rig.machine import Frame
 
+CELL_FAULT = "Cell_Fault"
+"""A cell's own fault, in the descriptions that have it."""
 PACKAGED = "torque_default"
 """The default description: frame 0x181, float32 in N·m, counter, sync bit."""
 
@@ -59,14 +62,23 @@ def _measured(value: float | NamedSignalValue) -> float:
     return math.nan if isinstance(value, NamedSignalValue) else float(value)
 
 
-def _whole(value: float | NamedSignalValue) -> int:
-    """Of a counter or a bit, also where the description has a word for it."""
-    return int(value.value if isinstance(value, NamedSignalValue) else value)
+def _raw(value: float | NamedSignalValue) -> float:
+    """Of a counter or a status word, also where the description has a word for it."""
+    return value.value if isinstance(value, NamedSignalValue) else value
+
+
+@contextlib.contextmanager
+def of_table(name: str) -> Iterator[None]:
+    """Begin a ConfigError with its table in the rig file."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{name}.{error}") from None
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSamples:
-    """Content of one frame: values in the signal's unit, counter (−1: none), flag (255: none)."""
+    """Content of one frame: values in the signal's unit, counter (−1: none), flag (0; 1: any other; 255: none)."""
 
     values: tuple[float, ...]
     counter: int
@@ -85,9 +97,13 @@ class SampleFrame:
     signals
         Names of the signals, in order of time (several if a frame contains several samples).
     counter, flag
-        Names of the signals of the counter and of a bit (a cell's sync line, a sensor's fault); None if there is none.
+        Names of the signals of the counter and of a word of which every value but 0 says the same (a cell's sync line,
+        a sensor's fault); None or empty if there is none.
     flag_key
-        How the rig file calls that bit.
+        How the rig file calls that word.
+    fault
+        Signal of a word of which every value but 0 says that the frame's values are no numbers; None or empty if there
+        is none. `CELL_FAULT` may be missing.
 
     Raises
     ------
@@ -103,6 +119,7 @@ class SampleFrame:
         counter: str | None,
         flag: str | None,
         flag_key: str = "sync",
+        fault: str | None = None,
     ) -> None:
         database = load(dbc)
         if message is None:
@@ -123,6 +140,8 @@ class SampleFrame:
                 raise ConfigError(f"signal: {place}, {name}: a floating-point signal has no words; remove its VAL_")
         self._counter = _choose("counter", counter, names, place) if counter else None
         self._flag = _choose(flag_key, flag, names, place) if flag else None
+        has_fault = fault and (fault != CELL_FAULT or fault in names)
+        self._fault = _choose("fault", fault, names, place) if fault and has_fault else None
         self.counter_modulus = 0
         if self._counter:
             self.counter_modulus = 1 << found.get_signal_by_name(self._counter).length
@@ -153,7 +172,8 @@ class SampleFrame:
         return found, damaged
 
     def decode(self, data: bytes) -> FrameSamples:
-        """Values of one frame; NaN where the description has a word for a value (`VAL_`, as "no reading").
+        """Values of one frame; NaN where the description has a word for a value (`VAL_`, as "no reading"), and in a
+        frame that reports a fault.
 
         Raises
         ------
@@ -166,10 +186,11 @@ class SampleFrame:
                 # a frame may be shorter than described, but the signals needed here must be in it
                 self.message.decode(data, decode_choices=True, scaling=True, allow_truncated=True),
             )
+            faulty = self._fault is not None and _raw(values[self._fault]) != 0
             return FrameSamples(
-                tuple(_measured(values[s]) for s in self._signals),
-                _whole(values[self._counter]) if self._counter else -1,
-                _whole(values[self._flag]) if self._flag else 255,
+                tuple(math.nan if faulty else _measured(values[s]) for s in self._signals),
+                int(_raw(values[self._counter])) if self._counter else -1,
+                int(_raw(values[self._flag]) != 0) if self._flag else 255,
             )
         except Exception as error:
             raise WireError(f"frame {data.hex(' ')} does not fit {self.message.name}: {error}") from None

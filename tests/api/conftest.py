@@ -31,6 +31,7 @@ from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness import postgres
 from tests.harness.late_answers import LateAnswers
+from tests.harness.looks_first import LooksFirst
 from tests.harness.postgres import Cluster
 
 TOKEN = "administrator-token-of-the-tests"
@@ -191,7 +192,8 @@ class Service:
     def client(self, token: str | None = TOKEN, **more: Any) -> httpx.Client:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         headers |= more.pop("headers", {})
-        client = httpx.Client(base_url=self.url, headers=headers, **{"timeout": PATIENCE_S, "verify": NO_TLS} | more)
+        more = {"timeout": PATIENCE_S, "verify": NO_TLS, "auth": LooksFirst()} | more
+        client = httpx.Client(base_url=self.url, headers=headers, **more)
         client.rig_thread = self.rig_thread  # type: ignore[attr-defined]  # for `run_test`
         return client
 

@@ -83,6 +83,9 @@ class FakeRig:
     def __init__(self, path: Path, data: Path, speed: float = 12.0, rate_hz: float = 400.0) -> None:
         self.path, self.data, self.speed, self.rate_hz = path, data, speed, rate_hz
         self.state, self.reason = "ready", ""
+        self.stops = 0
+        self.calibrated: m.Calibrated | None = None
+        self.withdrawn: list[m.WithdrawRequest] = []
         self.plan: m.TestPlan | None = None
         self.last_plan: m.TestPlan | None = None
         """Kept when the test has ended."""
@@ -119,9 +122,14 @@ class FakeRig:
         self._play: asyncio.Task[None] | None = None
         self._server: asyncio.Server | None = None
 
+    @property
+    def latch(self) -> str:
+        return f"fake-{self.stops}"
+
     def status(self) -> m.Status:
         return m.Status(
-            state=self.state, reason=self.reason, test_id=self.plan.test_id if self.plan else None,
+            state=self.state, reason=self.reason, latch=self.latch, calibrated=self.calibrated,
+            test_id=self.plan.test_id if self.plan else None,
             participant=self.plan.participant if self.plan else None, segment=self.segment,
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
             stimulator={"device": "fake P24", "firmware": "1.0"}, load_cell={"device": "fake cell", "rate_hz": 400.0},
@@ -149,6 +157,7 @@ class FakeRig:
 
     def become(self, state: Any, reason: str = "") -> None:
         """Another state, told at once."""
+        self.stops += state != "ready"
         self.state, self.reason = state, reason
         self._send(m.StateEvent(status=self.status()))
 
@@ -292,7 +301,11 @@ class FakeRig:
         return self.status().model_dump()
 
     async def _on_calibrate_finish(self, request: Any, writer: Any) -> dict[str, Any]:
-        known = self.calibration
+        known, kept = self.calibration, self.calibrated
+        if kept is not None and request.calibration_id == kept.calibration_id:
+            if request.discard:
+                self.calibrated = None
+            return (m.CalibrationResult() if request.discard else kept.result).model_dump()
         assert known is not None
         if known.missing and not request.discard:
             raise m_refusal("bad-plan", "Not marked yet", f"not marked yet: {', '.join(known.missing)}")
@@ -305,7 +318,22 @@ class FakeRig:
             sensory_pulse_width_us=marks["sensory"], motor_pulse_width_us=marks["motor"],
             set_at_utc="2026-01-01T08:00:00Z", expires_at_utc="2999-01-02T00:00:00Z",
         )  # fmt: skip
-        return m.CalibrationResult(profile=profile, recordings=["C1.001"]).model_dump()
+        result = m.CalibrationResult(profile=profile, recordings=["C1.001"])
+        self.calibrated = m.Calibrated(
+            calibration_id=known.calibration_id, participant=known.participant, by=known.by, result=result
+        )
+        return result.model_dump()
+
+    async def _on_calibrate_stored(self, request: Any, writer: Any) -> dict[str, Any]:
+        self.calibrated = None
+        return self.status().model_dump()
+
+    async def _on_withdraw(self, request: Any, writer: Any) -> dict[str, Any]:
+        self.withdrawn.append(request)
+        plays = self.state == "running" and self.plan is not None and self.plan.test_id == request.test_id
+        if plays and request.begun:
+            self._stop.set()
+        return {"withdrawn": plays and request.begun}
 
     async def _on_angle_pose(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state != "ready":
@@ -316,6 +344,7 @@ class FakeRig:
 
     async def _on_stop(self, request: Any, writer: Any) -> dict[str, Any]:
         self.stopped_by = request.by
+        self.stops += 1
         self._stop.set()
         if self.state != "running":
             self.state, self.reason = "latched", f"stopped by {request.by}"
@@ -328,6 +357,8 @@ class FakeRig:
     async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
         if self.state == "running":  # as the rig does until its recording is sealed, also after a stop
             raise m_refusal("busy", "Not now", "a test is running; nothing to re-arm")
+        if request.latch != self.latch:
+            raise m_refusal("latch-changed", "It was stopped again", f"{self.reason}; look, then re-arm")
         if not self.device_back:
             raise m_refusal(
                 "disconnected",

@@ -85,9 +85,11 @@ def test_a_body_without_an_end_is_not_taken_in(service: Service, path: str) -> N
     service.app.state.context.settings.max_upload_mb = 1.0
     with service.client() as client:
         client.post("/v1/participants", json={"code": "P017"})
+        seen = client.get("/v1/participants/P017").headers["etag"]
         host, port = service.url.removeprefix("http://").split(":")
         with socket.create_connection((host, int(port)), timeout=10) as line:
             head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {TOKEN}\r\n"
+            head += f"If-Match: {seen}\r\n"
             line.sendall(f"{head}Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n".encode())
             chunk = b"10000\r\n" + b"x" * 65536 + b"\r\n"
             sent, end = 0, time.monotonic() + 8

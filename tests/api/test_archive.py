@@ -39,7 +39,8 @@ def test_an_archived_participant_is_left_alone_until_it_is_taken_out(http: httpx
     assert run_test(http, "A1")["state"] == "completed"
     trail = [entry["action"] for entry in http.get("/v1/audit").json()["entries"] if entry["subject"] == "A1"]
     assert trail == ["create participant", "archive", "unarchive"]
-    assert http.post("/v1/participants/nobody/archive").status_code == 404
+    seen = {"If-Match": http.get("/v1/participants/A1").headers["etag"]}
+    assert http.post("/v1/participants/nobody/archive", headers=seen).status_code == 404
 
 
 def test_nobody_is_archived_in_the_middle_of_a_test(service: Service, http: httpx.Client) -> None:

@@ -13,10 +13,11 @@ import pytest
 from api.cli import stop_key
 from api.clock import Clock
 from api.errors import ApiError
-from api.people.auth import Auth, Scope, digest
+from api.people.auth import Auth, Scope
 from api.people.idle_lock import IdleLock
 from api.people.pace import Guesses
 from api.store import Store
+from api.store.hashes import digest
 from tests.api.conftest import Service, let_go, wait_done
 from tests.api.test_problems import problem
 

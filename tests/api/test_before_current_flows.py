@@ -116,17 +116,17 @@ def test_a_question_belongs_to_whom_it_was_asked(tab: httpx.Client, client: http
 @pytest.mark.parametrize(
     ("what", "body", "words"),
     [
-        ("profile", {"current_ma": 10}, "limits of P017 were"),
-        ("muscle", {"side": "right"}, "Side or muscle of P017 was"),
+        ("profile", {"current_ma": 10}, ("20 mA, 300 µs, 30 N·m", "10 mA, 300 µs, 30 N·m")),
+        ("muscle", {"side": "right"}, ("not said", "right")),
     ],
 )
 def test_limits_changed_meanwhile_are_not_played(
-    tab: httpx.Client, client: httpx.Client, service: Service, what: str, body: dict[str, Any], words: str
+    tab: httpx.Client, client: httpx.Client, service: Service, what: str, body: dict[str, Any], words: tuple[str, str]
 ) -> None:
     question = ask(tab)
     client.put(f"/v1/participants/P017/{what}", json=body)
     refused = yes(tab, question)
-    assert refused.status_code == 409 and f"{words} changed meanwhile" in refused.text
+    assert refused.status_code == 409 and f"<td>{words[0]}</td><td><b>{words[1]}</b></td>" in refused.text
     assert service.rig.starts == 0 and service.app.state.context.runner.current is None
 
 
@@ -152,7 +152,8 @@ def test_a_rig_that_asks_for_a_calibration_offers_that_first(
     page = tab.get(PAGE).text
     assert "Calibrate first" in page and "Start the pre-session test" not in page
     for path in (f"{PAGE}/tests", f"/models/{model}/experiment"):
-        refused = tab.post(path, data={"csrf": csrf(tab)})
+        seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
+        refused = tab.post(path, data={"csrf": csrf(tab), "seen": seen})
         assert refused.status_code == 409 and "Calibrate first" in refused.text
     assert service.rig.starts == starts
     calibrate(client)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import threading
+import zlib
 from typing import Any
 
 import httpx
@@ -57,7 +58,8 @@ def test_words_that_do_not_hold_are_refused_before_the_rig_hears_of_them(
     for body in ({"step_us": 26}, {"current_ma": -1}, {"current_ma": "NaN"}, {"train_s": 3}, {"pain": 1}):
         assert client.post(WHERE, json=body).status_code == 422, body
     assert service.rig.calibration is None
-    assert client.post("/v1/participants/P9/calibration").status_code == 404
+    seen = {"If-Match": client.get("/v1/participants/P017").headers["etag"]}
+    assert client.post("/v1/participants/P9/calibration", headers=seen).status_code == 404
 
 
 def test_no_calibration_during_a_test(client: httpx.Client, service: Service, participant: str) -> None:
@@ -78,10 +80,11 @@ def test_sequence_is_played_and_nothing_is_identified(client: httpx.Client, serv
 
 
 def sight(service: Service, token: dict[str, str]) -> dict[str, str]:
-    """What the page's forms send: the calibration that it shows, and how many trains."""
+    """What the page's forms send: the version of the calibration that it shows."""
     found = service.rig.calibration
     assert found is not None
-    return {**token, "calibration": found.calibration_id, "trains": str(len(found.trains))}
+    marks = zlib.crc32(repr(found.marks_us).encode())
+    return {**token, "calibration": f"{found.calibration_id}.{len(found.trains)}.{marks:08x}"}
 
 
 def test_whole_calibration_by_plain_forms(service: Service, participant: str) -> None:
@@ -97,9 +100,9 @@ def test_whole_calibration_by_plain_forms(service: Service, participant: str) ->
             browser.post(f"{page}/step/up", data=sight(service, token))
             browser.post(f"{page}/mark/{threshold}", data=sight(service, token))
         assert "Still to be marked" not in browser.get(page).text
-        assert browser.post(f"{page}/step/sideways", data=token).status_code == 422
+        assert browser.post(f"{page}/step/sideways", data=sight(service, token)).status_code == 422
         for what in ("step/up", "mark/comfort", "finish", "discard"):
-            assert browser.post(f"{page}/{what}", data=token).status_code == 409, "a form that shows no calibration"
+            assert browser.post(f"{page}/{what}", data=token, auth=None).status_code == 428, "it shows no calibration"
         led = browser.post(f"{page}/finish", data=sight(service, token))
         assert led.headers["location"] == "/participants/P017"
         assert "felt at 10 µs, moves at 20 µs" in browser.get("/participants/P017").text
@@ -228,7 +231,7 @@ def test_a_question_about_a_calibration_is_bound_to_the_limits_it_showed(
         asked = browser.post("/participants/P017/calibration", data={**token, "current_ma": "26", "step_us": "10"})
         assert "/confirm/" in asked.headers["location"]
         assert client.put(PROFILE, json=LOWER).status_code == 200
-        assert browser.post(asked.headers["location"], data=token).status_code == 412
+        assert browser.post(asked.headers["location"], data=token).status_code == 409
         assert service.rig.calibration is None
 
 

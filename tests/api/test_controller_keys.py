@@ -15,7 +15,7 @@ from sqlalchemy import select
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from api.people.auth import digest
+from api.store.hashes import digest
 from api.store.tables import AuditEntry, Test, Token
 from api.web.key_guard import OPEN
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done
@@ -98,7 +98,7 @@ def test_every_route_that_is_not_opened_is_closed(shared: Service, one_key: str,
     elif (method, path) == ("POST", "/v1/stop"):
         assert answer.status_code == 200 and "rig" not in answer.json()
     elif (method, path) == ("POST", "/v1/tests"):
-        assert answer.status_code == 422  # no body: which participant is meant is not known yet
+        assert answer.status_code == 428  # no body: which participant is meant is not known yet
     elif (method, path) in (("POST", "/sign-in"), ("POST", "/v1/sessions")):
         assert answer.status_code == 401
     else:
@@ -133,7 +133,8 @@ def test_what_is_anothers_is_refused_as_what_is_not_there(key: httpx.Client, don
     for path, body in (("prediction", {"pulse_width_us": [0]}), ("widths", {"reference_torque_nm": [0]})):
         answers = [key.post(f"/v1/models/{model}/{path}", json=body) for model in (other["model_id"], "nothing")]
         assert refused(answers[0]) == refused(answers[1])
-    answers = [key.post("/v1/tests", json={**TRIAL, "participant": code}) for code in ("P2", "P99")]
+    head = {"If-Match": key.get("/v1/participants/P1/model").headers["etag"]}
+    answers = [key.post("/v1/tests", json={**TRIAL, "participant": code}, headers=head) for code in ("P2", "P99")]
     assert refused(answers[0]) == refused(answers[1]) and "P2" not in answers[0].text
 
 
@@ -303,10 +304,11 @@ def test_after_a_rejection_it_plays_nothing_and_plans_nothing(
     model, before = done["P1"]["model_id"], shared.rig.starts
     approval = shared.app.state.context.versions.approved("P1")
     asked = {"widths": {"reference_torque_nm": [0, 1]}, "prediction": {"pulse_width_us": [0, 100]}}
+    head = {"If-Match": key.get("/v1/participants/P1/model").headers["etag"]}
     assert admin.post(f"/v1/models/{model}/reject", json={"reason": "wrong"}).status_code == 200
     try:
         answers = [key.post(f"/v1/models/{model}/{path}", json=body) for path, body in asked.items()]
-        for answer in [key.post("/v1/tests", json=TRIAL), *answers]:
+        for answer in [key.post("/v1/tests", json=TRIAL, headers=head), *answers]:
             assert answer.status_code == 409 and answer.json()["type"] == "/problems/no-approved-model"
             assert "No model of P1 is approved now." in answer.json()["detail"]
         assert shared.rig.starts == before and key.post("/v1/stop").status_code == 200
@@ -348,10 +350,11 @@ def test_a_plan_is_never_wider_than_the_participants_limits(
 
 
 @pytest.mark.parametrize("lacking", ["run-test", "read-live", "read-model"])
-def test_a_key_gives_no_scope_that_its_maker_lacks(shared: Service, lacking: str) -> None:
+def test_a_key_gives_no_scope_that_its_maker_lacks(shared: Service, admin: httpx.Client, lacking: str) -> None:
     scopes = {"approve-model", "run-test", "read-live", "read-model"} - {lacking}
     with shared.client(shared.token(f"lacks {lacking}", *scopes)) as clinician:
-        answer = clinician.post("/participants/P1/keys", data=PLAN, headers=HTML)
+        seen = admin.get("/v1/participants/P1").headers["etag"]
+        answer = clinician.post("/participants/P1/keys", data=PLAN, headers={**HTML, "If-Match": seen})
         assert answer.status_code == 403 and lacking in answer.text and "stimrig_" not in answer.text
         page = clinician.get("/participants/P1", headers=HTML)
         assert "Make the key" not in page.text

@@ -22,7 +22,8 @@ from tests.harness.c_program import compiled
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "controllers.md").read_text("utf-8")
-PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 30.0, "trials": 9}
+PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 30.0, "trials": 9,
+        "site": [None, None, None]}  # fmt: skip
 
 
 def blocks(language: str) -> list[str]:

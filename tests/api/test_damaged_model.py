@@ -97,13 +97,14 @@ def test_a_damaged_model_reaches_no_controller_and_is_not_approved(
     client: httpx.Client, service: Service, approved: str
 ) -> None:
     """A bit that has turned on the disk must not set anybody's stimulation."""
+    seen = {"If-Match": client.get(f"/v1/models/{approved}").headers["etag"]}
     damage(service, approved, "one digit")
     for answer in (
         client.get("/v1/participants/P017/model"),
         client.get(f"/v1/models/{approved}/file"),
-        client.post(f"/v1/models/{approved}/approve", json={"reason": "again"}),
+        client.post(f"/v1/models/{approved}/approve", json={"reason": "again"}, headers=seen),
     ):
         assert problem(answer, 500)["type"] == "/problems/model-damaged"
     assert client.get("/metrics").status_code == 200
-    assert client.post(f"/v1/models/{approved}/reject", json={"reason": "damaged"}).status_code == 200
+    assert client.post(f"/v1/models/{approved}/reject", json={"reason": "damaged"}, headers=seen).status_code == 200
     assert problem(client.get("/v1/participants/P017/model"), 404)["type"] == "/problems/no-approved-model"

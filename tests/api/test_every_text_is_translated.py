@@ -96,7 +96,9 @@ def test_every_text_of_a_page_is_a_message(name: str, browser: httpx.Client, pla
 
 
 def test_the_question_before_a_test_is_translated(browser: httpx.Client, places: dict[str, str]) -> None:
-    asked = browser.post("/participants/X1/tests", data={"csrf": csrf(browser)}, follow_redirects=True)
+    seen = re.findall(r'name="seen" value="([^"]+)"', browser.get("/participants/X1").text)[0]
+    form = {"csrf": csrf(browser), "seen": seen}
+    asked = browser.post("/participants/X1/tests", data=form, follow_redirects=True)
     assert "/confirm/" in str(asked.url), places
     assert untranslated(asked.text) == []
 

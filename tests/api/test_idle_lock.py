@@ -219,7 +219,7 @@ def test_actions_are_written_down_once_and_what_comes_meanwhile_is_kept(service:
     clock = SetClock()
     idle = IdleLock(context.store, clock, 10)
     with signed_in(service) as http:
-        row = context.auth.cookie(http.cookies["stimrig_session"]).page_session
+        row = context.auth.cookie(http.cookies[context.auth.cookie_name]).page_session
         clock.ahead_s = 500.0
         idle.acted(row.hash)
         idle.flush()

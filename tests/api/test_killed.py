@@ -17,6 +17,7 @@ import httpx
 
 from api.cli.launcher import Child
 from tests.api.conftest import TOKEN, soon, wait_done
+from tests.harness.looks_first import LooksFirst
 
 ROOT = Path(__file__).parents[2]
 KILLS, SEED = 3, 61
@@ -60,7 +61,7 @@ def service(folder: Path, socket: Path) -> Child:
 def busy_clinic(url: str, seed: int, kept: Acknowledged, ended: threading.Event) -> None:
     """Deeds of all kinds, one after the other; what is answered is noted, what is cut off is not."""
     rng = random.Random(seed)
-    with httpx.Client(base_url=url, headers=AUTHORIZED, timeout=60) as http:
+    with httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=60) as http:
         while not ended.is_set():
             try:
                 action(http, rng, kept)
@@ -136,7 +137,7 @@ def test_killed_at_any_moment_nothing_acknowledged_is_lost(tmp_path: Path, short
             child.end()
         child = service(tmp_path, socket)
         try:
-            with httpx.Client(base_url=child.start()["url"], headers=AUTHORIZED, timeout=60) as http:
+            with httpx.Client(base_url=child.start()["url"], auth=LooksFirst(TOKEN), timeout=60) as http:
                 everything_is_there(http, kept)
                 assert len(kept.participants) >= KILLS and len(kept.tests) >= 2, "there was something to lose"
         finally:

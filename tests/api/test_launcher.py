@@ -18,6 +18,7 @@ from api.cli.launcher import Services
 from api.client.rest import Client
 from api.settings import Settings
 from tests.api.conftest import TOKEN, soon
+from tests.harness.looks_first import LooksFirst
 
 pytestmark = pytest.mark.wire
 FAST = ["--speed", "4"]
@@ -28,7 +29,7 @@ def settings(tmp_path: Path, **more: object) -> Settings:
 
 
 def client(services: Services) -> httpx.Client:
-    return httpx.Client(base_url=services.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=60)
+    return httpx.Client(base_url=services.url, auth=LooksFirst(TOKEN), timeout=60)
 
 
 @pytest.mark.timeout(900)  # an identification gives way to every other process: beside them it takes minutes

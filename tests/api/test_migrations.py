@@ -31,6 +31,7 @@ ADDED_SINCE = [
     ("page_sessions", "acted_unix_s"), ("page_sessions", "locked_unix_s"), ("approvals", "tracking"),
     ("tokens", "participant"), ("tokens", "plan"), ("tokens", "made_by"),
     ("tests", "followed_by"), ("tests", "rig"),
+    ("participants", "placement"), ("recordings", "site"), ("approvals", "site"),
 ]  # fmt: skip
 """Columns that the tables of a first database did not have."""
 NEWER = "UPDATE alembic_version SET version_num = '0900'"
@@ -119,7 +120,7 @@ def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Pat
         tmp_path / "stimrig.db", "DROP TABLE alembic_version", "DROP TABLE schema_version", "DROP TABLE confirmations",
         "DROP TABLE known_places", "DROP TABLE users", "DROP TABLE notes", "DROP TABLE tracked",
         "DROP TABLE secrets",
-        "DROP TABLE outbox",
+        "DROP TABLE outbox", "DROP INDEX ix_audit_subject",
         *(f"DROP TABLE {table}" for table in Table.metadata.tables if table.startswith("centre_")),
         *(f"ALTER TABLE {table} DROP COLUMN {column}" for table, column in ADDED_SINCE),
     )  # fmt: skip

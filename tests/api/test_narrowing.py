@@ -15,7 +15,7 @@ from tests.api.conftest import Service, wait_done
 from tests.api.test_problems import problem
 
 CALIBRATED = {
-    "angle_range_rad": None,
+    "angle_range_rad": None, "angle_set_at_utc": None,
     "current_ma": 18.0, "max_pulse_width_us": 220.0, "max_torque_nm": 12.0, "sensory_pulse_width_us": 60.0,
     "motor_pulse_width_us": 120.0, "set_at_utc": "2026-01-01T08:00:00Z", "expires_at_utc": "2026-01-01T23:00:00Z",
     "rest_between_tests_s": 60.0,

@@ -153,6 +153,13 @@ def test_the_start_in_the_line_sets_what_was_typed(client: httpx.Client, service
     """It is a button of the limits' form: one click sets them and asks."""
     run_test(client, participant)
     with signed_in(service) as browser:
-        form = {"csrf": csrf(browser), "current_ma": "19", "max_pulse_width_us": "300", "max_torque_nm": "30"}
+        seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
+        form = {
+            "csrf": csrf(browser),
+            "seen": seen,
+            "current_ma": "19",
+            "max_pulse_width_us": "300",
+            "max_torque_nm": "30",
+        }
         page = browser.get(browser.post("/participants/P017/tests", data=form).headers["location"]).text
     assert "19 mA" in page and "Start now" in page

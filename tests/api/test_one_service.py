@@ -24,6 +24,7 @@ from api.settings import Settings
 from api.store import Store, lock
 from api.store.lock import HeldError, ServiceLock
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
+from tests.harness.looks_first import LooksFirst
 
 pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
@@ -58,12 +59,12 @@ def test_a_second_service_is_told_who_holds_the_data_and_a_kill_lets_go(tmp_path
             assert done.returncode == 2 and done.stdout == ""
             assert f"process {first.pid} on {socket.gethostname()}, since 20" in line and f"at {url}; stop it" in line
         assert main.run(["audit", "verify", "--data", str(data)]) == 0, "who only reads is let in"
-        http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=PATIENCE_S)
+        http = httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S)
         assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201, "the first works on"
         first.send_signal(signal.SIGKILL)
         first.wait(20)
     with served(other, DATABASE_URL=f"sqlite:///{link}") as (_, url):
-        http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=PATIENCE_S)
+        http = httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S)
         assert [row["code"] for row in http.get("/v1/participants").json()] == ["P1"]
 
 
@@ -171,7 +172,7 @@ def test_files_of_the_process_are_its_owners_alone(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
         with served(tmp_path / "data") as (_, url):
-            http = httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=PATIENCE_S)
+            http = httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S)
             http.post("/v1/participants", json={"code": "P1"})
             sent = http.post("/v1/participants/P1/recordings", content=b"time_s,pulse_width_us,torque_nm,segment\n")
             files = [path for path in (tmp_path / "data").rglob("*") if path.is_file()]

@@ -80,9 +80,26 @@ def test_every_operation_says_who_may_and_every_error_is_a_problem(document: dic
             if code >= "400":
                 schema = answer["content"]["application/problem+json"]["schema"]
                 assert schema == {"$ref": "#/components/schemas/Problem"}, (method, path, code)
+        asks = bool(operation.get("security")) or path == "/v1/sessions"
+        assert ("429" in operation["responses"]) == asks, (method, path)
+        assert not asks or set(operation["responses"]["429"]["headers"]) == {"Retry-After"}, (method, path)
     approve = document["paths"]["/v1/models/{model_id}/approve"]["post"]
     assert {"token": ["approve-model"]} in approve["security"]
     assert approve["description"].endswith("Scope: `approve-model`.")
+
+
+def test_the_answer_to_a_guess_is_as_the_document_says_and_the_cookie_has_its_name(
+    service: Service, document: dict[str, Any]
+) -> None:
+    with service.client() as admin:
+        admin.post("/v1/users", json={"name": "Grace", "password": "long enough"}).raise_for_status()
+    with service.client(token=None) as browser:
+        browser.post("/v1/sessions", json={"name": "Grace", "password": "long enough"}).raise_for_status()
+        assert list(browser.cookies) == [document["components"]["securitySchemes"]["session"]["name"]]
+    with service.client(token=None) as stranger:
+        for _ in range(20):
+            held = stranger.get("/v1/participants", headers={"Authorization": "Bearer guess"})
+        assert held.status_code == 429 and int(held.headers["Retry-After"]) >= 1
 
 
 def test_real_answers_hold_to_the_document(service: Service, document: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from tests.api.conftest import TOKEN, Service, run_test, shared_service
 HTML = {"Accept": "text/html"}
 NAMES = (
     "csrf", "code", "file", "reason", "effect", "force", "back", "name", "password", "token", "next", "role", "days",
-    "current_ma", "step_us", "max_pulse_width_us", "max_torque_nm", "version", "trains",
+    "current_ma", "step_us", "max_pulse_width_us", "max_torque_nm", "placement", "of", "seen", "latch",
     "calibration", "shown_us", "right",
     "archived", "at", "colours", "kind", "language", "muscle", "now", "q", "ran_by", "secret", "side",
     "plan", "reference", "max_duration_s", "trials", "target", "test_id", "text", "username",

@@ -43,9 +43,9 @@ POST   /v1/sessions/unlock                                 anyone         422
 GET    /v1/sequences                                       anyone         200
 GET    /v1/rig                                             read-live      200
 GET    /v1/rig/angle                                       read-live      200
-POST   /v1/rig/angle/pose                                  run-test       422
+POST   /v1/rig/angle/pose                                  run-test       428
 GET    /rig/angle                                          run-test       409
-POST   /rig/angle/pose                                     run-test       4xx
+POST   /rig/angle/pose                                     run-test       428
 GET    /v1/participants/x/joint                            run-test       404
 POST   /v1/participants/x/models                           run-test       422
 GET    /participants/x/joint                               run-test       404
@@ -82,15 +82,15 @@ GET    /jobs/now/x                                        read-model     404
 GET    /v1/participants                                    run-test       200
 POST   /v1/participants                                    run-test       422
 GET    /v1/participants/x                                  run-test       404
-PUT    /v1/participants/x/profile                          run-test       422
+PUT    /v1/participants/x/profile                          run-test       428
 GET    /v1/participants/x/tests                            run-test       404
-POST   /v1/participants/x/recordings                       run-test       404
+POST   /v1/participants/x/recordings                       run-test       428
 GET    /v1/participants/x/calibration                      run-test       404
-POST   /v1/participants/x/calibration                      run-test       404
-POST   /v1/participants/x/calibration/step                 run-test       422
-POST   /v1/participants/x/calibration/mark                 run-test       422
-POST   /v1/participants/x/calibration/finish               run-test       404
-POST   /v1/tests                                           run-test       422
+POST   /v1/participants/x/calibration                      run-test       428
+POST   /v1/participants/x/calibration/step                 run-test       428
+POST   /v1/participants/x/calibration/mark                 run-test       428
+POST   /v1/participants/x/calibration/finish               run-test       428
+POST   /v1/tests                                           run-test       428
 POST   /v1/tests/x/keep-plain                              run-test       404
 POST   /tests/x/keep-plain                                 run-test       404
 POST   /v1/tests/x/enough                                  run-test       404
@@ -103,15 +103,15 @@ GET    /participants/x                                     run-test       404
 GET    /participants/x/next                                run-test       404
 GET    /participants/x/trials                              run-test       404
 POST   /participants                                       run-test       4xx
-POST   /participants/x/profile                             run-test       4xx
-POST   /participants/x/tests                               run-test       4xx
-POST   /participants/x/recordings                          run-test       4xx
+POST   /participants/x/profile                             run-test       428
+POST   /participants/x/tests                               run-test       428
+POST   /participants/x/recordings                          run-test       428
 GET    /participants/x/calibration                         run-test       404
-POST   /participants/x/calibration                         run-test       4xx
-POST   /participants/x/calibration/step/up                 run-test       4xx
-POST   /participants/x/calibration/mark/motor              run-test       4xx
-POST   /participants/x/calibration/finish                  run-test       4xx
-POST   /participants/x/calibration/discard                 run-test       4xx
+POST   /participants/x/calibration                         run-test       428
+POST   /participants/x/calibration/step/up                 run-test       428
+POST   /participants/x/calibration/mark/motor              run-test       428
+POST   /participants/x/calibration/finish                  run-test       428
+POST   /participants/x/calibration/discard                 run-test       428
 GET    /participants/x/confirm/x                            run-test       410
 POST   /participants/x/confirm/x                           run-test       410
 POST   /models/x/effects                                   run-test       4xx
@@ -119,43 +119,43 @@ POST   /models/x/improve                                   run-test       4xx
 POST   /models/x/experiment                                run-test       4xx
 POST   /models/x/diagnosis/cancel                          run-test       303
 POST   /jobs/x/cancel                                      run-test       404
-PUT    /v1/participants/x/muscle                           run-test       422
-POST   /v1/participants/x/archive                          run-test       404
-POST   /v1/participants/x/unarchive                        run-test       404
+PUT    /v1/participants/x/muscle                           run-test       428
+POST   /v1/participants/x/archive                          run-test       428
+POST   /v1/participants/x/unarchive                        run-test       428
 GET    /v1/participants/x/notes                            run-test       404
 POST   /v1/participants/x/notes                            run-test       422
-POST   /v1/participants/x/notes/x/strike                   run-test       404
-PUT    /v1/tests/x/ran-by                                  run-test       422
+POST   /v1/participants/x/notes/x/strike                   run-test       428
+PUT    /v1/tests/x/ran-by                                  run-test       428
 POST   /participants/x/notes                               run-test       4xx
-POST   /participants/x/notes/x/strike                      run-test       4xx
-POST   /participants/x/archive                             run-test       404
-POST   /participants/x/unarchive                           run-test       404
-POST   /participants/x/muscle                              run-test       404
-POST   /tests/x/ran-by                                     run-test       404
+POST   /participants/x/notes/x/strike                      run-test       428
+POST   /participants/x/archive                             run-test       428
+POST   /participants/x/unarchive                           run-test       428
+POST   /participants/x/muscle                              run-test       428
+POST   /tests/x/ran-by                                     run-test       428
 POST   /participants/x/keys/x/revoke                       run-test       404
-POST   /participants/x/keys                                approve-model  404
-POST   /v1/rearm                                           rearm          200
-POST   /rearm                                              rearm          303
-POST   /v1/models/x/approve                                approve-model  404
-POST   /v1/models/x/reject                                 approve-model  404
-POST   /v1/models/x/undo                                   approve-model  404
+POST   /participants/x/keys                                approve-model  428
+POST   /v1/rearm                                           rearm          428
+POST   /rearm                                              rearm          428
+POST   /v1/models/x/approve                                approve-model  428
+POST   /v1/models/x/reject                                 approve-model  428
+POST   /v1/models/x/undo                                   approve-model  428
 GET    /models/x/approve                                   approve-model  404
-POST   /models/x/approve                                   approve-model  404
-POST   /models/x/reject                                    approve-model  422
-POST   /models/x/undo                                      approve-model  404
+POST   /models/x/approve                                   approve-model  428
+POST   /models/x/reject                                    approve-model  428
+POST   /models/x/undo                                      approve-model  428
 POST   /v1/tokens                                          administer     422
 GET    /v1/tokens                                          administer     200
 DELETE /v1/tokens/x                                        administer     404
 GET    /v1/audit                                           administer     200
 POST   /v1/users                                           administer     422
 GET    /v1/users                                           administer     200
-PUT    /v1/users/x/password                                administer     422
-DELETE /v1/users/x                                         administer     404
+PUT    /v1/users/x/password                                administer     428
+DELETE /v1/users/x                                         administer     428
 POST   /v1/controller-keys                                 administer     422
 GET    /administration                                     administer     200
 POST   /administration/users                               administer     422
-POST   /administration/users/x/password                    administer     422
-POST   /administration/users/x/remove                      administer     404
+POST   /administration/users/x/password                    administer     428
+POST   /administration/users/x/remove                      administer     428
 POST   /administration/keys                                administer     422
 POST   /administration/tokens/x/revoke                     administer     404
 GET    /administration/audit.jsonl                         administer     200
@@ -194,7 +194,7 @@ def holders(shared: Service) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def http(shared: Service) -> Iterator[httpx.Client]:
-    with shared.client(token=None) as client:
+    with shared.client(token=None, auth=None) as client:  # it does not look first: what decides is told so
         yield client
 
 

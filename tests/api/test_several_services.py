@@ -129,7 +129,7 @@ def test_what_a_killed_service_leaves_is_taken_up_by_the_other(
         b = one(stack, tmp_path / "b", address, rig)
         at_b = stack.enter_context(b.client())
         assert at_b.post("/v1/participants", json={"code": "P1"}).status_code == 201
-        header = {"Authorization": f"Bearer {TOKEN}"}
+        header = {"Authorization": f"Bearer {TOKEN}", "If-Match": at_b.get("/v1/participants/P1").headers["etag"]}
         begun = httpx.post(f"{url}/v1/tests", json={"participant": "P1"}, headers=header, timeout=PATIENCE_S)
         test_id = begun.json()["id"]
         state = "running" if when == "plays" else "identifying"

@@ -23,7 +23,7 @@ from api.workers import confinement
 from api.workers.pool import WORKER, Pool
 from api.workers.process import Places
 from api.workers.verbs import find_recording
-from tests.api.conftest import STUB, Service, run_service
+from tests.api.conftest import STUB, Service, run_service, soon
 from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool
 from tests.harness import hostile_files, hostile_shapes
@@ -300,3 +300,25 @@ def test_every_operation_with_a_body_documents_what_it_answers(shared_client: ht
     ]
     assert len(operations) >= 14
     assert [(path, method) for path, method, operation in operations if "400" not in operation["responses"]] == []
+
+
+def test_a_worker_is_killed_with_the_service_in_the_middle_of_a_call(tmp_path: Path) -> None:
+    """It would not read that its input has ended before the call is done."""
+    call = json.dumps({"call": 1, "verb": "warm", "arguments": {}})
+    service = f"""
+import subprocess, sys, time
+worker = subprocess.Popen({list(WORKER)!r}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+worker.stdout.readline()
+worker.stdin.write({call!r} + "\\n")
+worker.stdin.flush()
+worker.stdout.readline()
+print(worker.pid, flush=True)
+time.sleep(3600)
+"""
+    parent = subprocess.Popen([sys.executable, "-c", service], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    os.kill(worker, signal.SIGSTOP)  # it neither computes nor reads: only the kernel can end it
+    parent.kill()
+    parent.communicate()
+    soon(lambda: not Path(f"/proc/{worker}").exists() or " Z " in Path(f"/proc/{worker}/stat").read_text(), 20)

@@ -23,6 +23,7 @@ from api.cli.commands import test as test_verb
 from api.cli.stop_key import StopKey, at_rig, at_service
 from tests.api.conftest import TOKEN, Service, soon, wait_done
 from tests.api.fake_rig import RigThread
+from tests.harness.looks_first import LooksFirst
 
 ROOT = Path(__file__).parents[2]
 
@@ -246,7 +247,7 @@ def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
             url = first.split()[2]
             while "any key stops" not in (line := served.stdout.readline()):
                 assert line, "it says that keys stop"
-            with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=60) as http:
+            with httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=60) as http:
                 http.post("/v1/participants", json={"code": "A1"})
                 test_id = http.post("/v1/tests", json={"participant": "A1"}).json()["id"]
                 os.write(keyboard, b"s")

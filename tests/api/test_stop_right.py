@@ -36,6 +36,10 @@ def person(service: Service, name: str = "Ada") -> httpx.Client:
     return browser
 
 
+def cookie_name(service: Service) -> str:
+    return service.app.state.context.auth.cookie_name
+
+
 def right_on(page: str) -> str:
     (form,) = re.findall(r'<form method="post" action="/v1/stop".*?</form>', page, re.S)
     return re.findall(r'name="right" value="([^"]+)"', form)[0]
@@ -113,7 +117,7 @@ def test_no_page_gives_a_right_to_a_key_or_to_who_was_told_no_since(
     """A right outlives what a key may do, and says more of a stop than a key is told."""
     key, removed = service.token("ctl", "read-live"), person(service)
     by_key = service.client(key, headers=HTML)
-    as_cookie = service.client(token=None, headers=HTML, cookies={"stimrig_session": f"Bearer {key}"})
+    as_cookie = service.client(token=None, headers=HTML, cookies={cookie_name(service): f"Bearer {key}"})
     assert by_key.get("/v1/rig", headers={"Accept": "application/json"}).status_code == 200
     assert removed.get("/").status_code == 200
     remove(removed, client, service)
@@ -153,7 +157,7 @@ def test_a_stop_waits_for_no_database(service: Service, participant: str, monkey
     with store.write():  # another writer does not let go
         monkeypatch.setattr(store, "get", gone)
         monkeypatch.setattr(store, "all", gone)
-        answer = press(service, right, cookies={"stimrig_session": "old"})
+        answer = press(service, right, cookies={cookie_name(service): "old"})
         assert answer.status_code == 200 and CONFIRMED in answer.text
     monkeypatch.undo()
 
@@ -244,7 +248,7 @@ def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, mon
     monkeypatch.setattr("api.web.stop_guard.PATIENCE_S", 0.01)
     monkeypatch.setattr("api.web.stop_guard.LONGEST_PATIENCE_S", 60.0, raising=False)
     right = service.app.state.context.stop_rights.give("Ada", None)
-    with slow_form(service, f"right={right}", "Cookie: stimrig_session=ended\r\n") as connection:
+    with slow_form(service, f"right={right}", f"Cookie: {cookie_name(service)}=ended\r\n") as connection:
         connection.sendall(right[-1:].encode())
         assert connection.recv(12) == b"HTTP/1.1 200"
     assert service.rig.stopped_by == "Ada"
@@ -289,8 +293,9 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         assert "I have checked" not in page.get("/").text
         assert program.post("/v1/tests", json=start).status_code == 409
         assert program.post(calibration).status_code == 409
-        assert program.post(f"{calibration}/finish", json={"discard": True}).status_code == 404
-        assert program.post(f"{calibration}/step", json={}).status_code == 404
+        seen = {"If-Match": '"C1-1.0"'}
+        assert program.post(f"{calibration}/finish", json={"discard": True}, headers=seen).status_code == 404
+        assert program.post(f"{calibration}/step", json={}, headers=seen).status_code == 404
         assert program.get("/v1/rig").json()["state"] == "latched" and service.rig.starts == 0
         assert "I have checked" in browser.get("/").text
         csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]

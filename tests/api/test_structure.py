@@ -75,7 +75,9 @@ def test_an_uploads_model_page_says_what_was_left_out_of_its_structure(site: Ser
             client.post("/v1/participants", json={"code": code})
         (told,) = client.post("/v1/participants/P1/recordings", content=csv).json()["warnings"]
         form, token = "/participants/P2/recordings", csrf(browser)
-        page = browser.post(form, data={"csrf": token}, files={"file": ("a.csv", csv)}, follow_redirects=True)
+        page = browser.post(
+            form, data={"csrf": token}, files={"file": ("a.csv", f"{csv}0.025,0,0,rest\n")}, follow_redirects=True
+        )
         assert page.url.path.startswith("/models/") and html.escape(told) in page.text
         assert html.escape(told) in browser.get(page.url.path).text
         exports = page.text.partition('aria-label="Export"')[2].partition("</div>")[0]

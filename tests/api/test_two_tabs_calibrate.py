@@ -25,7 +25,7 @@ def tab(client: httpx.Client, service: Service, participant: str) -> Iterator[tu
     up(client)
     assert service.rig.calibration is not None
     with signed_in(service) as browser:
-        yield browser, {"csrf": csrf(browser), "trains": "1", "calibration": service.rig.calibration.calibration_id}
+        yield browser, {"csrf": csrf(browser), "calibration": client.get(WHERE).json()["version"]}
 
 
 def trains(service: Service) -> int:
@@ -68,18 +68,20 @@ def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(service: S
     assert trains(service) == 1 and not service.rig.calibration.marks_us  # pyright: ignore[reportOptionalMemberAccess]
 
 
-@pytest.mark.parametrize("stale", [{"trains": "0"}, {"calibration": "C20260101000000-abc-def"}])
+@pytest.mark.parametrize("stale", ["before the marks", "other"])
 def test_a_page_that_is_out_of_date_finishes_nothing(
-    client: httpx.Client, service: Service, tab: Any, stale: dict[str, str]
+    client: httpx.Client, service: Service, tab: Any, stale: str
 ) -> None:
     browser, fields = tab
     for threshold in ("sensory", "motor", "comfort"):
         client.post(f"{WHERE}/mark", json={"threshold": threshold})
-    for what in ("finish", *(("discard", "step/repeat", "mark/motor") if "calibration" in stale else ())):
-        assert browser.post(f"{PAGE}/{what}", data={**fields, **stale}).status_code == 409, what
+    version = fields["calibration"] if stale == "before the marks" else "C20260101000000-abc-def.1"
+    for what in ("finish", *(("discard", "step/repeat", "mark/motor") if stale == "other" else ())):
+        assert browser.post(f"{PAGE}/{what}", data={**fields, "calibration": version}).status_code == 409, what
     assert trains(service) == 1
     assert service.rig.calibration is not None
-    assert browser.post(f"{PAGE}/finish", data=fields).headers["location"] == "/participants/P017"
+    now = {**fields, "calibration": client.get(WHERE).json()["version"]}
+    assert browser.post(f"{PAGE}/finish", data=now).headers["location"] == "/participants/P017"
 
 
 def test_the_page_itself_sends_what_it_shows(service: Service, tab: Any) -> None:
@@ -87,4 +89,4 @@ def test_the_page_itself_sends_what_it_shows(service: Service, tab: Any) -> None
     forms = [part.partition("</form>")[0] for part in browser.get(PAGE).text.split("<form")[1:]]
     own = [form for form in forms if f"{PAGE}/" in form]
     assert len(own) == 3
-    assert all(f'name="{key}" value="{fields[key]}"' in form for form in own for key in ("calibration", "trains"))
+    assert all(f'name="calibration" value="{fields["calibration"]}"' in form for form in own)

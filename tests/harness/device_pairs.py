@@ -112,7 +112,7 @@ def stops_when_asked(bench: Bench, client: RigClient) -> float:
     assert evidence["confirmed"], evidence
     assert client.wait_finished("asked")["outcome"] == "stopped"
     assert client.wait_state("latched")["reason"] == "enough (by nurse)"
-    assert client.ask("rearm", by="nurse")["ok"]
+    assert client.rearm("nurse")["ok"]
     assert felt_after(bench, asked_s) <= 4  # of 25 ms each
     assert felt_after(bench, answered_s + SAME_CLOCK_S) == 0
     return 1e3 * (felt(bench)[-1]["monotonic_s"] - asked_s)
@@ -131,7 +131,7 @@ def stops_when_unheard(bench: Bench, client: RigClient) -> float:
     bench.fault(cmd="fault", name="no_ack", on=False)
     client.wait_state("latched")
     time.sleep(0.1)
-    rearmed = client.ask("rearm", by="nurse")
+    rearmed = client.rearm("nurse")
     assert rearmed["ok"], rearmed
     return last_ms
 
@@ -149,7 +149,7 @@ def says_nothing_when_killed(bench: Bench, client: RigClient) -> float:
     assert again.status()["state"] == "uncertain"
     again.ask("subscribe")
     assert len(felt(bench)) == len(after)
-    assert again.ask("rearm", by="nurse")["ok"]
+    assert again.rearm("nurse")["ok"]
     assert again.start(short_plan("next"))["ok"]
     event = again.wait_finished("next")
     assert event["outcome"] == "completed", event

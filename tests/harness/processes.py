@@ -107,6 +107,10 @@ class RigClient:
                 return reply
             time.sleep(0.05)
 
+    def rearm(self, by: str) -> dict[str, Any]:
+        """Look at the rig, then re-arm it; the whole reply."""
+        return self.ask("rearm", by=by, latch=self.status()["latch"])
+
     def send_raw(self, line: str) -> None:
         """Send a line as it is."""
         self._socket.sendall(line.encode() + b"\n")
@@ -256,7 +260,7 @@ def made_ready(bench: Bench, client: RigClient) -> tuple[Bench, RigClient]:
     if client.status()["state"] != "ready":
         client.ask("stop", reason="the test before left it so", by="test")
         client.wait_state("latched", "disconnected")
-        assert client.ask("rearm", by="test")["ok"]
+        assert client.rearm("test")["ok"]
     while not client.events.empty():
         client.events.get_nowait()
     return bench, client

@@ -112,11 +112,11 @@ def _session(bench: Bench, client: Any, minutes: float, every_minutes: float, pl
         reply = client.start(default_plan(name, **plan))
         if not reply["ok"]:
             tests.append({"outcome": "refused", "reason": reply["problem"]["detail"], "summary": {}})
-            client.ask("rearm", by="soak")
+            client.rearm("soak")
         else:
             tests.append(client.wait_finished(name, timeout_s=120))
             if tests[-1]["outcome"] != "completed":
-                client.ask("rearm", by="soak")
+                client.rearm("soak")
         memory.append(memory_mb(pid))
         while time.monotonic() < min(next_s, began_s + 60 * minutes):
             while not client.events.empty():

@@ -10,7 +10,7 @@ import numpy as np
 
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.errors import DeviceError
-from rig.signals import ANGLE_SAMPLE, AngleBlock, AngleScale
+from rig.signals import ANGLE_SAMPLE, AngleScale, Block
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 RATE_HZ = 200.0
@@ -33,7 +33,8 @@ class FakeSensor:
 
     def __init__(self, clock: VirtualClock, angle_rad: Callable[[float], float] = still) -> None:
         self.clock, self.angle_rad = clock, angle_rad
-        self.silent = self.fault = self.nan = self.repeating = False
+        self.silent = self.nan = self.repeating = False
+        self.fault: int = 0
         self.add_deg = 0.0
         self.rate = 1.0
         self.skip = 0
@@ -49,7 +50,7 @@ class FakeSensor:
 
     async def close(self) -> None: ...
 
-    def block(self, n: int = PER_BLOCK, at_s: float | None = None) -> AngleBlock:
+    def block(self, n: int = PER_BLOCK, at_s: float | None = None) -> Block:
         """The next samples; the last one is taken now."""
         now_s = self.clock.now_s() if at_s is None else at_s
         if not self.repeating:
@@ -63,7 +64,7 @@ class FakeSensor:
         samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
         samples["counter"] = (self.counter - np.arange(n)[::-1]) % 65536
         samples["fault"] = self.fault
-        return AngleBlock(samples)
+        return Block(samples)
 
     def feed(self, receiver: AngleReceiver, until_s: float) -> None:
         """Schedule blocks for the receiver until a time."""
@@ -82,7 +83,7 @@ class FakeSensor:
         else:
             receiver.take(block)
 
-    def _arrive(self, receiver: AngleReceiver, block: AngleBlock) -> None:
+    def _arrive(self, receiver: AngleReceiver, block: Block) -> None:
         block.samples["host_time_s"] = self.clock.now_s()
         receiver.take(block)
 
@@ -97,7 +98,7 @@ class OpenedSensor(FakeSensor):
         self.done: list[str] = []
         self._opened = 0
 
-    async def open(self, on_block: Callable[[AngleBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         await self.tasks.sleep(self.opens_s)
         if self.gone:
             raise DeviceError("angle sensor: no adapter")
@@ -111,7 +112,7 @@ class OpenedSensor(FakeSensor):
         await self.tasks.sleep(self.closes_s)
         self.done.append("closed")
 
-    def _beat(self, on_block: Callable[[AngleBlock], None], opened: int) -> None:
+    def _beat(self, on_block: Callable[[Block], None], opened: int) -> None:
         if self._opened != opened:
             return
         if self.gone:

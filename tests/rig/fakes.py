@@ -21,7 +21,7 @@ from rig.gate import Gate
 from rig.journal import Journal, Kind
 from rig.limits import Admitted, Steps
 from rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
-from rig.signals import SAMPLE, Ack, LateError, TorqueBlock
+from rig.signals import SAMPLE, Ack, Block, LateError
 from rig.tasks import Outcome
 from tests.rig.angle import FakeSensor
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
@@ -42,7 +42,6 @@ class FakeStimulator:
     """Acknowledges each pulse `ack_delay_s` later; its faults are plain attributes."""
 
     steps = Steps()
-    silence_s = 0.0
 
     def __init__(self, clock: VirtualClock) -> None:
         self.clock = clock
@@ -150,7 +149,7 @@ class FakeCell:
         for i in range(1, math.ceil((until_s - first_s) / period_s)):
             self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver.take, per_block))
 
-    def _block(self, take: Callable[[TorqueBlock], None], n: int) -> None:
+    def _block(self, take: Callable[[Block], None], n: int) -> None:
         self.counter += n + self.skip
         self.skip = 0
         if self.silent:
@@ -183,7 +182,7 @@ class FakeCell:
         block["host_time_s"] = now_s
         if self.read_share == 1.0:
             self._held.clear()
-        take(TorqueBlock(block))
+        take(Block(block))
 
 
 class VirtualRig:

@@ -16,7 +16,7 @@ from rig.control.rig import Rig
 from rig.errors import DeviceError
 from rig.machine import Disk
 from rig.messages import Event, Profile, Status, StopEvidence, TestPlan
-from rig.signals import TorqueBlock
+from rig.signals import Block
 from rig.tasks import Outcome, Task, Tasks
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, hold, rest
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
@@ -85,7 +85,7 @@ class LiveStimulator(FakeStimulator):
         await self.machine.tasks.sleep(ANSWER_S)
 
 
-class MistakenBlock(TorqueBlock):
+class MistakenBlock(Block):
     """What a driver with a mistake gives."""
 
     def __len__(self) -> int:
@@ -101,7 +101,7 @@ class LiveCell(FakeCell):
         self.gone = self.broken = False
         self._opened = 0
 
-    async def open(self, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         if self.gone:
             raise DeviceError("load cell: the bus is not there")
         self._opened += 1
@@ -111,7 +111,7 @@ class LiveCell(FakeCell):
     async def close(self) -> None:
         self._opened += 1
 
-    def _beat(self, opened: int, on_block: Callable[[TorqueBlock], None], on_lost: Callable[[str], None]) -> None:
+    def _beat(self, opened: int, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> None:
         if opened != self._opened:
             return
         if self.gone:
@@ -178,7 +178,7 @@ class LiveRig:
         return self.ask(self.rig.stop(reason, by))
 
     def rearm(self, by: str = "nurse") -> Status:
-        return self.ask(self.rig.rearm(by))
+        return self.ask(self.rig.rearm(by, self.rig.latch))
 
     def close(self) -> None:
         self.ask(self.rig.close())

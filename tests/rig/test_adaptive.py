@@ -18,10 +18,11 @@ from tests.rig.fakes import VirtualRig, slow_work
 def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(tmp_path: Path):
     rig = adaptive(tmp_path)
     result = rig.execute()
-    assert (result.outcome, result.ended_by, result.duration_s) == ("completed", "plan", pytest.approx(3.475))
+    assert (result.outcome, result.summary["ended_by"]) == ("completed", "plan")
+    assert result.summary["duration_s"] == pytest.approx(3.475)
     (tmp_path / "fixed").mkdir()
     same = VirtualRig(tmp_path / "fixed", FIXED)
-    assert same.execute().ended_by == "plan"
+    assert same.execute().summary["ended_by"] == "plan"
     assert widths_sent(rig) == widths_sent(same)
     recording = rig.recording()
     assert recording.names == ["rest", "first", "ramp", "rest"]
@@ -44,7 +45,7 @@ def test_what_is_added_plays_at_its_boundary_and_the_fixed_plan_goes_on_after_it
     assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5, 3.5, 4.5]
     sent_us = recording.columns["pulses/sent_pulse_width_us"]
     assert np.all(sent_us[20:60] == 100) and np.all(sent_us[100:140] == 300)
-    assert result.duration_s == pytest.approx(len(sent_us) / RATE_HZ)
+    assert result.summary["duration_s"] == pytest.approx(len(sent_us) / RATE_HZ)
     times = np.array([time_s for time_s, _ in rig.stimulator.sent])
     assert np.allclose((times - times[0]) * RATE_HZ, np.round((times - times[0]) * RATE_HZ))
     assert '"by": "extension"' in recording.attributes["laid"] and '"seed": 3' in recording.attributes["laid"]
@@ -86,7 +87,7 @@ def test_while_an_extension_is_checked_the_test_goes_on(tmp_path: Path, takes_s:
     rig.at(0.2, ask)
     result = rig.execute()
     late = takes_s > 0.3
-    assert result.outcome == "completed" and max(result.lateness_s) < 1e-9
+    assert result.outcome == "completed" and max(rig.gate.lateness_s) < 1e-9
     assert [type(one.error) for one in found] == [TooLateError if late else type(None), BusyError]
     assert rig.recording().names == ["rest", *([] if late else ["a"]), "first", "ramp", "rest"]
 
@@ -97,11 +98,11 @@ def test_enough_ends_it_well(tmp_path: Path, at_once: bool, pulses: int):
     rig.at(0.6, lambda: extend(rig, 60, [hold("never played")]))
     rig.at(1.21, lambda: rig.run.score.enough("P1's nurse", at_once))
     result = rig.execute()
-    assert (result.outcome, result.ended_by, result.evidence.confirmed) == ("completed", "enough", True)
+    assert (result.outcome, result.summary["ended_by"], result.evidence.confirmed) == ("completed", "enough", True)
     assert len(rig.stimulator.sent) == pulses
     recording = rig.recording()
     assert recording.names == ["rest", "first", "rest"]
-    assert result.duration_s == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
+    assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
     assert len(recording.columns["pulses/status"]) == 20 + pulses + 40
     told = next(event for event in recording.events if event["event"] == "ended")
     assert (told["by"], told["reason"], told["index"]) == ("enough", "P1's nurse", 20 + pulses)
@@ -115,7 +116,7 @@ def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
     found: list[RigError] = []
     rig.at(1.3, lambda: found.extend(refusals(lambda: extend(rig, len(score.laid), [hold()]))))
     result = rig.execute()
-    assert result.duration_s == pytest.approx(0.5 + len(rig.stimulator.sent) / RATE_HZ + 1.0)
+    assert result.summary["duration_s"] == pytest.approx(0.5 + len(rig.stimulator.sent) / RATE_HZ + 1.0)
     assert 19 <= len(rig.stimulator.sent) <= 21
     assert "is ending (enough)" in str(found[0])
     assert [event["event"] for event in rig.recording().events].count("ended") == 2
@@ -127,15 +128,15 @@ def test_enough_right_before_a_boundary_begins_no_further_segment(tmp_path: Path
     rig = adaptive(tmp_path, fixed=[rest(0.5), hold("plays"), hold("next"), hold("after", on_s=3.0)])
     rig.at(1.5 - before_s, lambda: rig.run.score.enough("me", at_once=False))
     result = rig.execute()
-    assert (result.ended_by, len(rig.stimulator.sent)) == ("enough", pulses)
-    assert result.duration_s == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
+    assert (result.summary["ended_by"], len(rig.stimulator.sent)) == ("enough", pulses)
+    assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
 
 
 def test_enough_before_the_first_pulse_sends_none(tmp_path: Path):
     rig = adaptive(tmp_path)
     rig.run.score.enough("me", at_once=True)
     result = rig.execute()
-    assert (result.outcome, rig.stimulator.sent, result.duration_s) == ("completed", [], pytest.approx(1.0))
+    assert (result.outcome, rig.stimulator.sent, result.summary["duration_s"]) == ("completed", [], pytest.approx(1.0))
     assert rig.recording().names == ["rest"]
 
 
@@ -153,7 +154,7 @@ def test_a_stop_is_a_stop(tmp_path: Path, cause: Any):
     result = rig.execute()
     size = rig.path.stat().st_size
     found += refusals(lambda: extend(rig, len(score.laid), [hold()]), lambda: score.enough("me", False))
-    assert (result.outcome, result.ended_by, len(found)) == (cause, cause, 8)
+    assert (result.outcome, result.summary["ended_by"], len(found)) == (cause, cause, 8)
     assert all(isinstance(error, TooLateError) for error in found)
     assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
     recording = rig.recording()

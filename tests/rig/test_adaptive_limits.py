@@ -58,7 +58,7 @@ def test_the_dose_is_that_of_the_whole_test(tmp_path: Path):
     with pytest.raises(RefusedError, match=r"charge_per_test_uc 720 .*rig file"):
         extend(rig, 60, [hold("two more"), hold("seconds")])
     result = rig.execute()
-    assert (result.ended_by, result.charge_uc) == ("limit", 480.0)
+    assert (result.summary["ended_by"], result.summary["charge_uc"]) == ("limit", 480.0)
     assert rig.recording().names == ["rest", "added", "first", "rest"]
     told = next(event for event in rig.recording().events if event["event"] == "ended")
     assert "charge_per_test_uc 720" in told["reason"]
@@ -72,7 +72,7 @@ def test_the_charge_of_a_second_holds_across_a_boundary(tmp_path: Path):
     with pytest.raises(RefusedError, match="charge_per_second_uc 240"):
         extend(rig, 60, [hold("b", on_s=0.5)])
     extend(rig, 60, [rest(1.0), hold("c", on_s=0.5)])
-    assert rig.execute().ended_by == "limit"  # the fixed plan's half second would follow one without a pause
+    assert rig.execute().summary["ended_by"] == "limit"  # the fixed plan's half second would follow one without a pause
     assert rig.recording().names == ["rest", "a", "rest", "c", "rest"]
 
 
@@ -122,13 +122,13 @@ def test_the_measured_torque_time_ends_it_within_a_pulse(tmp_path: Path, pending
     at_end: list[float] = []
     rig.stimulator.on_send = lambda _: at_end.append(rig.run.torque_time_nms)
     result = rig.execute()
-    assert (result.outcome, result.ended_by) == ("completed", "torque_time")
+    assert (result.outcome, result.summary["ended_by"]) == ("completed", "torque_time")
     a_pulse_nms = 6.0 / RATE_HZ
     assert at_end[-1] < 5.0 + a_pulse_nms
-    assert 5.0 < result.torque_time_nms < 5.0 + 2 * a_pulse_nms + 6.0 * 0.1  # the torque falls within 0.1 s
+    assert 5.0 < result.summary["torque_time_nms"] < 5.0 + 2 * a_pulse_nms + 6.0 * 0.1  # the torque falls within 0.1 s
     recording = rig.recording()
     assert recording.names == ["rest", "long", "rest"]
-    assert result.duration_s == pytest.approx(recording.columns["segments/start_s"][-1] + 1.0, abs=1e-6)
+    assert result.summary["duration_s"] == pytest.approx(recording.columns["segments/start_s"][-1] + 1.0, abs=1e-6)
 
 
 def test_the_torque_time_is_counted_from_rest_and_through_lost_samples(tmp_path: Path):
@@ -137,7 +137,7 @@ def test_the_torque_time_is_counted_from_rest_and_through_lost_samples(tmp_path:
     rig.at(1.5, lambda: setattr(rig.cell, "skip", 100))
     result = rig.execute()
     assert result.outcome == "completed"
-    assert result.torque_time_nms == pytest.approx(6.0 * 2.0, rel=0.05)
+    assert result.summary["torque_time_nms"] == pytest.approx(6.0 * 2.0, rel=0.05)
 
 
 def test_only_so_many_are_checked_for_one_boundary(tmp_path: Path):

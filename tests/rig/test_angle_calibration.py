@@ -15,11 +15,12 @@ from rig import journal
 from rig.acquire.angle_receiver import AngleReceiver
 from rig.control import angle_calibration
 from rig.control.angle_calibration import AngleCalibrating
+from rig.control.calibration import check_range
 from rig.devices import can_angle_sensor
-from rig.errors import BusyError, DeviceError, PlanError, RefusedError, RigError
+from rig.errors import BusyError, DeviceError, LatchChangedError, PlanError, RefusedError, RigError
 from rig.journal import Kind
 from rig.limits import HARD_LIMITS
-from rig.messages import AngleCalibration, AnglePlan, AnglePoseRequest, Status, TestPlan
+from rig.messages import AngleCalibration, AnglePlan, AnglePoseRequest, Profile, Status, TestPlan
 from tests.rig.angle import FakeSensor, OpenedSensor
 from tests.rig.live import SPEED, LiveRig
 from tests.simulator.virtual_time import VirtualMachine
@@ -203,10 +204,11 @@ def test_no_angle_of_an_elbow_is_no_pose(posed: Posed, told_rad: float):
 def test_without_good_angles_there_is_no_pose(posed: Posed):
     with pytest.raises(DeviceError, match="too few angles"):
         posed.pose(20.0)
-    posed.sensor.fault = True
-    posed.hold(20.0)
-    with pytest.raises(RefusedError, match="a fault of its own"):
-        posed.pose(20.0)
+    for word in (1, 2, 254):
+        posed.sensor.fault = word
+        posed.hold(20.0)
+        with pytest.raises(RefusedError, match="a fault of its own"):
+            posed.pose(20.0)
     posed.sensor.fault, posed.sensor.nan = False, True
     posed.hold(20.0)
     with pytest.raises(RefusedError, match="no number"):
@@ -216,7 +218,7 @@ def test_without_good_angles_there_is_no_pose(posed: Posed):
 def test_what_cannot_be_stored_does_not_hold(posed: Posed, monkeypatch: pytest.MonkeyPatch):
     posed.take(20.0)
     (posed.folder / "file").write_text("")
-    monkeypatch.setattr(posed.poses, "_path", posed.folder / "file" / "x.json")
+    monkeypatch.setattr(posed.poses._file, "path", posed.folder / "file" / "x.json")
     with pytest.raises(RigError):
         posed.take(90.0)
     assert posed.poses.calibration is None
@@ -310,7 +312,7 @@ def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle_nor_is_that
     assert live.rearm().state == "ready"
     live.sensor.gone = False
     live.until(starting.done.is_set)
-    assert isinstance(starting.error, BusyError)
+    assert isinstance(starting.error, LatchChangedError)
     live.machine.wait(8.0)
     assert live.stimulator.sent == []
 
@@ -341,3 +343,27 @@ def test_without_a_sensor_poses_and_angles_are_refused(make: Callable[..., LiveR
         live.ask(live.rig.angle_pose(AnglePoseRequest(angle_rad=1.0, by="nurse")))
     with pytest.raises(PlanError, match=r"plan.angle: this rig has no angle sensor"):
         live.start(live.plan("t", **HELD))
+
+
+def test_a_range_that_was_said_under_another_calibration_is_refused(angled: Angled):
+    live = angled()
+    said = Profile(angle_range_rad=(0.2, 2.2))
+    live.machine.wait(0.2)
+    live.start(live.plan("before", profile=said, **HELD))  # no calibration then, and none now
+    live.wait("ready")
+    live.pose(20.0)
+    first = live.pose(90.0).angle.calibration
+    assert first is not None
+    live.hold(60.0)
+    for wrong in (said, said.model_copy(update={"angle_set_at_utc": "2026-01-01T00:00:00Z"})):
+        with pytest.raises(RefusedError, match=f"calibrated anew at {first.set_at_utc}; say the range again"):
+            live.start(live.plan("one", profile=wrong, **HELD))
+    right = said.model_copy(update={"angle_set_at_utc": first.set_at_utc})
+    live.machine.wait(10.0)
+    live.start(live.plan("one", profile=right, **HELD))
+    live.wait("ready")
+    live.machine.wait(10.0)
+    live.start(live.plan("two", profile=said))  # it asks for no angle
+    live.wait("ready")
+    with pytest.raises(RefusedError, match="has lost its calibration since; say the range again"):
+        check_range(live.plan("three", profile=right, **HELD), None)

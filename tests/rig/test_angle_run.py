@@ -51,6 +51,7 @@ FAULTS: dict[str, tuple[Callable[[VirtualRig], None], str, float]] = {
     "silent": (set_to("silent", True), "stale", 0.16),
     "nan": (set_to("nan", True), "not a number (NaN)", 0.05),
     "fault bit": (set_to("fault", True), "a fault of its own", 0.05),
+    "fault word": (set_to("fault", 2), "a fault of its own", 0.05),
     "jump": (set_to("add_deg", -15.0), "jumped by 1", 0.05),
     "counter": (set_to("skip", 5000), "counter jumped", 0.05),
     "repeated": (set_to("repeating", True), "counter went back", 0.16),
@@ -77,11 +78,11 @@ def test_a_fault_of_the_sensor_ends_the_test_and_says_why(tmp_path: Path, make: 
     assert rig.stimulator.stops == 1
 
 
-@pytest.mark.parametrize("fault", ["silent", "nan", "jump", "repeated", "power", "nonsense", "fault bit"])
+@pytest.mark.parametrize("fault", ["silent", "nan", "jump", "repeated", "power", "nonsense", "fault bit", "fault word"])
 def test_a_test_without_an_angle_goes_on_records_and_warns(tmp_path: Path, fault: str):
     rig = VirtualRig(tmp_path, has_sensor=True)
     rig.at(1.3, lambda: FAULTS[fault][0](rig))
-    if fault == "fault bit":
+    if fault.startswith("fault "):
         rig.at(1.3, lambda: set_to("add_deg", 40.0)(rig))
     result = rig.execute()
     assert (result.outcome, result.reason) == ("completed", "")
@@ -89,7 +90,7 @@ def test_a_test_without_an_angle_goes_on_records_and_warns(tmp_path: Path, fault
     columns = sealed.recording.columns
     assert len(columns["angle/time_s"]) > 200
     assert all(np.isfinite(columns[path]).all() for path, _, _ in archive.ANGLE_COLUMNS)
-    if fault in ("nonsense", "fault bit"):
+    if fault in ("nonsense", "fault bit", "fault word"):
         assert np.all(np.abs(columns["angle/angle_rad"] - math.radians(60)) < 0.01), "what is no angle is left out"
     told = [line for line in warnings(sealed.recording) if line.startswith("angle sensor: ")]
     assert len(told) == 1 and FAULTS[fault][1] in told[0]
@@ -101,7 +102,7 @@ def test_a_test_with_an_angle_plays_to_its_end(tmp_path: Path, make: Callable[..
     rig = make(tmp_path)
     result = rig.execute()
     assert (result.outcome, result.reason) == ("completed", "")
-    assert result.angle_counts is not None and result.angle_counts.lost_samples == 0
+    assert result.summary["angle"]["lost_samples"] == 0
     assert warnings(rig.recording()) == []
 
 
@@ -178,8 +179,8 @@ def test_enough_ends_a_passive_test_well_and_no_pulse_can_be_added(tmp_path: Pat
     rig.at(1.31, add)
     rig.at(3.01, lambda: rig.run.score.enough("nurse", at_once=True))
     result = rig.execute()
-    assert (result.outcome, result.ended_by) == ("completed", "enough")
-    assert result.duration_s == pytest.approx(3.0, abs=0.1)
+    assert (result.outcome, result.summary["ended_by"]) == ("completed", "enough")
+    assert result.summary["duration_s"] == pytest.approx(3.0, abs=0.1)
     assert "passive test" in refused[0] and rig.stimulator.sent == []
     assert rig.test.first_pulse is None
 

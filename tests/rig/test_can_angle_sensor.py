@@ -36,13 +36,14 @@ def frame(data: bytes, host_time_s: float = 1000.0) -> Frame:
 def test_a_frame_of_its_own():
     sensor = sensor_of({}, offset=10.0, direction=-1)
     assert (sensor.counter_modulus, sensor.sample_rate_hz) == (65536, 200.0)
-    told = [(100.0, 0), (math.nan, 1), (-80.0, 254)]
+    told = [(100.0, 0), (math.nan, 1), (-80.0, 0), (0.0, 2), (0.0, 254), (0.0, 255)]
     frames = [frame(struct.pack("<fHBB", degrees, i, status, 0)) for i, (degrees, status) in enumerate(told)]
     block = sensor.decode([*frames, frame(b"\0\0")], damaged=1, errors=2)
     assert (block.malformed, block.error_frames) == (2, 2)
     assert block.samples["raw"][[0, 2]].tolist() == [100.0, -80.0] and np.isnan(block.samples["raw"][1])
     assert np.degrees(block.samples["angle_rad"][[0, 2]]) == pytest.approx([-90.0, 90.0])
-    assert block.samples["counter"].tolist() == [0, 1, 2] and block.samples["fault"].tolist() == [0, 1, 0]
+    assert block.samples["counter"].tolist() == list(range(6))
+    assert block.samples["fault"].tolist() == [0, 1, 0, 1, 1, 1], "every word but the good one"
 
 
 def test_a_signal_in_the_cells_own_frame():
@@ -52,7 +53,7 @@ def test_a_signal_in_the_cells_own_frame():
     with pytest.raises(DeviceError, match=r"angle_sensor\.of_the_cell: the load cell's bus is not open"):
         MACHINE.run(sensor.open(lambda _: None, lambda _: None))
     frames = [
-        frame(struct.pack("<fhBB", 0.25 * i, -1234 + i if i < 4 else -32768, i, i % 2 + 2 * (i > 2)), 0.1 * i)
+        frame(struct.pack("<fhBB", 0.25 * i, -1234 + i if i < 4 else -32768, i, i % 2 + (0, 0, 0, 2, 254)[i]), 0.1 * i)
         for i in range(5)
     ]
     torques, angles = cell.decode(frames).samples, sensor.decode(frames).samples

@@ -34,7 +34,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, int, float]
     rig.path.unlink()
     book = journal_at(rig.path)
     book.begin(header(rig.run, rig.clock), rig.test.pulse_width_us.astype("<f8").tobytes())
-    rig.journal = rig.run._journal = book
+    rig.journal = rig.run.journal = book
     assert rig.execute().outcome == "completed"
     felt = [pulse for _, pulse in rig.stimulator.sent]
     assert len(felt) > 50

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rig.errors import ConfigError, WireError
-from rig.wire.dbc import PACKAGED, SampleFrame
+from rig.wire.dbc import CELL_FAULT, PACKAGED, SampleFrame
 
 COUNTS = """VERSION ""
 BS_:
@@ -29,6 +29,11 @@ def test_the_default_frame():
     got = frame.decode(struct.pack("<fHBB", -3.25, 65535, 1, 0))
     assert (got.values, got.counter, got.flag) == ((-3.25,), 65535, 1)
     assert frame.decode(struct.pack("<fHBB", 0, 0, 2, 0)).flag == 0
+    for fault in (None, CELL_FAULT):
+        frame = SampleFrame(PACKAGED, None, ["Torque_Nm"], "Counter", "Sync", fault=fault)
+        for status in (0, 1, 2, 4, 128, 254, 255):
+            (value,) = frame.decode(struct.pack("<fHBB", 5.0, 0, status, 0)).values
+            assert math.isnan(value) == (fault is not None and status > 1), "every word but the good one"
     assert math.isnan(frame.decode(struct.pack("<fHBB", math.nan, 0, 0, 0)).values[0])
 
 

@@ -74,7 +74,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     assert extend(live, 44).laid == 68
     run = live.rig._run
     assert run is not None
-    run._gate.late, run._gate.not_sent = [(3, 0.004)], [4]
+    run.gate.late, run.gate.not_sent = [(3, 0.004)], [4]
     event = live.rig.live(samples=True)
     assert event is not None and event.samples is not None and event.pulse_time_s
     assert (event.laid, event.boundary_s, event.duration_s) == (68, 1.7, 60.0)
@@ -107,7 +107,7 @@ def test_what_the_muscle_did_not_feel_is_known_by_its_index(tmp_path: Path):
     assert rig.execute().outcome == "completed"
     skipped = [jn.SKIPPED.unpack(p) for kind, p in jn.read(rig.path).blocks if kind == jn.Kind.SKIPPED]
     dropped = [index for index, status, _ in skipped if status == PulseStatus.DROPPED]
-    assert len(dropped) > 20 and rig.run.not_sent == dropped
+    assert len(dropped) > 20 and rig.gate.not_sent == dropped
 
 
 def test_neither_before_nor_after_a_test_nor_when_it_is_stopped(make: Make):

@@ -81,3 +81,19 @@ def test_what_is_wrong_is_told_and_the_builder_lives_on():
         await asked.close()
 
     asyncio.run(run())
+
+
+def test_a_range_is_judged_by_the_calibration_of_the_moment():
+    asks = {"profile": {"angle_range_rad": [0.2, 2.0], "angle_set_at_utc": "first"}, "kind": "moving"}
+    plan = {**PLAN, **asks, "angle": {"range_rad": [0.2, 2.0], "still_s": 2.0}}
+    line = json.dumps({"kind": "preview", "id": 1, "plan": plan}).encode() + b"\n"
+
+    async def run() -> None:
+        asked = Previews(HARD_LIMITS, 1.0)
+        for now, fine in (("first", True), ("second", False), (None, False), ("first", True)):
+            reply = json.loads(await asked.reply(line, now))
+            assert reply["ok"] is fine, reply
+            assert fine or "say the range again" in reply["problem"]["detail"]
+        await asked.close()
+
+    asyncio.run(run())

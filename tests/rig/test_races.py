@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from rig.errors import BusyError, DeviceError, LatchedError, PlanError, RigError
+from rig.control.replies import refusal
+from rig.errors import BusyError, DeviceError, LatchChangedError, LatchedError, PlanError, RigError
 from rig.messages import CalibrateStartRequest
 from rig.tasks import Task
 from tests.rig.live import LiveRig
@@ -82,10 +83,10 @@ async def begin_train(live: LiveRig) -> None:
 
 def rearm_and_start(live: LiveRig) -> Coroutine[Any, Any, Any]:
     """Of a ready rig, while a start waits behind it."""
-    rearming, starting = live.begin(live.rig.rearm("nurse")), live.begin(begin_test(live))
+    rearming, starting = live.begin(live.rig.rearm("nurse", live.rig.latch)), live.begin(begin_test(live))
 
     async def both() -> None:
-        with contextlib.suppress(BusyError):
+        with contextlib.suppress(LatchChangedError):
             await live.machine.tasks.join(rearming)
         await live.machine.tasks.join(starting)
 
@@ -97,7 +98,7 @@ def library(live: LiveRig) -> Coroutine[Any, Any, Any]:
 
 
 def rearm(live: LiveRig) -> Coroutine[Any, Any, Any]:
-    return live.rig.rearm("nurse")
+    return live.rig.rearm("nurse", live.rig.latch)
 
 
 def nothing(live: LiveRig) -> object: ...
@@ -116,7 +117,7 @@ STORIES = {
     "a start": (begin_test, playing, nothing, {LatchedError, NoneType}),
     "a calibration and its train": (begin_train, playing, nothing, {LatchedError, PlanError, NoneType}),
     "sealing": (library, ready, play_to_the_end, {NoneType}),
-    "re-arming": (rearm, ready, stop_first, {BusyError}),
+    "re-arming": (rearm, ready, stop_first, {LatchChangedError}),
     "re-arming before a start": (rearm_and_start, playing, nothing, {LatchedError, NoneType}),
 }
 """What is asked for, until when, what happened before, and how it may end."""
@@ -125,7 +126,7 @@ STORIES = {
 @pytest.mark.parametrize("story", STORIES)
 def test_a_stop_at_each_moment_holds_until_a_person_undoes_it(make: Make, story: str):
     begin, over, before, errors = STORIES[story]
-    reason = "first (by nurse)" if story == "re-arming" else "now (by nurse)"
+    reason = "now (by nurse); before: first (by nurse)" if story == "re-arming" else "now (by nurse)"
     ended = set[type]()
     for live, task in moments(make, begin, over, before):
         sent, told = len(live.stimulator.sent), len(live.states)
@@ -200,13 +201,78 @@ def test_a_rearm_that_waits_its_turn_releases_no_stop_that_came_meanwhile(make: 
     """Two people re-arm at once, and somebody presses stop before the second one's turn."""
     live = make(disk=SimulatedDisk(World(0)), clock=None)
     live.stop("first")
-    one, two = (live.begin(live.rig.rearm(name)) for name in ("nurse", "doctor"))
+    one, two = (live.begin(live.rig.rearm(name, live.rig.latch)) for name in ("nurse", "doctor"))
     live.machine.wait(0.001)
     assert live.stop("second").confirmed
     live.until(two.done.is_set)
-    assert all(isinstance(task.error, BusyError) for task in (one, two))
+    assert all(isinstance(task.error, LatchChangedError) for task in (one, two))
     assert live.rig.status().state == "latched"
     assert remembered(live)["state"] == "latched"
+
+
+def lose_the_cell(live: LiveRig) -> object:
+    live.cell.gone = True
+    return live.machine.wait(0.5)
+
+
+AGAIN = {
+    "a stop": lambda live: live.stop("it hurts", "colleague"),
+    "the same stop": lambda live: live.stop("first"),
+    "a fault": lambda live: live.rig._fault("stimulator: electrode error"),
+    "a lost device": lose_the_cell,
+}
+"""What may come while it is latched, and be seen by nobody yet."""
+
+
+@pytest.mark.parametrize("again", AGAIN)
+def test_a_rearm_by_who_has_not_seen_the_last_stop_is_refused(make: Make, again: str):
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+    live.stop("first")
+    seen = live.rig.status().latch
+    AGAIN[again](live)
+    with pytest.raises(LatchChangedError, match="look at the participant and the rig, then re-arm"):
+        live.ask(live.rig.rearm("nurse", seen))
+    status = live.rig.status()
+    assert status.state == "latched" and "first (by nurse)" in status.reason
+    told = [event.status for event in live.events if event.event == "state"][-1]
+    assert (told.latch, told.reason) == (status.latch, status.reason), "it is told to who looks"
+    assert refusal(1, LatchChangedError("")).problem.code == "latch-changed"
+    live.cell.gone = False
+    assert live.ask(live.rig.rearm("nurse", status.latch)).state == "ready"
+
+
+@pytest.mark.parametrize("state", ["stopping", "latched"])
+def test_a_later_reason_is_told_and_outlives_the_process(make: Make, state: str):
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+    live.start(live.plan("one", hold_s=5.0))
+    live.wait_pulses(3)
+    live.begin(live.rig.stop("the session is over", "nurse"))
+    live.wait(state)
+    live.stop("it hurts", "colleague")
+    both = "it hurts (by colleague); before: the session is over (by nurse)"
+    assert live.wait("latched") == both
+    assert remembered(live) == {"state": "latched", "reason": both}
+    assert live.rig.finished is not None and live.rig.finished.reason == "the session is over (by nurse)"
+    live.close()
+    live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
+    again = make(disk=live.machine.disk, clock=live.clock)
+    assert again.rig.status().reason == both
+    with pytest.raises(LatchChangedError):
+        again.ask(again.rig.rearm("nurse", live.rig.latch))  # of the process before
+
+
+def test_a_stop_while_uncertain_is_told_after_the_next_restart_too(make: Make):
+    live = make(disk=SimulatedDisk(World(0)), clock=None)
+    live.close()
+    live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
+    live.machine.disk.replace(live.config.data_dir / "latch.json", b"damaged")
+    live = make(disk=live.machine.disk, clock=live.clock)
+    seen = live.rig.latch
+    live.stop("it hurts")
+    with pytest.raises(LatchChangedError):
+        live.ask(live.rig.rearm("nurse", seen))
+    assert live.rig.status().state == "uncertain"
+    assert remembered(live)["state"] == "running" and remembered(live)["reason"].startswith("it hurts (by nurse); ")
 
 
 @pytest.mark.parametrize("begin", ["re-arming", "sealing"])
@@ -221,7 +287,7 @@ def test_a_stop_is_remembered_by_the_next_process_once_it_is_answered(make: Make
             live.wait("sealing")
 
     def go_on(live: LiveRig) -> Coroutine[Any, Any, Any]:
-        return live.rig.rearm("nurse") if begin == "re-arming" else live.machine.tasks.sleep(2.0)
+        return live.rig.rearm("nurse", live.rig.latch) if begin == "re-arming" else live.machine.tasks.sleep(2.0)
 
     for live, _ in moments(make, go_on, ready, before):
         live.stop("now")

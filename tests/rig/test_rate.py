@@ -66,7 +66,7 @@ def heard(arrival_s: list[float], size: int = 16) -> list[str | None]:
         block = np.zeros(size, SAMPLE)
         block["counter"], block["host_time_s"], block["torque_nm"] = -1, now_s, i % 2
         found.append(judge.fault(block))
-    return [*found, judge.fault_at_end()]
+    return [*found, judge.rate.fault_at_end()]
 
 
 @pytest.mark.parametrize("rate", [1.0, 1.05])
@@ -169,10 +169,10 @@ def test_a_backlog_read_while_arming_does_not_end_the_test(tmp_path: Path):
 
 def test_what_came_too_little_is_not_judged():
     judge = PlausibilityCheck(5.0, 1e9, 1e9, 1600.0, 1.0)
-    assert judge.fault_at_end() is None
+    assert judge.rate.fault_at_end() is None
     block = np.zeros(16, SAMPLE)
     judge.fault(block)
-    assert judge.fault_at_end() is None
+    assert judge.rate.fault_at_end() is None
 
 
 def test_times_in_doubt_are_told_with_the_finished_test(tmp_path: Path):

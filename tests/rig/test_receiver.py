@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rig.acquire.receiver import Receiver
 from rig.acquire.stream import LONGEST_READ_S, LOOK_S, SILENCE_S, CounterUnwrapper
-from rig.signals import SAMPLE, TorqueBlock
+from rig.signals import SAMPLE, Block
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, journal_at
 from tests.simulator.virtual_time import VirtualMachine
 
@@ -34,10 +34,10 @@ def test_repeats_and_late_samples_are_left_out():
     assert (repeats, late) == (1, 1)
 
 
-def block(counters: list[int], torque_nm: float = 1.0) -> TorqueBlock:
+def block(counters: list[int], torque_nm: float = 1.0) -> Block:
     samples = np.zeros(len(counters), SAMPLE)
     samples["counter"], samples["torque_nm"], samples["host_time_s"] = counters, torque_nm, 1000.0
-    return TorqueBlock(samples, malformed=1, error_frames=2)
+    return Block(samples, malformed=1, error_frames=2)
 
 
 class Heard(Receiver):

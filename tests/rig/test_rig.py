@@ -15,7 +15,7 @@ from rig.control.building import previewed
 from rig.control.calibration import end_of_day_s
 from rig.control.replies import refusal
 from rig.errors import BusyError, DeviceError, PlanError, RefusedError, RestError, UncertainError
-from rig.messages import CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
+from rig.messages import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import SPEED, WORK_S, LiveRig
 
 Make = Callable[..., LiveRig]
@@ -103,8 +103,9 @@ def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
         with pytest.raises(RefusedError, match="began on an earlier day"):
             late()
     with pytest.raises(RefusedError, match="began on an earlier day"):
-        live.ask(live.rig.calibrate_finish("t", discard=False))
-    assert live.ask(live.rig.calibrate_finish("t", discard=True)).profile is None
+        live.ask(live.rig.calibrate_finish(CalibrateFinishRequest(by="t")))
+    discarded = live.ask(live.rig.calibrate_finish(CalibrateFinishRequest(by="t", discard=True)))
+    assert discarded.profile is None
     assert live.rig.finished is None, "a train is no test"
     assert live.rig.status().state == "ready"
 

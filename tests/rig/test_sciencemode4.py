@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import struct
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.errors import WireError
+from rig.devices import p24
+from rig.errors import DeviceError, WireError
 from rig.wire import sciencemode4 as wire
+from rig.wire.framing import Packet
 from tests.rig.test_framing import FRAMES_4
+from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 
 @pytest.mark.parametrize(("number", "width_us", "current_ma"), [(5, 250, 20.0), (6, 300, 20.5), (15, 240, 20.0)])
@@ -43,3 +47,20 @@ def test_status_and_identity():
     assert wire.parse_device_id(b"\0SN12345678") == "SN12345678"
     assert wire.parse_version(bytes([0, 3, 2, 1, 4, 0, 1])) == "3.2.1 (ScienceMode 4.0.1)"
     assert wire.parse_version(b"\0") == ""
+
+
+@pytest.mark.parametrize("data", [b"", b"\x01", b"\x08", b"\xff"])
+def test_every_answer_but_the_good_one_is_an_error(data: bytes, monkeypatch: pytest.MonkeyPatch):
+    """Also one without a result: it confirms nothing."""
+    machine = VirtualMachine(VirtualClock())
+    monkeypatch.setattr(machine, "port", lambda *_, **__: SimpleNamespace())
+    device = p24.P24(p24.Settings(device="p24", port="/dev/p24"), machine)
+
+    async def ask(*_: object) -> Packet:
+        return Packet(0, 1, data)
+
+    monkeypatch.setattr(device._line, "ask", ask)
+    monkeypatch.setattr(device._line, "discard", lambda: None)
+    for asked in (device.arm, device.stop):
+        with pytest.raises(DeviceError, match="error"):
+            machine.run(asked())

@@ -24,7 +24,7 @@ def test_a_cell_at_its_ceiling_in_each_hold_goes_on_to_the_end(tmp_path: Path, s
     rig.cell.sign = sign
     result = rig.execute()
     assert result.outcome == "completed", result.reason
-    assert result.peak_nm == 5.0
+    assert result.summary["torque_peak_nm"] == 5.0
 
 
 def test_a_cell_that_stays_at_its_ceiling_ends_the_test_within_3_s(tmp_path: Path):
@@ -63,4 +63,4 @@ def test_a_coarse_cell_that_dies_at_rest_is_not_taken_for_one_at_its_end(tmp_pat
     result = rig.execute()
     assert result.outcome == "fault"
     assert "it is stuck" in result.reason
-    assert result.duration_s < at_s + 0.6
+    assert result.summary["duration_s"] < at_s + 0.6

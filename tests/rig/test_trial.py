@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
-from rig.trial import TransitionError, Trial
+from rig.trial import LONGEST_REASON, TransitionError, Trial
 
 STEPS = {
     "start": lambda t: t.start("id", "P"),
@@ -108,16 +108,27 @@ def test_where_the_sealing_leads():
     assert replace(TRAIN, state="sealing", lost="gone").sealed() == Trial("disconnected", "gone")
 
 
-def test_a_stop_leads_to_the_latch_from_everywhere_and_its_first_reason_stays():
+def test_a_stop_leads_to_the_latch_from_everywhere_and_every_reason_is_told_the_newest_first():
     for begun in (ARMING, TRAIN, replace(ARMING, state="running"), replace(TRAIN, state="running")):
         assert begun.halted("why") == replace(begun, state="stopping", reason="why", latch=True)
     for ending in (STOPPING, SEALING):
-        assert ending.halted("another") == ending
+        assert ending.halted("another") == replace(ending, reason="another; before: why")
+        assert ending.halted("why") == ending
     assert replace(ARMING, state="sealing").halted("why") == SEALING
     assert READY.halted("why") == CALIBRATING.halted("why") == LATCHED
     for stopped in (LATCHED, UNCERTAIN):
-        assert stopped.halted("another") == stopped
+        more = stopped.halted("another")
+        assert more == replace(stopped, reason=f"another; before: {stopped.reason}")
+        assert more.halted(stopped.reason).reason == f"{stopped.reason}; before: another"
     assert Trial("disconnected", "gone").halted("why") == replace(LATCHED, lost="gone")
+
+
+def test_reasons_are_told_up_to_a_length_and_the_newest_is_never_cut():
+    trial = LATCHED
+    for number in range(100):
+        trial = trial.halted(f"{number} {'x' * 600}")
+    assert len(trial.reason) == LONGEST_REASON
+    assert trial.reason.startswith(f"99 {'x' * 600}; before: 98 x")
 
 
 def test_a_lost_device_is_remembered_until_the_end_of_a_test_and_while_a_person_is_awaited():

@@ -31,6 +31,7 @@ class Outcome(NamedTuple):
     seed: int
     wrong: list[str]
     faults: int
+    decisions: int
     simulated_s: float
     digest: str
 
@@ -64,7 +65,7 @@ def live(seed: int, only: frozenset[int] | None = None) -> tuple[Life, list[str]
 def outcome_of(seed: int) -> Outcome:
     """For a pool of processes."""
     life, wrong = live(seed)
-    return Outcome(seed, wrong, life.world.faults, life.world.now_s, life.world.digest())
+    return Outcome(seed, wrong, life.world.faults, len(life.clinic.asked), life.world.now_s, life.world.digest())
 
 
 def shrink(seed: int) -> frozenset[int]:
@@ -100,13 +101,14 @@ def _replay(options: argparse.Namespace) -> int:
 
 def _simulate(options: argparse.Namespace) -> int:
     began_s, digest = time.monotonic(), hashlib.sha256()
-    lives = faults = 0
+    lives = faults = decisions = 0
     simulated_s = told_s = 0.0
     broke: list[int] = []
     end_s = began_s + 60 * options.minutes
     seeds = islice(count(options.seed), options.lives) if options.lives else _until(end_s, options.seed)
     for outcome in _outcomes(seeds, options.processes):
         lives, faults, simulated_s = lives + 1, faults + outcome.faults, simulated_s + outcome.simulated_s
+        decisions += outcome.decisions
         digest.update(outcome.digest.encode())
         if outcome.wrong:
             broke.append(outcome.seed)
@@ -120,8 +122,9 @@ def _simulate(options: argparse.Namespace) -> int:
         only = ",".join(map(str, sorted(shrink(seed))))
         print(f"replay: .venv/bin/python -m tests.simulator --replay --seed {seed} --only '{only}'")
     found = {
-        "lives": lives, "faults": faults, "broken": len(broke), "simulated_s": round(simulated_s, 3),
-        "wall_s": round(time.monotonic() - began_s, 3), "trace_sha256": digest.hexdigest(),
+        "lives": lives, "faults": faults, "decisions": decisions, "broken": len(broke),
+        "simulated_s": round(simulated_s, 3), "wall_s": round(time.monotonic() - began_s, 3),
+        "trace_sha256": digest.hexdigest(),
     }  # fmt: skip
     print(json.dumps(found))
     return 1 if broke else 0

@@ -5,22 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
 
 from rig.control import desk
-from rig.control.replies import to_line
+from rig.control.replies import id_of, invalid_request, to_line
 from rig.control.rig import Rig
 from rig.messages import (
     EnoughRequest,
     Event,
     ExtendRequest,
     FinishedEvent,
+    RearmRequest,
     Reply,
     SegmentPlan,
     StartRequest,
     StateEvent,
     StopRequest,
     TestPlan,
+    WithdrawRequest,
 )
 from tests.simulator.host import Process
 from tests.simulator.world import World
@@ -42,10 +46,25 @@ class Asked:
     """When the rig replied, also where the reply was lost."""
     reply: Reply | None = None
     about: str = ""
+    latch: str = ""
+    """Of a re-arm."""
+    lets_go: bool = False
+    """Whether a calibration's result need not wait after it."""
     armed: bool = False
     """Whether the stimulator could stimulate as the rig replied."""
     then: Callable[[Asked], None] = lambda _: None
     """Called when the reply has come."""
+
+
+class Told(NamedTuple):
+    """A state that a rig's process told, and when."""
+
+    time_s: float
+    process: Process
+    state: str
+    latch: str
+    calibrated: str
+    """The calibration whose result waits to be stored."""
 
 
 @dataclass
@@ -56,8 +75,9 @@ class Clinic:
     device: Callable[[], dict[str, Any]]
     """What the devices are in."""
     asked: list[Asked] = field(default_factory=list)
-    states: list[tuple[float, Process, str]] = field(default_factory=list)
-    """Each state that the rig told, when, and which process."""
+    states: list[Told] = field(default_factory=list)
+    shown: dict[str, float] = field(default_factory=dict)
+    """Each latch that was told, and when first."""
     latched: list[str] = field(default_factory=list)
     """Why it latched, each time."""
     finished: list[FinishedEvent] = field(default_factory=list)
@@ -70,6 +90,10 @@ class Clinic:
     process: Process | None = None
     rig: Rig | None = None
     state: str = "disconnected"
+    latch: str = ""
+    """What a page shows now."""
+    calibrated: str = ""
+    """Whose result waits to be stored."""
     tests: int = 0
 
     def meet(self, process: Process, rig: Rig) -> None:
@@ -81,12 +105,16 @@ class Clinic:
         time_s = process.computer.true_s
         if isinstance(event, StateEvent):
             state = event.status.state
-            if state == "latched" and any(one is process for _, one, _ in self.states):  # not told again by a new one
+            # a new one only tells again
+            if state == "latched" and any(told.process is process for told in self.states):
                 self.latched.append(event.status.reason)
-            self.states.append((time_s, process, state))
+            waits = event.status.calibrated
+            calibrated = "" if waits is None else waits.calibration_id
+            self.states.append(Told(time_s, process, state, event.status.latch, calibrated))
+            self.shown.setdefault(event.status.latch, time_s)
             self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
             if process is self.process:
-                self.state = state
+                self.state, self.latch, self.calibrated = state, event.status.latch, calibrated
         elif isinstance(event, FinishedEvent):
             self.finished.append(event)
             self.world.tell("rig", f"finished {event.test_id} {event.outcome} {event.reason}".rstrip(), time_s)
@@ -96,7 +124,9 @@ class Clinic:
         process, rig, chance = self.process, self.rig, self.world.chance
         assert process is not None
         assert rig is not None
-        asked = Asked(request.kind, self.world.now_s, process, about=about)
+        latch = request.latch if isinstance(request, RearmRequest) else ""
+        lets_go = request.kind == "calibrate-stored" or getattr(request, "discard", False)
+        asked = Asked(request.kind, self.world.now_s, process, about=about, latch=latch, lets_go=lets_go)
         self.asked.append(asked)
         self.world.tell("people", f"{request.kind} {about}".rstrip())
         line, lost = to_line(request), chance.random() < self.loses
@@ -104,7 +134,7 @@ class Clinic:
 
         async def obey() -> None:
             asked.obeyed_s, asked.place = process.computer.true_s, next(self.places)
-            asked.reply = await desk.answer(rig, line)
+            asked.reply = await answer(rig, line)
             asked.replied_s = process.computer.true_s
             asked.armed = self.device()["mode"] not in ("none", "start")
             if asked.kind == "stop" and self.dies_after_stop_s is not None:
@@ -135,6 +165,10 @@ class Clinic:
         """Press stop."""
         return self.ask(StopRequest(id=1, reason="somebody pressed", by="nurse"))
 
+    def withdraw(self, test_id: str, begun: bool) -> Asked:
+        """What a test was allowed on is no longer so."""
+        return self.ask(WithdrawRequest(id=1, test_id=test_id, reason="signed out", begun=begun), test_id)
+
     def extend(self, test_id: str, key: str, after: int) -> Asked:
         """Lay one more segment, as a client that chooses them."""
         more = SegmentPlan(name="more", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1})
@@ -143,3 +177,12 @@ class Clinic:
     def enough(self, test_id: str) -> Asked:
         """End an adaptive test."""
         return self.ask(EnoughRequest(id=1, test_id=test_id, by="clinician"), test_id)
+
+
+async def answer(rig: Rig, line: bytes) -> Reply:
+    """Obey a line of JSON, as the server does."""
+    try:
+        request = desk.read(line)
+    except ValidationError as error:
+        return invalid_request(id_of(line), error)
+    return await desk.obey(rig, request)

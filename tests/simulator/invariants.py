@@ -190,6 +190,47 @@ def nothing_is_written_while_stopped(life: Life) -> Iterator[str]:
             yield f"{pulse.time_s:.4f} s: written at {pulse.written_s:.4f} s, stopped since {stopped_s[0]:.4f} s"
 
 
+def a_stop_is_undone_only_by_who_was_shown_it(life: Life) -> Iterator[str]:
+    """After a stop or a fault no rig is ready, arms or calibrates until somebody re-armed who was shown that one."""
+    came = [
+        (asked.obeyed_s, _shown_s(life, asked))
+        for asked in life.clinic.asked
+        if asked.kind == "rearm" and asked.obeyed_s is not None and not _refused(asked)
+    ]
+    for since_s, told_s in _stops(life):
+        until_s = _forgotten(life, since_s)
+        for time_s, _, state, *_ in life.clinic.states:
+            works = state in ("ready", "calibrating", "arming") and since_s < time_s <= until_s
+            if works and not any(shown_s >= told_s and obeyed_s <= time_s for obeyed_s, shown_s in came):
+                yield f"{time_s:.4f} s: {state}, and nobody re-armed who was shown the stop at {since_s:.4f} s"
+
+
+def nothing_of_a_withdrawn_test_is_written(life: Life) -> Iterator[str]:
+    """From the moment on at which the rig took a withdrawal to which it says yes."""
+    played_by = {asked.about: asked.process for asked in life.clinic.asked if asked.kind == "start"}
+    for asked in life.clinic.asked:
+        if asked.kind != "withdraw" or asked.reply is None or played_by[asked.about] is not asked.process:
+            continue
+        for pulse in _by_test(life).get(asked.about, []) if asked.reply.body.get("withdrawn") else []:
+            if pulse.written_s > (asked.obeyed_s or 0.0):
+                yield f"{pulse.time_s:.4f} s: {asked.about} was withdrawn at {asked.obeyed_s:.4f} s"
+
+
+def a_calibrations_result_waits_until_it_is_stored(life: Life) -> Iterator[str]:
+    """From its answer on each status tells it, whichever process, until somebody says that it is stored, or discards
+    it: the first of such requests that came."""
+    asked = [one for one in life.clinic.asked if one.obeyed_s is not None]
+    for done in asked:
+        profile = done.reply is not None and done.reply.ok and done.reply.body.get("profile")
+        if done.kind != "calibrate-finish" or not profile:
+            continue
+        let_go_s = (one.obeyed_s for one in asked if one.lets_go and one.place > done.place)
+        until_s = min(let_go_s, default=np.inf)
+        for told in life.clinic.states:
+            if (done.replied_s or 0.0) < told.time_s < until_s and not told.calibrated and told.state != "disconnected":
+                yield f"{told.time_s:.4f} s: the result of {done.replied_s} s is told no more, and nobody stored it"
+
+
 def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
     """A line that held what was sent may let go of one pulse, never of several, whatever ended the test meanwhile."""
     late = [pulse for pulse in _true(life) if not (pulse.time_s - pulse.written_s <= ON_ITS_WAY_S)]
@@ -200,7 +241,7 @@ def no_pulse_is_felt_late(life: Life) -> Iterator[str]:
 
 def a_stop_takes_back_what_has_not_left(life: Life) -> Iterator[str]:
     """A command that still waits in the computer as a test is ended is felt by nobody."""
-    ends = [time_s for time_s, _, state in life.clinic.states if state == "stopping"]
+    ends = [time_s for time_s, _, state, *_ in life.clinic.states if state == "stopping"]
     stood = [*life.computer.pauses, *((death_s, np.inf) for death_s in life.deaths)]
     for pulse in _true(life):
         left_s = life.wires.to_device.left_late_s.get(pulse.written_s, 0.0)
@@ -251,7 +292,7 @@ def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
     """No more acknowledged pulses in the files than were felt; a pulse of which a RehaStim 2 reports that it failed is
     acknowledged first, and ends its test or its train."""
     acknowledged = sum(1 for test in _tests(life).values() for _, _, status in test if status == 0)
-    failed = sum(reason.startswith("stimulator:") for reason in life.clinic.latched)
+    failed = sum("stimulator:" in reason for reason in life.clinic.latched)
     if acknowledged > len(life.felt) + failed:
         yield f"{acknowledged} pulses acknowledged, {len(life.felt)} felt"
 
@@ -326,6 +367,9 @@ INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
     a_computer_that_stands_still_ends_a_test,
     a_torque_beyond_its_limit_ends_a_test,
     nothing_is_written_while_stopped,
+    a_stop_is_undone_only_by_who_was_shown_it,
+    nothing_of_a_withdrawn_test_is_written,
+    a_calibrations_result_waits_until_it_is_stored,
     no_pulse_is_felt_late,
     a_stop_takes_back_what_has_not_left,
     a_confirmed_stop_is_true,
@@ -350,28 +394,40 @@ def _true(life: Life) -> list[Felt]:
 
 
 def _barred(life: Life) -> list[tuple[float, float]]:
-    """Times during which nothing may be written, world's time. A re-arm counts for what was before it came.
+    """Times during which nothing may be written, world's time. A re-arm counts for what its person was shown.
 
-    One that was sent before a stop and comes after it releases that stop: it does not say what its person saw yet."""
-    asked = [(one.obeyed_s, one.place, one) for one in life.clinic.asked if one.obeyed_s is not None]
-    rearmed = [(*came, _effect_s(life, one)) for *came, one in asked if one.kind == "rearm" and not _refused(one)]
-    began = [(came_s, place) for came_s, place, one in asked if one.kind == "stop"]
-    began += [(time_s, -1) for time_s in _fell(life)]
+    One whose latch was told before a stop releases no such stop, whenever it comes."""
+    rearmed = [
+        (_shown_s(life, one), _effect_s(life, one))
+        for one in life.clinic.asked
+        if one.kind == "rearm" and one.obeyed_s is not None and not _refused(one)
+    ]
     until = [
-        (since[0], min((by_s for *came, by_s in rearmed if tuple(came) > since), default=np.inf)) for since in began
+        (since_s, min((by_s for shown_s, by_s in rearmed if shown_s >= told_s), default=np.inf))
+        for since_s, told_s in _stops(life)
     ]
     until = [(since_s, min(until_s, _forgotten(life, since_s))) for since_s, until_s in until]
-    born = [time_s for time_s, _, state in life.clinic.states if state in STATES]
+    born = [time_s for time_s, _, state, *_ in life.clinic.states if state in STATES]
     return until + [(death_s, min((s for s in born if s > death_s), default=np.inf)) for death_s in life.deaths]
 
 
-def _fell(life: Life) -> Iterator[float]:
-    """When a process told that it is stopped; one that only tells more of it was stopped before."""
+def _stops(life: Life) -> Iterator[tuple[float, float]]:
+    """When it was stopped, and when those who re-arm must have been shown that at the earliest.
+
+    By a request, or a process told that it is stopped; one that only tells more of it was stopped before."""
+    for asked in life.clinic.asked:
+        if asked.kind == "stop" and asked.obeyed_s is not None:
+            yield asked.obeyed_s, asked.obeyed_s
     before: tuple[Any, str] = (None, "")
-    for time_s, process, state in life.clinic.states:
+    for time_s, process, state, latch, _ in life.clinic.states:
         if state in ("latched", "uncertain") and (process, state) != before:
-            yield time_s
+            yield time_s, life.clinic.shown[latch]  # perhaps while its test was being ended
         before = process, state
+
+
+def _shown_s(life: Life, rearm: Asked) -> float:
+    """When the latch that a re-arm names was told first."""
+    return life.clinic.shown.get(rearm.latch, -np.inf)
 
 
 def _effect_s(life: Life, rearm: Asked) -> float:

@@ -91,7 +91,8 @@ class Life:
         self.quiet = False
         self._plan_accidents(chance, only)
         self.begin_process()
-        self.people = People(self)
+        self.people = People(self, set())
+        self.others = [People(self, self.people.jumping, leads=False) for _ in range(chance.choice((0, 1, 1, 2, 3)))]
 
     def live(self) -> None:
         """From the first start to the last test."""

@@ -13,6 +13,7 @@ from rig.messages import (
     CalibrateMarkRequest,
     CalibrateStartRequest,
     CalibrateStepRequest,
+    CalibrateStoredRequest,
     Profile,
     RearmRequest,
     SegmentPlan,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.25
 """On average."""
+PATIENCE_S = 1.0
 KEY = "a key that only its maker knows"
 SEGMENTS = [
     SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 0.25}),
@@ -35,21 +37,34 @@ LONGEST_ADAPTIVE_S = 6.0
 
 
 class People:
-    """Those of one life. Once it is quiet they only re-arm, and start a test until one plays to its end."""
+    """One of those of a life. Once it is quiet the first only re-arms, and starts a test until one plays to its end.
 
-    def __init__(self, life: Life) -> None:
+    Parameters
+    ----------
+    jumping
+        Tests of widths that say of themselves that they jump on purpose; of all people of the life.
+    leads
+        Whether it is the first one; the others leave when it becomes quiet.
+    """
+
+    def __init__(self, life: Life, jumping: set[str], leads: bool = True) -> None:
+        self.jumping, self.leads = jumping, leads
         self.life, self.clinic, self.chance = life, life.clinic, life.world.chance
         self.saw_one_end = False
         """Whether a test that was started in the quiet time was completed."""
-        self.jumping: set[str] = set()
-        """Tests of widths that say of themselves that they jump on purpose."""
+        self._calibrates = self.chance.random() < 0.2
+        """Whether they would rather calibrate, and to its end."""
+        self._seen = ""
+        """The latch that they were shown as they last looked why the rig is stopped."""
         life.world.after(LOOK_S, self._look)
 
     def _look(self) -> None:
         self.life.world.after(self.chance.uniform(0.02, 2 * LOOK_S), self._look)
         process, state, quiet = self.clinic.process, self.clinic.state, self.life.quiet
-        if process is None or not process.alive:
+        if process is None or not process.alive or (quiet and not self.leads):
             return
+        if self.clinic.calibrated and self.chance.random() < 0.3:
+            self._take_the_result(self.clinic.calibrated)
         if state in ("latched", "uncertain", "disconnected"):
             self._rearm()
         elif state == "ready" and (quiet or self.chance.random() < 0.6):
@@ -72,12 +87,22 @@ class People:
 
     def _rearm(self) -> None:
         if self.life.quiet or self.chance.random() < 0.5:
-            self._repeat(lambda: self.clinic.ask(RearmRequest(id=1, by="nurse")))
+            self._seen = self._seen or self.clinic.latch
+            self._repeat(lambda: self._ask_to_rearm(self._seen))
             if not self.life.quiet and self.chance.random() < 0.1:
                 self.clinic.stop()
 
+    def _ask_to_rearm(self, seen: str) -> None:
+        """Who was shown this some time before; who is refused, or obeyed, or hears nothing for long, looks again."""
+
+        def look_again(_: object = None) -> None:
+            self._seen = ""
+
+        self.clinic.ask(RearmRequest(id=1, by="nurse", latch=seen)).then = look_again
+        self.life.world.after(PATIENCE_S, look_again)
+
     def _start(self) -> None:
-        if not self.life.quiet and self.chance.random() < 0.15:
+        if not self.life.quiet and self.chance.random() < (0.8 if self._calibrates else 0.1):
             self._open_calibration()
         else:
             self._repeat(self._start_test)
@@ -104,6 +129,14 @@ class People:
                 self._await_end(test_id)
 
         self.clinic.start(plan, KEY).then = then
+        if not quiet and self.chance.random() < 0.1:  # on its way beside the start, or at any time of the test
+            delay_s, begun = self.chance.choice((0.0, 0.01, 0.3, 1.0)), self.chance.random() < 0.5
+            life.world.after(delay_s, lambda: self._withdraw(test_id, begun))
+
+    def _withdraw(self, test_id: str, begun: bool) -> None:
+        process = self.clinic.process
+        if process is not None and process.alive:
+            self.clinic.withdraw(test_id, begun)
 
     def _nonsense_of_a_test(self, test_id: str) -> tuple[Profile, list[SegmentPlan], float]:
         """What a program with a mistake asks for: a list of widths that might pass but for one number, or two."""
@@ -147,7 +180,7 @@ class People:
 
     def _open_calibration(self) -> None:
         self.clinic.tests += 1
-        wild = self.chance.random() < 0.3
+        wild = self.chance.random() < (0.05 if self._calibrates else 0.3)
         request = CalibrateStartRequest(
             calibration_id=f"c{self.clinic.tests}", participant="P1", by="nurse",
             train_s=self._nonsense(2.0) if wild else 0.3, step_us=self._nonsense(25.0) if wild else 10.0,
@@ -156,9 +189,24 @@ class People:
         )  # fmt: skip
         self.clinic.ask(request, request.calibration_id)
 
+    def _take_the_result(self, calibration_id: str) -> None:
+        """It is stored; or asked for once more, as its answer was lost; or not wanted."""
+        drawn = self.chance.random()
+        if self.life.quiet or drawn < 0.4:
+            self.clinic.ask(CalibrateStoredRequest(calibration_id=calibration_id), calibration_id)
+        elif drawn < 0.9:
+            self.clinic.ask(CalibrateFinishRequest(by="nurse", calibration_id=calibration_id), calibration_id)
+        else:
+            wanted = CalibrateFinishRequest(by="nurse", calibration_id=calibration_id, discard=True)
+            self.clinic.ask(wanted, calibration_id)
+
     def _calibrate(self) -> None:
         drawn = self.chance.random()
-        if self.life.quiet or drawn < 0.05:
+        found = None if self.clinic.rig is None else self.clinic.rig.status().calibration
+        if found is not None and found.trains and self._calibrates and self.chance.random() < 0.9:
+            wanted = CalibrateMarkRequest(threshold=found.missing[0]) if found.missing else None
+            self.clinic.ask(wanted or CalibrateFinishRequest(by="nurse"))
+        elif self.life.quiet or drawn < 0.05:
             self.clinic.ask(CalibrateFinishRequest(by="nurse", discard=True))
         elif drawn < 0.6:
             direction = self.chance.choice(("up", "up", "up", "fine", "repeat", "down"))

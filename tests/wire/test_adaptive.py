@@ -17,6 +17,7 @@ import pytest
 from api.settings import Settings
 from api.web.app import create_app
 from tests.api.conftest import TOKEN, Server, wait_done
+from tests.harness.looks_first import LooksFirst
 from tests.harness.processes import Bench
 
 pytestmark = [pytest.mark.wire, pytest.mark.timeout(600)]
@@ -59,8 +60,10 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Whole]:
         bench.start_rig().wait_state("ready")
         folder = tmp_path_factory.mktemp("service")
         app = create_app(Settings(data_dir=folder, admin_token=TOKEN, rig_socket=bench.socket, port=0))  # pyright: ignore[reportArgumentType]
-        headers = {"Authorization": f"Bearer {TOKEN}"}
-        with Server(app) as url, httpx.Client(base_url=url, headers=headers, timeout=PATIENCE_S) as client:
+        with (
+            Server(app) as url,
+            httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S) as client,
+        ):
             client.post("/v1/participants", json={"code": "P017"})
             yield Whole(client, app.state.context.runner.adaptive.adviser)
     finally:

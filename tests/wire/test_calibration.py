@@ -57,6 +57,9 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     rise_nm = [t["torque_rise_nm"] for t in trains if t["torque_rise_nm"] is not None]
     assert rise_nm[-1] > 5 * rise_nm[0]
     result = client.ask("calibrate-finish", by="therapist")["body"]
+    waiting = client.status()["calibrated"]
+    assert waiting["result"] == result
+    assert client.ask("calibrate-stored", calibration_id=waiting["calibration_id"])["body"]["calibrated"] is None
     profile = result["profile"]
     assert profile["max_pulse_width_us"] == 200.0
     assert profile["expires_at_utc"] > profile["set_at_utc"]

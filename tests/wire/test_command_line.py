@@ -88,9 +88,9 @@ def test_a_port_that_is_not_there_is_told_until_it_is(make_bench: Callable[..., 
         assert rig.ready["state"] == "disconnected"
         client = RigClient(tmp_path / "rig.sock")
         assert "no-such-port is missing" in client.status()["reason"]
-        assert client.ask("rearm", by="nurse")["problem"]["code"] == "disconnected"
+        assert client.rearm("nurse")["problem"]["code"] == "disconnected"
         link.symlink_to(bench.emulator.ready["stimulator"])
-        assert client.ask("rearm", by="nurse")["body"]["state"] == "ready"
+        assert client.rearm("nurse")["body"]["state"] == "ready"
         client.close()
     finally:
         assert rig.stop() == 0

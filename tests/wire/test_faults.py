@@ -85,7 +85,7 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     assert refused["problem"]["code"] == "latched"
     bench.fault(cmd="fault", name=fault, on=False)
     time.sleep(0.1)
-    rearmed = client.ask("rearm", by="nurse")
+    rearmed = client.rearm("nurse")
     assert rearmed["ok"], rearmed
     assert rearmed["body"]["state"] == "ready"
 
@@ -95,7 +95,7 @@ def test_a_load_cell_that_is_unplugged_and_comes_back_elsewhere(bench: Bench):
     assert bench.fault(cmd="fault", name="cell_unplugged", on=True)["ok"]
     check_kept(client.wait_finished("unplugged"), "fault")
     bench.fault(cmd="fault", name="cell_unplugged", on=False)  # under another port
-    assert client.ask("rearm", by="nurse")["problem"]["code"] == "disconnected"
+    assert client.rearm("nurse")["problem"]["code"] == "disconnected"
     assert client.ask("start", plan=short_plan("refused"))["problem"]["code"] == "latched"
 
 
@@ -114,7 +114,7 @@ def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient])
     time.sleep(0.2)
     assert state(bench)["pulses_received"] == count
     assert client.wait_state("latched")["reason"] == "participant asks (by nurse)"
-    assert client.ask("rearm", by="nurse")["body"]["state"] == "ready"
+    assert client.rearm("nurse")["body"]["state"] == "ready"
 
 
 def test_a_signal_stops_stimulation_first_and_seals(bench: Bench):
@@ -151,9 +151,19 @@ def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
         acknowledged = int(np.sum(file["pulses/status"][:] == 0))
         assert acknowledged >= count - 2  # the last ack may have been on its way
         assert np.sum(np.isfinite(file["pulses/sent_pulse_width_us"][:]) & (file["pulses/status"][:] != 1)) >= count
+    felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+    felt_uc = sum(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)
+    summary = event["summary"]
+    most_uc = max(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)
+    assert felt_uc - 1e-6 <= summary["charge_uc"] <= felt_uc + most_uc + 1e-6  # one may not have left
+    assert len(felt) <= summary["pulses"] <= len(felt) + 1
+    assert summary["duration_s"] >= felt[-1]["time_s"] - felt[0]["time_s"] > 0
+    assert summary["torque_time_nms"] > 0 and summary["torque_peak_nm"] > 0
+    assert summary["dose_is_bound"] == (summary["doubtful_pulses"] > 0)
+    assert summary["dose_is_bound"] == any(words.startswith("dose: ") for words in summary["warnings"])
     refused = client.ask("start", plan=short_plan("next"))
     assert refused["problem"]["code"] == "uncertain"
-    assert client.ask("rearm", by="nurse")["ok"]
+    assert client.rearm("nurse")["ok"]
     client.ask("subscribe")
     assert client.start(short_plan("next"))["ok"]
     assert client.wait_finished("next")["outcome"] == "completed"

@@ -43,7 +43,9 @@ ADVICE: dict[str, Any] = {
     "too-long": lazy(
         "It has {megabytes} MB, and stays at the rig. The longest that is taken is set by STIMRIG_CENTRE_MAX_FILE_MB."
     ),
-    "audit": lazy("Its newest entry has another hash than before. Compare the rig's database with a backup."),
+    "audit": lazy(
+        "Entry {seq} is not the one that was told before. Verify the trail at the rig, and compare with a backup."
+    ),
     "ahead": lazy("It is {seconds} s ahead of the centre's. Set both by NTP."),
     "behind": lazy("It is {seconds} s behind the centre's. Set both by NTP."),
     "no-time": lazy("It tells a time that cannot be read. Set its clock by NTP."),

@@ -10,7 +10,7 @@ from fastapi.security import HTTPBearer
 
 from api.centre.chain import BatchIn, HelloIn, read
 from api.centre.context import Ctx
-from api.centre.responses import HelloOut, LackingFilesOut, PieceOut, PlaceOut
+from api.centre.responses import HeadsOut, HelloOut, LackingFilesOut, PieceOut, PlaceOut
 from api.centre.spool import MOST_LISTED, MOST_PIECE_BYTES
 from api.errors import ApiError
 from api.store.centre_tables import CentreRig
@@ -64,6 +64,15 @@ async def items(request: Request, context: Ctx, rig: Rig) -> dict[str, Any]:
 def files(context: Ctx, rig: Rig, limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100) -> dict[str, Any]:
     """Files that items of this rig name and the centre lacks, oldest first."""
     return {"files": context.spool.lacking(rig, limit)}
+
+
+@router.get("/heads", **answers(HeadsOut))
+def heads(
+    context: Ctx, rig: Rig, chain: Annotated[str, Query(max_length=32)] = "",
+    item: Annotated[int, Query(ge=0, le=2**53)] = 0,
+) -> dict[str, Any]:  # fmt: skip
+    """Heads of the rig's audit trail, countersigned (Ed25519), after that of an item; at most 500."""
+    return {"heads": context.heads.after(rig, chain, item)}
 
 
 @router.put("/files/{sha256}", **answers(PieceOut), openapi_extra={"requestBody": {"content": BYTES}})

@@ -1,8 +1,10 @@
-"""`stimrig audit`: verify the chain of the audit trail, and export it."""
+"""`stimrig audit`: verify the audit trail against itself and what was noted of it elsewhere; export it."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,18 +12,30 @@ import typer
 
 from api.cli.errors import InputError
 from api.cli.terminal import Json, say, say_json, write
+from api.clock import Clock
 from api.errors import ApiError
+from api.outbox import receipts
+from api.outbox.errors import PushError
+from api.outbox.link import Link
+from api.outbox.receipts import Receipt
 from api.settings import Settings
 from api.store import Store, audit
 from api.store.tables import AuditEntry
 
 DataDir = Annotated[Path | None, typer.Option("--data", help="data folder; default ./var, or STIMRIG_DATA_DIR")]
 
+NO_HEAD = "no entry has this hash; the trail was cut short or written anew"
+
+HeadsFiles = Annotated[
+    list[Path] | None, typer.Option(help="file written by `stimrig audit heads`, or one of receipts")
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the verb and what it can do."""
     verbs = typer.Typer(no_args_is_help=True, help="Who did what, when, why: verify the chain of hashes, or export it.")
     verbs.command("verify")(verify)
+    verbs.command("heads")(heads)
     verbs.command("export")(export)
     app.add_typer(verbs, name="audit")
 
@@ -30,26 +44,114 @@ def verify(
     data: DataDir = None,
     file: Annotated[Path | None, typer.Option(help="an exported file instead of the database")] = None,
     head: Annotated[str, typer.Option(help="hash that was noted elsewhere: it must be in the chain")] = "",
+    heads: HeadsFiles = None,
+    ask: Annotated[bool, typer.Option("--centre/--no-centre", help="ask the centre for what it countersigned")] = True,
+    restored: Annotated[int, typer.Option(help="entry since which a restored database is known to lack some")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Exit 0 if the chain is complete; 1 if an entry was changed, removed or added."""
-    entries = read_export(file) if file is not None else stored(data)
-    broken = audit.first_broken(entries)
+    """Exit 0 if the trail is whole; 1 if an entry was changed, removed or added."""
+    settings = settings_of(data)
+    entries = read_export(file) if file is not None else stored(settings)
+    noted, wrong = outside(settings, file is None, heads or [])
+    asked, centre = from_centre(settings) if ask and file is None else ([], "not asked")
+    stands = receipts.standing(entries, noted + asked)
     missing = bool(head) and head not in {entry.hash for entry in entries}
+    gone = stands.missing_since if stands.missing_since != restored else None
     last = entries[-1].hash if entries else audit.GENESIS
-    found = {"whole": broken is None and not missing, "first_broken": broken, "head_found": not missing,
-             "entries": len(entries), "head": last}  # fmt: skip
+    found = {
+        "whole": stands.first_broken is None and not missing and gone is None and not wrong,
+        "first_broken": stands.first_broken, "missing_since": stands.missing_since, "head_found": not missing,
+        "receipts": len({(one.key, one.seq, one.hash) for one in noted + asked}), "receipts_wrong": wrong,
+        "centre": centre, "entries": len(entries), "head": last,
+    }  # fmt: skip
     if as_json:
         say_json(found)
-    elif broken is not None:
-        say(f"broken at entry {broken}: it, or one before it, was changed, taken out or put in")
-    elif missing:
-        say(f"{head}: no entry has this hash; the trail was cut short or written anew")
     else:
-        say(f"whole: {len(entries)} entries; head {last}")
-        say("note the head elsewhere: --head finds out later whether the trail's end was cut off")
+        say("\n".join([*words(stands, entries), *wrong, *([f"{head}: {NO_HEAD}"] if missing else []), told(found)]))
     if not found["whole"]:
         raise typer.Exit(1)
+
+
+def words(stands: receipts.Standing, entries: list[AuditEntry]) -> Iterator[str]:
+    """What is wrong with the trail, a line each."""
+    noted, broken, lost = stands.differs, stands.first_broken, stands.missing
+    if noted is not None and noted.seq == broken:
+        (now,) = [entry for entry in entries if entry.seq == broken]
+        yield (
+            f"entry {broken} is not the one that was {how(noted)}: it says now that {now.who} did "
+            f"“{now.action}” to {now.subject or 'nothing'} on {now.at_utc}; its hash was {noted.hash}"
+        )
+    elif broken is not None:
+        yield f"broken at entry {broken}: it, or one before it, was changed, taken out or put in"
+    if lost is not None:
+        yield (
+            f"entries are missing since {lost.seq}, which was {how(lost)}: the trail was cut off, or the database "
+            f"restored from a backup; where that is known, --restored {lost.seq} counts it no more"
+        )
+
+
+def how(noted: Receipt) -> str:
+    """Who noted it, and when."""
+    return f"countersigned by the centre on {noted.noted_utc}" if noted.key else f"noted on {noted.noted_utc}"
+
+
+def told(found: dict[str, Any]) -> str:
+    """The trail's length and head, and against what it was held."""
+    length = f"{found['entries']} entries; head {found['head']}"
+    held = f"compared with {found['receipts']} receipts and noted heads; centre: {found['centre']}"
+    if found["whole"] and not found["receipts"]:
+        held += "\nnote the head elsewhere (`stimrig audit heads`): else nobody sees a chain that was made anew"
+    return f"{'whole: ' if found['whole'] else ''}{length}\n{held}"
+
+
+def heads(
+    data: DataDir = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="file to which a line is added; default: print it")
+    ] = None,
+) -> None:
+    """The trail's present end: number and hash of the newest entry, and when it was noted; for `verify --heads`."""
+    with opened(settings_of(data)) as store:
+        head = receipts.head(store, Clock())
+    if output is None:
+        say(head.model_dump_json(exclude_defaults=True))
+        return
+    try:
+        receipts.append(output, [head])
+    except OSError as error:
+        raise InputError(f"{output}: {error.strerror}. Give a file that can be written.") from error
+
+
+def outside(settings: Settings, of_rig: bool, given: list[Path]) -> tuple[list[Receipt], list[str]]:
+    """What was noted of the trail outside the database, and what is wrong with those files."""
+    own = receipts.files(settings.data_dir) if of_rig else []
+    if of_rig and settings.heads_file is not None and settings.heads_file.exists():
+        own.append(settings.heads_file)
+    noted: list[Receipt] = []
+    wrong: list[str] = []
+    for path in [*own, *given]:
+        try:
+            kept, said = receipts.checked(path)
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig audit heads`.") from error
+        noted, wrong = noted + kept, wrong + said
+    return noted, wrong
+
+
+def from_centre(settings: Settings) -> tuple[list[Receipt], str]:
+    """What the centre countersigned, and whether it answered."""
+    if settings.centre_url is None or settings.centre_key is None:
+        return [], "none is configured"
+    link = Link(settings.centre_url, settings.centre_key.get_secret_value(), Clock())
+    noted: list[Receipt] = []
+    try:
+        while given := link.heads(noted[-1].chain if noted else "", noted[-1].item if noted else 0):
+            noted += given
+    except PushError as error:
+        return noted, str(error)
+    finally:
+        link.close()
+    return noted, "asked"
 
 
 def export(
@@ -57,31 +159,42 @@ def export(
     data: DataDir = None,
 ) -> None:
     """Write the trail, one entry a line; `verify --file` checks it without the database."""
-    entries = stored(data)
+    entries = stored(settings_of(data))
     write(output, "".join(json.dumps(entry.as_dict(), sort_keys=True) + "\n" for entry in entries))
     say(f"{len(entries)} entries written to {output}; head {entries[-1].hash if entries else audit.GENESIS}")
 
 
-def stored(data: Path | None) -> list[AuditEntry]:
-    """The trail in the database, read only.
+def settings_of(data: Path | None) -> Settings:
+    """The service's settings, perhaps with another data folder."""
+    return Settings() if data is None else Settings(data_dir=data)
+
+
+@contextmanager
+def opened(settings: Settings) -> Iterator[Store]:
+    """The database.
 
     Raises
     ------
     InputError
-        There is no database.
+        There is none.
     """
-    given: dict[str, Any] = {} if data is None else {"data_dir": data}
-    settings = Settings(**given)
-    if settings.database_url is None and not (settings.data_dir / "stimrig.db").is_file():
-        raise InputError(f"{settings.data_dir / 'stimrig.db'}: there is no database. Give the data folder with --data.")
+    place = settings.data_dir / "stimrig.db"
+    if settings.database_url is None and not place.is_file():
+        raise InputError(f"{place}: there is no database. Give the data folder with --data.")
     try:
         store = Store(settings.database)
     except ApiError as error:
         raise InputError(str(error)) from error
     try:
-        return store.all(AuditEntry, order=AuditEntry.seq)
+        yield store
     finally:
         store.close()
+
+
+def stored(settings: Settings) -> list[AuditEntry]:
+    """The trail in the database, read only. Raises InputError."""
+    with opened(settings) as store:
+        return store.all(AuditEntry, order=AuditEntry.seq)
 
 
 def read_export(path: Path) -> list[AuditEntry]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import signal
+import contextlib
 import time
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from api.cli.errors import InputError
-from api.cli.launcher import Services
+from api.cli.launcher import Ended, Services
 from api.cli.stop_key import StopKey, at_rig
 from api.cli.terminal import say
 from api.settings import Settings
@@ -40,20 +40,18 @@ def serve(
     given = {"port": port, "host": host, "rig_file": rig, "rig_socket": rig_socket, "data_dir": data, "lsl": lsl}
     settings = Settings(**{key: value for key, value in given.items() if value is not None})
     found = attachable(settings, emulate) if settings.rig_socket else None
-    ended: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda caught, _frame: ended.append(caught))
-    with Services(settings, emulate.split(), attach=settings.rig_socket) as services:
+    with contextlib.suppress(Ended), Services(settings, emulate.split(), attach=settings.rig_socket) as services:
         say(*welcome(services, settings), *rig_state(services, found))
-        with StopKey(at_rig(services.socket), say) as key:
-            if key.listens:
-                say("any key stops a running test; Ctrl-C ends the service" + ("" if found else " and the rig"))
-            while not ended:
-                time.sleep(0.2)
-                if not ended:
+        try:
+            with StopKey(at_rig(services.socket), say) as key:
+                if key.listens:
+                    say("any key stops a running test; Ctrl-C ends the service" + ("" if found else " and the rig"))
+                while True:
+                    time.sleep(0.2)
                     for event in services.watch():
                         say(event)
-        say("stopping" + ("; the rig goes on by itself" if found else ""))
+        except Ended:
+            say("stopping" + ("; the rig goes on by itself" if found else ""))
 
 
 def attachable(settings: Settings, emulate: str) -> Status:

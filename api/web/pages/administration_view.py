@@ -10,9 +10,8 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
 from api.language import lazy
-from api.outbox import status
+from api.outbox import receipts, status
 from api.people.auth import Scope
-from api.store import audit
 from api.store.tables import AuditEntry
 from api.web.dependencies import Administrator, Context, Ctx
 from api.web.pages import typed
@@ -53,7 +52,7 @@ async def shown(request: Request, context: Context, key: dict[str, Any] | None =
             "tokens": [token for token in tokens.list_tokens(context, None) if token["origin"] == "issued"],  # pyright: ignore[reportArgumentType]
             "entries": entries[: -NEWEST - 1 : -1],
             "count": len(entries),
-            "broken": audit.first_broken(entries),
+            "stands": receipts.of_folder(entries, context.settings.data_dir),
             "centre": status.read(context.settings, context.clock.unix_s()),
         }
 

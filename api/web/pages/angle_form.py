@@ -8,6 +8,7 @@ from typing import Any
 
 from api.sessions import angles
 from api.web.pages import typed
+from api.web.routes.participants import calibrated_utc
 from rig.messages import Status
 
 NAMES = ("angle_from_deg", "angle_to_deg")
@@ -16,10 +17,10 @@ HALF_A_STEP_DEG = 0.006
 """What is shown has two digits behind the point: nearer than half of them is the same angle."""
 
 
-def texts(profile: Mapping[str, Any]) -> dict[str, str]:
-    """What stands in the two fields; empty where there is no range."""
+def texts(profile: Mapping[str, Any], status: Status | None) -> dict[str, str]:
+    """What stands in the two fields; empty where there is no range, or the sensor was calibrated anew since."""
     range_rad = angles.of(profile)
-    if range_rad is None:
+    if range_rad is None or (present(status) and angles.outdated(profile, calibrated_utc(status))):
         return dict.fromkeys(NAMES, "")
     return {name: shown(angle) for name, angle in zip(NAMES, range_rad, strict=True)}
 
@@ -58,12 +59,15 @@ def of_pose(text: str, status: Status | None) -> float:
     return angle_rad
 
 
-def asked(given: Mapping[str, str], profile: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+def asked(
+    given: Mapping[str, str], profile: Mapping[str, Any], status: Status | None
+) -> tuple[dict[str, Any], dict[str, str]]:
     """The range that is asked for as part of a profile, and what is wrong with it, by field.
 
     Nothing is asked where the fields say what is saved. Both empty: the participant has no range any more.
     """
-    if dict(given) == texts(profile):
+    before = texts(profile, status)
+    if dict(given) == before:
         return {}, {}
     if not any(text.strip() for text in given.values()):
         return ({} if angles.of(profile) is None else {angles.RANGE: None}), {}
@@ -79,7 +83,7 @@ def asked(given: Mapping[str, str], profile: Mapping[str, Any]) -> tuple[dict[st
     if not (high - low >= angles.NARROWEST_RAD - 1e-9):
         least = math.degrees(angles.NARROWEST_RAD)
         return {}, {NAMES[1]: f"the second angle must be at least {least:.0f}° above the first"}
-    saved = angles.of(profile)
+    saved = angles.of(profile) if before[NAMES[0]] else None
     near = math.radians(HALF_A_STEP_DEG)
     if saved is not None and abs(saved[0] - low) < near and abs(saved[1] - high) < near:
         return {}, {}

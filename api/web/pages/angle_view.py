@@ -8,6 +8,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
+from api.store.seen import ChangedError
 from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import angle_form
 from api.web.pages.checked import checked
@@ -50,6 +51,8 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
     body = checked(PoseIn, angle_rad=angle_rad, first=first)
     try:
         await joint.take_pose(context, body, who.name)
+    except ChangedError:  # it has a page of its own
+        raise
     except ApiError as error:
         words = error.detail.removeprefix("angle_pose: ")
         error.detail = words[:1].upper() + words[1:]

@@ -17,20 +17,16 @@ from api.language import lazy
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
 from api.sessions.requests import CalibrationIn, MarkIn, StepIn
+from api.store import seen
 from api.store.tables import Participant
 from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import typed
 from api.web.pages.checked import checked
 from api.web.pages.render import page
 from api.web.routes import calibration, participants
-from api.web.routes.calibration import Shown
 from rig.messages import Status
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/calibration")
-Seen = Annotated[str, Form(alias="calibration")]
-"""Id of the calibration that the page shows; a form without it has shown none, and changes none."""
-Trains = Annotated[str, Form()]
-"""How many trains the page knows of."""
 DEFAULTS = CalibrationIn.model_validate({})
 MARKS = {
     "sensory": (lazy("It is felt"), lazy("the narrowest pulse the participant feels")),
@@ -60,13 +56,15 @@ async def shown(
         if error.status != 404:
             raise
         found = None
+    kept = context.rig.status.calibrated if context.rig.status and found is None else None
+    waits = kept if kept is not None and kept.participant == code else None
     own = {"current_ma": typed.shown(row.profile["current_ma"]), "step_us": typed.shown(DEFAULTS.step_us)}
     limits = context.rig.status.limits if context.rig.status else {}
     low_us, high_us = fine_range(context.rig.status)
     status = problem.status if problem else 422 if errors else 200
     return page(
         request, "calibration.html", status,
-        participant=row, found=found, marks=MARKS, last=last(row), problem=problem,
+        participant=row, found=found, waits=waits, marks=MARKS, last=last(row), problem=problem,
         texts=texts or own, errors=errors or {},
         help={"current_ma": profiles.takes("current_ma", limits), "step_us": f"{low_us:g} to {high_us:g} µs"},
     )  # fmt: skip
@@ -91,6 +89,8 @@ async def attempt(request: Request, context: Context, code: str, done: Awaitable
     """Do it and go on; what the rig or the service refuses is said on the page."""
     try:
         await done
+    except seen.ChangedError:  # it has a page of its own
+        raise
     except ApiError as error:
         return await shown(request, context, code, problem=error)
     return RedirectResponse(leads, 303)
@@ -105,12 +105,13 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     values, errors = read(texts, row, context.rig.status)
     if errors:
         return await shown(request, context, code, texts, errors)
-    body, seen = checked(CalibrationIn, **values, large_steps=True), profiles.version(row.profile)
+    body = checked(CalibrationIn, **values, large_steps=True)
 
     async def open_it() -> str:
-        await calibration.begin(context, code, body, who.name, seen)
+        await calibration.begin(context, code, body, who.name)
         return address(code)
 
+    await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
     doubts = profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]})
     if not doubts:
         return await attempt(request, context, code, open_it(), address(code))
@@ -153,40 +154,33 @@ def read(
 @router.post("/step/{direction}")
 async def step(
     request: Request, context: Ctx, _who: Tester, code: str, direction: str,
-    trains: Trains = "", seen: Seen = "",
     shown_us: Annotated[float | None, Form()] = None,
 ) -> Response:  # fmt: skip
-    """Play one train; `trains`, how many the page knew of, and the width on the button say whether both still hold."""
+    """Play one train; the trains that the page knew of and the width on the button say whether both still hold."""
     body = checked(StepIn, direction=direction, shown_us=shown_us)
-
-    done = calibration.step(context, code, body, Shown(seen, trains))
+    done = calibration.step(context, code, body)
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/mark/{threshold}")
-async def mark(
-    request: Request, context: Ctx, who: Tester, code: str, threshold: str,
-    trains: Trains = "", seen: Seen = "",
-) -> Response:  # fmt: skip
+async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str) -> Response:
     """Mark the last train's width."""
     wanted = checked(MarkIn, threshold=threshold).threshold
-    done = calibration.mark(context, code, wanted, who.name, Shown(seen, trains))
+    done = calibration.mark(context, code, wanted, who.name)
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/finish")
-async def finish(
-    request: Request, context: Ctx, who: Tester, code: str, trains: Trains = "", seen: Seen = ""
-) -> Response:  # fmt: skip
+async def finish(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Take over what was found."""
-    done = calibration.finish(context, code, False, who.name, Shown(seen, trains))
+    done = calibration.finish(context, code, False, who.name)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 
 @router.post("/discard")
-async def discard(request: Request, context: Ctx, who: Tester, code: str, seen: Seen = "") -> Response:
+async def discard(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Leave everything as it was; however many trains were sent."""
-    done = calibration.finish(context, code, True, who.name, Shown(seen))
+    done = calibration.finish(context, code, True, who.name)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
-from api.people.auth import COOKIE, LOCKED, Scope
+from api.people.auth import LOCKED, Scope
 from api.sessions import directory
 from api.web.browser_session import local, same_origin, set_cookie
 from api.web.dependencies import Context, Ctx, EvenLocked
@@ -93,7 +93,7 @@ async def sign_in(
 @router.post("/sign-out")
 async def sign_out(request: Request, context: Ctx, _who: EvenLocked) -> Response:
     """End the session."""
-    await asyncio.to_thread(context.auth.sign_out, request.cookies.get(COOKIE, ""))
+    await asyncio.to_thread(context.auth.sign_out, request.cookies.get(context.auth.cookie_name, ""))
     response = RedirectResponse("/", 303)
-    response.delete_cookie(COOKIE)
+    response.delete_cookie(context.auth.cookie_name)
     return response

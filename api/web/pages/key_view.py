@@ -13,6 +13,7 @@ from api.errors import ApiError, NotFoundError
 from api.people import controller_keys
 from api.sessions.controller_trials import PlanIn, plan_within
 from api.sessions.refusals import refuse_archived
+from api.store import seen
 from api.web.dependencies import Approver, Ctx, Tester
 from api.web.pages import participant_view, typed
 from api.web.pages.checked import checked
@@ -37,6 +38,8 @@ async def make(
     row = await asyncio.to_thread(participants.find, context, code)
     controller_keys.refuse_without(who)
     refuse_archived(row)
+    about = (seen.participant(code), seen.decisions(code))
+    await asyncio.to_thread(context.store.refuse_changed, *about)
     asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
     body = checked(
         KeyFor, name=name.strip(), trials=typed.whole(trials), **{k: _number(k, v) for k, v in asked.items()}

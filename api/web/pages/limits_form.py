@@ -9,7 +9,6 @@ from typing import Any
 from starlette.datastructures import FormData
 
 from api.sessions import angles, profiles
-from api.sessions.questions import Row
 from api.web.pages import angle_form, typed
 from rig.messages import Bound, Status
 
@@ -22,8 +21,6 @@ class LimitsForm:
 
     Parameters
     ----------
-    version : str
-        Of the limits that it was made from.
     texts : dict
         What stands in each field.
     seen : dict
@@ -34,23 +31,19 @@ class LimitsForm:
         What is wrong, one line a field.
     notice : str
         What is to be said above it.
-    theirs : list of Row
-        Where somebody else was quicker: what was typed, and what is saved.
     """
 
-    version: str
     texts: dict[str, str]
     seen: dict[str, str]
     asked: dict[str, Any] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
     notice: str = ""
-    theirs: list[Row] = field(default_factory=list)
 
 
-def fresh(profile: Mapping[str, Any]) -> LimitsForm:
+def fresh(profile: Mapping[str, Any], status: Status | None) -> LimitsForm:
     """The form with what is saved."""
-    texts = {name: typed.shown(profile[name]) for name in profiles.LIMITS} | angle_form.texts(profile)
-    return LimitsForm(profiles.version(profile), texts, dict(texts))
+    texts = {name: typed.shown(profile[name]) for name in profiles.LIMITS} | angle_form.texts(profile, status)
+    return LimitsForm(texts, dict(texts))
 
 
 def read(sent: FormData, profile: Mapping[str, Any], status: Status | None) -> LimitsForm:
@@ -59,9 +52,8 @@ def read(sent: FormData, profile: Mapping[str, Any], status: Status | None) -> L
     A field that still holds what it was made with asks for nothing, so a limit that somebody else has set meanwhile is
     not set back by a form that only wanted another one.
     """
-    form = fresh(profile)
-    if _one(sent, "version") not in (None, form.version):
-        return _stale(form, sent)
+    form = fresh(profile, status)
+    form.seen |= {name: text for name in form.seen if (text := _one(sent, f"seen_{name}")) is not None}
     for name in profiles.LIMITS:
         _take(form, name, sent, profile[name])
     limits: Mapping[str, Bound] = status.limits if status else {}
@@ -76,9 +68,9 @@ def read(sent: FormData, profile: Mapping[str, Any], status: Status | None) -> L
 def _take_angles(form: LimitsForm, sent: FormData, profile: Mapping[str, Any], status: Status | None) -> None:
     """The range of angles, where the form has its fields."""
     given = {name: text[:LONGEST_SHOWN] for name in angle_form.NAMES if (text := _one(sent, name)) is not None}
-    if len(given) < len(angle_form.NAMES):
+    if len(given) < len(angle_form.NAMES) or given.items() <= form.seen.items():
         return
-    asked, errors = angle_form.asked(given, profile)
+    asked, errors = angle_form.asked(given, profile, status)
     rigs = (status.angle.range_rad if status else None) or (angles.LEAST_RAD, angles.MOST_RAD)
     if beyond := angles.outside(asked, rigs):
         errors[angle_form.NAMES[1]] = beyond[angles.RANGE]
@@ -102,22 +94,6 @@ def _take(form: LimitsForm, name: str, sent: FormData, saved: float) -> None:
         return
     if value != saved:
         form.asked[name] = value
-
-
-def _stale(form: LimitsForm, sent: FormData) -> LimitsForm:
-    form.notice = "Nothing was saved, nothing was started. The limits were changed"
-    for name, limit in profiles.LIMITS.items():
-        text = _one(sent, name)
-        if text is None or text == _one(sent, f"seen_{name}"):
-            continue
-        form.texts[name] = text[:LONGEST_SHOWN]
-        form.theirs.append(Row(f"{limit.words.capitalize()} ({limit.unit})", form.texts[name], form.seen[name]))
-    for name in angle_form.NAMES:
-        text = _one(sent, name)
-        if text is not None and text != _one(sent, f"seen_{name}"):
-            form.texts[name] = text[:LONGEST_SHOWN]
-            form.theirs.append(Row(angle_form.LABELS[name], form.texts[name], form.seen[name]))
-    return form
 
 
 def _one(sent: FormData, name: str) -> str | None:

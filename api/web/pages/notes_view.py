@@ -10,8 +10,10 @@ from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
 from api.language import _, lazy
+from api.models.places import site_of
 from api.sessions.questions import Question, Row
 from api.sessions.requests import MuscleIn, NoteIn
+from api.store import seen
 from api.web.browser_session import local
 from api.web.dependencies import Ctx, Tester
 from api.web.pages import typed
@@ -82,26 +84,32 @@ async def take_out(context: Ctx, who: Tester, code: str) -> Response:
 @router.post(ONE + "/muscle")
 async def set_muscle(
     context: Ctx, who: Tester, code: str, side: Annotated[str, Form()] = "",
-    name: Annotated[str, Form(alias="muscle")] = "",
+    name: Annotated[str, Form(alias="muscle")] = "", placement: Annotated[str, Form()] = "",
 ) -> Response:  # fmt: skip
-    """Say side and muscle; asked about where the calibration of the day would be lost."""
-    body = checked(MuscleIn, side=side or None, muscle=name.strip() or None)
+    """Say the site; asked about where calibration, approved model or keys would be lost."""
+    body = checked(MuscleIn, side=side or None, muscle=name.strip() or None, placement=placement.strip() or None)
     row = await asyncio.to_thread(participants.find, context, code)
 
     async def save() -> str:
         await muscle.change(context, code, body, who.name, voids=True)
         return f"/participants/{code}"
 
-    if not muscle.loses(row, body):
+    await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
+    before, after = site_words(site_of(row)), site_words(muscle.site_in(body))
+    warnings = []
+    if muscle.loses(row, body):
+        warnings += [_("The calibration is lost with it: its thresholds were found at %(muscle)s.", muscle=before)]
+    if before != after and await asyncio.to_thread(context.versions.approved, code) is not None:
+        warnings += [_("The approved model and its keys are of %(muscle)s. Here there is none.", muscle=before)]
+    if not warnings:
         return RedirectResponse(await save(), 303)
-    before, after = site_words(row.side, row.muscle), site_words(body.side, body.muscle)
     question = Question(
         participant=code,
         title=_("Change side and muscle of %(code)s?", code=code),
         button=_("Yes, it is %(muscle)s", muscle=after),
         action=save,
         rows=[Row(_("Side and muscle"), after, before)],
-        warnings=[_("The calibration is lost with it: its thresholds were found at %(muscle)s.", muscle=before)],
+        warnings=warnings,
     )
     return RedirectResponse(context.questions.ask(question, who), 303)
 

@@ -9,19 +9,17 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 
-from api.language import when
 from api.people import controller_keys
 from api.people.auth import Principal
 from api.sessions import angles, profiles
 from api.sessions.questions import Question, Row
-from api.store import audit
+from api.store import seen
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import angle_form, kind_form, limits_form, next_view, starting, trials_view
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
 from api.web.routes import participants
-from api.web.routes.participants import Change
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
 
@@ -49,7 +47,7 @@ async def shown(
             "notes": context.notes.of(code),
             "calibrated": starting.calibrated(context, row),
             "step": next_view.step(context, row),
-            "form": form or limits_form.fresh(row.profile),
+            "form": form or limits_form.fresh(row.profile, context.rig.status),
             "meanwhile": participants.meanwhile(context, code),
             "fields": limits_form.fields(context.rig.status),
             "tests": [context.runner.document(test) for test in history],
@@ -87,9 +85,6 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
     status = context.rig.status
     sent = await request.form()
     form = limits_form.read(sent, row.profile, status)
-    if form.notice and not form.errors:
-        form.notice += await asyncio.to_thread(_by_whom, context, code)
-        return await shown(request, context, who, code, form, 409)
     if form.errors:
         return await shown(request, context, who, code, form, 422)
     wanted = kind_form.asked(sent, code) if start else None
@@ -101,11 +96,12 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
 
     if not form.asked:
         return RedirectResponse(await on(), 303)
+    await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
     new, voids = profiles.changed(row.profile, form.asked)
-    change = Change(form.asked, [profiles.version(row.profile)], bool(voids))
 
     async def save() -> str:
-        await participants.change_profile(context, code, change, who.name)
+        _row, place = await participants.change_profile(context, code, form.asked, who.name, bool(voids))
+        seen.looked.set(place)  # what is asked next rests on what was just decided
         return await on()
 
     doubts = [*profiles.jumps(row.profile, new), *_lost(context, voids)]
@@ -140,9 +136,3 @@ def _lost(context: Context, voids: str) -> list[str]:
     required = context.rig.status is None or context.rig.status.require_calibration is not False
     then = " Until the participant is calibrated anew, no test starts." if required else ""
     return [f"The calibration is lost with it: {voids}.{then}"]
-
-
-def _by_whom(context: Context, code: str) -> str:
-    with context.store.read() as session:
-        entry = audit.newest(session, code, "set profile", "finish calibration")
-    return f" by {entry.who}, {when(entry.at_utc)}." if entry else "."

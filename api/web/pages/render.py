@@ -10,14 +10,17 @@ from urllib.parse import quote
 from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
+from markupsafe import Markup
 from sqlalchemy.exc import SQLAlchemyError
 
 from api import language
 from api.clock import zone_name
 from api.errors import ApiError
 from api.people.auth import LOCKED, Principal, Scope
+from api.store import seen
 from api.web.dependencies import Context
-from api.web.pages import colours, rig_state
+from api.web.pages import changes, colours, rig_state
+from api.web.pages.changes import Again
 from api.web.pages.environment import environment
 
 environment.filters["what_to_check"] = rig_state.what_to_check
@@ -47,9 +50,18 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     principal = None if looking is None or looking.locked else looking
     bar = {**face.bar(request, looking, principal), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
+    shown["signed"] = signed(principal)
     shown["colours"] = colours.chosen(request)
     html = face.environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
+
+
+def signed(principal: Principal | None) -> Markup:
+    """What every form carries: that it is of this session, and what the page was shown on."""
+    told = seen.shown.get() or seen.looked.get()  # a form that comes back for want of something is as old as it was
+    fields = {"csrf": (principal.csrf if principal else None) or "", "seen": told or ""}
+    field = Markup('<input type="hidden" name="{}" value="{}">')
+    return Markup("").join(field.format(name, value) for name, value in fields.items())
 
 
 def zone(context: Context) -> str:
@@ -92,7 +104,8 @@ def _right_of(context: Context, name: str) -> str:
 def fragment(context: Context, template: str, principal: Principal, place: str) -> str:
     """A part of a page by itself, for a script that renews it; `place`: the page it is on."""
     bar = bar_of(context, principal)
-    return environment.get_template(template).render(bar=bar, principal=principal, here=place)
+    values = {"principal": principal, "here": place, "signed": signed(principal)}
+    return environment.get_template(template).render(bar=bar, **values)
 
 
 def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
@@ -123,13 +136,16 @@ def here(request: Request) -> str:
     return back[0] if back else "/"
 
 
-def problem_page(request: Request, problem: ApiError) -> Response:
+def problem_page(request: Request, problem: ApiError, again: Again | None = None) -> Response:
     """A problem as a page that says what to do; the way to the door where nobody is signed in."""
     if problem.code == LOCKED[0]:
         return RedirectResponse(f"/locked?next={quote(here(request), safe='')}", 303)
     if problem.status == 401 and request.method == "GET":
         return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
-    response = page(request, "problem.html", problem.status, problem=problem, back=back_from(request.url.path))
+    values: dict[str, Any] = {"problem": problem, "back": back_from(request.url.path), "again_at": request.url.path}
+    if isinstance(problem, seen.ChangedError):
+        values |= {"rows": changes.rows(problem.extra["changes"]), "again": again}
+    response = page(request, "problem.html", problem.status, **values)
     response.headers.update(problem.headers)
     return response
 

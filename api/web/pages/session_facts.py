@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from api.clock import local_day
+from api.models.places import Site, site_of, site_of_recording
 from api.store.tables import Note, Participant, Recording, Test
 from api.web.dependencies import Context
 
@@ -19,8 +20,8 @@ class SessionFacts:
 
     Parameters
     ----------
-    side, muscle : str or None
-        As they were called then; of a record that was uploaded, as they are now.
+    site : list of str or None
+        As it was then; of a record whose site was not kept, as it is now.
     profile : dict
         The limits and thresholds of that test; empty for a record that was uploaded.
     test : Test or None
@@ -31,8 +32,7 @@ class SessionFacts:
         So many do not fit on the report.
     """
 
-    side: str | None
-    muscle: str | None
+    site: Site
     profile: dict[str, Any]
     test: Test | None
     notes: list[Note]
@@ -49,9 +49,9 @@ def of(context: Context, recording: Recording) -> SessionFacts:
     participant: Participant = context.store.get(Participant, recording.participant)
     test: Test | None = context.store.get(Test, recording.test_id) if recording.test_id else None
     notes = _notes(context, recording, test)
-    said = test.plan if test and "side" in test.plan else participant.as_dict()
+    kept = site_of_recording(recording, test if test and "side" in test.plan else None)
     return SessionFacts(
-        said["side"], said["muscle"], (test.plan.get("profile") or {}) if test else {}, test,
+        kept or site_of(participant), (test.plan.get("profile") or {}) if test else {}, test,
         notes[:MOST_NOTES], max(0, len(notes) - MOST_NOTES),
     )  # fmt: skip
 

@@ -9,12 +9,12 @@ from typing import Any, Literal
 from api.clinical_words import test_kind_words
 from api.errors import ApiError
 from api.language import _, lazy, localised, translated, until, when
+from api.models.places import Site, site_of
 from api.people.auth import Principal
 from api.sessions import profiles
 from api.sessions.questions import Question, Row
 from api.sessions.refusals import other_than, refuse_archived
 from api.sessions.requests import TestIn
-from api.sessions.runner import Seen
 from api.store import audit
 from api.store.tables import Participant
 from api.web.dependencies import Context
@@ -67,10 +67,9 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         detail = f"{row.code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
     preview = await context.runner.preview(body)
-    seen = Seen(profiles.version(row.profile), preview, row.side, row.muscle)
 
     async def action() -> str:
-        test = await context.runner.start(body, who.name, seen)
+        test = await context.runner.start(body, who.name, preview, who.token_hash)
         return f"/tests/{test.id}"
 
     strength = f"{current_words(row)}, {number(widest_us(preview), 0, 'µs')}"
@@ -128,7 +127,7 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
     widest, most = number(widest_us(preview), 0, "µs"), number(profile["max_pulse_width_us"], 0, "µs")
     return [
         Row(_("Who"), row.code),
-        Row(_("Side and muscle"), site_words(row.side, row.muscle)),
+        Row(_("Side and muscle"), site_words(site_of(row))),
         Row(_("Current of every pulse"), current_words(row)),
         Row(_("Widest pulse"), _("%(widest)s, comfort maximum %(most)s", widest=widest, most=most)),
         *more,
@@ -141,13 +140,13 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
     ]
 
 
-def site_words(side: str | None, muscle: str | None) -> str:
-    """Side and muscle as a person says them: left, biceps brachii. Muscles keep their Latin names."""
+def site_words(site: Site) -> str:
+    """A site as a person says it: left, biceps brachii, A. Muscles keep their Latin names."""
     sides = {"left": _("left"), "right": _("right")}
-    return ", ".join(part for part in (sides.get(side or ""), muscle) if part) or _("not said")
+    return ", ".join(part for part in (sides.get(site[0] or ""), *site[1:]) if part) or _("not said")
 
 
-environment.globals["site_words"] = site_words
+environment.globals |= {"site_words": site_words, "site_of": site_of}
 
 
 def current_words(row: Participant) -> str:

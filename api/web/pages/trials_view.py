@@ -15,10 +15,12 @@ from api.language import _, clock, ngettext
 from api.models.tracking import Limits
 from api.models.tracking_words import OUTCOMES, sentences
 from api.people.auth import Principal
+from api.store import seen
 from api.store.tables import Recording
 from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import rig_state
 from api.web.pages.environment import environment
+from api.web.pages.render import signed
 from api.web.routes import participants
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
@@ -31,6 +33,7 @@ async def trials(context: Ctx, who: Tester, code: str) -> Response:
 
     def gather() -> str:
         participants.find(context, code)
+        seen.looked.set(context.store.seen(context.clock))
         found = card(context, code)
         return "" if found is None else drawn(context, who, code, found)
 
@@ -39,8 +42,8 @@ async def trials(context: Ctx, who: Tester, code: str) -> Response:
 
 def drawn(context: Context, who: Principal, code: str, found: dict[str, Any]) -> str:
     """The card as HTML."""
-    ready = rig_state.now(context, who)["ready"]
-    return environment.get_template("trials.html").render(trials=found, code=code, csrf=who.csrf or "", ready=ready)
+    values = {"code": code, "ready": rig_state.now(context, who)["ready"], "signed": signed(who)}
+    return environment.get_template("trials.html").render(trials=found, **values)
 
 
 def card(context: Context, code: str) -> dict[str, Any] | None:

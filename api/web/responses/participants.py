@@ -23,6 +23,10 @@ class ProfileOut(Document):
     expires_at_utc: str | None = Field(None, description="when the calibration expires: the end of its day")
     rest_between_tests_s: float | None = Field(None, description="shortest rest between two tests, s")
     angle_range_rad: list[float] | None = Field(None, description="joint angles that are comfortable today, rad")
+    angle_set_at_utc: str | None = Field(
+        None,
+        description="calibration of the angle sensor under which that range was said",
+    )
 
 
 class ParticipantOut(Document):
@@ -34,6 +38,7 @@ class ParticipantOut(Document):
     created_by: str
     side: Literal["left", "right"] | None = Field(None, description="of the body; null: nobody has said")
     muscle: str | None = Field(None, description="the muscle that is stimulated")
+    placement: str | None = Field(None, description="of the electrodes: with side and muscle the site")
     archived_utc: str | None = Field(None, description="since when it is archived: no test starts, nothing is deleted")
 
 
@@ -64,6 +69,7 @@ class CalibrationOut(CalibrationStatus, Document):
     rig_state: RigState
     playing: bool = Field(description="a train is on its way")
     outdated: str = Field(description="why it goes no further: the limits were changed since; else empty")
+    version: str = Field(description="of what is shown: the calibration, and how many trains were sent")
 
 
 class CalibratedOut(Document):

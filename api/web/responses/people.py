@@ -80,5 +80,6 @@ class AuditOut(Document):
     """The audit trail."""
 
     whole: bool = Field(description="whether the chain of hashes holds")
-    first_broken: int | None = Field(description="`seq` of the first entry that does not hold")
+    first_broken: int | None = Field(description="`seq` of the first entry that does not hold, or was changed")
+    missing_since: int | None = Field(description="`seq` of the first entry that a receipt names and that is gone")
     entries: list[AuditEntryOut]

@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter
 
 from api.errors import ApiError, NotFoundError
-from api.store import audit
+from api.store import audit, seen
 from api.store.holds import LIMITS_TURN
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
@@ -50,6 +50,7 @@ def _put(context: Context, code: str, archived: bool, by: str) -> Participant:
         row = session.get(Participant, code)
         if row is None:
             raise NotFoundError("participant", code)
+        seen.check(session, seen.participant(code))
         if archived != (row.archived_utc is not None):
             row.archived_utc = now if archived else None
             audit.write(session, now, by, "archive" if archived else "unarchive", code)

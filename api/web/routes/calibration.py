@@ -5,27 +5,30 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import secrets
-from dataclasses import dataclass
+import zlib
 from typing import Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
+from sqlalchemy.orm import Session
 
-from api.errors import ApiError
+from api.errors import ApiError, NotFoundError
 from api.sessions import profiles
 from api.sessions.refusals import refuse_archived
 from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
-from api.store import audit
+from api.store import audit, seen
 from api.store.holds import LIMITS_TURN
-from api.store.tables import Participant
+from api.store.tables import AuditEntry, Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.responses.base import answers
 from api.web.responses.participants import CalibratedOut, CalibrationOut
 from api.web.routes import participants
 from rig.messages import (
+    Calibrated,
     CalibrateFinishRequest,
     CalibrateMarkRequest,
     CalibrateStartRequest,
     CalibrateStepRequest,
+    CalibrateStoredRequest,
     CalibrationResult,
     CalibrationStatus,
     Profile,
@@ -35,29 +38,34 @@ from rig.messages import (
 router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibration"], responses=PROBLEM)
 
 
-async def begin(
-    context: Context, code: str, body: CalibrationIn, by: str, seen: str | None = None
-) -> dict[str, Any]:  # fmt: skip
+async def begin(context: Context, code: str, body: CalibrationIn, by: str) -> dict[str, Any]:
     """Open a calibration; nothing is sent yet. What is not asked for is the participant's own, so never wider.
 
-    It is bound to the limits that it is begun with; `seen`, their version that a person was shown.
+    It is bound to the limits that it is begun with: the place in the audit trail at which it began ends its id, and so
+    is kept by the rig, which may outlive this service.
     """
     async with context.holds.turn(LIMITS_TURN):
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
-        version = profiles.version(row.profile)
-        if seen not in (None, version):
-            raise participants.stale(row)
-        stamp = context.clock.utc()[:19].replace("-", "").replace(":", "")
-        identity = f"C{stamp}-{secrets.token_hex(3)}-{version}"
         asked = settings(body, row.profile)
-        await asyncio.to_thread(note, context, by, "begin calibration", code, calibration=identity, **asked)
+        identity = await asyncio.to_thread(_write_begin, context, by, code, asked)
         last = Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
             CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **asked)
         )
         return await standing(context, code)
+
+
+def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any]) -> str:
+    """The intent; the calibration's id."""
+    with context.store.write() as session:
+        seen.check(session, seen.participant(code))
+        begun, now = seen.newest(session, ""), context.clock.utc()
+        stamp = now[:19].replace("-", "").replace(":", "")
+        identity = f"C{stamp}-{secrets.token_hex(3)}-{begun.entry}"
+        audit.write(session, now, by, "begin calibration", code, calibration=identity, **asked)
+    return identity
 
 
 def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
@@ -76,64 +84,74 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
     return asked
 
 
-@dataclass(frozen=True)
-class Shown:
-    """What a page showed when a button on it was pressed; None: not said."""
-
-    calibration: str | None = None
-    """Its id."""
-    trains: str | None = None
-    """How many had been sent."""
-
-    def check(self, found: dict[str, Any]) -> None:
-        """Refuse what was pressed on a page that shows another calibration, or does not know of the last train.
-
-        Raises
-        ------
-        ApiError
-            409: it is another one, or another train was sent or is on its way.
-        """
-        same = self.calibration in (None, found["calibration_id"])
-        if same and (self.trains is None or (self.trains == str(len(found["trains"])) and not found["playing"])):
-            return
-        detail = "Another train was sent after this page was shown. Nothing was done now. Look at the last train first."
-        raise ApiError(409, "not-what-was-seen", "This page is out of date", detail)
-
-
-NOT_SAID = Shown()
-
-
-async def step(context: Context, code: str, body: StepIn, shown: Shown = NOT_SAID) -> dict[str, Any]:
+async def step(context: Context, code: str, body: StepIn) -> dict[str, Any]:
     """Play one train. Looking and playing are one turn: of two presses on the same sight one plays."""
     async with context.holds.turn(LIMITS_TURN):
-        shown.check(await sound(context, code))
+        check_seen(await sound(context, code))
         await context.rig.ask(CalibrateStepRequest(direction=body.direction, shown_us=body.shown_us))
     return await standing(context, code)
 
 
-async def mark(context: Context, code: str, threshold: Any, by: str, shown: Shown = NOT_SAID) -> dict[str, Any]:
+async def mark(context: Context, code: str, threshold: Any, by: str) -> dict[str, Any]:
     """Mark the last train's width; no train comes between looking and marking."""
     async with context.holds.turn(LIMITS_TURN):
         found = await sound(context, code)
-        shown.check(found)
+        check_seen(found)
         await context.rig.ask(CalibrateMarkRequest(threshold=threshold))
     await asyncio.to_thread(note, context, by, f"mark {threshold}", code, pulse_width_us=found["pulse_width_us"])
     return await standing(context, code)
 
 
-async def finish(
-    context: Context, code: str, discard: bool, by: str, shown: Shown = NOT_SAID
-) -> dict[str, Any]:  # fmt: skip
-    """Close it; unless discarded, what it found is the participant's profile for the day."""
+def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
+    """Refuse what was decided on another calibration, or, but with `any_train`, without knowing of the last train.
+
+    Raises
+    ------
+    ApiError
+        409: it is another one, or another train was sent or is on its way.
+    """
+    sent = seen.sent.get()
+    if any_train and sent.partition(".")[0] == found["calibration_id"]:
+        return
+    if sent and (sent != found["version"] or found["playing"]):
+        raise another_train()
+
+
+def another_train() -> ApiError:
+    """409: it is another calibration, another train was sent, or another width marked."""
+    detail = "Another train was sent after this page was shown. Nothing was done now. Look at the last train first."
+    return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
+
+
+async def finish(context: Context, code: str, discard: bool, by: str) -> dict[str, Any]:
+    """Close it; unless discarded, what it found is the participant's profile for the day.
+
+    The rig keeps what was found until it is stored here: where that fails, finishing again stores it.
+    """
     async with context.holds.turn(LIMITS_TURN):
-        found = await (standing if discard else sound)(context, code)
-        shown.check(found)
-        result = await context.rig.ask_for(CalibrationResult, CalibrateFinishRequest(by=by, discard=discard))
-        version = profiles.of_calibration(found["calibration_id"])
-        profile = await asyncio.to_thread(_store, context, code, result, by, version)
-        with contextlib.suppress(ApiError):  # the rig has let it go: what was found is stored whatever it says now
+        waits = await _waiting(context, code)
+        if waits is None:
+            found = await (standing if discard else sound)(context, code)
+            check_seen(found, any_train=discard)
+            identity = str(found["calibration_id"])
+        else:
+            identity = waits.calibration_id
+            if (sent := seen.sent.get()) and sent.partition(".")[0] != identity:
+                raise another_train()
+        request = CalibrateFinishRequest(by=by, discard=discard, calibration_id=identity)
+        result = await context.rig.ask_for(CalibrationResult, request)
+        profile = await asyncio.to_thread(_store, context, code, result, by, identity)
+        with contextlib.suppress(ApiError):  # it is stored, whatever the rig says now
+            await context.rig.ask(CalibrateStoredRequest(calibration_id=identity))
             await context.rig.fresh_status()
     return {"profile": profile, "recordings": result.recordings}
+
+
+async def _waiting(context: Context, code: str) -> Calibrated | None:
+    """A calibration of this participant that is closed, and was not stored."""
+    status = await context.rig.fresh_status()
+    waits = status.calibrated
+    return waits if waits is not None and waits.participant == code and status.calibration is None else None
 
 
 async def standing(context: Context, code: str) -> dict[str, Any]:
@@ -149,21 +167,38 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
     if found is None or found.participant != code:
         ended = f" The rig is {status.state}: {status.reason}." if status.state == "latched" else ""
         detail = f"No calibration of {code} is open.{ended} POST /v1/participants/{code}/calibration begins one."
-        raise ApiError(404, "no-calibration", "No calibration is open", detail)
-    row = await asyncio.to_thread(participants.find, context, code)
-    playing = status.state != "calibrating"
-    return {**found.model_dump(), "rig_state": status.state, "playing": playing, "outdated": outdated(row, found)}
+        error = ApiError(404, "no-calibration", "No calibration is open", detail)
+        if (waits := status.calibrated) is not None and waits.participant == code:
+            error.detail = "It was finished, and waits to be stored. Finish it again, or discard it, with this ETag."
+            error.headers["ETag"] = f'"{waits.calibration_id}.0"'
+        raise error
+    return {
+        **found.model_dump(),
+        "rig_state": status.state,
+        "playing": status.state != "calibrating",
+        "outdated": await asyncio.to_thread(outdated, context, code, found),
+        "version": f"{found.calibration_id}.{len(found.trains)}.{zlib.crc32(repr(found.marks_us).encode()):08x}",
+    }
 
 
-def outdated(row: Participant, found: CalibrationStatus) -> str:
+def outdated(context: Context, code: str, found: CalibrationStatus) -> str:
     """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
-    if profiles.of_calibration(found.calibration_id) == profiles.version(row.profile):
-        return ""
+    row = participants.find(context, code)
+    with context.store.read() as session:
+        if not _changed_since(session, code, found.calibration_id):
+            return ""
     now = ", ".join(f"{row.profile[name]:g} {limit.unit}" for name, limit in profiles.LIMITS.items())
     return (
         f"{row.code} now has other limits ({now}) than when this calibration was begun with {found.current_ma:g} mA. "
         "It sends no further train and gives no profile. Discard it and begin anew."
     )
+
+
+def _changed_since(session: Session, code: str, calibration_id: str) -> list[AuditEntry]:
+    """What was changed of a participant since a calibration began."""
+    begun = calibration_id.rpartition("-")[2]
+    entry = int(begun) if begun.isdecimal() else 0
+    return seen.since(session, seen.Seen(entry, "", ""), seen.participant(code))
 
 
 async def sound(context: Context, code: str) -> dict[str, Any]:
@@ -187,49 +222,61 @@ def note(context: Context, by: str, action: str, code: str, **detail: Any) -> No
 
 
 def _store(
-    context: Context, code: str, result: CalibrationResult, by: str, version: str
+    context: Context, code: str, result: CalibrationResult, by: str, identity: str
 ) -> dict[str, Any] | None:  # fmt: skip
-    """What was found is the profile, if that is still of this version; what a calibration does not look for (the rest
-    between tests) stays."""
+    """What was found is the profile, if nothing of that was changed since; what a calibration does not look for (the
+    rest between tests) stays. Storing it again changes nothing."""
     found = result.profile.model_dump() if result.profile else None
     with context.store.write() as session:
         row = session.get(Participant, code)
-        assert row is not None
-        if found is not None:
-            if profiles.version(row.profile) != version:
-                raise participants.stale(row)
+        if found is not None and row is None:
+            raise NotFoundError("participant", code)
+        if found is not None and row is not None:
+            changed = _changed_since(session, code, identity)
+            if any(entry.detail.get("calibration") == identity for entry in changed):
+                return dict(row.profile)
+            if changed:
+                raise seen.ChangedError([{"now": seen.told(entry), "seen": None} for entry in changed], None)
             kept = {name: value for name, value in row.profile.items() if found.get(name) is None}
             found = row.profile = {**found, **kept}
-        action = "finish calibration" if found else "discard calibration"
-        audit.write(session, context.clock.utc(), by, action, code, profile=found, recordings=result.recordings)
+        action, said = "finish calibration" if found else "discard calibration", {"calibration": identity}
+        audit.write(session, context.clock.utc(), by, action, code, profile=found, recordings=result.recordings, **said)
     return found
 
 
 @router.post("", status_code=201, **answers(CalibrationOut, 201, "open; nothing was sent yet"))
-async def begin_calibration(context: Ctx, who: Tester, code: str, body: CalibrationIn | None = None) -> dict[str, Any]:
+async def begin_calibration(
+    context: Ctx, who: Tester, code: str, response: Response, body: CalibrationIn | None = None
+) -> dict[str, Any]:  # fmt: skip
     """Open a guided calibration: nothing is sent until a step is asked for."""
-    return await begin(context, code, body or CalibrationIn.model_validate({}), who.name)
+    return tagged(response, await begin(context, code, body or CalibrationIn.model_validate({}), who.name))
 
 
 @router.get("", **answers(CalibrationOut))
-async def calibration(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
+async def calibration(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
     """Where it stands: width, ceiling and whose it is, marks, what is missing, every train."""
-    return await standing(context, code)
+    return tagged(response, await standing(context, code))
+
+
+def tagged(response: Response, found: dict[str, Any]) -> dict[str, Any]:
+    """With its version as `ETag`."""
+    response.headers["ETag"] = f'"{found["version"]}"'
+    return found
 
 
 @router.post("/step", status_code=202, **answers(CalibrationOut, 202, "the train is on its way"))
-async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn) -> dict[str, Any]:
+async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, response: Response) -> dict[str, Any]:
     """Play one train: wider (`up`, or `fine` by a fine step), narrower, or the same again.
 
     It is over when `playing` is false again.
     """
-    return await step(context, code, body)
+    return tagged(response, await step(context, code, body))
 
 
 @router.post("/mark", **answers(CalibrationOut))
-async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn) -> dict[str, Any]:
+async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response: Response) -> dict[str, Any]:
     """Mark the last train's width as a threshold; marking again replaces."""
-    return await mark(context, code, body.threshold, who.name)
+    return tagged(response, await mark(context, code, body.threshold, who.name))
 
 
 @router.post("/finish", **answers(CalibratedOut))

@@ -12,7 +12,8 @@ from api.errors import ApiError
 from api.models import together
 from api.sessions import angles
 from api.sessions.requests import AngleRad, Body
-from api.store import audit
+from api.store import audit, seen
+from api.store.holds import LIMITS_TURN
 from api.store.tables import Model, Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
 from api.web.responses.base import answers
@@ -21,7 +22,7 @@ from api.web.responses.models import VersionOut
 from api.web.routes import participants
 from api.web.routes.criticism import LATER, later
 from api.workers.tracker import FIT_TOGETHER, Job
-from rig.messages import AnglePoseRequest, AngleStatus, Status
+from rig.messages import AngleCalibration, AnglePoseRequest, AngleStatus, Status
 
 router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
 
@@ -66,19 +67,20 @@ async def take_pose(context: Context, body: PoseIn, by: str) -> AngleStatus:
         409: no sensor, a test runs, or the joint moved; 422: the poses are too near to one another.
     """
     sensor(context)
-    before = context.rig.status.angle.calibration if context.rig.status else None
-    status = await context.rig.ask_for(Status, AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first))
-    context.rig.status = status
-    done = status.angle.calibration if status.angle.calibration != before else None
 
-    def note() -> None:
+    def note(done: AngleCalibration | None) -> None:
         with context.store.write() as session:
-            now = context.clock.utc()
-            audit.write(session, now, by, "pose of the angle sensor", "rig", angle_rad=round(body.angle_rad, 4))
+            now, taken = context.clock.utc(), {"angle_rad": round(body.angle_rad, 4)}
+            audit.write(session, now, by, seen.POSES[0], "rig", **taken)
             if done is not None:
-                audit.write(session, now, by, "calibrate the angle sensor", "rig", **done.model_dump(exclude={"by"}))
+                audit.write(session, now, by, seen.POSES[1], "rig", **done.model_dump(exclude={"by"}))
 
-    await asyncio.to_thread(note)
+    async with context.holds.turn(LIMITS_TURN):  # no other pose comes between looking and taking it
+        before = context.rig.status.angle.calibration if context.rig.status else None
+        await asyncio.to_thread(context.store.refuse_changed, seen.of("rig", *seen.POSES))
+        status = await context.rig.ask_for(Status, AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first))
+        context.rig.status = status
+        await asyncio.to_thread(note, status.angle.calibration if status.angle.calibration != before else None)
     return status.angle
 
 
@@ -111,8 +113,10 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
 
 
 @router.get("/rig/angle", **answers(AngleOut))
-async def angle(context: Ctx, _who: LiveReader) -> dict[str, Any]:
+async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
+    of_poses = seen.of("rig", *seen.POSES)
+    response.headers["ETag"] = (await asyncio.to_thread(context.store.seen, context.clock, of_poses)).etag
     return (await context.rig.fresh_status()).angle.model_dump()
 
 

@@ -12,6 +12,7 @@ from api.clock import unix_of
 from api.errors import ApiError
 from api.models import stored
 from api.models.tracking import Limits
+from api.store import seen
 from api.store.tables import Model
 from api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader
 from api.web.headers import entity_tags
@@ -83,9 +84,10 @@ def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]
 
 
 @router.get("/models/{model_id}", response_model=None, responses={200: WITH_MODEL})
-def one_model(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
+def one_model(context: Ctx, _who: ModelReader, model_id: str, response: Response) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
     row = context.versions.get(model_id)
+    response.headers["ETag"] = context.store.seen(context.clock, seen.decisions(row.participant)).etag
     return {**context.versions.document(row), "model": stored.read(row)}
 
 

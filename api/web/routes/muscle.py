@@ -1,4 +1,4 @@
-"""Which side and which muscle of a participant is stimulated."""
+"""The site of a participant that is stimulated: models, approvals and keys belong to one."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 
 from api.errors import ApiError, NotFoundError
+from api.models.places import Site, in_words, site_of
 from api.sessions import profiles
 from api.sessions.requests import MuscleIn
-from api.store import audit
+from api.store import audit, seen
 from api.store.holds import LIMITS_TURN
 from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
@@ -22,7 +23,7 @@ router = APIRouter(prefix="/v1/participants/{code}", tags=["participants"], resp
 
 
 async def change(context: Context, code: str, body: MuscleIn, by: str, voids: bool = False) -> Participant:
-    """Say another side or muscle. What a calibration found at the one before does not hold for it.
+    """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
     Raises
     ------
@@ -36,10 +37,15 @@ async def change(context: Context, code: str, body: MuscleIn, by: str, voids: bo
 
 
 def loses(row: Participant, body: MuscleIn) -> bool:
-    """Whether a calibration is lost: it was found at another side or muscle than the new one."""
+    """Whether a calibration is lost: it was found at another site than the new one."""
     found = any(row.profile.get(name) is not None for name in profiles.FOUND)
-    pairs = ((row.side, body.side), (row.muscle, body.muscle))
+    pairs = zip(site_of(row), site_in(body), strict=True)
     return found and any(before is not None and before != after for before, after in pairs)
+
+
+def site_in(body: MuscleIn) -> Site:
+    """The site that is asked for."""
+    return body.side, body.muscle, body.placement
 
 
 def _change(context: Context, code: str, body: MuscleIn, by: str, voids: bool) -> Participant:
@@ -48,23 +54,19 @@ def _change(context: Context, code: str, body: MuscleIn, by: str, voids: bool) -
         row = session.get(Participant, code)
         if row is None:
             raise NotFoundError("participant", code)
+        seen.check(session, seen.participant(code))
         lost = loses(row, body)
         if lost and not voids:
             detail = (
-                f"The thresholds of {code} were found at {words(row.side, row.muscle)}. To change it and make the "
+                f"The thresholds of {code} were found at {in_words(site_of(row))}. To change it and make the "
                 "calibration invalid: ?void_calibration=true."
             )
             raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
-        if (row.side, row.muscle) != (body.side, body.muscle):
-            row.side, row.muscle = body.side, body.muscle
+        if site_of(row) != site_in(body):
+            row.side, row.muscle, row.placement = site_in(body)
             row.profile = {**row.profile, **dict.fromkeys(profiles.FOUND)} if lost else row.profile
-            audit.write(session, now, by, "set muscle", code, side=row.side, muscle=row.muscle, voids_calibration=lost)
+            audit.write(session, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
     return row
-
-
-def words(side: str | None, muscle: str | None) -> str:
-    """As a person says it: left biceps brachii."""
-    return " ".join(part for part in (side, muscle) if part) or "a side and muscle that nobody has said"
 
 
 @router.put("/muscle", **answers(ParticipantOut))
@@ -75,8 +77,9 @@ async def set_muscle(
     body: MuscleIn,
     void_calibration: Annotated[bool, Query(description="the change may void the calibration of the day")] = False,
 ) -> dict[str, Any]:
-    """Say which side and muscle is stimulated. Another one than before voids the calibration: 409, unless allowed.
+    """Say the site. Another one than before voids the calibration: 409, unless allowed.
 
-    Tests that were made keep the side and muscle that they were begun with.
+    A model belongs to the site at which it was measured: at another one there is no approved model, and no key of a
+    controller, until it has its own. Tests keep the site that they were begun with.
     """
     return (await change(context, code, body, who.name, void_calibration)).as_dict()

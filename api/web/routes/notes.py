@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
 
 from api.sessions import notes
 from api.sessions.requests import NoteIn
@@ -26,8 +26,9 @@ async def add(context: Context, code: str, body: NoteIn, by: str) -> Note:
 
 
 @router.get("", **answers(list[NoteOut]))
-def list_notes(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
+def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> list[dict[str, Any]]:
     """A participant's notes, newest first, the struck ones among them."""
+    response.headers["ETag"] = context.store.seen(context.clock, notes.about(code)).etag
     participants.find(context, code)
     return [notes.document(note) for note in context.notes.of(code)]
 

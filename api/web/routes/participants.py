@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection
-from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Query, Response
 
+from api.clock import local_day
 from api.errors import ApiError, NotFoundError
 from api.sessions import angles, directory, profiles
 from api.sessions.requests import ProfileIn
-from api.store import audit
+from api.store import audit, seen
 from api.store.holds import LIMITS_TURN
+from api.store.seen import Seen
 from api.store.tables import Participant, Test
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
-from api.web.headers import entity_tags
-from api.web.openapi import problem
 from api.web.requests import ParticipantIn
 from api.web.responses.base import answers
 from api.web.responses.participants import ChangedOut, ParticipantOut
 from api.web.responses.rig import TestOut
+from rig.messages import Status
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
-TAG = {"description": "the version of the limits: send it as `If-Match`", "schema": {"type": "string"}}
-CHANGED: dict[int | str, dict[str, Any]] = {
-    200: {"model": ChangedOut, "description": "changed", "headers": {"ETag": TAG}},
-    412: problem("changed since it was looked at"),
-}
 
 
 def create(context: Context, body: ParticipantIn, by: str) -> Participant:
@@ -37,14 +31,15 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
     profile = body.profile.model_dump(exclude_none=True)
     if "profile" in body.model_fields_set:
         check_asked(context, profile, profile)
+        profile = with_calibration(context, profile)
     with context.store.write() as session:
         if session.get(Participant, body.code) is not None:
             raise ApiError(409, "exists", "The code is taken", f"Participant {body.code!r} exists. Take another code.")
         row = Participant(code=body.code, profile=profile, created_utc=now, created_by=by)
-        row.side, row.muscle = body.side, body.muscle
+        row.side, row.muscle, row.placement = body.side, body.muscle, body.placement
         session.add(row)
         session.flush()
-        said = {"side": row.side, "muscle": row.muscle}
+        said = {"side": row.side, "muscle": row.muscle, "placement": row.placement}
         audit.write(session, now, by, "create participant", body.code, profile=row.profile, **said)
     return row
 
@@ -57,55 +52,40 @@ def find(context: Context, code: str) -> Participant:
     return row
 
 
-@dataclass(frozen=True)
-class Change:
-    """A change of some of a participant's limits.
-
-    Parameters
-    ----------
-    asked : dict
-        The limits to be changed; the others keep their value.
-    seen : collection of str or None
-        The versions that the one who asks has seen; None: whatever there is.
-    voids : bool
-        Whether a calibration may be lost by it.
-    """
-
-    asked: dict[str, Any]
-    seen: Collection[str] | None = None
-    voids: bool = False
-
-
-async def change_profile(context: Context, code: str, change: Change, by: str) -> Participant:
-    """New limits for a participant: those that are asked for, the rest stays.
+async def change_profile(
+    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False
+) -> tuple[Participant, Seen]:  # fmt: skip
+    """New limits for a participant: those that are asked for, the rest stays; and the place in the trail.
 
     Raises
     ------
     ApiError
-        404 no such participant; 412 the limits were changed meanwhile; 422 beyond what the rig takes, or the first ones
-        are not whole; 409 the calibration would be lost, and that was not allowed.
+        404 no such participant; 422 beyond what the rig takes, or the first ones are not whole; 409 changed meanwhile,
+        or the calibration would be lost, and that was not allowed.
     """
     async with context.holds.turn(LIMITS_TURN):
-        return await asyncio.to_thread(_change, context, code, change, by)
+        return await asyncio.to_thread(_change, context, code, asked, by, may_void)
 
 
-def _change(context: Context, code: str, change: Change, by: str) -> Participant:
+def _change(
+    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool
+) -> tuple[Participant, Seen]:  # fmt: skip
     with context.store.write() as session:
         row = session.get(Participant, code)
         if row is None:
             raise NotFoundError("participant", code)
-        if change.seen is not None and profiles.version(row.profile) not in change.seen:
-            raise stale(row)
-        check_asked(context, row.profile, change.asked)
-        profile, voids = profiles.changed(row.profile, change.asked)
-        if voids and not change.voids:
+        seen.check(session, seen.participant(code))
+        check_asked(context, row.profile, asked)
+        profile, voids = profiles.changed(row.profile, with_calibration(context, asked))
+        if voids and not may_void:
             detail = (
                 f"{voids[0].upper()}{voids[1:]}. To set it and make the calibration invalid: ?void_calibration=true."
             )
             raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
-        row.profile = profile
-        audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
-    return row
+        if profile != row.profile:
+            row.profile = profile
+            audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
+        return row, seen.newest(session, local_day(context.clock.utc()))
 
 
 def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]) -> None:
@@ -120,12 +100,17 @@ def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]
         raise ApiError(422, "invalid-input", "These limits cannot be used", detail, errors=errors)
 
 
-def stale(row: Participant) -> ApiError:
-    """412: somebody changed the limits since they were looked at."""
-    now = ", ".join(f"{name} {row.profile[name]:g}" for name in profiles.LIMITS)
-    title = "The limits were changed by someone else"
-    detail = f"The limits of {row.code} are now {now}. Check them, then change them again."
-    return ApiError(412, "changed-meanwhile", title, detail, profile=row.profile)
+def with_calibration(context: Context, asked: dict[str, Any]) -> dict[str, Any]:
+    """What is asked for; a range of joint angles holds as long as the angle sensor's calibration of now."""
+    if asked.get(angles.RANGE) is None:
+        return asked
+    return {**asked, angles.SET_AT: calibrated_utc(context.rig.status)}
+
+
+def calibrated_utc(status: Status | None) -> str | None:
+    """When the rig's angle sensor was calibrated; None: by nobody."""
+    calibration = status.angle.calibration if status else None
+    return calibration.set_at_utc if calibration else None
 
 
 def meanwhile(context: Context, code: str) -> str:
@@ -144,9 +129,9 @@ def meanwhile(context: Context, code: str) -> str:
     return ""
 
 
-def etag(row: Participant) -> str:
-    """The limits' version as HTTP has it."""
-    return f'"{profiles.version(row.profile)}"'
+def etag(context: Context, code: str) -> str:
+    """The version of a participant, decisions on its models included."""
+    return context.store.seen(context.clock, seen.participant(code), seen.decisions(code)).etag
 
 
 @router.post("", status_code=201, **answers(ParticipantOut, 201, "made; see `Location`"))
@@ -168,22 +153,20 @@ def list_participants(
     return [row.as_dict() for row, _last_utc in directory.found(context.store, q, archived)]
 
 
-@router.get("/{code}", **answers(ParticipantOut, headers={"ETag": TAG}))
+@router.get("/{code}", **answers(ParticipantOut))
 def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
-    """One participant with its profile; `ETag` is the version of its limits."""
-    row = find(context, code)
-    response.headers["ETag"] = etag(row)
-    return row.as_dict()
+    """One participant with its profile."""
+    response.headers["ETag"] = etag(context, code)  # read first: it is not newer than what is told
+    return find(context, code).as_dict()
 
 
-@router.put("/{code}/profile", response_model=None, responses=CHANGED)
+@router.put("/{code}/profile", **answers(ChangedOut))
 async def set_profile(
     context: Ctx,
     who: Tester,
     code: str,
     body: ProfileIn,
     response: Response,
-    if_match: Annotated[str | None, Header(description="the `ETag` of the limits that were looked at")] = None,
     void_calibration: Annotated[bool, Query(description="the change may void the calibration of the day")] = False,
 ) -> dict[str, Any]:
     """Change limits: those that are sent; the others keep their values, and so does what a calibration found.
@@ -191,9 +174,8 @@ async def set_profile(
     A limit wider than at the calibration voids it: 409, unless `void_calibration`. `meanwhile` says what it means for a
     test that runs, or a calibration that is open.
     """
-    seen = None if if_match in (None, "*") else [tag.strip('"') for tag in entity_tags(if_match)]
-    row = await change_profile(context, code, Change(body.sent(), seen, void_calibration), who.name)
-    response.headers["ETag"] = etag(row)
+    row, place = await change_profile(context, code, body.sent(), who.name, void_calibration)
+    response.headers["ETag"] = place.etag
     return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
 
 

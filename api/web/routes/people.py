@@ -12,16 +12,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstra
 from api.clock import utc_label
 from api.errors import ApiError, NotFoundError
 from api.people import names
-from api.people.auth import COOKIE, Principal, Scope, unauthorized
+from api.people.auth import Principal, Scope, unauthorized
+from api.store import seen
 from api.web.browser_session import local, same_origin, set_cookie
 from api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx, EvenLocked
-from api.web.openapi import problem
+from api.web.openapi import TOO_MANY
 from api.web.responses.base import answers
 from api.web.responses.people import KeyOut, ListedUser, SessionOut, UserOut
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 
-TOO_MANY: dict[int | str, dict[str, Any]] = {429: problem("too many wrong passwords: `Retry-After`")}
 Name = Annotated[
     str,
     StringConstraints(min_length=1, max_length=320),
@@ -81,8 +81,9 @@ async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, 
 
 
 @router.get("/users", **answers(list[ListedUser]))
-def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
+def list_users(context: Ctx, _who: Administrator, response: Response) -> list[dict[str, Any]]:
     """All users."""
+    response.headers["ETag"] = context.store.seen(context.clock, seen.accounts()).etag
     return context.people.documents()
 
 
@@ -110,7 +111,7 @@ def remove_user(context: Ctx, who: Administrator, name: str) -> None:
     "/sessions",
     status_code=201,
     response_model=None,
-    responses={**TOO_MANY, 201: {"model": SessionOut, "description": "signed in; the session is in `Set-Cookie`"}},
+    responses={429: TOO_MANY, 201: {"model": SessionOut, "description": "signed in; the session is in `Set-Cookie`"}},
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": SignIn.model_json_schema()}}}},
 )
 async def sign_in(context: Ctx, request: Request) -> Response:
@@ -141,7 +142,7 @@ async def _given(request: Request, form: bool) -> SignIn:
         raise unauthorized("Send `name` and `password`.") from None
 
 
-@router.post("/sessions/confirm", status_code=204, responses=TOO_MANY)
+@router.post("/sessions/confirm", status_code=204)
 async def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
     """The password once more, before a model is approved."""
     await context.people.confirm(who, body.password)
@@ -155,7 +156,7 @@ async def lock(context: Ctx, who: Anyone) -> None:
     await asyncio.to_thread(context.auth.idle.lock, who.page_session.hash, who.name)
 
 
-@router.post("/sessions/unlock", status_code=204, responses=TOO_MANY)
+@router.post("/sessions/unlock", status_code=204)
 async def unlock(context: Ctx, who: EvenLocked, body: ConfirmIn) -> None:
     """Unlock this session by its person's password, or by the token that it was opened with."""
     await context.people.unlock(who, body.password)
@@ -164,7 +165,7 @@ async def unlock(context: Ctx, who: EvenLocked, body: ConfirmIn) -> None:
 @router.delete("/sessions/current", status_code=204)
 def sign_out(context: Ctx, request: Request, _who: EvenLocked) -> None:
     """Sign out."""
-    cookie = request.cookies.get(COOKIE)
+    cookie = request.cookies.get(context.auth.cookie_name)
     if cookie is None:
         raise NotFoundError("session", "current", "A token has none; DELETE /v1/tokens/{id} revokes it.")
     context.auth.sign_out(cookie)

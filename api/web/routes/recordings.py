@@ -15,8 +15,10 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
 from api.errors import ApiError, NotFoundError
-from api.store import audit, uploads
-from api.store.tables import Model, Recording
+from api.models.places import site_of
+from api.people.auth import Principal, Scope
+from api.store import audit, seen, uploads
+from api.store.tables import Model, Participant, Recording
 from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
 from api.web.openapi import problem
 from api.web.responses.base import answers
@@ -51,8 +53,6 @@ async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> F
     """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
     _row, source = await asyncio.to_thread(held, context, recording_id)
     name = f"{recording_id}.csv"
-    if source.suffix == ".csv":
-        return FileResponse(source, media_type="text/csv", filename=name)
     out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
     gone = BackgroundTask(out.unlink, missing_ok=True)
     try:
@@ -91,22 +91,24 @@ async def upload(
     request: Request,
     response: Response,
     columns: Annotated[list[str], Query(alias="map", max_length=MOST_COLUMNS)] = [],  # noqa: B006
+    of: Annotated[str, Query(description="whose recording it is, where the participant's it is not")] = "",
 ) -> dict[str, Any]:
     """Upload a recording of another tool (CSV, MAT or HDF5 as the request's body) and identify a model from it.
 
     `map` says what a column is called there and its unit, once for each column: `map=torque_nm=Drehmoment:Nm`.
-    What was assumed is told in `warnings`.
+    What was assumed is told in `warnings`. A recording that says that it is another participant's is refused, but with
+    `of`, by who may approve models; the audit trail keeps both codes.
     """
     await asyncio.to_thread(participants.find, context, code)
     data = await bounded_body(request, context.settings.max_upload_mb)
-    row, model, warnings = await take_in(context, code, data, who.name, columns)
+    row, model, warnings = await take_in(context, code, data, who, columns, of)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
     return {"recording_id": row.id, "model": version, "warnings": warnings}
 
 
 async def take_in(
-    context: Context, code: str, data: bytes, by: str, columns: Sequence[str] = ()
+    context: Context, code: str, data: bytes, who: Principal, columns: Sequence[str] = (), of: str = ""
 ) -> tuple[Recording, Model, list[str]]:
     """Keep a recording of another tool and identify a model from it; what was assumed, and left out of its structure.
 
@@ -115,20 +117,37 @@ async def take_in(
     Raises
     ------
     ApiError
-        422: it cannot be read or fitted; nothing is kept of it.
+        422: it cannot be read or fitted; 409: it is another participant's than `of` says. Nothing is kept of it.
     """
     whole = await asyncio.to_thread(_write, context, data, ".csv" if columns else _suffix(data))
     part = uploads.part_of(whole)
     try:
         assumed, data = await _with_our_columns(context, part, columns, data)
         found, warning = await _identified(context, code, part)
+        of = await asyncio.to_thread(_whose, context, code, who, found.get("of") or "", data, of)
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
     warnings = [note for note in (*assumed, *found["notes"], warning) if note]
-    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, by, warnings))
-    plain = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, by)
+    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, who.name, warnings, of))
+    plain = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, who.name)
     return row, await asyncio.shield(context.analyses.carried_structure.carry(plain, row.path)), warnings
+
+
+def _whose(context: Context, code: str, who: Principal, says: str, data: bytes, of: str) -> str:
+    """The other participant whose recording a person has decided to take in; empty: it is nobody else's.
+
+    Refuses what the file, or this database, says is another participant's, where nobody has decided that.
+    """
+    same = Recording.file_sha256 == hashlib.sha256(data).hexdigest()
+    own = says or next(iter(context.store.all(Recording.participant, same, order=Recording.created_utc)), code)
+    if own == code or (own == of and who.may(Scope.APPROVE_MODEL)):
+        return "" if own == code else own
+    detail = (
+        f"The file says that it is a recording of {own}, not of {code}. Nothing of it was kept. Who may approve models "
+        f"can take it for {code} all the same: send it again with of={own}."
+    )
+    raise ApiError(409, "other-participant", "This is another participant's recording", detail, of=own)
 
 
 async def _with_our_columns(
@@ -190,13 +209,20 @@ def _write(context: Context, data: bytes, suffix: str) -> Path:
     return path
 
 
-def _store(context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str]) -> Recording:
+def _store(
+    context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str], of: str
+) -> Recording:  # fmt: skip
     now = context.clock.utc()
     row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
     row.file_sha256 = hashlib.sha256(data).hexdigest()
     row.warnings = warnings
+    said = {"participant": code, "sha256": row.file_sha256, **({"of": of} if of else {})}
     with uploads.taken_in(path), context.store.write() as session:
+        seen.check(session, seen.participant(code))
+        participant = session.get(Participant, code)
+        assert participant is not None
+        row.site = list(site_of(participant))
         session.add(row)
         session.flush()
-        audit.write(session, now, by, "upload recording", row.id, participant=code, sha256=row.file_sha256)
+        audit.write(session, now, by, "upload recording", row.id, **said)
     return row

@@ -11,9 +11,9 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from api.errors import ApiError
 from api.sessions.requests import StopIn, TestIn
 from api.sessions.stop_log import StopResult
-from api.store import audit
-from api.web.browser_session import wants_html
+from api.store import audit, seen
 from api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
+from api.web.headers import wants_html
 from api.web.responses.base import answers
 from api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
 from api.web.stop_guard import Press
@@ -43,8 +43,9 @@ def rig_state(context: Context) -> dict[str, Any]:
 
 
 @router.get("/rig", **answers(RigOut))
-def rig(context: Ctx, _who: LiveReader) -> dict[str, Any]:
-    """State, devices, newest torque and its age."""
+def rig(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
+    """State, devices, newest torque and its age. `ETag` names the last stop: a re-arm says which one it answers."""
+    response.headers["ETag"] = f'"{context.rig.status.latch if context.rig.status else ""}"'
     return rig_state(context)
 
 
@@ -83,12 +84,24 @@ async def stop_on_page(request: Request, context: Context, press: Press) -> Resp
 async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
     """A person has looked and lets the rig work again."""
 
-    def note() -> None:
-        with context.store.write() as session:
-            audit.write(session, context.clock.utc(), by, "re-arm", "rig")
+    latch = seen.sent.get()
 
-    await asyncio.to_thread(note)
-    await context.rig.ask(RearmRequest(by=by))
+    def note(action: str, **detail: Any) -> None:
+        with context.store.write() as session:
+            audit.write(session, context.clock.utc(), by, action, "rig", **detail)
+
+    shown = context.rig.latches.get(latch)
+    await asyncio.to_thread(note, "re-arm", reason=shown and shown["detail"]["reason"])
+    try:
+        await context.rig.ask(RearmRequest(by=by, latch=latch))
+    except ApiError as error:
+        await asyncio.to_thread(note, "re-arm refused", why=error.detail)
+        if error.code != "rig-latch-changed":
+            raise
+        status = await context.rig.fresh_status()
+        told = seen.ChangedError([{"seen": shown, "now": context.rig.latches[status.latch]}], None)
+        told.extra["latch"] = status.latch
+        raise told from error
     await context.rig.fresh_status()
     return rig_state(context)
 

@@ -18,7 +18,7 @@ from api.people.auth import Principal, Scope
 from api.sessions import controller_trials
 from api.sessions.refusals import other_than
 from api.sessions.requests import TestIn
-from api.store import audit
+from api.store import audit, seen
 from api.store.holds import KEY_TURN
 from api.store.tables import Test
 from api.web import page_language
@@ -33,6 +33,7 @@ LOOK_S = 1.0
 """How often a live channel looks whether its session or token is still valid."""
 GOODBYE_S = 2.0
 """So long it waits for a client that reads nothing to hear why it is closed."""
+RAN_BY = "set who ran it"
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
 
 
@@ -60,8 +61,9 @@ def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str
 
 
 @router.get("/{test_id}", **answers(TestOut))
-def one_test(context: Ctx, _who: LiveReader, test_id: str) -> dict[str, Any]:
+def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
+    response.headers["ETag"] = context.store.seen(context.clock, seen.of(test_id, RAN_BY)).etag
     return context.runner.document(find(context, test_id))
 
 
@@ -77,8 +79,9 @@ def change_ran_by(context: Context, test_id: str, body: RanByIn, by: str) -> Tes
         row = session.get(Test, test_id)
         if row is None:
             raise NotFoundError("test", test_id, "GET /v1/tests lists them.")
+        seen.check(session, seen.of(test_id, RAN_BY))
         row.ran_by = other_than(row.requested_by, body.ran_by)
-        audit.write(session, context.clock.utc(), by, "set who ran it", test_id, ran_by=row.ran_by or row.requested_by)
+        audit.write(session, context.clock.utc(), by, RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
     return row
 
 

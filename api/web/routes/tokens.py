@@ -7,8 +7,8 @@ from typing import Any
 from fastapi import APIRouter
 
 from api.errors import ApiError, NotFoundError
+from api.outbox import receipts
 from api.people.auth import Scope
-from api.store import audit
 from api.store.tables import AuditEntry, Token
 from api.web.dependencies import PROBLEM, Administrator, Ctx
 from api.web.requests import TokenIn
@@ -52,5 +52,8 @@ def revoke_token(context: Ctx, who: Administrator, token_id: str) -> None:
 def trail(context: Ctx, _who: Administrator) -> dict[str, Any]:
     """The audit trail, and whether its chain holds."""
     entries = context.store.all(AuditEntry, order=AuditEntry.seq)
-    broken = audit.first_broken(entries)
-    return {"whole": broken is None, "first_broken": broken, "entries": [entry.as_dict() for entry in entries]}
+    stands = receipts.of_folder(entries, context.settings.data_dir)
+    return {
+        "whole": stands.first_broken is None and stands.missing_since is None, "first_broken": stands.first_broken,
+        "missing_since": stands.missing_since, "entries": [entry.as_dict() for entry in entries],
+    }  # fmt: skip

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import csv
-import io
-import re
 from typing import Any
 
 from fastapi import APIRouter
@@ -18,6 +15,7 @@ from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
 from api.web.responses.base import answers
 from api.web.responses.trend import TrendOut
 from api.web.routes import participants
+from identify.records.cells import lines
 
 router = APIRouter(prefix="/v1/participants/{code}", tags=["trend"], responses=PROBLEM)
 CSV: dict[int | str, dict[str, Any]] = {
@@ -30,10 +28,6 @@ HEAD = (
     "session_utc", "model_id", "recording_id", "approved", "approved_by", "approved_utc", "verdict", "method",
     "effects", "versions",
 )  # fmt: skip
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
-INNER_FORMULA = re.compile(r"([;,]\s*)([=+\-@])")
-"""A spreadsheet of another language separates at such a sign."""
-"""What a spreadsheet takes for the beginning of a formula."""
 
 
 async def sessions(context: Context, code: str) -> list[Session]:
@@ -81,12 +75,10 @@ def table(found: list[dict[str, Any]]) -> str:
     """The sessions as CSV."""
     units = {name: figure["unit"] for one in found for name, figure in one["figures"].items()}
     known = {name for one in found for name, figure in one["figures"].items() if figure["sd"] is not None}
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\r\n")
     head = list(HEAD)
     for name, unit in units.items():
         head += [f"{name} ({unit})", *([f"{name} sd ({unit})"] if name in known else [])]
-    rows.writerow([guarded(cell) for cell in (*head, "notes")])
+    rows = [[*head, "notes"]]
     for one in found:
         cells = [one["at_utc"], one["model_id"], one["recording_id"], "yes" if one["approved"] else "no",
                  one["approved_by"], one["approved_utc"], one["verdict"], one["method"], ", ".join(one["effects"]),
@@ -94,20 +86,10 @@ def table(found: list[dict[str, Any]]) -> str:
         for name in units:
             figure = one["figures"].get(name) or {}
             cells += [figure.get("value"), *([figure.get("sd")] if name in known else [])]
-        rows.writerow([guarded(cell) for cell in (*cells, notes(one["notes"]))])
-    return out.getvalue()
+        rows.append([*cells, notes(one["notes"])])
+    return "".join(lines(rows, end="\r\n"))
 
 
 def notes(found: list[dict[str, Any]]) -> str:
     """The notes of a session in one cell."""
     return " | ".join(f"{note['at_utc']} {note['by']}, {note['kind']}: {note['text']}" for note in found)
-
-
-def guarded(cell: Any) -> str:
-    """A cell's text; one that a spreadsheet would compute begins with an apostrophe, a number does not."""
-    if cell is None:
-        return ""
-    if isinstance(cell, int | float):
-        return f"{cell:.8g}" if isinstance(cell, float) else str(cell)
-    safe = INNER_FORMULA.sub(r"\1'\2", cell)
-    return f"'{safe}" if safe.startswith(FORMULA) else safe

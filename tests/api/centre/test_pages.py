@@ -60,7 +60,7 @@ POST   /rigs/x/revoke                             administrator  404
 POST   /warnings/1/acknowledge                    administrator  404
 GET    /v1/users                                  administrator  200
 POST   /v1/users                                  administrator  422
-PUT    /v1/users/x/password                       administrator  422
+PUT    /v1/users/x/password                       administrator  428
 DELETE /v1/users/x                                administrator  404
 GET    /v1/tokens                                 administrator  200
 POST   /v1/tokens                                 administrator  422
@@ -68,7 +68,7 @@ DELETE /v1/tokens/x                               administrator  404
 GET    /v1/audit                                  administrator  200
 GET    /administration                            administrator  200
 POST   /administration/users                      administrator  422
-POST   /administration/users/x/password           administrator  422
+POST   /administration/users/x/password           administrator  428
 POST   /administration/users/x/remove             administrator  404
 POST   /administration/keys                       administrator  422
 POST   /administration/tokens/x/revoke            administrator  404
@@ -76,6 +76,7 @@ GET    /administration/audit.jsonl                administrator  200
 POST   /v1/rig/hello                              rig            400
 POST   /v1/rig/items                              rig            400
 GET    /v1/rig/files                              rig            200
+GET    /v1/rig/heads                              rig            200
 PUT    /v1/rig/files/{zeros}                      rig            404
 """
 """Method, path, who may, and what they are answered, where nothing of the name x is there and no body is sent."""

@@ -166,3 +166,6 @@ def test_the_document_describes_every_route_of_rest(centre: Centre) -> None:
     put = document["paths"]["/v1/rig/files/{sha256}"]["put"]
     assert "application/octet-stream" in put["requestBody"]["content"] and "507" in put["responses"]
     assert "HTTPValidationError" not in json.dumps(document)
+    asking = [one for methods in document["paths"].values() for one in methods.values() if one.get("security")]
+    assert len(asking) > 20
+    assert all(set(one["responses"]["429"]["headers"]) == {"Retry-After"} for one in asking)

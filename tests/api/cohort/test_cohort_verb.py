@@ -21,8 +21,6 @@ import pytest
 from api import schemas
 from api.cli import main
 from api.cohort import cluster
-from api.cohort.cluster import Workers, connected
-from api.cohort.errors import CohortError
 from api.cohort.fields import FIELDS
 from tests.harness.cohort_records import cohort
 
@@ -287,10 +285,3 @@ def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
     said = [line for line in err.splitlines() if not line.startswith("dashboard")]
     assert run.returncode == 1 and len(said) == 1 and "the scheduler is gone" in said[0], err
     assert rows_in(tmp_path / "r.parquet.parts") >= 3
-
-
-def test_without_keys_no_scheduler_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "cryptography" else find(name))
-    with pytest.raises(CohortError, match="pip install cryptography"), connected(Workers(count=1)):
-        pass

@@ -1,0 +1,195 @@
+"""What was seen when somebody decided, and what has changed since: the one place where that is judged.
+
+Every change writes an entry into the audit trail, in its own transaction. So the number of the newest entry says all
+that a page or a document rested on, and a decision holds if the trail has no later entry about its subject. The number
+goes out as an entity tag (RFC 9110, section 8.8.3) and as a field of each form, and comes back with the decision
+(`If-Match`, section 13.1.1). `check` is called in the decision's own transaction, where nothing can come between.
+"""
+
+from __future__ import annotations
+
+import re
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, or_, select
+from sqlalchemy.orm import Session
+
+from api.errors import ApiError
+from api.store.tables import AuditEntry, Model
+
+About = ColumnElement[bool]
+"""Which entries of the trail a decision rests on."""
+SETTINGS = ("create participant", "set profile", "set muscle", "archive", "unarchive", "finish calibration")
+DECISIONS = ("approve", "reject")
+ACCOUNTS = ("add user", "change password", "revoke token")
+POSES = ("pose of the angle sensor", "calibrate the angle sensor")
+RIGHTS = (*DECISIONS, "revoke token")
+"""Entries with which a right ends that a controller plays by."""
+MOST_TOLD = 20
+"""Changes that are told, the newest."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A place in the trail, and the day: approvals and calibrations end with it.
+
+    Parameters
+    ----------
+    entry : int
+        Number of the newest entry at that time; 0: there was none.
+    mark : str
+        Begin of that entry's hash: a database that was restored has another one.
+    day : str
+        As 2026-11-26, where the service stands.
+    """
+
+    entry: int
+    mark: str
+    day: str
+
+    def __str__(self) -> str:
+        return f"{self.entry}.{self.mark}.{self.day}"
+
+    @property
+    def etag(self) -> str:
+        """As HTTP has it."""
+        return f'"{self}"'
+
+
+def read(text: str) -> Seen | None:
+    """What was sent back; None where it is none of ours."""
+    found = re.fullmatch(r"(\d{1,15})\.([0-9a-f]{8})\.(\d{4}-\d\d-\d\d)", text, re.ASCII)
+    return None if found is None else Seen(int(found[1]), found[2], found[3])
+
+
+shown: ContextVar[Seen | None] = ContextVar("shown", default=None)
+"""What who asks was shown, as the request says; None: its action needs none (docs/safety/decisions.toml)."""
+looked: ContextVar[Seen | None] = ContextVar("looked", default=None)
+"""The place when this request began to read what it shows: a page's forms carry it, and a question is bound to it."""
+sent: ContextVar[str] = ContextVar("sent", default="")
+"""The same as it came: of what the rig keeps, and of models, the version is another one."""
+
+
+def participant(code: str) -> About:
+    """Limits, site, archive and calibration of a participant."""
+    return and_(AuditEntry.subject == code, AuditEntry.action.in_(SETTINGS))
+
+
+def decisions(code: str) -> About:
+    """Approvals and rejections of a participant's models."""
+    models = select(Model.id).where(Model.participant == code)
+    return and_(AuditEntry.action.in_(DECISIONS), AuditEntry.subject.in_(models))
+
+
+def account(name: str) -> About:
+    """A person's, a program's or a controller's right to do anything."""
+    return and_(AuditEntry.subject == name, AuditEntry.action.in_(ACCOUNTS))
+
+
+def revoked(*token_hashes: str | None) -> About:
+    """The end of a token's right, or of that of who made it."""
+    ids = [token_hash[:16] for token_hash in token_hashes if token_hash]
+    return and_(AuditEntry.action == "revoke token", AuditEntry.detail["token"].as_string().in_(ids))
+
+
+def accounts() -> About:
+    """All of them."""
+    return AuditEntry.action.in_(ACCOUNTS)
+
+
+def of(subject: str, *actions: str) -> About:
+    """Some actions on one subject."""
+    return and_(AuditEntry.subject == subject, AuditEntry.action.in_(actions))
+
+
+def newest(session: Session, day: str, *about: About) -> Seen:
+    """The place of the newest entry about something; without `about`, of the whole trail."""
+    entries = select(AuditEntry.seq, AuditEntry.hash)
+    found = session.execute((entries.where(or_(*about)) if about else entries).order_by(AuditEntry.seq.desc())).first()
+    return Seen(found[0], found[1][:8], day) if found else Seen(0, "0" * 8, day)
+
+
+def since(session: Session, seen: Seen, *about: About) -> list[AuditEntry]:
+    """The entries about something that came after what was seen, the oldest first."""
+    later = select(AuditEntry).where(AuditEntry.seq > seen.entry, or_(*about))
+    return list(session.scalars(later.order_by(AuditEntry.seq)))
+
+
+def check(session: Session, *about: About) -> None:
+    """Refuse a decision on what has changed since it was shown. In the decision's own transaction.
+
+    Raises
+    ------
+    ChangedError
+        With each change: what, by whom, when, and what was there before.
+    """
+    seen = shown.get()
+    if seen is None:
+        return
+    known = seen.entry == 0 or session.scalar(
+        select(AuditEntry.seq).where(AuditEntry.seq == seen.entry, AuditEntry.hash.startswith(seen.mark))
+    )
+    if not known:
+        raise another_trail(seen)
+    if changed := since(session, seen, *about):
+        raise ChangedError([change(session, seen, entry) for entry in changed[-MOST_TOLD:]], seen)
+
+
+def change(session: Session, seen: Seen, entry: AuditEntry) -> dict[str, Any]:
+    """A change, beside what was there when the page was shown."""
+    before = select(AuditEntry).where(
+        AuditEntry.subject == entry.subject, AuditEntry.seq <= seen.entry, AuditEntry.action.in_(_alike(entry.action))
+    )
+    was = session.scalars(before.order_by(AuditEntry.seq.desc()).limit(1)).first()
+    return {"now": told(entry), "seen": None if was is None else told(was)}
+
+
+def _alike(action: str) -> tuple[str, ...]:
+    """Actions that set what this one has set."""
+    groups = (("create participant", "set profile", "finish calibration"), ("create participant", "set muscle"),
+              ("create participant", "archive", "unarchive"), DECISIONS, ACCOUNTS, POSES)  # fmt: skip
+    return next((group for group in groups if action in group), (action,))
+
+
+def told(entry: AuditEntry) -> dict[str, Any]:
+    """An entry, as a problem tells it."""
+    return {name: getattr(entry, name) for name in ("at_utc", "who", "action", "subject", "detail")}
+
+
+class ChangedError(ApiError):
+    """What a decision rests on has changed since it was shown.
+
+    Parameters
+    ----------
+    changes : list of dict
+        `seen` and `now`, each an entry of the trail or None.
+    seen : Seen or None
+        What was sent.
+    """
+
+    def __init__(self, changes: list[dict[str, Any]], seen: Seen | None, detail: str = "") -> None:
+        if changes:
+            last = changes[-1]["now"]
+            detail = (
+                f"{last['who']}: {last['action']} {last['subject']}, {last['at_utc']}. Nothing was done. "
+                "Look at what is there now; what you decide then is a new decision."
+            )
+        super().__init__(409, "changed-meanwhile", "This was changed since you saw it", detail, changes=changes)
+        self.extra["seen"] = None if seen is None else str(seen)
+
+
+def another_trail(seen: Seen | None) -> ChangedError:
+    """What was sent was seen before a backup was restored, or at another service."""
+    detail = "This page was shown by another database than the one of now. Nothing was done. Load the page again."
+    return ChangedError([], seen, detail)
+
+
+def another_day(seen: Seen) -> ChangedError:
+    """What was sent was seen before midnight."""
+    detail = (
+        f"This page is of {seen.day}. Approvals and calibrations end with their day. Nothing was done. Load the page "
+        "again."
+    )
+    return ChangedError([], seen, detail)

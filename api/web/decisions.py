@@ -1,0 +1,69 @@
+"""The one door of what people and programs decide: each decision says on which version it was made."""
+
+from __future__ import annotations
+
+import re
+
+from fastapi import Request
+
+from api import decisions
+from api.clock import local_day
+from api.decisions import MODEL_TAG, OF_RIG, Decision
+from api.errors import ApiError
+from api.store import seen
+from api.web.headers import entity_tags
+
+
+async def take(request: Request) -> None:
+    """Note what the request was decided on, for `api.store.seen.check`.
+
+    Raises
+    ------
+    ApiError
+        428: it does not say; 409: another day has begun since, or what it says is no version.
+    """
+    found = decisions.find(request.method, request.url.path)
+    if found is None:
+        return
+    decision, names = found
+    text = await _sent(request, decision)
+    if decision.field == "latch" and not request.app.state.context.rig.latch_known:
+        raise old_rig()
+    if not re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII):
+        raise missing(decision, names)
+    seen.sent.set(text)
+    place = seen.read(text)
+    if decision.field in OF_RIG or (decision.path == "/v1/tests" and len(text) == MODEL_TAG):
+        return
+    if place is None:
+        raise seen.another_trail(None)
+    if place.day != local_day(request.app.state.context.clock.utc()):
+        raise seen.another_day(place)
+    seen.shown.set(place)
+
+
+async def _sent(request: Request, decision: Decision) -> str:
+    """The version, as `If-Match` or the form's field has it."""
+    field = request.headers.get("if-match")
+    if field is not None:
+        tags = [tag.strip('"') for tag in entity_tags(field)]
+        return next((tag for tag in tags if seen.read(tag)), tags[0])
+    if "form" not in request.headers.get("content-type", ""):
+        return ""
+    return str((await request.form()).get(decision.field) or "")
+
+
+def old_rig() -> ApiError:
+    """409: the rig says nothing by which a stop could be named."""
+    detail = "Its program does not say which stop it stands at. Update and restart the rig's program; then re-arm."
+    return ApiError(409, "rig-outdated", "The rig's program is older than this service", detail)
+
+
+def missing(decision: Decision, names: dict[str, str]) -> ApiError:
+    """428: nobody says what this was decided on (RFC 6585, section 3)."""
+    document = decision.document.format(**{"code": "{code}", **names})
+    detail = (
+        f"Send the ETag of GET {document} as If-Match, as you last saw it. On a page: load it again and repeat what "
+        "you did. Nothing was done."
+    )
+    return ApiError(428, "seen-missing", "Say what this was decided on", detail)

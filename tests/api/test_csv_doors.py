@@ -1,0 +1,180 @@
+"""Every table that leaves: what begins like a formula is text in it, a number stays one, and we read back what it was.
+
+`DOORS` names each place in the code where lines of a table are made; one that is not among them fails here.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import identify
+from api.cli import main
+from api.cohort import bids, dictionary
+from api.models import inverted
+from api.web.routes import trend
+from api.workers import verbs
+from identify.records import cells, parts_csv
+from identify.records.record import Record, Source
+from tests.harness.cohort_records import Session, write
+
+ROOT = Path(__file__).parents[2]
+WRITES = re.compile(r'csv\.(?:Dict)?[wW]riter|savetxt|to_csv|write_csv|"(?:,|;|\\t|\|)"\.join|csv_stringify|text/csv')
+ONLY_NUMBERS = "numbers under a header of ours"
+DOORS: dict[str, tuple[int, str]] = {
+    "identify/records/cells.py": (1, "the writer itself"),
+    "identify/records/parts_csv.py": (3, "test_a_joined_record"),
+    "api/workers/verbs.py": (2, "test_a_recording"),
+    "api/web/routes/trend.py": (2, "test_a_trend"),
+    "api/web/routes/recordings.py": (4, "names the kind of what api/workers/verbs.py wrote, and of files as they came"),
+    "api/web/pages/widths_view.py": (1, "names the kind of what api/models/inverted.py wrote"),
+    "api/cohort/bids.py": (3, "test_an_export"),
+    "api/models/inverted.py": (1, ONLY_NUMBERS),
+    "api/cli/commands/predict.py": (2, ONLY_NUMBERS),
+    "api/models/analyses.py": (1, "no table: names of effects in the database"),
+    "api/models/carried_structure.py": (1, "no table: names of effects in the database"),
+    "bench/diagnosis.py": (1, "no table: the default of an option"),
+    "bench/goals.py": (1, "a made-up record for a bench: segments of ours"),
+    "bench/hidden_moving_played.py": (2, "a made-up record for a bench: segments of ours"),
+    "bench/pictures.py": (2, "a made-up record for a bench: segments of ours"),
+    "hardware_sim/hidden_records.py": (4, "a made-up record for a bench: segments of ours"),
+}
+"""How often each file writes, and which test here plays a hostile text through it, or why none can get there."""
+HOSTILE = ("=HYPERLINK(1)", "+1+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\uff1d1", "a;=1", "'=1")
+
+
+def test_every_door_is_known() -> None:
+    files = [p for room in ("api", "stimrig", "identify", "bench", "examples", "hardware_sim", "deploy", "rig")
+             for kind in ("py", "js") for p in (ROOT / room).rglob(f"*.{kind}")]  # fmt: skip
+    found = {str(p.relative_to(ROOT)): len(WRITES.findall(p.read_text())) for p in files}
+    assert {name: count for name, count in found.items() if count} == {name: n for name, (n, _) in DOORS.items()}
+    tests = [why for _, why in DOORS.values() if why.startswith("test_")]
+    assert all(any(name.startswith(why) for name in globals()) for why in tests)
+
+
+@given(st.text("=+-@\t\r\n'\uff1d;, a"))
+def test_a_text_is_told_as_text_and_read_back(text: str) -> None:
+    assert cells.as_written(cells.told(text)) == text
+    assert not runs(cells.told(text))
+
+
+@pytest.mark.parametrize("text", [*HOSTILE[:5], "\t=1", "\r=1"])
+def test_a_cell_that_begins_like_a_formula_is_text(text: str) -> None:
+    assert cells.cell(text) == f"'{text}"
+    assert cells.cell("a;" + text.strip()) == f"a;'{text.strip()}", "a German spreadsheet separates at ;"
+
+
+def test_a_number_stays_a_number() -> None:
+    assert [cells.cell(value) for value in (-1.5, -2, 1e-7, None, "no-formula=")] == [
+        "-1.5", "-2", "1e-07", "", "no-formula="
+    ]  # fmt: skip
+
+
+def test_a_joined_record(tmp_path: Path) -> None:
+    record = named()
+    parts_csv.write(record, tmp_path / "joined.csv")
+    assert texts_of(tmp_path / "joined.csv", "segment", "name") >= {cells.told(text) for text in HOSTILE}
+    back = identify.read(tmp_path / "joined.csv")
+    assert back.segment_names == record.segment_names
+    assert np.array_equal(back.torque_nm, record.torque_nm), "negative ones, too"
+
+
+def test_a_recording(tmp_path: Path) -> None:
+    """Somebody's own file goes in with formulas; what is handed out has none, and is read as the same segments."""
+    rows = (f"{k / 100:.2f},{k % 7},{-k / 1000},{HOSTILE[k // 40]}\n" for k in range(40 * len(HOSTILE)))
+    (tmp_path / "in.csv").write_text("time_s,pulse_width_us,torque_nm,segment\n" + "".join(rows))
+    verbs.export_csv(str(tmp_path / "in.csv"), lambda *_: None, str(tmp_path / "out.csv"))
+    texts_of(tmp_path / "out.csv", "segment")
+    given, back = identify.read(tmp_path / "in.csv"), identify.read(tmp_path / "out.csv")
+    assert back.segment_names == given.segment_names
+    assert np.array_equal(back.torque_nm, given.torque_nm)
+
+
+def test_a_trend() -> None:
+    for text in HOSTILE:
+        note = {"at_utc": text, "by": text, "kind": text, "text": text}
+        figure = {"unit": text, "value": -1.5, "sd": None}
+        session: dict[str, Any] = {
+            "at_utc": "2026-01-05T09:00:00Z", "approved": True, "effects": [text], "figures": {text: figure},
+            "notes": [note], **dict.fromkeys(("model_id", "recording_id", "approved_by", "approved_utc"), text),
+            **dict.fromkeys(("verdict", "method", "versions"), text),
+        }  # fmt: skip
+        head, row = csv.reader(trend.table([session]).splitlines())
+        assert not any(map(runs, head)) and {cell for cell in row if runs(cell)} == {"-1.5"}
+
+
+def test_an_export(tmp_path: Path) -> None:
+    """BIDS, the list of what could not be exported, and the dictionary."""
+    data = tmp_path / "data"
+    data.mkdir()
+    for number, text in enumerate(HOSTILE):
+        write(data / f"{number}.h5", Session(f"{text}{number}", seed=number, kind=text))
+    (data / "=broken.csv").write_text("a,b\n=1,2\n")
+    assert main.run(["export", str(data), "--bids", str(tmp_path / "out"), "--json"]) == 0
+    tables = sorted((tmp_path / "out").rglob("*.tsv"))
+    assert len(tables) > len(HOSTILE)
+    for path in tables:
+        texts_of(path)
+    codes = texts_of(tmp_path / "out" / "participants.tsv", "code")
+    assert codes == {cells.told(f"{text}{number}") for number, text in enumerate(HOSTILE)}
+    for path in (tmp_path / "out").rglob("*.tsv.gz"):
+        assert all(is_number(cell) for cell in re.split(r"[\t\n]", gzip.decompress(path.read_bytes()).decode()[:-1]))
+    assert "broken" in " ".join(texts_of(tmp_path / "out" / "errors.csv", "address"))
+    (tmp_path / "errors.csv").write_text("".join(cells.lines([("address", "kind", "reason"), ("=a", "+b", "-c")])))
+    assert texts_of(tmp_path / "errors.csv", "address", "kind", "reason") == {"'=a", "'+b", "'-c"}
+    (tmp_path / "dictionary.csv").write_text(dictionary.as_csv())
+    texts_of(tmp_path / "dictionary.csv")
+    assert list(bids.tsv(["=a"], [{"=a": -1.5}, {"=a": "-x"}]))[1:] == ["-1.5\n", "'-x\n"]
+
+
+def test_numbers_only() -> None:
+    widths = {"pulse_rate_hz": 40.0, **{name: [-0.5, 1.0] for name in inverted.COLUMNS}}
+    assert all(is_number(cell) for row in inverted.table(widths).split()[1:] for cell in row.split(","))
+
+
+def named() -> Record:
+    """A record of two parts whose segments, file and id are hostile."""
+    count = 40 * len(HOSTILE)
+    time_s = np.arange(count) / 100
+    segment = np.repeat(HOSTILE, 40)
+
+    def one(number: int) -> Record:
+        source = Source(HOSTILE[number], f"@{number}", f"{number}" * 64)
+        width_us = np.where(np.arange(count) % 50 < 25, 100.0 + number, 0.0)
+        return Record.from_arrays(time_s, width_us, -time_s - number, segment, source=source)
+
+    from identify.records.join import join
+
+    joined = [join([one(a), one(b)], [0.0, 100.0]) for a, b in ((0, 1), (2, 3), (4, 5))]
+    return join([*joined, one(6)], [0.0, 500.0, 1000.0, 1500.0])
+
+
+def texts_of(path: Path, *columns: str) -> set[str]:
+    """The cells of some columns; no text in the whole table may run."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file, delimiter="\t" if path.suffix == ".tsv" else ","))
+    assert rows
+    assert not [cell for row in rows for pair in row.items() for cell in pair if runs(cell) and not is_number(cell)]
+    return {row[column] for row in rows for column in columns}
+
+
+def runs(cell: str) -> bool:
+    """Whether a spreadsheet computes a cell, also one that separates at a semicolon."""
+    parts = (part.lstrip(" ") for part in re.split("[;,]", cell))
+    return any(part.startswith(tuple("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")) for part in parts)
+
+
+def is_number(cell: str) -> bool:
+    try:
+        float(cell.replace("n/a", "nan"))
+    except ValueError:
+        return False
+    return True
