@@ -40,7 +40,7 @@ def widths(service: Service) -> list[float]:
 
 def settled(page: Any, trains: int) -> None:
     """Wait until the page knows of so many trains and takes the next press."""
-    expected(page.locator("[name=calibration]").first).to_have_value(re.compile(rf"\.{trains}$"))
+    expected(page.locator("[name=calibration]").first).to_have_value(re.compile(rf"\.{trains}\."))
     expected(page.locator("#step-repeat" if trains else "#step-up")).to_be_enabled()
 
 
