@@ -29,13 +29,10 @@ SENTENCES = (
     "identify/estimation/effect_fit.py", "identify/estimation/pilot.py", "identify/methods/**/*.py",
     "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/adapters/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py",
-    "rig/journal.py",
-    "rig/intended.py", "rig/limits.py", "rig/pieces.py", "rig/plan.py", "rig/protocols/*.py", "rig/score.py",
-    "rig/sequences/*.py", "rig/trial.py", "api/models/*.py", "api/people/*.py", "api/store/seen.py",
-    "api/sessions/*.py",
-    "api/web/*.py",
-    "api/web/routes/*.py", "api/web/pages/*.py", "api/workers/*.py", "api/errors.py",
-    "api/centre/handed_out.py", "api/centre/rigs.py", "api/centre/routes/participants.py",
+    "rig/intended.py", "rig/journal.py", "rig/limits.py", "rig/pieces.py", "rig/plan.py", "rig/protocols/*.py",
+    "rig/score.py", "rig/sequences/*.py", "rig/trial.py", "api/models/*.py", "api/people/*.py", "api/sessions/*.py",
+    "api/store/seen.py", "api/web/*.py", "api/web/routes/*.py", "api/web/pages/*.py", "api/workers/*.py",
+    "api/errors.py", "api/centre/handed_out.py", "api/centre/rigs.py", "api/centre/routes/participants.py",
 )  # fmt: skip
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {

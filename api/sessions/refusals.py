@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from api.errors import ApiError
 from api.people import names
+from api.sessions.trials import SEQUENCE
 from api.store import seen
 from api.store.tables import AuditEntry, Participant
 
@@ -26,8 +27,6 @@ class Current:
     """Its end has been heard."""
     tokens: list[str] = field(default_factory=list)
     """Hashes of the tokens by whose right it is played."""
-    rests_on: tuple[seen.About, ...] = ()
-    """Entries of the audit trail with which it would not have been begun."""
     since: seen.Seen | None = None
     """The trail's place at its intent, or at the last change that was found; None: not written yet."""
     overtaken: list[AuditEntry] = field(default_factory=list)
@@ -37,6 +36,17 @@ class Current:
     """How often in a row the rig, asked for its state, did not name it."""
     let_go: asyncio.Event = field(default_factory=asyncio.Event)
     """The rig is free of it."""
+
+    @property
+    def rests_on(self) -> tuple[seen.About, ...]:
+        """Entries of the audit trail with which it would not have been begun."""
+        return rests_of(self.participant, self.kind, self.tokens)
+
+
+def rests_of(participant: str, kind: str, tokens: list[str]) -> tuple[seen.About, ...]:
+    """Entries of the trail with which a test would not be begun; a controller's trial rests on the models, too."""
+    models = (seen.decisions(participant),) if kind == SEQUENCE else ()
+    return (seen.participant(participant), seen.revoked(*tokens), *models)
 
 
 def other_than(asker: str, ran_by: str | None) -> str | None:

@@ -68,7 +68,7 @@ class RigClient:
         self.poll_listeners: list[Callable[[Status], None]] = []
         self._heard_s: float | None = None
         self._numbers = itertools.count(1)
-        self._waiting: dict[int, asyncio.Future[Reply]] = {}
+        self._waiting: dict[int, tuple[Any, asyncio.Future[Reply]]] = {}
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -123,7 +123,7 @@ class RigClient:
             return await self._request_apart(message, timeout_s)
         message = message.model_copy(update={"id": next(self._numbers)})
         future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        self._waiting[message.id] = future
+        self._waiting[message.id] = message, future
         try:
             self._writer.write(line_of(message))
             async with asyncio.timeout(timeout_s):  # not wait_for: in Python 3.11 it may lose a cancellation
@@ -152,9 +152,9 @@ class RigClient:
             raise no_rig("It closed the connection, or sent something that is no answer.") from error
 
     async def fresh_status(self) -> Status:
-        """Ask for the state now."""
-        self.status = status = await self.ask_for(Status, StatusRequest())
-        return status
+        """Ask for the state now; the newest that was told, which may have come behind the answer."""
+        answer = await self.ask_for(Status, StatusRequest())
+        return self.status or answer
 
     async def _request_apart(self, message: Any, timeout_s: float) -> Reply:
         """Ask on a connection of its own; a stop at the rig's own door for stops, which nothing else can fill."""
@@ -167,7 +167,9 @@ class RigClient:
                 try:
                     writer.write(request)
                     line = await reader.readline()
-                    return Reply.model_validate_json(line)
+                    reply = Reply.model_validate_json(line)
+                    self._take_state(message, reply)
+                    return reply
                 finally:
                     writer.close()
         except ValueError as error:  # no answer at all, another's words, or a line without an end
@@ -192,7 +194,7 @@ class RigClient:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-        for future in self._waiting.values():
+        for _, future in self._waiting.values():
             if not future.done():
                 future.set_exception(no_rig("The connection to the rig broke."))
         if self.connected:
@@ -245,9 +247,16 @@ class RigClient:
             self.status = Status.model_validate(reply.body)
             self.connected = True
             self._tell_link()
-        future = self._waiting.get(reply.id)
+        asked, future = self._waiting.get(reply.id, (None, None))
+        self._take_state(asked, reply)
         if future is not None and not future.done():
             future.set_result(reply)
+
+    def _take_state(self, asked: Any, reply: Reply) -> None:
+        """Keep a state as it is read: who asked for it may come to it after a later one."""
+        if isinstance(asked, StatusRequest) and reply.ok:
+            with contextlib.suppress(ValidationError):  # `ask_for` says it
+                self.status = Status.model_validate(reply.body)
 
 
 async def _opened(path: Path, stops: bool) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:

@@ -30,7 +30,7 @@ from api.sessions.lifecycle import Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
 from api.sessions.planned import Planned
-from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived
+from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived, rests_of
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
 from api.sessions.trials import SEQUENCE, Trials
@@ -71,16 +71,8 @@ MISSED_POLLS = 3
 NOTE_S = 0.3
 """So long the answer to a stop waits for its entry in the audit trail; the entry is made all the same."""
 EMERGENCY = "Use the stimulator's own emergency switch now."
-
-
 LOOK_AGAIN_S = 0.25
 """How often it is looked whether a test may still be played: another service's changes are seen so late at most."""
-
-
-def rests_of(participant: str, kind: str, tokens: list[str]) -> tuple[seen.About, ...]:
-    """Entries of the trail with which a test would not be begun; a controller's trial rests on the models, too."""
-    models = (seen.decisions(participant),) if kind == SEQUENCE else ()
-    return (seen.participant(participant), seen.revoked(*tokens), *models)
 
 
 def same(confirmed: dict[str, Any], preview: dict[str, Any]) -> bool:
@@ -198,15 +190,14 @@ class Runner:
         plan = planned.plan
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
-        how: dict[str, Any] = {"tokens": tokens, "rests_on": rests_on}
-        current = self.current = Current(plan.test_id, plan.participant, by, plan.kind, **how)
+        current = self.current = Current(plan.test_id, plan.participant, by, plan.kind, tokens=tokens)
         current_test.set(plan.test_id)
         self.pool.cancel_background()
         try:
             preview = await self._previewed(plan)
             if confirmed is not None and not same(confirmed, preview):
                 raise not_what_was_seen()
-            row = await asyncio.to_thread(self._write_intent, planned, preview, by, body, participant)
+            row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant)
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
@@ -226,10 +217,8 @@ class Runner:
         try:
             async with self.follower.holds.turn(LIMITS_TURN):
                 if changed := current.overtaken or await asyncio.to_thread(self._overtaking, current):
-                    raise seen.ChangedError([{"now": seen.told(entry), "seen": None} for entry in changed], None)
-                self._refuse_overtaken(
-                    asked_s.get(self.clock.monotonic_s())
-                )  # nothing is waited for between this and the command
+                    raise seen.overtaken(changed)
+                self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.adaptive.begin(planned) or self.joint.begin(planned)
                 await self.rig.ask(StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
@@ -285,7 +274,7 @@ class Runner:
                 log.error("%s could not be withdrawn: %s", current.test_id, error)
                 await self._stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
             else:
-                current.since = seen.Seen(last.seq, last.hash[:8], "")
+                current.since = seen.at(last, "")
 
     def _tokens(self, holder: str) -> list[str]:
         """Hashes of the tokens by whose right a test is played: the asker's, and that of who made a key."""
@@ -345,25 +334,21 @@ class Runner:
         return f"T{stamp}-{secrets.token_hex(3)}"
 
     def _write_intent(
-        self, planned: Planned, preview: dict[str, Any], by: str, body: TestIn, participant: Participant
+        self, planned: Planned, preview: dict[str, Any], current: Current, body: TestIn, participant: Participant
     ) -> Test:
-        now, plan = self.clock.utc(), planned.plan
+        now, plan, by = self.clock.utc(), planned.plan, current.by
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
         kept: dict[str, Any] = {
             "joins": body.joins,
             **dict(zip(("side", "muscle", "placement"), site_of(participant), strict=True)),
+            "tokens": current.tokens,
+            **planned.kept(),
+            **self.trials.kept(body, len(preview["pulse_width_us"])),
         }
-        kept |= (
-            {"tokens": self.current.tokens if self.current else []}
-            | planned.kept()
-            | self.trials.kept(body, len(preview["pulse_width_us"]))
-        )
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         self.follower.mark(row)
         dose = {name: preview.get(name) for name in ("duration_s", "charge_uc", "torque_time_nms")}
-        current = self.current
-        assert current is not None
         with self.store.write() as session:
             seen.check(session, *current.rests_on)
             session.add(row)
@@ -545,8 +530,7 @@ class Runner:
                 and status.state not in ("ready", "latched", "uncertain")
             ):
                 tokens = row.plan.get("tokens") or []
-                how: dict[str, Any] = {"tokens": tokens, "rests_on": rests_of(row.participant, row.kind, tokens)}
-                self.current = Current(row.id, row.participant, row.requested_by, row.kind, started=True, **how)
+                self.current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
                 self.hub.begin(row.id)
                 self._keep(self._look_from_its_intent(self.current))
             else:

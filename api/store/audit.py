@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from api.store import seen
@@ -27,7 +26,7 @@ def write(session: Session, at_utc: str, who: str, action: str, subject: str, **
     """
     if tag := seen.sent.get():
         detail["seen"] = tag
-    last = session.scalars(select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)).first()
+    last = seen.last(session)
     fields = {
         "seq": last.seq + 1 if last else 1,
         "at_utc": at_utc,
@@ -50,9 +49,3 @@ def first_broken(entries: list[AuditEntry]) -> int | None:
             return entry.seq
         previous = entry.hash
     return None
-
-
-def newest(session: Session, subject: str, *actions: str) -> AuditEntry | None:
-    """The last entry about a subject among some actions: who did that, and when."""
-    of = select(AuditEntry).where(AuditEntry.subject == subject, AuditEntry.action.in_(actions))
-    return session.scalars(of.order_by(AuditEntry.seq.desc()).limit(1)).first()

@@ -104,11 +104,21 @@ def of(subject: str, *actions: str) -> About:
     return and_(AuditEntry.subject == subject, AuditEntry.action.in_(actions))
 
 
+def last(session: Session, *about: About) -> AuditEntry | None:
+    """The newest entry about something; without `about`, of the whole trail."""
+    entries = select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)
+    return session.scalars(entries.where(or_(*about)) if about else entries).first()
+
+
 def newest(session: Session, day: str, *about: About) -> Seen:
-    """The place of the newest entry about something; without `about`, of the whole trail."""
-    entries = select(AuditEntry.seq, AuditEntry.hash)
-    found = session.execute((entries.where(or_(*about)) if about else entries).order_by(AuditEntry.seq.desc())).first()
-    return Seen(found[0], found[1][:8], day) if found else Seen(0, "0" * 8, day)
+    """The place of that entry."""
+    found = last(session, *about)
+    return Seen(0, "0" * 8, day) if found is None else at(found, day)
+
+
+def at(entry: AuditEntry, day: str) -> Seen:
+    """An entry's place."""
+    return Seen(entry.seq, entry.hash[:8], day)
 
 
 def since(session: Session, seen: Seen, *about: About) -> list[AuditEntry]:
@@ -139,10 +149,7 @@ def check(session: Session, *about: About) -> None:
 
 def change(session: Session, seen: Seen, entry: AuditEntry) -> dict[str, Any]:
     """A change, beside what was there when the page was shown."""
-    before = select(AuditEntry).where(
-        AuditEntry.subject == entry.subject, AuditEntry.seq <= seen.entry, AuditEntry.action.in_(_alike(entry.action))
-    )
-    was = session.scalars(before.order_by(AuditEntry.seq.desc()).limit(1)).first()
+    was = last(session, and_(of(entry.subject, *_alike(entry.action)), AuditEntry.seq <= seen.entry))
     return {"now": told(entry), "seen": None if was is None else told(was)}
 
 
@@ -178,6 +185,11 @@ class ChangedError(ApiError):
             )
         super().__init__(409, "changed-meanwhile", "This was changed since you saw it", detail, changes=changes)
         self.extra["seen"] = None if seen is None else str(seen)
+
+
+def overtaken(changed: list[AuditEntry]) -> ChangedError:
+    """What a decision rests on was changed while it was carried out: nobody was shown a page between."""
+    return ChangedError([{"now": told(entry), "seen": None} for entry in changed], None)
 
 
 def another_trail(seen: Seen | None) -> ChangedError:

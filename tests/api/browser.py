@@ -68,7 +68,8 @@ def bring_to_rest(service: Service) -> None:
         while (rig := http.get("/v1/rig").json())["holder"] or service.rig.state == "running":
             assert time.monotonic() < end, (stopped.text, rig, http.get("/v1/tests").json()[:2], service.rig.status())
             time.sleep(0.05)
-        assert http.post("/v1/rearm").status_code == 200
+        rearmed = http.post("/v1/rearm")
+        assert rearmed.status_code == 200, rearmed.text
 
 
 def enter(page: Any, service: Service, name: str = NAME, password: str = PASSWORD) -> None:

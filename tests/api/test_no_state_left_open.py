@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import threading
 import time
@@ -21,7 +22,7 @@ from api.sessions.rig_client import RigClient
 from api.store import Store
 from api.store.holds import Alone
 from api.store.tables import Model, Participant, Recording, Test
-from rig.messages import StartRequest
+from rig.messages import Reply, StartRequest, StateEvent, Status
 from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
 
@@ -246,3 +247,28 @@ def test_a_failure_in_a_poll_does_not_end_the_polling(client: httpx.Client, serv
     rig.poll_listeners.insert(0, always)
     soon(lambda: len(calls) >= 2, 20)
     assert client.get("/v1/rig").json()["connected"]
+
+
+def test_a_stop_told_behind_an_answer_outlasts_that_answer(short_dir: Path) -> None:
+    """Both came while this process stood still: the state of before is not kept over the stop's."""
+    ready, stopped = Status(state="ready", latch="1"), Status(state="latched", reason="pain", latch="2")
+
+    async def rig(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        for kind, more in (("subscribe", ""), ("status", StateEvent(status=stopped).model_dump_json() + "\n")):
+            asked = json.loads(await reader.readline())
+            assert asked["kind"] == kind
+            reply = Reply(id=asked["id"], ok=True, body=ready.model_dump())
+            writer.write((reply.model_dump_json() + "\n" + more).encode())
+        await reader.read()
+        writer.close()
+
+    async def ask() -> None:
+        async with await asyncio.start_unix_server(rig, str(short_dir / "rig")):
+            link = RigClient(short_dir / "rig", Clock())
+            link.start()
+            while not link.connected:
+                await asyncio.sleep(0.01)
+            assert await link.fresh_status() == link.status == stopped
+            await link.close()
+
+    asyncio.run(ask())

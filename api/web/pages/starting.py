@@ -15,7 +15,7 @@ from api.sessions import profiles
 from api.sessions.questions import Question, Row
 from api.sessions.refusals import other_than, refuse_archived
 from api.sessions.requests import TestIn
-from api.store import audit
+from api.store import seen
 from api.store.tables import Participant
 from api.web.dependencies import Context
 from api.web.pages import joint_words
@@ -41,7 +41,7 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
         required = bool(context.rig.status and context.rig.status.require_calibration)
         return Calibrated(state, _("not calibrated"), not required)
     with context.store.read() as session:
-        entry = audit.newest(session, row.code, "finish calibration")
+        entry = seen.last(session, seen.of(row.code, "finish calibration"))
     said = {"time": when(row.profile.get("set_at_utc")), "end": until(row.profile.get("expires_at_utc"))}
     said["name"] = entry.who if entry else "–"
     if state == "expired":

@@ -23,10 +23,7 @@ class ProfileOut(Document):
     expires_at_utc: str | None = Field(None, description="when the calibration expires: the end of its day")
     rest_between_tests_s: float | None = Field(None, description="shortest rest between two tests, s")
     angle_range_rad: list[float] | None = Field(None, description="joint angles that are comfortable today, rad")
-    angle_set_at_utc: str | None = Field(
-        None,
-        description="calibration of the angle sensor under which that range was said",
-    )
+    angle_set_at_utc: str | None = Field(None, description="of the angle sensor: its calibration when that was said")
 
 
 class ParticipantOut(Document):

@@ -236,7 +236,7 @@ def _store(
             if any(entry.detail.get("calibration") == identity for entry in changed):
                 return dict(row.profile)
             if changed:
-                raise seen.ChangedError([{"now": seen.told(entry), "seen": None} for entry in changed], None)
+                raise seen.overtaken(changed)
             kept = {name: value for name, value in row.profile.items() if found.get(name) is None}
             found = row.profile = {**found, **kept}
         action, said = "finish calibration" if found else "discard calibration", {"calibration": identity}
