@@ -251,7 +251,8 @@ def test_a_failure_in_a_poll_does_not_end_the_polling(client: httpx.Client, serv
 
 def test_a_stop_told_behind_an_answer_outlasts_that_answer(short_dir: Path) -> None:
     """Both came while this process stood still: the state of before is not kept over the stop's."""
-    ready, stopped = Status(state="ready", latch="1"), Status(state="latched", reason="pain", latch="2")
+    ready = Status.model_validate({"state": "ready", "latch": "1"})
+    stopped = Status.model_validate({"state": "latched", "reason": "pain", "latch": "2"})
 
     async def rig(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         for kind, more in (("subscribe", ""), ("status", StateEvent(status=stopped).model_dump_json() + "\n")):
