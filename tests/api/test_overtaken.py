@@ -196,6 +196,23 @@ def test_another_service_that_changes_something_is_heard_within_the_bound(
     assert runner.LOOK_AGAIN_S <= 0.25
 
 
+def test_a_trial_that_outlives_its_service_ends_with_the_right_that_was_revoked_meanwhile(
+    service: Service, client: httpx.Client, participant: str, approved: str
+) -> None:
+    """The service is killed in a trial, and its key is revoked by another one before it is there again."""
+    key, controller = key_of(service, client, participant)
+    service.rig.speed = 0.1
+    test = controller.post("/v1/tests", json={"participant": participant, **TRIAL}).json()
+    context = service.app.state.context
+    soon(lambda: context.rig.status.test_id == test["id"])
+    context.runner.current = None
+    context.runner.lifecycle.update(test["id"], followed_by="dead")
+    assert context.auth.revoke(key, "somebody elsewhere")
+    asyncio.run_coroutine_threadsafe(context.runner.resume(), context.rig._task.get_loop()).result(30)
+    told = soon(lambda: service.rig.withdrawn)
+    assert (told[0].test_id, told[0].begun) == (test["id"], True)
+
+
 def test_a_rearm_that_a_stop_overtakes_is_not_done(service: Service, client: httpx.Client) -> None:
     """The re-arm waits while the database is busy; a stop is pressed and confirmed; then the re-arm arrives."""
     assert client.post("/v1/stop", json={"reason": "first"}).is_success
@@ -208,7 +225,8 @@ def test_a_rearm_that_a_stop_overtakes_is_not_done(service: Service, client: htt
         answer = asked.result()
     assert answer.status_code == 409 and service.rig.state == "latched"
     changed = answer.json()["changes"][0]
-    assert changed["seen"]["detail"]["reason"] != changed["now"]["detail"]["reason"] or changed["seen"] is not None
+    assert changed["seen"]["detail"]["state"] == changed["now"]["detail"]["state"] == "latched"
+    assert answer.json()["latch"] == service.rig.latch != seen.strip('"')
 
 
 # ---- a site, another's recording, a result that could not be stored -------------------------------------------------
