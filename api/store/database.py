@@ -85,6 +85,10 @@ class Store:
         with self.read() as session:
             return newest(session, local_day(clock.utc()), *about)
 
+    def etag(self, clock: Clock, document: str, *about: About) -> str:
+        """The same, as HTTP has it for the document at this path."""
+        return self.seen(clock, *about).etag(document)
+
     def refuse_changed(self, *about: About) -> None:
         """Refuse to ask a question about what has changed since the page was shown. Raises ChangedError."""
         with self.read() as session:

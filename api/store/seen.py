@@ -8,6 +8,7 @@ goes out as an entity tag (RFC 9110, section 8.8.3) and as a field of each form,
 
 from __future__ import annotations
 
+import hashlib
 import re
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -52,16 +53,22 @@ class Seen:
     def __str__(self) -> str:
         return f"{self.entry}.{self.mark}.{self.day}"
 
-    @property
-    def etag(self) -> str:
-        """As HTTP has it."""
-        return f'"{self}"'
+    def etag(self, document: str) -> str:
+        """As HTTP has it, for the document at this path: the version of another one says nothing about it."""
+        return f'"{self}.{mark_of(document)}"'
 
 
-def read(text: str) -> Seen | None:
-    """What was sent back; None where it is none of ours."""
-    found = re.fullmatch(r"(\d{1,15})\.([0-9a-f]{8})\.(\d{4}-\d\d-\d\d)", text, re.ASCII)
-    return None if found is None else Seen(int(found[1]), found[2], found[3])
+def mark_of(document: str) -> str:
+    """What the versions of a document end in."""
+    return hashlib.sha256(document.encode()).hexdigest()[:8]
+
+
+def read(text: str, document: str) -> Seen | None:
+    """What was sent back, by a page or as a document's version; None where it is none, or of another document."""
+    found = re.fullmatch(r"(\d{1,15})\.([0-9a-f]{8})\.(\d{4}-\d\d-\d\d)(?:\.([0-9a-f]{8}))?", text, re.ASCII)
+    if found is None or found[4] not in (None, mark_of(document)):
+        return None
+    return Seen(int(found[1]), found[2], found[3])
 
 
 shown: ContextVar[Seen | None] = ContextVar("shown", default=None)
@@ -192,7 +199,14 @@ def overtaken(changed: list[AuditEntry]) -> ChangedError:
     return ChangedError([{"now": told(entry), "seen": None} for entry in changed], None)
 
 
-def another_trail(seen: Seen | None) -> ChangedError:
+def another_document(document: str) -> ChangedError:
+    """What was sent is the version of something else, or of nothing."""
+    return ChangedError(
+        [], None, f"This is no version of {document}. Send the ETag of GET {document}. Nothing was done."
+    )
+
+
+def another_trail(seen: Seen) -> ChangedError:
     """What was sent was seen before a backup was restored, or at another service."""
     detail = "This page was shown by another database than the one of now. Nothing was done. Load the page again."
     return ChangedError([], seen, detail)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+from contextlib import suppress
 
 from fastapi import Request
 
@@ -26,28 +28,39 @@ async def take(request: Request) -> None:
     if found is None:
         return
     decision, names = found
-    text = await _sent(request, decision)
+    document = decision.document.format(**{**await _names(request, decision), **names})
+    text = await _sent(request, decision, document)
     if decision.field == "latch" and not request.app.state.context.rig.latch_known:
         raise old_rig()
     if not re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII):
-        raise missing(decision, names)
+        raise missing(document)
     seen.sent.set(text)
-    place = seen.read(text)
+    place = seen.read(text, document)
     if decision.field in OF_RIG or (decision.path == "/v1/tests" and len(text) == MODEL_TAG):
         return
     if place is None:
-        raise seen.another_trail(None)
+        raise seen.another_document(document)
     if place.day != local_day(request.app.state.context.clock.utc()):
         raise seen.another_day(place)
     seen.shown.set(place)
 
 
-async def _sent(request: Request, decision: Decision) -> str:
-    """The version, as `If-Match` or the form's field has it."""
+async def _names(request: Request, decision: Decision) -> dict[str, str]:
+    """What a request's body names of the document: a test's participant."""
+    code = "{code}"
+    if decision.path == "/v1/tests" and request.url.path == decision.path:
+        with suppress(ValueError, KeyError, TypeError):  # the route says what is wrong with it
+            code = str(json.loads(await request.body())["participant"])
+    return {"code": code}
+
+
+async def _sent(request: Request, decision: Decision, document: str) -> str:
+    """The version, as `If-Match` or the form's field has it; of several the newest of this document."""
     field = request.headers.get("if-match")
     if field is not None:
         tags = [tag.strip('"') for tag in entity_tags(field)]
-        return next((tag for tag in tags if seen.read(tag)), tags[0])
+        places = {place.entry: tag for tag in tags if (place := seen.read(tag, document))}
+        return places[max(places)] if places else tags[0]
     if "form" not in request.headers.get("content-type", ""):
         return ""
     return str((await request.form()).get(decision.field) or "")
@@ -59,9 +72,8 @@ def old_rig() -> ApiError:
     return ApiError(409, "rig-outdated", "The rig's program is older than this service", detail)
 
 
-def missing(decision: Decision, names: dict[str, str]) -> ApiError:
+def missing(document: str) -> ApiError:
     """428: nobody says what this was decided on (RFC 6585, section 3)."""
-    document = decision.document.format(**{"code": "{code}", **names})
     detail = (
         f"Send the ETag of GET {document} as If-Match, as you last saw it. On a page: load it again and repeat what "
         "you did. Nothing was done."

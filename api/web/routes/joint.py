@@ -115,8 +115,8 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
 @router.get("/rig/angle", **answers(AngleOut))
 async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
-    of_poses = seen.of("rig", *seen.POSES)
-    response.headers["ETag"] = (await asyncio.to_thread(context.store.seen, context.clock, of_poses)).etag
+    about = seen.of("rig", *seen.POSES)
+    response.headers["ETag"] = await asyncio.to_thread(context.store.etag, context.clock, "/v1/rig/angle", about)
     return (await context.rig.fresh_status()).angle.model_dump()
 
 

@@ -87,7 +87,9 @@ def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]
 def one_model(context: Ctx, _who: ModelReader, model_id: str, response: Response) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
     row = context.versions.get(model_id)
-    response.headers["ETag"] = context.store.seen(context.clock, seen.decisions(row.participant)).etag
+    response.headers["ETag"] = context.store.etag(
+        context.clock, f"/v1/models/{model_id}", seen.decisions(row.participant)
+    )
     return {**context.versions.document(row), "model": stored.read(row)}
 
 

@@ -28,7 +28,7 @@ async def add(context: Context, code: str, body: NoteIn, by: str) -> Note:
 @router.get("", **answers(list[NoteOut]))
 def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> list[dict[str, Any]]:
     """A participant's notes, newest first, the struck ones among them."""
-    response.headers["ETag"] = context.store.seen(context.clock, notes.about(code)).etag
+    response.headers["ETag"] = context.store.etag(context.clock, f"/v1/participants/{code}/notes", notes.about(code))
     participants.find(context, code)
     return [notes.document(note) for note in context.notes.of(code)]
 

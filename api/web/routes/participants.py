@@ -129,11 +129,6 @@ def meanwhile(context: Context, code: str) -> str:
     return ""
 
 
-def etag(context: Context, code: str) -> str:
-    """The version of a participant, decisions on its models included."""
-    return context.store.seen(context.clock, seen.participant(code), seen.decisions(code)).etag
-
-
 @router.post("", status_code=201, **answers(ParticipantOut, 201, "made; see `Location`"))
 def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: Response) -> dict[str, Any]:
     """Make a participant: a code, never a name."""
@@ -156,7 +151,9 @@ def list_participants(
 @router.get("/{code}", **answers(ParticipantOut))
 def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
     """One participant with its profile."""
-    response.headers["ETag"] = etag(context, code)  # read first: it is not newer than what is told
+    about = seen.participant(code), seen.decisions(code)
+    version = context.store.etag(context.clock, f"/v1/participants/{code}", *about)
+    response.headers["ETag"] = version  # read first: it is not newer than what is told
     return find(context, code).as_dict()
 
 
@@ -175,7 +172,7 @@ async def set_profile(
     test that runs, or a calibration that is open.
     """
     row, place = await change_profile(context, code, body.sent(), who.name, void_calibration)
-    response.headers["ETag"] = place.etag
+    response.headers["ETag"] = place.etag(f"/v1/participants/{code}")
     return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
 
 

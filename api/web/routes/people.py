@@ -83,7 +83,7 @@ async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, 
 @router.get("/users", **answers(list[ListedUser]))
 def list_users(context: Ctx, _who: Administrator, response: Response) -> list[dict[str, Any]]:
     """All users."""
-    response.headers["ETag"] = context.store.seen(context.clock, seen.accounts()).etag
+    response.headers["ETag"] = context.store.etag(context.clock, "/v1/users", seen.accounts())
     return context.people.documents()
 
 

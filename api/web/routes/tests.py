@@ -63,7 +63,7 @@ def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str
 @router.get("/{test_id}", **answers(TestOut))
 def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
-    response.headers["ETag"] = context.store.seen(context.clock, seen.of(test_id, RAN_BY)).etag
+    response.headers["ETag"] = context.store.etag(context.clock, f"/v1/tests/{test_id}", seen.of(test_id, RAN_BY))
     return context.runner.document(find(context, test_id))
 
 
