@@ -25,6 +25,8 @@ class Decision(NamedTuple):
         Address that the page's form is posted to; empty where there is none.
     field : str
         The form's field with the version.
+    needed : bool
+        False: who sends none decides on what is there now, since it can only take away, or bring back what was before.
     """
 
     method: str
@@ -32,6 +34,7 @@ class Decision(NamedTuple):
     document: str
     form: str = ""
     field: str = "seen"
+    needed: bool = True
 
 
 PERSON, OF_MODEL, OF_PERSON = "/v1/participants/{code}", "/models/{model_id}", "/participants/{code}"
@@ -43,6 +46,7 @@ OF_RIG = ("latch", "calibration")
 DECISIONS = (
     *(Decision("POST", f"/v1{OF_MODEL}/{word}", f"/v1{OF_MODEL}", f"{OF_MODEL}/{word}")
       for word in ("approve", "undo")),
+    Decision("POST", f"/v1{OF_MODEL}/reject", f"/v1{OF_MODEL}", f"{OF_MODEL}/reject", needed=False),
     *(Decision("PUT", f"{PERSON}/{word}", PERSON, f"{OF_PERSON}/{word}") for word in ("profile", "muscle")),
     *(Decision("POST", f"{PERSON}/{word}", PERSON, f"{OF_PERSON}/{word}")
       for word in ("archive", "unarchive", "recordings", "calibration")),

@@ -179,9 +179,15 @@ class Versions:
             stored.whole(row)
             reasons.refuse_without(self.quality(row)["verdict"], reason)
         with self.store.write() as session:
-            if approved:  # a rejection only takes away
+            if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
             return self._decide(session, row, approved, by, reason, tracking.to_dict() if tracking else None)
+
+    def _brings_back(self, row: Model) -> bool:
+        """Whether without this version another one is served; else a rejection only takes away."""
+        holding = self.approved(row.participant)
+        served = holding is not None and holding.model_id == row.id
+        return served and bool(self._last_approvals([row.participant], {row.id}))
 
     def _decide(
         self, session: Session, row: Model, approved: bool, by: str, reason: str,
@@ -240,9 +246,9 @@ class Versions:
         """The newest approval of a version that was not rejected since; its day may be over."""
         return self._last_approvals([participant]).get(participant)
 
-    def _last_approvals(self, participants: Collection[str]) -> dict[str, Approval]:
+    def _last_approvals(self, participants: Collection[str], without: Collection[str] = ()) -> dict[str, Approval]:
         query = select(Approval).where(Approval.participant.in_(participants)).order_by(Approval.id.desc())
-        rejected: set[str] = set()
+        rejected = set(without)
         newest: dict[str, Approval] = {}
         with self.store.read() as session:
             of = session.scalars(select(Participant).where(Participant.code.in_(participants)))

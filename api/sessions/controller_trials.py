@@ -73,6 +73,8 @@ async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: 
         return await runner.start(body, who.name, holder=who.token_hash)
     seen.shown.set(await asyncio.to_thread(store.seen, runner.clock))
     if who.participant is None:
+        if body.kind != SEQUENCE:  # it is played within the participant's limits: those were not seen
+            raise seen.another_document(f"/v1/participants/{body.participant}")
         await asyncio.to_thread(_refuse_other_model, runner, body.participant)
         return await runner.start(body, who.name, holder=who.token_hash)
     async with turn:  # no two trials share the last one that is left

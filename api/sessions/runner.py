@@ -250,6 +250,8 @@ class Runner:
     def _overtaking(self, current: Current) -> list[AuditEntry]:
         """What was changed since its intent was written, with which it would not have been begun."""
         with self.store.read() as session:
+            if current.since is None and current.started:  # it plays although this service was restarted
+                current.since = seen.newest(session, "", seen.of(current.test_id, "start test"))
             return [] if current.since is None else seen.since(session, current.since, *current.rests_on)
 
     async def look_again(self) -> None:
@@ -532,15 +534,9 @@ class Runner:
                 tokens = row.plan.get("tokens") or []
                 self.current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
                 self.hub.begin(row.id)
-                self._keep(self._look_from_its_intent(self.current))
+                self._keep(self._look_again_and_again(self.current))
             else:
                 self._follow(row.id, self._recover(row.id, "the service was restarted during the test"))
-
-    async def _look_from_its_intent(self, current: Current) -> None:
-        """A test plays although this service was restarted: what it rests on may have changed meanwhile."""
-        asked = seen.of(current.test_id, "start test")
-        current.since = await asyncio.to_thread(self.store.seen, self.clock, asked)
-        await self._look_again_and_again(current)
 
     async def _recover(self, test_id: str, why: str) -> None:
         """A test whose end was not heard: its recording, if the rig sealed one, is adopted."""

@@ -201,9 +201,8 @@ def overtaken(changed: list[AuditEntry]) -> ChangedError:
 
 def another_document(document: str) -> ChangedError:
     """What was sent is the version of something else, or of nothing."""
-    return ChangedError(
-        [], None, f"This is no version of {document}. Send the ETag of GET {document}. Nothing was done."
-    )
+    detail = f"This is no version of {document}. Send the ETag with which you last saw it. Nothing was done."
+    return ChangedError([], None, detail)
 
 
 def another_trail(seen: Seen) -> ChangedError:

@@ -32,8 +32,10 @@ async def take(request: Request) -> None:
     text = await _sent(request, decision, document)
     if decision.field == "latch" and not request.app.state.context.rig.latch_known:
         raise old_rig()
+    if not (text or decision.needed):
+        return
     if not re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII):
-        raise missing(document)
+        raise missing(document, decision)
     seen.sent.set(text)
     place = seen.read(text, document)
     if decision.field in OF_RIG or (decision.path == "/v1/tests" and len(text) == MODEL_TAG):
@@ -72,10 +74,11 @@ def old_rig() -> ApiError:
     return ApiError(409, "rig-outdated", "The rig's program is older than this service", detail)
 
 
-def missing(document: str) -> ApiError:
+def missing(document: str, decision: Decision) -> ApiError:
     """428: nobody says what this was decided on (RFC 6585, section 3)."""
+    trial = f" (a trial: of GET {document}/model)" if decision.path == "/v1/tests" else ""
     detail = (
-        f"Send the ETag of GET {document} as If-Match, as you last saw it. On a page: load it again and repeat what "
-        "you did. Nothing was done."
+        f"Send the ETag of GET {document}{trial} as If-Match, as you last saw it. On a page: load it again and repeat "
+        "what you did. Nothing was done."
     )
     return ApiError(428, "seen-missing", "Say what this was decided on", detail)

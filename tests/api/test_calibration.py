@@ -59,7 +59,8 @@ def test_words_that_do_not_hold_are_refused_before_the_rig_hears_of_them(
         assert client.post(WHERE, json=body).status_code == 422, body
     assert service.rig.calibration is None
     seen = {"If-Match": client.get("/v1/participants/P017").headers["etag"]}
-    assert client.post("/v1/participants/P9/calibration", headers=seen).status_code == 404
+    refused = client.post("/v1/participants/P9/calibration", headers=seen)
+    assert refused.status_code == 409 and "no version of /v1/participants/P9" in refused.json()["detail"]
 
 
 def test_no_calibration_during_a_test(client: httpx.Client, service: Service, participant: str) -> None:

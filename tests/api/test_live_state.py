@@ -175,6 +175,22 @@ def test_a_latched_or_restarted_rig_is_re_armed_from_the_page_that_shows_it(tab:
         assert tab.url.endswith("/participants/E1")
 
 
+def test_another_stop_that_comes_under_the_hand_is_read_before_it_is_re_armed(tab: Any, service: Service) -> None:
+    tab.goto(service.url + "/participants/E1")
+    service.rig_thread.become("latched", "one")
+    button = tab.get_by_role("button", name="I have checked: re-arm")
+    expected(button).to_be_enabled()
+    tab.evaluate("""() => { window.pressable = []; new MutationObserver(() => {
+        const now = document.querySelector("#rig-notice [name=latch]");
+        if (now) window.pressable.push([now.value, now.form.querySelector("button").disabled]);
+    }).observe(document.getElementById("rig-notice"), { childList: true, subtree: true, attributes: true }); }""")
+    service.rig_thread.become("latched", "two")
+    tab.locator("#rig-notice", has_text="two").wait_for()
+    expected(button).to_be_enabled()
+    held = [disabled for latch, disabled in tab.evaluate("window.pressable") if latch == service.rig.latch]
+    assert held[0] is True and held[-1] is False
+
+
 def test_without_scripts_the_state_carries_its_time(browser: Any, service: Service) -> None:
     for page in open_tab(browser, service, java_script_enabled=False):
         assert re.search(r"No stimulation\s+ready\s+at \d\d:\d\d:\d\d", page.locator("#rig-state").inner_text())

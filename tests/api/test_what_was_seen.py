@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import httpx
@@ -11,12 +12,15 @@ import pytest
 from api.client.errors import Conflict
 from api.client.rest import Client
 from api.errors import ApiError
+from rig import messages as m
 from rig.messages import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
+from tests.api.fake_arm import still
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_forms import fields, yes
 from tests.api.test_overtaken import TRIAL, key_of
 
+HTML = {"Accept": "text/html"}
 HOME = "/v1/participants/P017"
 PAGE = "/participants/P017"
 
@@ -102,6 +106,17 @@ def test_a_form_that_comes_back_for_want_of_something_is_as_old_as_it_was(
         assert tab.post(f"{PAGE}/profile", data={**form, "seen": kept, "current_ma": "19"}).status_code == 409
 
 
+def test_a_question_ends_with_its_day(service: Service, client: httpx.Client, participant: str) -> None:
+    with signed_in(service) as tab:
+        asked = tab.post(f"{PAGE}/tests", data=fields(tab))
+        questions = service.app.state.context.questions
+        (question,) = questions._all.values()
+        question.seen = replace(question.seen, day="2020-01-01")
+        answer = tab.post(asked.headers["location"], data={"csrf": csrf(tab)})
+        assert answer.status_code == 409 and "2020-01-01" in answer.text
+    assert service.rig.starts == 0
+
+
 def test_a_page_of_another_day_offers_nothing(service: Service, client: httpx.Client, participant: str) -> None:
     with signed_in(service) as tab:
         form = {**fields(tab), "csrf": csrf(tab), "current_ma": "19"}
@@ -127,10 +142,13 @@ def test_a_waiting_result_is_let_go_by_who_saw_it(service: Service, client: http
     assert service.rig.calibrated is None
 
 
+def found_limits() -> m.CalibrationResult:
+    limits = {"current_ma": 20.0, "max_pulse_width_us": 250.0, "max_torque_nm": 30.0}
+    return m.CalibrationResult.model_validate({"profile": limits, "recordings": []})
+
+
 def finished(service: Service) -> Any:
     """As if the service had not heard the rig's answer."""
-    from rig import messages as m
-
     open_one = service.rig.calibration
     assert open_one is not None
     service.rig.calibration, service.rig.state = None, "ready"
@@ -153,3 +171,133 @@ def test_a_program_is_held_to_what_it_read(service: Service, client: httpx.Clien
         lab.approved_model(participant)
         client.post(f"/v1/models/{model}/reject", json={"reason": "wrong arm"})
         assert lab.start_test(participant)["state"] in ("requested", "running")
+
+
+def test_another_documents_version_says_nothing_and_several_count_in_any_order(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    client.post("/v1/participants", json={"code": "P018"})
+    old = client.get(HOME).headers["etag"]
+    client.put(f"{HOME}/profile", json={"max_torque_nm": 12})
+    new, others = (client.get(f"/v1/participants/{code}").headers["etag"] for code in (participant, "P018"))
+    for tag in (others, '"abc"', '"99999999999999999999"', client.get("/v1/rig").headers["etag"]):
+        refused = client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": tag})
+        assert refused.status_code == 409 and f"no version of {HOME}" in refused.json()["detail"], tag
+        assert client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": tag}).status_code == 409
+    assert service.rig.starts == 0
+    assert client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": old}).status_code == 409
+    for number, tags in enumerate((f"{old}, {new}", f'"abc", {others}')):
+        both = client.put(f"{HOME}/profile", json={"current_ma": 7 + number}, headers={"If-Match": tags})
+        assert both.status_code == (409 if number else 200), both.text
+
+
+def test_an_entry_of_another_trail_is_no_version(service: Service, client: httpx.Client, participant: str) -> None:
+    """As after a backup was restored: the number is there, with another hash."""
+    tag = client.get(HOME).headers["etag"]
+    mark = tag.split(".")[1]
+    other = tag.replace(mark, "".join("0" if one != "0" else "1" for one in mark))
+    refused = client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": other})
+    assert refused.status_code == 409 and "another database" in refused.json()["detail"]
+
+
+def test_a_range_that_was_said_under_another_calibration_of_the_sensor_is_asked_for_again(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    service.rig.arm.way = still(0.2)
+    old = client.get(HOME).headers["etag"]
+    assert client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}).is_success
+    asked = {"json": {"angle_range_rad": [0.5, 1.2]}, "headers": {"If-Match": old}}
+    assert client.put(f"{HOME}/profile", **asked).status_code == 409
+    assert client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": old}).is_success
+    assert client.put(f"{HOME}/profile", json=asked["json"]).is_success
+
+
+def test_a_pose_whose_answer_was_lost_is_a_change(
+    service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.rig.arm.way = still(0.2)
+    old = client.get("/v1/rig/angle").headers["etag"]
+    with monkeypatch.context() as patch:
+        patch.setattr(service.app.state.context.rig, "patience_s", 0.0)
+        lost = client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}, headers={"If-Match": old})
+        assert lost.status_code == 503, lost.text
+    second = client.post("/v1/rig/angle/pose", json={"angle_rad": 1.5}, headers={"If-Match": old})
+    assert second.status_code == 409 and service.rig.arm.calibration is None
+
+
+def test_a_models_version_plays_a_trial_and_nothing_else(
+    service: Service, client: httpx.Client, participant: str, approved: str
+) -> None:
+    lab = service.client(service.token("lab", "run-test", "read-live", "read-model"))
+    tag = {"If-Match": lab.get(f"{HOME}/model").headers["etag"]}
+    refused = lab.post("/v1/tests", json={"participant": participant}, headers=tag)
+    assert refused.status_code == 409 and f"no version of {HOME}" in refused.json()["detail"]
+    other = {"If-Match": f'"{"0" * 64}"'}
+    assert lab.post("/v1/tests", json={"participant": participant, **TRIAL}, headers=other).status_code == 409
+    assert lab.post("/v1/tests", json={"participant": participant, **TRIAL}, headers=tag).status_code == 202
+    assert approved
+
+
+def test_limits_are_answered_and_not_what_was_decided_on_models(
+    service: Service, client: httpx.Client, participant: str, approved: str
+) -> None:
+    old = {"If-Match": client.get(HOME).headers["etag"]}
+    client.post(f"/v1/models/{approved}/reject", json={"reason": "wrong arm"})
+    changed = client.put(f"{HOME}/profile", json={"current_ma": 7}, headers=old)
+    assert changed.is_success
+    body, answered = {"participant": participant, **TRIAL}, {"If-Match": changed.headers["etag"]}
+    assert client.post("/v1/tests", json=body, headers=answered).status_code == 409
+    assert service.rig.starts == 1
+
+
+def test_a_key_is_made_on_what_was_seen_also_when_its_check_is_overtaken(
+    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The form's own look is before the transaction: what comes between is refused there."""
+    page = client.get(PAGE, headers=HTML).text
+    version = re.findall(r'name="seen" value="([^"]+)"', page)[-1]
+    assert client.put(f"{HOME}/profile", json={"max_torque_nm": 12}).is_success
+    store = service.app.state.context.store
+    monkeypatch.setattr(store, "refuse_changed", lambda *_about: None)
+    key = {"name": "ilc", "current_ma": "8", "max_pulse_width_us": "200", "max_duration_s": "60", "trials": "3"}
+    refused = client.post(f"{PAGE}/keys", data={**key, "seen": version}, headers=HTML, auth=None)
+    assert refused.status_code == 409 and approved
+    assert "ilc" in refused.text and "3 trials of at most 60 s, 8 mA, 200 µs" in refused.text
+    assert not [token for token in client.get("/v1/tokens").json() if token["name"].startswith("ilc")]
+    begun = client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": f'"{version}"'})
+    assert begun.status_code == 409 and service.rig.starts == 1, "in the intent's own transaction, too"
+
+
+def test_the_page_says_what_is_pressed_once_more(service: Service, client: httpx.Client, participant: str) -> None:
+    model = run_test(client, participant)["model_id"]
+    with signed_in(service) as tab:
+        form = {**fields(tab), "csrf": csrf(tab)}
+        client.put(f"{HOME}/muscle", json={"side": "right", "muscle": "triceps brachii"})
+        site = tab.post(f"{PAGE}/muscle", data={**form, "side": "left", "muscle": "biceps brachii", "placement": "B"})
+        assert "You wanted: left, biceps brachii, B" in site.text
+        assert "Set this side and muscle all the same" in site.text
+        client.post(f"{HOME}/archive")
+        again = tab.post(f"{PAGE}/archive", data=form).text
+        assert re.search(r"not in the archive.*<b>in the archive</b>", again, re.DOTALL)
+        client.post(f"{HOME}/unarchive")
+        client.put(f"{HOME}/muscle", json={})
+        version = re.findall(r'name="seen" value="([^"]+)"', tab.get(f"/models/{model}").text)[-1]
+        client.post(f"/v1/models/{model}/reject", json={"reason": "wrong arm"})
+        data = {"csrf": form["csrf"], "seen": version, "reason": "good enough"}
+        refused = tab.post(f"/models/{model}/approve", data=data).text
+        assert f'<a href="/models/{model}">Model {model[:8]}</a>' in refused and "wrong arm" in refused
+
+
+def test_a_result_of_other_limits_is_not_offered_once_more(
+    service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at = f"{HOME}/calibration"
+    client.post(at, json={})
+    client.post(f"{at}/step", json={"direction": "up"})
+    service.rig.calibrated = finished(service).model_copy(update={"result": found_limits()})
+    version = client.get(at).headers["etag"].strip('"')
+    client.put(f"{HOME}/profile", json={"max_torque_nm": 12})
+    with signed_in(service) as tab:
+        refused = tab.post(f"{PAGE}/calibration/finish", data={"csrf": csrf(tab), "calibration": version})
+        assert refused.status_code == 409 and "12 N·m" in refused.text
+        assert "all the same" not in refused.text

@@ -134,6 +134,8 @@ def outside(settings: Settings, of_rig: bool, given: list[Path]) -> tuple[list[R
             kept, said = receipts.checked(path)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig audit heads`.") from error
+        if path in given and not kept and not said:
+            said = [f"{path}: no head is in it"]
         noted, wrong = noted + kept, wrong + said
     return noted, wrong
 

@@ -21,8 +21,13 @@ KEPT_OUT = ("csrf", "seen", "password", "latch")
 ALL_THE_SAME = lazy("Do it all the same")
 BUTTONS = {
     "approve": lazy("Approve all the same"), "reject": lazy("Reject all the same"), "undo": lazy("Undo all the same"),
-    "profile": lazy("Set the limits all the same"), "rearm": lazy("I have seen this and checked: re-arm"),
+    "profile": lazy("Set the limits all the same"), "muscle": lazy("Set this side and muscle all the same"),
+    "keys": lazy("Make the key all the same"), "rearm": lazy("I have seen this and checked: re-arm"),
 }  # fmt: skip
+ARCHIVED = {"create participant": lazy("not in the archive"), "archive": lazy("in the archive"),
+            "unarchive": lazy("not in the archive")}  # fmt: skip
+PLAN = {"duration": ("max_duration_s", "s"), "current": ("current_ma", "mA"), "width": ("max_pulse_width_us", "µs")}
+"""Fields of a key's form, with their units."""
 DECIDED = {"approve": "approved", "reject": "rejected"}
 
 
@@ -35,6 +40,10 @@ class Row:
     now: str
     who: str
     at_utc: str
+    before_utc: str = ""
+    """Since when it was so."""
+    at: str = ""
+    """Address of a page that tells more of it."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +53,7 @@ class Again:
     action: str
     hidden: list[tuple[str, str]]
     asked: list[str]
-    """What was typed of a participant's limits."""
+    """What was wanted."""
     password: bool
     button: str
 
@@ -55,15 +64,24 @@ def rows(changes: list[dict[str, Any]]) -> list[Row]:
     for change in changes:
         now = change["now"]
         before, after = (words(entry, now["action"]) for entry in (change["seen"], now))
-        found.append(Row(what(now), before, after, now["who"], now["at_utc"]))
+        since_utc = change["seen"]["at_utc"] if change["seen"] else ""
+        at = f"/models/{now['subject']}" if now["action"] in DECIDED else ""
+        found.append(Row(what(now), before, after, now["who"], now["at_utc"], since_utc, at))
     return found
 
 
 def what(entry: dict[str, Any]) -> str:
     """What an entry is about."""
     names = {"set profile": _("Limits"), "finish calibration": _("Limits"), "set muscle": _("Side and muscle"),
-             "approve": _("Model"), "reject": _("Model"), "latched": _("The rig")}  # fmt: skip
+             "archive": _("Archive"), "unarchive": _("Archive"), "latched": _("The rig")}  # fmt: skip
+    if entry["action"] in DECIDED:
+        return model_words(entry["subject"])
     return f"{names.get(entry['action'], _('Change'))} {entry['subject']}".removesuffix(" rig")
+
+
+def model_words(model_id: str) -> str:
+    """A model as its pages head it."""
+    return f"{_('Model')} {model_id[:8]}"
 
 
 def words(entry: dict[str, Any] | None, of: str) -> str:
@@ -73,6 +91,10 @@ def words(entry: dict[str, Any] | None, of: str) -> str:
     detail = entry["detail"]
     if entry["action"] in DECIDED:
         return ": ".join(part for part in (decision_words(DECIDED[entry["action"]]), detail.get("reason")) if part)
+    if of in ARCHIVED and entry["action"] in ARCHIVED:
+        return str(ARCHIVED[entry["action"]])
+    if detail.get("ran_by"):
+        return str(detail["ran_by"])
     if entry["action"] == "latched":
         return translated(detail["reason"])
     if of == "set muscle":
@@ -106,11 +128,12 @@ def _without_reason(entry: dict[str, Any] | None) -> dict[str, Any] | None:
 async def again(request: Request, problem: ChangedError) -> Again | None:
     """The form that was sent, to be sent again on what is there now; None where it cannot be: a file, a question.
 
-    Nor is it where not every change is shown.
+    Nor is it where not every change is shown, or of a calibration: that goes no further on limits of another one.
     """
     found = decisions.find(request.method, request.url.path)
     all_told = 0 < len(problem.extra["changes"]) < MOST_TOLD
-    if found is None or not all_told or "form" not in request.headers.get("content-type", ""):
+    by_form = "form" in request.headers.get("content-type", "")
+    if found is None or found[0].field == "calibration" or not all_told or not by_form:
         return None
     sent = (await request.form()).multi_items()
     if any(not isinstance(value, str) for _name, value in sent):
@@ -118,8 +141,23 @@ async def again(request: Request, problem: ChangedError) -> Again | None:
     hidden = [(name, str(value)) for name, value in sent if name not in KEPT_OUT]
     if found[0].field == "latch":
         hidden.append(("latch", problem.extra["latch"]))
-    button = str(BUTTONS.get(request.url.path.rpartition("/")[2], ALL_THE_SAME))
-    texts = dict(hidden)
-    typed = [f"{plain(label)} {texts[name]}" for name, label in LABELS.items()
-             if name in texts and texts[name] != texts.get(f"seen_{name}")]  # fmt: skip
-    return Again(request.url.path, hidden, typed, any(name == "password" for name, _value in sent), button)
+    action = request.url.path.rpartition("/")[2]
+    button = str(BUTTONS.get(action, ALL_THE_SAME))
+    asked = wanted(action, found[1], dict(hidden))
+    return Again(request.url.path, hidden, asked, any(name == "password" for name, _value in sent), button)
+
+
+def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[str]:
+    """What the form asks for: it is not looked at again on the page that it came from."""
+    if action == "muscle":
+        return [site_words((texts.get("side"), texts.get("muscle"), texts.get("placement")))]
+    if "model_id" in names:
+        return [model_words(names["model_id"])]
+    if "ran_by" in texts:
+        return [texts["ran_by"]]
+    if action == "keys":
+        plan = {name: f"{texts.get(field, '')} {unit}" for name, (field, unit) in PLAN.items()}
+        plan["trials"] = texts.get("trials", "")
+        return [texts.get("name", ""), _("%(trials)s trials of at most %(duration)s, %(current)s, %(width)s", **plan)]
+    return [f"{plain(label)} {texts[name]}" for name, label in LABELS.items()
+            if name in texts and texts[name] != texts.get(f"seen_{name}")]  # fmt: skip

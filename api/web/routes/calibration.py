@@ -119,7 +119,10 @@ def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
 
 def another_train() -> ApiError:
     """409: it is another calibration, another train was sent, or another width marked."""
-    detail = "Another train was sent after this page was shown. Nothing was done now. Look at the last train first."
+    detail = (
+        "Another train was sent after this page was shown, or another mark was set. Nothing was done now. Look at the "
+        "last train and the marks first."
+    )
     return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
 
 
@@ -211,7 +214,8 @@ async def sound(context: Context, code: str) -> dict[str, Any]:
     """
     found = await standing(context, code)
     if found["outdated"]:
-        raise ApiError(409, "changed-meanwhile", "The limits were changed by someone else", found["outdated"])
+        title = "The limits were changed since this calibration was begun"
+        raise ApiError(409, "changed-meanwhile", title, found["outdated"])
     return found
 
 

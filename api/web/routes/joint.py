@@ -78,7 +78,13 @@ async def take_pose(context: Context, body: PoseIn, by: str) -> AngleStatus:
     async with context.holds.turn(LIMITS_TURN):  # no other pose comes between looking and taking it
         before = context.rig.status.angle.calibration if context.rig.status else None
         await asyncio.to_thread(context.store.refuse_changed, seen.of("rig", *seen.POSES))
-        status = await context.rig.ask_for(Status, AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first))
+        try:
+            pose = AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first)
+            status = await context.rig.ask_for(Status, pose)
+        except ApiError as error:
+            if error.code == "rig-unreachable":  # it may have heard us all the same
+                await asyncio.to_thread(note, None)
+            raise
         context.rig.status = status
         await asyncio.to_thread(note, status.angle.calibration if status.angle.calibration != before else None)
     return status.angle

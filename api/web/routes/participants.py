@@ -74,7 +74,8 @@ def _change(
         row = session.get(Participant, code)
         if row is None:
             raise NotFoundError("participant", code)
-        seen.check(session, seen.participant(code))
+        poses = [] if asked.get(angles.RANGE) is None else [seen.of("rig", *seen.POSES)]
+        seen.check(session, seen.participant(code), *poses)
         check_asked(context, row.profile, asked)
         profile, voids = profiles.changed(row.profile, with_calibration(context, asked))
         if voids and not may_void:
@@ -85,6 +86,9 @@ def _change(
         if profile != row.profile:
             row.profile = profile
             audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
+        shown = seen.shown.get()
+        if shown is not None and seen.since(session, shown, seen.decisions(code)):
+            return row, shown  # limits are answered, not what was decided on models
         return row, seen.newest(session, local_day(context.clock.utc()))
 
 

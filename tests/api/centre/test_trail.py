@@ -221,6 +221,8 @@ def test_receipts_of_two_rigs_on_one_database_stay_apart(trail: Trail) -> None:
 def test_a_rig_without_a_centre_notes_its_heads(trail: Trail, tmp_path: Path) -> None:
     trail.file.unlink()
     noted = tmp_path / "heads.jsonl"
+    noted.touch()
+    assert trail.verify("--heads", str(noted))[0] == 1, "emptied, it would pass whatever was noted"
     of = ["audit", "heads", "--data", str(trail.rig.folder)]
     assert main.run([*of, "-o", str(noted)]) == 0
     trail.work(3)

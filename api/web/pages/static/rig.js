@@ -3,7 +3,7 @@
 "use strict";
 {
   const words = JSON.parse(document.getElementById("rig-words").textContent);
-  const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, TORQUE_OLD_S = 1.0;
+  const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, TORQUE_OLD_S = 1.0, READ_MS = 2000;
   const clock = () => [performance.now(), Date.now()]; // the first stands still while a machine sleeps, the second may be set
   const since = (then) => Math.max(performance.now() - then[0], Date.now() - then[1]);
   const pill = document.getElementById("rig-state"), notice = document.getElementById("rig-notice");
@@ -83,9 +83,22 @@
     fetching = key;
     try {
       const answer = await get("/rig/notice?back=" + encodeURIComponent(notice.dataset.back));
-      if (answer.ok) { notice.innerHTML = await answer.text(); notice.dataset.key = key; }
+      if (answer.ok) {
+        const before = notice.querySelector("[name=latch]"), words = await answer.text();
+        notice.innerHTML = words;
+        notice.dataset.key = key;
+        hold(before);
+      }
     } catch { /* the next answer asks again */ }
     fetching = "";
+  }
+
+  function hold(before) { // another stop came under the hand that was about to re-arm: it is read first
+    const latch = notice.querySelector("[name=latch]");
+    if (!before || !latch || latch.value === before.value) return;
+    const button = latch.form.querySelector("button");
+    button.disabled = true;
+    setTimeout(() => { button.disabled = false; }, READ_MS);
   }
 
   function look() {
