@@ -72,6 +72,18 @@ def lag_after(before, after, state, tau_s, step_s):
     return state + (0.5 * (before + after) - state) * (1.0 - math.exp(-step_s / tau_s))
 
 
+@helper
+def delayed(x, late, s, first, size):
+    """`x` of `late` steps ago, linear between steps, by a ring s[first : first + size] whose place is s[0]."""
+    i = int(s[0])
+    s[first + i] = x
+    s[0] = (i + 1) % size
+    whole = int(late)
+    a = s[first + (i - whole) % size]
+    b = s[first + (i - whole - 1) % size]
+    return a + (late - whole) * (b - a)
+
+
 @kernel
 def second_order(x, p, s, c):
     """p: 1/Tω, ζ."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden import effects, kept_back, outside, outside_kept
+from hardware_sim.patients.hidden import effects, outside, outside_kept
 from hardware_sim.patients.hidden.base import Base, draw_base
 from hardware_sim.patients.hidden.design import Design, make_design
 from hardware_sim.patients.hidden.kernels import Formulation, NotSuited, Stage
@@ -23,7 +23,8 @@ ATTEMPTS = 40
 CALIBRATION_STEP_S = 1.0 / 1600.0
 
 KEPT_BACK_FROM = 1000
-"""Seeds from here on may also draw the formulations in `kept_back`."""
+"""Seeds from here on may also draw an effect's formulations `KEPT_BACK`: nobody develops on them, so they tell how a
+diagnosis generalises."""
 
 MOVING = frozenset({"torque_angle", "torque_velocity", "passive_torque"})
 """These effects show only where the joint moves."""
@@ -68,10 +69,8 @@ def formulations(effect: str, seed: int = KEPT_BACK_FROM) -> tuple[Writer, ...]:
             return import_module(f"{package.__name__}.{effect}").FORMULATIONS
     if effect not in effect_ids():
         raise ValueError(f"effect {effect!r}: one of {', '.join((*effect_ids(), *outside_ids()))}")
-    known = import_module(f"{effects.__name__}.{effect}").FORMULATIONS
-    if seed < KEPT_BACK_FROM or effect not in _files_of(kept_back):
-        return known
-    return (*known, *import_module(f"{kept_back.__name__}.{effect}").FORMULATIONS)
+    module = import_module(f"{effects.__name__}.{effect}")
+    return module.FORMULATIONS if seed < KEPT_BACK_FROM else (*module.FORMULATIONS, *module.KEPT_BACK)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
-from numpy.random import Generator
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -110,11 +109,6 @@ def smooth_table(p: Any, first: int, count: int, position: float) -> float:
     a = p[first + i - 1] if i > 0 else b
     e = p[first + i + 2] if i + 2 < count else d
     return b + 0.5 * r * (d - a + r * (2 * a - 5 * b + 4 * d - e + r * (3 * (b - d) + e - a)))
-
-
-def random_sign(rng: Generator, positive_share: float) -> float:
-    """1 with this probability, otherwise -1."""
-    return 1.0 if rng.random() < positive_share else -1.0
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base, lag_after
-from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, SPEED, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.base import lag_after
+from hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, SPEED, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Sign, Written, even, two_lags
 
 
 @kernel
@@ -20,16 +19,16 @@ def _by_level(x, p, s, c):
 
 @kernel
 def _calcium_pump(x, p, s, c):
-    """p: τ of calcium at half, τ of force, saturation of the pump. s: calcium, force.
+    """p: saturation of the pump, τ of force, τ of calcium at half. s: calcium, force.
 
     The pump takes calcium up at C (1 + σ) / (1 + σ C) (Michaelis-Menten), so it lags behind at high activation;
     release is written so that the steady calcium is the recruited share.
     """
     e = max(x / c[LARGEST_NM], 0.0)
-    sigma = p[2]
+    sigma = p[0]
     half = 1.0 + 0.5 * sigma
     before = s[0]
-    rate = math.sqrt(1.0 + sigma) * half / p[0]  # the pump's speed at half activation stays near 1 / p[0]
+    rate = math.sqrt(1.0 + sigma) * half / p[2]  # the pump's speed at half activation stays near 1 / p[2]
     release = e / (1.0 + sigma * e)
     slope = rate * (release - before / (1.0 + sigma * before))
     guess = max(before + c[STEP_S] * slope, 0.0)
@@ -41,11 +40,11 @@ def _calcium_pump(x, p, s, c):
 
 @kernel
 def _bound_calcium(x, p, s, c):
-    """p: τ of calcium, τ of force, k. s: calcium, force. Force decays with τ1 + τ2 * (bound calcium)."""
+    """p: k, τ of calcium, τ of force. s: calcium, force. Force decays with τ1 + τ2 * (bound calcium)."""
     before = s[0]
-    s[0] += (x / c[LARGEST_NM] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[0]))
+    s[0] += (x / c[LARGEST_NM] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
     bound = max(s[0], 0.0)
-    tau = p[1] * (1.0 + p[2] * bound) / (1.0 + 0.4 * p[2])
+    tau = p[2] * (1.0 + p[0] * bound) / (1.0 + 0.4 * p[0])
     s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], tau, c[STEP_S])
     c[FORCE] = s[1] / c[LARGEST_NM]
     return s[1]
@@ -53,59 +52,70 @@ def _bound_calcium(x, p, s, c):
 
 @kernel
 def _cooperative(x, p, s, c):
-    """p: τ of calcium, τ of force, k. s: calcium, force. Attached bridges help others attach: faster when strong."""
+    """p: k, τ of calcium, τ of force. s: calcium, force. Attached bridges help others attach: faster when strong."""
     before = s[0]
-    s[0] += (x / c[LARGEST_NM] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[0]))
+    s[0] += (x / c[LARGEST_NM] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
     share = min(max(s[1] / c[LARGEST_NM], 0.0), 1.2)
-    rate = (1.0 + p[2] * share) / (1.0 + 0.4 * p[2]) / p[1]
+    rate = (1.0 + p[0] * share) / (1.0 + 0.4 * p[0]) / p[2]
     s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], 1.0 / rate, c[STEP_S])
     c[FORCE] = s[1] / c[LARGEST_NM]
     return s[1]
 
 
-def by_level(rng: Generator, _base: Base) -> Formulation:
-    sign, lag = float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.01, 0.1))
-    return Formulation(
+@kernel
+def _by_recruitment(x, p, s, c):
+    """p: size (signed), exponent. Rates go with how many units are being stimulated, not with their force."""
+    a = min(max(c[ACTIVATION], 0.0), 1.2)
+    c[SPEED] *= 1.0 + p[0] * a ** p[1] if p[0] > 0.0 else 1.0 / (1.0 - p[0] * a ** p[1])
+    return x
+
+
+FORMULATIONS = (
+    Written(
         "all rates go with the level",
         "Hunt, Munih, Donaldson and Barr 1998",
-        lambda m: [Stage("delay", _by_level, (sign * m, lag))],
+        "delay",
+        _by_level,
         2.0,
         "log_speed_ratio",
-        {"faster_when": "strong" if sign > 0 else "weak", "lag_s": lag},
-    )
-
-
-def calcium_pump(_rng: Generator, base: Base) -> Formulation:
-    fast, slow = base.two_lags_s()
-    return Formulation(
+        {"faster_when": Sign(even, "strong", "weak"), "lag_s": (0.01, 0.1)},
+    ),
+    Written(
         "calcium pump saturates",
         "Michaelis-Menten uptake, Westerblad and Allen 1994; Stein, Bobet, Oğuztöreli and Fryer 1988",
-        lambda m: [Stage("dynamics", _calcium_pump, (slow, fast, m))],
+        "dynamics",
+        _calcium_pump,
         8.0,
         "saturation",
-    )
-
-
-def bound_calcium(_rng: Generator, base: Base) -> Formulation:
-    fast, slow = base.two_lags_s()
-    return Formulation(
+        {"_lags": two_lags},
+    ),
+    Written(
         "force decays more slowly with bound calcium",
         "Ding, Wexler and Binder-Macleod 2000: τ1 + τ2 CN / (Km + CN)",
-        lambda m: [Stage("dynamics", _bound_calcium, (fast, slow, m))],
+        "dynamics",
+        _bound_calcium,
         8.0,
         "tau2_over_tau1",
-    )
-
-
-def cooperative(_rng: Generator, base: Base) -> Formulation:
-    fast, slow = base.two_lags_s()
-    return Formulation(
+        {"_lags": two_lags},
+    ),
+    Written(
         "cooperative attachment, faster when strong",
         "Campbell 1997",
-        lambda m: [Stage("dynamics", _cooperative, (fast, slow, m))],
+        "dynamics",
+        _cooperative,
         8.0,
         "cooperativity",
-    )
-
-
-FORMULATIONS = (by_level, calcium_pump, bound_calcium, cooperative)
+        {"_lags": two_lags},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "rates go with the recruited share",
+        "local models at several levels, Hunt, Munih, Donaldson and Barr 1998",
+        "delay",
+        _by_recruitment,
+        4.0,
+        "speed_gain",
+        {"faster_when": Sign(even, "more recruited", "less recruited"), "exponent": (0.6, 2.0)},
+    ),
+)

@@ -7,7 +7,8 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base, lag_after, second_order_step
-from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, Stage, kernel, random_sign
+from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Sign, Written, mostly, second_order_of, two_lags
 
 
 @kernel
@@ -41,64 +42,76 @@ def _de_groote(x, p, s, c):
 
 @kernel
 def _cross_bridges(x, p, s, c):
-    """p: 1/Tω, ζ, log ratio, smoothing. Second order; the rate depends on whether force is being made or lost."""
+    """p: log ratio, 1/Tω, ζ, smoothing. Second order; the rate depends on whether force is being made or lost."""
     made = math.tanh((x - s[0]) / (p[3] * c[LARGEST_NM]))
-    rate = p[0] * math.exp(0.25 * p[2] * made)
-    y = second_order_step(x, rate, p[1], s, 0, c[STEP_S])
+    rate = p[1] * math.exp(0.25 * p[0] * made)
+    y = second_order_step(x, rate, p[2], s, 0, c[STEP_S])
     c[FORCE] = y / c[LARGEST_NM]
     return y
 
 
-def _lags(base: Base, rng: Generator) -> tuple[float, float]:
+@kernel
+def _limited_fall(x, p, s, c):
+    """p: s it takes at least to fall from the largest torque, τ1, τ2. s: two lags; the second falls no faster."""
+    before = s[0]
+    s[0] += (x - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
+    goal = lag_after(before, s[0], s[1], p[2], c[STEP_S])
+    if p[0] > 0.0:
+        fastest = c[STEP_S] * c[LARGEST_NM] / p[0]
+        change = goal - s[1]
+        goal = s[1] + (change if change > 0.0 else -fastest * math.tanh(-change / fastest))
+    s[1] = goal
+    c[FORCE] = s[1] / c[LARGEST_NM]
+    return s[1]
+
+
+def _lags(rng: Generator, base: Base) -> tuple[float, float]:
     """The time constant that becomes asymmetric, and the other."""
     fast, slow = base.two_lags_s()
     return (slow, fast) if rng.random() < 0.7 else (fast, slow)
 
 
-def _sign(rng: Generator) -> float:
-    """1 where relaxation is slower, in three of four; -1 where development is."""
-    return random_sign(rng, 0.75)
+SLOWER = Sign(mostly(0.75), "relaxation", "development")
 
-
-def thelen(rng: Generator, base: Base) -> Formulation:
-    asymmetric, other = _lags(base, rng)
-    sign = _sign(rng)
-    exponent = float(rng.uniform(0.0, 1.0))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "activation and deactivation time constants with 0.5 + 1.5 a",
         "Winters 1995; Thelen 2003",
-        lambda m: [Stage("dynamics", _thelen, (asymmetric, other, math.exp(sign * m), exponent * min(m, 1.0)))],
+        "dynamics",
+        _thelen,
         2.2,
         "log_ratio",
-        {"slower": "relaxation" if sign > 0 else "development", "exponent": exponent},
-    )
-
-
-def de_groote(rng: Generator, base: Base) -> Formulation:
-    asymmetric, other = _lags(base, rng)
-    sign = _sign(rng)
-    steepness, share = float(rng.uniform(5.0, 30.0)), float(rng.uniform(0.0, 0.5))
-    return Formulation(
+        {"_lags": _lags, "slower": SLOWER, "exponent": (0.0, 1.0)},
+        lambda m, asymmetric, other, exponent: (asymmetric, other, math.exp(m), exponent * min(abs(m), 1.0)),
+    ),
+    Written(
         "tanh-smoothed activation dynamics",
         "De Groote, Kinney, Rao and Fregly 2016",
-        lambda m: [Stage("dynamics", _de_groote, (asymmetric, other, sign * m, steepness, share * min(m, 1.0)))],
+        "dynamics",
+        _de_groote,
         2.2,
         "log_ratio",
-        {"slower": "relaxation" if sign > 0 else "development", "b": steepness, "share": share},
-    )
-
-
-def cross_bridges(rng: Generator, base: Base) -> Formulation:
-    sign = _sign(rng)
-    smooth = float(rng.uniform(0.02, 0.15))
-    return Formulation(
+        {"_lags": _lags, "slower": SLOWER, "b": (5.0, 30.0), "share": (0.0, 0.5)},
+        lambda m, asymmetric, other, steepness, share: (asymmetric, other, m, steepness, share * min(abs(m), 1.0)),
+    ),
+    Written(
         "attachment faster than detachment, smoothed, second order",
         "McCrea, Eng and Hodgson 2003 (development and relaxation impaired apart); rates after Huxley 1957",
-        lambda m: [Stage("dynamics", _cross_bridges, (1.0 / base.t_omega_s, base.zeta, sign * m, smooth))],
+        "dynamics",
+        _cross_bridges,
         2.5,
         "log_ratio",
-        {"slower": "relaxation" if sign > 0 else "development", "smoothing": smooth},
-    )
-
-
-FORMULATIONS = (thelen, de_groote, cross_bridges)
+        {"_base": second_order_of, "slower": SLOWER, "smoothing": (0.02, 0.15)},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "torque falls no faster than the bridges let go",
+        "linear phase of relaxation, Tesi, Piroddi, Colomo and Poggesi 2002",
+        "dynamics",
+        _limited_fall,
+        3.0,
+        "shortest_fall_s",
+        {"_lags": two_lags},
+    ),
+)

@@ -9,6 +9,7 @@ from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel, smooth_table
+from hardware_sim.patients.hidden.written import Sign, Written, even
 
 
 @kernel
@@ -29,8 +30,20 @@ def _wander(x, p, s, c):
     return x + p[0] * smooth_table(p, 2, 200, c[TIME_S] / p[1])
 
 
+@kernel
+def _logarithmic(x, p, s, c):
+    """p: N·m a decade, first time s."""
+    return x + p[0] * math.log10(1.0 + c[TIME_S] / p[1])
+
+
+@kernel
+def _swing(x, p, s, c):
+    """p: N·m, period s, phase: half a turn or more of a slow swing of the room's temperature."""
+    return x + p[0] * (math.sin(2.0 * math.pi * c[TIME_S] / p[1] + p[2]) - math.sin(p[2]))
+
+
 def warm_up(rng: Generator, _base: Base) -> Formulation:
-    sign = float(rng.choice([-1.0, 1.0]))
+    sign = even(rng)
     fast, slow, share = float(rng.uniform(4.0, 12.0)), float(rng.uniform(25.0, 90.0)), float(rng.uniform(0.0, 0.6))
     return Formulation(
         "bridge and amplifier warm up",
@@ -42,30 +55,41 @@ def warm_up(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-def linear(rng: Generator, _base: Base) -> Formulation:
-    sign = float(rng.choice([-1.0, 1.0]))
-    return Formulation(
-        "linear",
-        "temperature ramp",
-        lambda m: [Stage("additive", _linear, (sign * m,))],
-        0.2,
-        "nm_per_s",
-        {"sign": sign},
-    )
-
-
-def wander(rng: Generator, _base: Base) -> Formulation:
-    spacing = float(rng.uniform(9.0, 20.0))
+def _knots(rng: Generator, _base: Base) -> list[float]:
     knots = np.concatenate([[0.0], np.cumsum(rng.normal(0.0, 1.0, 199))])
-    knots /= np.abs(knots[:6]).max()
-    return Formulation(
+    return list(knots / np.abs(knots[:6]).max())
+
+
+FORMULATIONS = (
+    warm_up,
+    Written("linear", "temperature ramp", "additive", _linear, 0.2, "nm_per_s", {"sign": Sign()}),
+    Written(
         "smooth random walk",
         "limb settling in the splint",
-        lambda m: [Stage("additive", _wander, (m, spacing, *knots))],
+        "additive",
+        _wander,
         4.0,
         "largest_nm",
-        {"knots_s": spacing},
-    )
-
-
-FORMULATIONS = (warm_up, linear, wander)
+        {"knots_s": (9.0, 20.0), "_knots": _knots},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "creep with the logarithm of time",
+        "load-cell creep",
+        "additive",
+        _logarithmic,
+        4.0,
+        "nm_per_decade",
+        {"first_s": (1.0, 8.0), "sign": Sign()},
+    ),
+    Written(
+        "slow swing",
+        "room temperature",
+        "additive",
+        _swing,
+        4.0,
+        "amplitude_nm",
+        {"period_s": (50.0, 110.0), "_phase": (0.0, 2.0 * math.pi)},
+    ),
+)

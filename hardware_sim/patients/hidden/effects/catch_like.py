@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ACTIVATION, COUNT, PAUSE_S, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import ACTIVATION, COUNT, PAUSE_S, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -45,40 +43,52 @@ def _burst(x, p, s, c):
     return x * (1.0 + p[0] * s[2] * (z + 0.3) * math.exp(-z))
 
 
-def first_pulses(rng: Generator, _base: Base) -> Formulation:
-    lasts, recovery = float(rng.uniform(3.0, 12.0)), float(rng.uniform(0.1, 0.6))
-    return Formulation(
+@kernel
+def _primed(x, p, s, c):
+    """p: gain, priming s, use s. s[0]: primed share; grows at rest, used up by activity in proportion to itself."""
+    a = min(max(c[ACTIVATION], 0.0), 1.0)
+    gain = 1.0 + p[0] * s[0] * s[0]
+    s[0] += c[STEP_S] * ((1.0 - a) * (1.0 - s[0]) / p[1] - a * s[0] / p[2])
+    return x * gain
+
+
+FORMULATIONS = (
+    Written(
         "gain of the first pulses",
         "Binder-Macleod and Kesar 2005; Bickel, Slade and Dudley 2004",
-        lambda m: [Stage("gain", _first_pulses, (m, lasts, recovery))],
+        "gain",
+        _first_pulses,
         2.5,
         "first_gain",
-        {"lasts_pulses": lasts, "recovery_s": recovery},
-    )
-
-
-def store(rng: Generator, _base: Base) -> Formulation:
-    refill, empty = float(rng.uniform(0.3, 1.2)), float(rng.uniform(0.1, 0.3))
-    return Formulation(
+        {"lasts_pulses": (3.0, 12.0), "recovery_s": (0.1, 0.6)},
+    ),
+    Written(
         "calcium store that runs down",
         "store depletion as in Tsodyks and Markram 1997, for calcium release after Duchateau and Hainaut 1986",
-        lambda m: [Stage("gain", _store, (m, refill, empty))],
+        "gain",
+        _store,
         4.0,
         "gain",
-        {"refill_s": refill, "empty_s": empty},
-    )
-
-
-def burst(rng: Generator, _base: Base) -> Formulation:
-    peak, pause = float(rng.uniform(0.06, 0.2)), float(rng.uniform(0.08, 0.5))
-    return Formulation(
+        {"refill_s": (0.3, 1.2), "empty_s": (0.1, 0.3)},
+    ),
+    Written(
         "burst at the onset of a train",
         "stiffness of the series elastic element, Parmiggiani and Stein 1981",
-        lambda m: [Stage("gain", _burst, (m, peak, pause))],
+        "gain",
+        _burst,
         3.0,
         "gain",
-        {"peak_s": peak, "pause_s": pause},
-    )
-
-
-FORMULATIONS = (first_pulses, store, burst)
+        {"peak_s": (0.06, 0.2), "pause_s": (0.08, 0.5)},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "rest primes the next onset",
+        "Lee, Gerdom and Binder-Macleod 1999, in one state",
+        "gain",
+        _primed,
+        4.0,
+        "gain",
+        {"priming_s": (0.1, 0.5), "use_s": (0.1, 0.3)},
+    ),
+)

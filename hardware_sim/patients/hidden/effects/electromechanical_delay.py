@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.base import Base, delayed
 from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
 def _line(x, p, s, c):
     """p: delay s. s[0]: place in the ring; a transport line with linear interpolation between samples."""
-    size = 700
-    i = int(s[0])
-    s[1 + i] = x
-    late = min(p[0] / c[STEP_S], 690.0)
-    whole = int(late)
-    part = late - whole
-    a = s[1 + (i - whole) % size]
-    b = s[1 + (i - whole - 1) % size]
-    s[0] = (i + 1) % size
-    return a + part * (b - a)
+    return delayed(x, min(p[0] / c[STEP_S], 690.0), s, 1, 700)
 
 
 @kernel
@@ -55,22 +49,14 @@ def _spread(x, p, s, c):
     return torque * c[LARGEST_NM] / 10.0
 
 
-def transport_line(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation(
-        "transport line", "Cavanagh and Komi 1979", lambda m: [Stage("delay", _line, (m,))], 0.12, "delay_s"
-    )
-
-
-def chain_of_lags(rng: Generator, _base: Base) -> Formulation:
-    count = int(rng.integers(5, 13))
-    return Formulation(
-        "chain of equal lags",
-        "linear chain trick, MacDonald 1978",
-        lambda m: [Stage("delay", _lags, (m, count))],
-        0.14,
-        "delay_s",
-        {"lags": count},
-    )
+@kernel
+def _onset(x, p, s, c):
+    """p: delay s, share of it that is a lag. s[0]: place in the ring, s[1]: the lag's state."""
+    x = delayed(x, min(p[0] * (1.0 - p[1]) / c[STEP_S], 690.0), s, 10, 700)
+    if p[0] > 0.0:
+        s[1] += (x - s[1]) * (1.0 - math.exp(-c[STEP_S] / (p[0] * p[1])))
+        return s[1]
+    return x
 
 
 def motor_units(rng: Generator, _base: Base) -> Formulation:
@@ -85,4 +71,27 @@ def motor_units(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-FORMULATIONS = (transport_line, chain_of_lags, motor_units)
+FORMULATIONS = (
+    Written("transport line", "Cavanagh and Komi 1979", "delay", _line, 0.12, "delay_s"),
+    Written(
+        "chain of equal lags",
+        "linear chain trick, MacDonald 1978",
+        "delay",
+        _lags,
+        0.14,
+        "delay_s",
+        {"lags": lambda rng, _base: int(rng.integers(5, 13))},
+    ),
+    motor_units,
+)
+KEPT_BACK = (
+    Written(
+        "conduction, then a lag of the series elastic element",
+        "parts of the electromechanical delay, Nordez et al. 2009",
+        "delay",
+        _onset,
+        0.13,
+        "delay_s",
+        {"lag_share": (0.15, 0.45)},
+    ),
+)

@@ -16,6 +16,7 @@ from hardware_sim.patients.hidden.kernels import (
     Stage,
     kernel,
 )
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -37,9 +38,6 @@ def _three_compartments(x, p, s, c):
     return x * (1.0 - s[0])
 
 
-UNITS = 24
-
-
 @kernel
 def _motor_units(x, p, s, c):
     """p[0:24]: rate of tiring of each unit, p[24:48]: of recovery. s: each unit's lost share, in recruitment order."""
@@ -52,6 +50,16 @@ def _motor_units(x, p, s, c):
     return torque / 24.0 * c[LARGEST_NM] + max(level - 24.0, 0.0) / 24.0 * c[LARGEST_NM]
 
 
+@kernel
+def _phosphate(x, p, s, c):
+    """p: production per s, clearance s, Hill exponent. s[0]: phosphate over the level that halves the force."""
+    s[0] += c[STEP_S] * (p[0] * c[ACTIVATION] - s[0] / p[1])
+    return x / (1.0 + s[0] ** p[2])
+
+
+UNITS = 24
+
+
 def ding(rng: Generator, _base: Base) -> Formulation:
     tau = float(rng.uniform(40.0, 150.0))
     slowing = float(rng.choice([0.0, 0.3, 0.8]))
@@ -62,18 +70,6 @@ def ding(rng: Generator, _base: Base) -> Formulation:
         0.25,
         "alpha_per_s",
         {"tau_s": tau, "slowing": slowing},
-    )
-
-
-def xia_frey_law(rng: Generator, _base: Base) -> Formulation:
-    recovery, factor = float(rng.uniform(0.004, 0.03)), float(rng.uniform(1.0, 10.0))
-    return Formulation(
-        "three compartments: resting, active, fatigued",
-        "Xia and Frey-Law 2008; rest factor Looft, Herkert and Frey-Law 2018",
-        lambda m: [Stage("gain", _three_compartments, (m, recovery, factor))],
-        0.3,
-        "F_per_s",
-        {"R_per_s": recovery, "rest_factor": factor},
     )
 
 
@@ -90,4 +86,27 @@ def motor_units(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-FORMULATIONS = (ding, xia_frey_law, motor_units)
+FORMULATIONS = (
+    ding,
+    Written(
+        "three compartments: resting, active, fatigued",
+        "Xia and Frey-Law 2008; rest factor Looft, Herkert and Frey-Law 2018",
+        "gain",
+        _three_compartments,
+        0.3,
+        "F_per_s",
+        {"R_per_s": (0.004, 0.03), "rest_factor": (1.0, 10.0)},
+    ),
+    motor_units,
+)
+KEPT_BACK = (
+    Written(
+        "phosphate inhibits force",
+        "inorganic phosphate, Allen, Lamb and Westerblad 2008",
+        "gain",
+        _phosphate,
+        0.5,
+        "production_per_s",
+        {"clearance_s": (25.0, 90.0), "exponent": (1.0, 2.2)},
+    ),
+)

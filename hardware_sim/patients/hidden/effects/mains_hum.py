@@ -9,6 +9,7 @@ from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Stage, kernel, normal
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -37,12 +38,21 @@ def _wandering(x, p, s, c):
     return x + p[0] * (math.sin(s[0]) + 0.3 * math.sin(3.0 * s[0]))
 
 
-def _mains(rng: Generator) -> float:
+@kernel
+def _switching(x, p, s, c):
+    """p: size, mains Hz, period and share of the machine's work s, third harmonic. s[0]: present size."""
+    at = (c[TIME_S] / p[2]) % 1.0
+    s[0] += c[STEP_S] / 0.1 * ((1.0 if at < p[3] else 0.35) - s[0])
+    turn = 2.0 * math.pi * p[1] * c[TIME_S]
+    return x + p[0] * s[0] * (math.sin(turn) + p[4] * math.sin(3.0 * turn + 1.0))
+
+
+def _mains(rng: Generator, _base: Base) -> float:
     return float(rng.choice([50.0, 60.0]) + rng.normal(0.0, 0.01))
 
 
-def harmonics(rng: Generator, _base: Base) -> Formulation:
-    mains = _mains(rng)
+def harmonics(rng: Generator, base: Base) -> Formulation:
+    mains = _mains(rng, base)
     amplitude = np.array([1.0, 0.1, 0.4, 0.05, 0.2]) * rng.uniform(0.3, 1.2, 5)
     parts = np.column_stack([amplitude, rng.uniform(0.0, 2.0 * np.pi, 5)]).ravel()
     depth, slow = float(rng.uniform(0.0, 0.3)), float(rng.uniform(0.02, 0.2))
@@ -56,29 +66,36 @@ def harmonics(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-def rectifier(rng: Generator, _base: Base) -> Formulation:
-    mains, phase, share = _mains(rng), float(rng.uniform(0.0, 2.0 * np.pi)), float(rng.uniform(0.2, 0.8))
-    return Formulation(
+FORMULATIONS = (
+    harmonics,
+    Written(
         "flattened sine with current peaks",
         "capacitor-input rectifiers",
-        lambda m: [Stage("sensor", _rectifier, (m, mains, phase, share))],
+        "sensor",
+        _rectifier,
         2.0,
         "amplitude_nm",
-        {"mains_hz": mains, "share_flattened": share},
-    )
-
-
-def wandering(rng: Generator, _base: Base) -> Formulation:
-    mains, spread, tau = _mains(rng), float(rng.uniform(0.005, 0.03)), float(rng.uniform(3.0, 20.0))
-    seed = int(rng.integers(1, 2**31))
-    return Formulation(
+        {"mains_hz": _mains, "_phase": (0.0, 2.0 * np.pi), "share_flattened": (0.2, 0.8)},
+    ),
+    Written(
         "the grid's frequency wanders",
         "grid frequency as an Ornstein-Uhlenbeck process",
-        lambda m: [Stage("sensor", _wandering, (m, mains, spread, tau), (0.0, 0.0, seed))],
+        "sensor",
+        _wandering,
         2.0,
         "amplitude_nm",
-        {"mains_hz": mains, "spread_hz": spread},
-    )
-
-
-FORMULATIONS = (harmonics, rectifier, wandering)
+        {"mains_hz": _mains, "spread_hz": (0.005, 0.03), "_tau_s": (3.0, 20.0)},
+        seed_at=2,
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "a machine switches on and off",
+        "compressor duty cycle",
+        "sensor",
+        _switching,
+        2.5,
+        "amplitude_nm",
+        {"mains_hz": [50.0, 60.0], "period_s": (8.0, 25.0), "share_on": (0.4, 0.8), "_third": (0.0, 0.5)},
+    ),
+)

@@ -9,6 +9,7 @@ from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base, second_order_step
 from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.written import Written, second_order_of
 
 
 @kernel
@@ -36,31 +37,30 @@ def _spectrum(x, p, s, c):
 
 @kernel
 def _slow_tail(x, p, s, c):
-    """p: 1/Tω, ζ, slow share, time constant of the slow first-order fibres s."""
-    fast = second_order_step(x, p[0], p[1], s, 0, c[STEP_S])
+    """p: slow share, 1/Tω, ζ, time constant of the slow first-order fibres s."""
+    fast = second_order_step(x, p[1], p[2], s, 0, c[STEP_S])
     s[2] += (x - s[2]) * (1.0 - math.exp(-c[STEP_S] / p[3]))
-    y = (1.0 - p[2]) * fast + p[2] * s[2]
+    y = (1.0 - p[0]) * fast + p[0] * s[2]
     c[FORCE] = y / c[LARGEST_NM]
     return y
 
 
-def _pair(rng: Generator, base: Base, name: str, source: str, ordered: bool) -> Formulation:
-    share, rate = float(rng.uniform(0.3, 0.7)), 1.0 / base.t_omega_s
+@kernel
+def _third_order(x, p, s, c):
+    """p: slow share, 1/Tω, ζ, time constant of each of three lags s."""
+    fast = second_order_step(x, p[1], p[2], s, 0, c[STEP_S])
+    keep = math.exp(-c[STEP_S] / p[3])
+    signal = x
+    for i in range(3):
+        s[2 + i] = signal + (s[2 + i] - signal) * keep
+        signal = s[2 + i]
+    y = (1.0 - p[0]) * fast + p[0] * signal
+    c[FORCE] = y / c[LARGEST_NM]
+    return y
 
-    def build(m: float) -> list[Stage]:
-        rates = rate * math.exp(m * (1.0 - share)), rate * math.exp(-m * share)
-        return [Stage("dynamics", _two_branches, (*rates, base.zeta, share, 1.0 if ordered else 0.0))]
 
-    return Formulation(name, source, build, 2.3, "log_ratio", {"fast_share": share})
-
-
-def fast_and_slow(rng: Generator, base: Base) -> Formulation:
-    return _pair(rng, base, "fast and slow in parallel", "Milner-Brown, Stein and Yemm 1973", False)
-
-
-def fast_first(rng: Generator, base: Base) -> Formulation:
-    name = "fast fibres recruited before the slow ones"
-    return _pair(rng, base, name, "reversed order: Trimble and Enoka 1991; Gregory and Bickel 2005", True)
+def _apart(m: float, rate: float, zeta: float, share: float, ordered: float) -> tuple[float, ...]:
+    return rate * math.exp(m * (1.0 - share)), rate * math.exp(-m * share), zeta, share, ordered
 
 
 def spectrum(rng: Generator, base: Base) -> Formulation:
@@ -77,16 +77,49 @@ def spectrum(rng: Generator, base: Base) -> Formulation:
     )
 
 
-def slow_tail(rng: Generator, base: Base) -> Formulation:
-    tail = float(np.exp(rng.uniform(np.log(2.5), np.log(8.0)))) * base.t_omega_s
-    return Formulation(
+FORMULATIONS = (
+    Written(
+        "fast and slow in parallel",
+        "Milner-Brown, Stein and Yemm 1973",
+        "dynamics",
+        _two_branches,
+        2.3,
+        "log_ratio",
+        {"_base": second_order_of, "fast_share": (0.3, 0.7), "_ordered": 0.0},
+        _apart,
+    ),
+    Written(
+        "fast fibres recruited before the slow ones",
+        "reversed order: Trimble and Enoka 1991; Gregory and Bickel 2005",
+        "dynamics",
+        _two_branches,
+        2.3,
+        "log_ratio",
+        {"_base": second_order_of, "fast_share": (0.3, 0.7), "_ordered": 1.0},
+        _apart,
+    ),
+    spectrum,
+    Written(
         "second-order fast fibres, first-order slow ones",
         "sim",
-        lambda m: [Stage("dynamics", _slow_tail, (1.0 / base.t_omega_s, base.zeta, m, tail))],
+        "dynamics",
+        _slow_tail,
         0.7,
         "slow_share",
-        {"tau_slow_s": tail},
-    )
-
-
-FORMULATIONS = (fast_and_slow, fast_first, spectrum, slow_tail)
+        {
+            "_base": second_order_of,
+            "tau_slow_s": lambda rng, base: float(np.exp(rng.uniform(np.log(2.5), np.log(8.0)))) * base.t_omega_s,
+        },
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "slow fibres of third order",
+        "sim",
+        "dynamics",
+        _third_order,
+        0.8,
+        "slow_share",
+        {"_base": second_order_of, "lag_s": lambda rng, base: float(rng.uniform(1.0, 2.2)) * base.t_omega_s},
+    ),
+)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -39,50 +37,61 @@ def _tendon(x, p, s, c):
 
 @kernel
 def _knee(x, p, s, c):
-    """p: torque of the knee over the largest torque, slope lost above it, roundness. Softplus knee."""
-    at, width = p[0] * c[LARGEST_NM], p[2] * c[LARGEST_NM]
+    """p: slope lost above the knee, torque of the knee over the largest torque, roundness. Softplus knee."""
+    at, width = p[1] * c[LARGEST_NM], p[2] * c[LARGEST_NM]
     z = (x - at) / width
     z0 = -at / width
     above = width * (max(z, 0.0) + math.log1p(math.exp(-abs(z))) - math.log1p(math.exp(z0)))
-    return x - p[1] * above
+    return x - p[0] * above
 
 
-def tanh(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation("tanh", "textbook", lambda m: [Stage("structure", _tanh, (m,))], 4.0, "largest_over_knee")
+@kernel
+def _hyperbola(x, p, s, c):
+    """p: largest torque over the half-saturation torque."""
+    if x <= 0.0:
+        return x
+    return x / (1.0 + p[0] * x / c[LARGEST_NM])
 
 
-def power(rng: Generator, _base: Base) -> Formulation:
-    exponent = float(rng.uniform(1.5, 6.0))
-    return Formulation(
+@kernel
+def _arctangent(x, p, s, c):
+    """p: largest torque over the knee."""
+    if p[0] <= 0.0:
+        return x
+    knee = c[LARGEST_NM] / p[0]
+    return knee * math.atan(x / knee)
+
+
+FORMULATIONS = (
+    Written("tanh", "textbook", "structure", _tanh, 4.0, "largest_over_knee"),
+    Written(
         "x / (1 + x^p)^(1/p)",
         "Naka and Rushton 1966, generalised",
-        lambda m: [Stage("structure", _power, (m, exponent))],
+        "structure",
+        _power,
         4.0,
         "largest_over_limit",
-        {"exponent": exponent},
-    )
-
-
-def tendon(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation(
+        {"exponent": (1.5, 6.0)},
+    ),
+    Written(
         "tendon with an exponential toe",
         "after the series elastic element of Zajac 1989",
-        lambda m: [Stage("structure", _tendon, (m,))],
+        "structure",
+        _tendon,
         4.0,
         "exponent",
-    )
-
-
-def knee(rng: Generator, _base: Base) -> Formulation:
-    at, roundness = float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.02, 0.08))
-    return Formulation(
+    ),
+    Written(
         "two slopes with a soft knee",
         "bilinear fixture stiffness",
-        lambda m: [Stage("structure", _knee, (at, m, roundness))],
+        "structure",
+        _knee,
         0.97,
         "slope_lost",
-        {"knee_share": at, "roundness": roundness},
-    )
-
-
-FORMULATIONS = (tanh, power, tendon, knee)
+        {"knee_share": (0.35, 0.6), "roundness": (0.02, 0.08)},
+    ),
+)
+KEPT_BACK = (
+    Written("hyperbola", "Hill 1910", "structure", _hyperbola, 5.0, "largest_over_half"),
+    Written("arctangent", "textbook", "structure", _arctangent, 5.0, "largest_over_knee"),
+)

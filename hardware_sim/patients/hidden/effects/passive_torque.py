@@ -8,6 +8,7 @@ from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.kernels import ANGLE_RAD, STEP_S, VELOCITY_RAD_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -43,6 +44,14 @@ def _relaxing(x, p, s, c):
     return x - p[0] * (p[1] * angle + (1.0 - p[1]) * (angle - s[0]))
 
 
+@kernel
+def _tangent(x, p, s, c):
+    """p: size N·m, range rad, viscous share, exponent of the velocity."""
+    d = min(max((c[ANGLE_RAD] - 0.5 * math.pi) / p[1], -0.95), 0.95)
+    v = c[VELOCITY_RAD_S]
+    return x - p[0] * (math.tan(0.5 * math.pi * d) + p[2] * math.copysign(abs(v) ** p[3], v))
+
+
 def exponential(rng: Generator, _base: Base) -> Formulation:
     per_rad = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.7))
     slack = 0.5 * math.pi - math.copysign(float(rng.uniform(0.1, 0.6)), per_rad)
@@ -57,48 +66,50 @@ def exponential(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-def two_ends(rng: Generator, _base: Base) -> Formulation:
-    numbers = (
-        float(rng.uniform(2.0, 5.0)),
-        float(rng.uniform(0.8, 1.3)),
-        float(rng.uniform(2.0, 5.0)),
-        float(rng.uniform(1.8, 2.3)),
-        float(rng.uniform(0.1, 0.6)),
-    )
-    return Formulation(
+FORMULATIONS = (
+    exponential,
+    Written(
         "exponentials at both ends of the range",
         "Hatze 1997; Riener and Edrich 1999",
-        lambda m: [Stage("additive", _two_ends, (m, *numbers))],
+        "additive",
+        _two_ends,
         6.0,
         "size_nm",
-        dict(
-            zip(("flexed_per_rad", "flexed_rad", "extended_per_rad", "extended_rad", "viscous_s"), numbers, strict=True)
-        ),
-    )
-
-
-def friction(rng: Generator, _base: Base) -> Formulation:
-    shares = float(rng.uniform(0.6, 1.4)), float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.0, 0.25))
-    return Formulation(
+        {
+            "flexed_per_rad": (2.0, 5.0),
+            "flexed_rad": (0.8, 1.3),
+            "extended_per_rad": (2.0, 5.0),
+            "extended_rad": (1.8, 2.3),
+            "viscous_s": (0.1, 0.6),
+        },
+    ),
+    Written(
         "spring, dashpot and some dry friction",
         "Ashworth-like stiffness, linear",
-        lambda m: [Stage("additive", _friction, (m, *shares))],
+        "additive",
+        _friction,
         5.0,
         "size_nm",
-        dict(zip(("stiffness", "viscosity_s", "dry"), shares, strict=True)),
-    )
-
-
-def relaxing(rng: Generator, _base: Base) -> Formulation:
-    lasting, tau = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.4, 2.0))
-    return Formulation(
+        {"stiffness": (0.6, 1.4), "viscosity_s": (0.2, 0.8), "dry": (0.0, 0.25)},
+    ),
+    Written(
         "standard linear solid",
         "Fung 1981",
-        lambda m: [Stage("additive", _relaxing, (m, lasting, tau))],
+        "additive",
+        _relaxing,
         6.0,
         "stiffness_nm_per_rad",
-        {"lasting_share": lasting, "relaxation_s": tau},
-    )
-
-
-FORMULATIONS = (exponential, two_ends, friction, relaxing)
+        {"lasting_share": (0.3, 0.7), "relaxation_s": (0.4, 2.0)},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "tangent of the angle and a power of the velocity",
+        "stiffening towards both ends",
+        "additive",
+        _tangent,
+        4.0,
+        "size_nm",
+        {"range_rad": (1.1, 1.6), "viscous_share": (0.1, 1.0), "velocity_exponent": (0.7, 1.2)},
+    ),
+)

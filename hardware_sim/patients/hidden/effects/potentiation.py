@@ -5,7 +5,8 @@ from __future__ import annotations
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, PULSE, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, PULSE, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -36,40 +37,56 @@ def _calcium_sensitivity(x, p, s, c):
     return c[LARGEST_NM] * share * (1.0 + shift) / (1.0 + shift * share)
 
 
-def phosphorylation(rng: Generator, _base: Base) -> Formulation:
-    on, off = float(rng.uniform(0.06, 0.4)), 1.0 / float(rng.uniform(15.0, 80.0))
-    return Formulation(
+@kernel
+def _by_work(x, p, s, c):
+    """p: gain, build-up s, two decays s. s: two stores filled by force."""
+    fill = c[STEP_S] * max(c[FORCE], 0.0) / p[1]
+    s[0] += fill * (1.0 - s[0]) - c[STEP_S] * s[0] / p[2]
+    s[1] += fill * (1.0 - s[1]) - c[STEP_S] * s[1] / p[3]
+    return x * (1.0 + p[0] * (0.5 * s[0] + 0.5 * s[1]) ** 1.3)
+
+
+def _decay_per_s(rng: Generator, _base: Base) -> float:
+    return 1.0 / float(rng.uniform(15.0, 80.0))
+
+
+FORMULATIONS = (
+    Written(
         "light-chain phosphorylation",
         "Sweeney, Bowman and Stull 1993; sizes of O'Leary, Hope and Sale 1997",
-        lambda m: [Stage("gain", _phosphorylation, (m, on, off))],
+        "gain",
+        _phosphorylation,
         1.2,
         "full_gain",
-        {"kinase_per_s": on, "phosphatase_per_s": off},
-    )
-
-
-def staircase(rng: Generator, _base: Base) -> Formulation:
-    step, decay = float(rng.uniform(0.004, 0.02)), float(rng.uniform(10.0, 60.0))
-    return Formulation(
+        {"kinase_per_s": (0.06, 0.4), "phosphatase_per_s": _decay_per_s},
+    ),
+    Written(
         "staircase, pulse by pulse",
         "treppe, Bowditch 1871; MacIntosh 2010",
-        lambda m: [Stage("gain", _staircase, (m, step, decay))],
+        "gain",
+        _staircase,
         1.2,
         "full_gain",
-        {"share_a_pulse": step, "decay_s": decay},
-    )
-
-
-def calcium_sensitivity(rng: Generator, _base: Base) -> Formulation:
-    on, off = float(rng.uniform(0.08, 0.4)), 1.0 / float(rng.uniform(15.0, 80.0))
-    return Formulation(
+        {"share_a_pulse": (0.004, 0.02), "decay_s": (10.0, 60.0)},
+    ),
+    Written(
         "leftward shift of the force-calcium curve",
         "Persechini, Stull and Cooke 1985",
-        lambda m: [Stage("gain", _calcium_sensitivity, (m, on, off))],
+        "gain",
+        _calcium_sensitivity,
         15.0,
         "shift",
-        {"kinase_per_s": on, "phosphatase_per_s": off},
-    )
-
-
-FORMULATIONS = (phosphorylation, staircase, calcium_sensitivity)
+        {"kinase_per_s": (0.08, 0.4), "phosphatase_per_s": _decay_per_s},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "two stores filled by force",
+        "biexponential decay of potentiation, O'Leary, Hope and Sale 1997",
+        "gain",
+        _by_work,
+        1.5,
+        "gain",
+        {"build_up_s": (2.5, 8.0), "fast_decay_s": (8.0, 20.0), "slow_decay_s": (40.0, 120.0)},
+    ),
+)

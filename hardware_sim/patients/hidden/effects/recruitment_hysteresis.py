@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.base import Base, look_up
 from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, Formulation, Stage, kernel
 
 
@@ -20,9 +20,6 @@ def _bouc_wen(x, p, s, c):
         size = abs(s[0])
         s[0] += d - p[2] * abs(d) * size ** (p[4] - 1.0) * s[0] - p[3] * d * size ** p[4]
     return max(x - p[0] * s[0], 0.0) if x > 0.0 else 0.0
-
-
-SIDE = 20
 
 
 @kernel
@@ -63,6 +60,21 @@ def _unit_thresholds(x, p, s, c):
             w += step * min(max(s[i] - i, 0.0), 1.0)
     c[ACTIVATION] = w / c[LARGEST_NM]
     return w
+
+
+@kernel
+def _two_curves(x, p, s, c):
+    """p[0:512]: torque at every µs; shift as a share of the width; reach µs. s: direction -1 to 1, width before."""
+    s[0] = min(max(s[0] + (x - s[1]) / p[513], -1.0), 1.0)
+    s[1] = x
+    q = s[0] * (1.5 - 0.5 * s[0] * s[0])
+    up, down = look_up(p, x * (1.0 - p[512])), look_up(p, x * (1.0 + p[512]))
+    w = 0.5 * (1.0 + q) * up + 0.5 * (1.0 - q) * down
+    c[ACTIVATION] = w / c[LARGEST_NM]
+    return w
+
+
+SIDE = 20
 
 
 def bouc_wen(rng: Generator, _base: Base) -> Formulation:
@@ -109,4 +121,17 @@ def unit_thresholds(rng: Generator, base: Base) -> Formulation:
     )
 
 
+def two_curves(rng: Generator, base: Base) -> Formulation:
+    reach = float(rng.uniform(20.0, 60.0))
+    return Formulation(
+        "a curve for rising and one for falling widths, blended",
+        "two curves of ramp deconvolution, Durfee and MacLean 1989",
+        lambda m: [Stage("recruitment", _two_curves, (*base.table_nm, m, reach))],
+        0.25,
+        "shift_share",
+        {"reach_us": reach},
+    )
+
+
 FORMULATIONS = (bouc_wen, preisach, unit_thresholds)
+KEPT_BACK = (two_curves,)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, TIME_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -34,32 +32,46 @@ def _converter(x, p, s, c):
     return min(float(round(x / count)), p[1]) * count
 
 
-def rail(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation("upper rail", "textbook", lambda m: [Stage("converter", _rail, (m,))], 0.8, "share_cut_off")
+@kernel
+def _overload(x, p, s, c):
+    """p: share of the largest torque cut off, s the amplifier stays at the rail. s[0]: until when."""
+    if p[0] <= 0.0:
+        return x
+    rail = (1.0 - p[0]) * c[LARGEST_NM]
+    if x >= rail:
+        s[0] = c[TIME_S] + p[1]
+    return rail if c[TIME_S] <= s[0] and s[0] > 0.0 else x
 
 
-def both_rails(rng: Generator, _base: Base) -> Formulation:
-    lower = float(rng.uniform(0.05, 0.3))
-    return Formulation(
+FORMULATIONS = (
+    Written("upper rail", "textbook", "converter", _rail, 0.8, "share_cut_off"),
+    Written(
         "upper and lower rail",
         "textbook",
-        lambda m: [Stage("converter", _both_rails, (m, lower))],
+        "converter",
+        _both_rails,
         0.8,
         "share_cut_off",
-        {"lower_rail_share": lower},
-    )
-
-
-def converter(rng: Generator, _base: Base) -> Formulation:
-    counts = int(rng.choice([2047, 4095, 8191]))
-    return Formulation(
+        {"lower_rail_share": (0.05, 0.3)},
+    ),
+    Written(
         "converter at its last code",
         "textbook",
-        lambda m: [Stage("converter", _converter, (m, counts))],
+        "converter",
+        _converter,
         0.8,
         "share_cut_off",
-        {"counts": counts},
-    )
-
-
-FORMULATIONS = (rail, both_rails, converter)
+        {"counts": lambda rng, _base: int(rng.choice([2047, 4095, 8191]))},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "the amplifier stays at its rail a little longer",
+        "overload recovery",
+        "converter",
+        _overload,
+        0.8,
+        "share_cut_off",
+        {"stays_s": (0.005, 0.03)},
+    ),
+)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, helper, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, helper, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @helper
@@ -53,52 +52,75 @@ def _anti_resonance(x, p, s, c):
     return x - p[0] * (s[1] - speed) / c[STEP_S] / (omega * omega)
 
 
-def mass_and_spring(rng: Generator, _base: Base) -> Formulation:
-    damping = float(np.exp(rng.uniform(np.log(0.03), np.log(0.3))))
-    return Formulation(
+@kernel
+def _chain(x, p, s, c):
+    """p: 1/ω² s², ζ, second ω over first. s: two displacements and speeds.
+
+    Muscle pulls the first mass against the second, the load cell holds the second: x -> m1 -> spring -> m2 -> cell.
+    """
+    if p[0] < 1e-8:
+        return x
+    omega = 1.0 / math.sqrt(p[0])
+    second = omega * p[2]
+    pieces = int(second * c[STEP_S] / 0.05) + 1
+    h = c[STEP_S] / pieces
+    for i in range(pieces):
+        drive = s[4] + (x - s[4]) * (i + 0.5) / pieces
+        first = s[0] - s[2] + 2.0 * p[1] / omega * (s[1] - s[3])
+        s[1] += h * omega * omega * (drive - first)
+        s[3] += h * second * second * (first - s[2] - 2.0 * p[1] / second * s[3])
+        s[0] += h * s[1]
+        s[2] += h * s[3]
+    s[4] = x
+    return s[2] + 2.0 * p[1] / second * s[3]
+
+
+FORMULATIONS = (
+    Written(
         "mass on a spring",
         "load cell and splint as a single mode",
-        lambda m: [Stage("structure", _in_series, (m, damping, 0.0))],
+        "structure",
+        _in_series,
         0.02,
         "inverse_omega_squared_s2",
-        {"zeta": damping},
-    )
-
-
-def stiffening(rng: Generator, _base: Base) -> Formulation:
-    damping, stiff = float(rng.uniform(0.04, 0.3)), float(rng.uniform(0.3, 2.5))
-    return Formulation(
+        {"zeta": lambda rng, _base: float(np.exp(rng.uniform(np.log(0.03), np.log(0.3)))), "_stiffening": 0.0},
+    ),
+    Written(
         "mass on a spring that stiffens",
         "tendon toe region, Zajac 1989",
-        lambda m: [Stage("structure", _in_series, (m, damping, stiff))],
+        "structure",
+        _in_series,
         0.02,
         "inverse_omega_squared_s2",
-        {"zeta": damping, "stiffening": stiff},
-    )
-
-
-def beside(rng: Generator, _base: Base) -> Formulation:
-    hz, damping = float(rng.uniform(1.5, 6.0)), float(rng.uniform(0.03, 0.2))
-    return Formulation(
+        {"zeta": (0.04, 0.3), "stiffening": (0.3, 2.5)},
+    ),
+    Written(
         "part of the torque goes through the mode",
         "two-mode fixture",
-        lambda m: [Stage("structure", _beside, (m, hz, damping))],
+        "structure",
+        _beside,
         1.0,
         "share",
-        {"frequency_hz": hz, "zeta": damping},
-    )
-
-
-def acceleration(rng: Generator, _base: Base) -> Formulation:
-    hz, damping = float(rng.uniform(1.5, 6.0)), float(rng.uniform(0.03, 0.2))
-    return Formulation(
+        {"frequency_hz": (1.5, 6.0), "zeta": (0.03, 0.2)},
+    ),
+    Written(
         "the load cell feels the forearm's acceleration",
         "inertial torque of a compliant splint",
-        lambda m: [Stage("structure", _anti_resonance, (m, hz, damping))],
+        "structure",
+        _anti_resonance,
         2.0,
         "size",
-        {"frequency_hz": hz, "zeta": damping},
-    )
-
-
-FORMULATIONS = (mass_and_spring, stiffening, beside, acceleration)
+        {"frequency_hz": (1.5, 6.0), "zeta": (0.03, 0.2)},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "two masses in a row",
+        "forearm and splint, a mode each",
+        "structure",
+        _chain,
+        0.02,
+        "inverse_omega_squared_s2",
+        {"zeta": (0.05, 0.25), "second_over_first": (2.0, 4.0)},
+    ),
+)

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel, random_sign, smooth_table
+from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, WIDTH_US, Formulation, Stage, kernel, smooth_table
+from hardware_sim.patients.hidden.written import Sign, Written, mostly
 
 
 @kernel
@@ -42,36 +43,21 @@ def _linear(x, p, s, c):
     return max(x - p[0] * min(c[TIME_S], p[1]), 0.0) if x > 0.0 else 0.0
 
 
-def _sign(rng: Generator) -> float:
-    return random_sign(rng, 0.65)
+@kernel
+def _settling(x, p, s, c):
+    """p: µs a decade of time, first time s. Charge transfer at the interface settles with the logarithm of time."""
+    return max(x - p[0] * math.log10(1.0 + c[TIME_S] / p[1]), 0.0) if x > 0.0 else 0.0
 
 
-def impedance(rng: Generator, _base: Base) -> Formulation:
-    tau, sign = float(rng.uniform(10.0, 60.0)), _sign(rng)
-    return Formulation(
-        "electrode settles like an RC",
-        "electrode-skin impedance, Dorgan and Reilly 1999",
-        lambda m: [Stage("electrode", _warm_up, (sign * m, tau))],
-        90.0,
-        "final_shift_us",
-        {"tau_s": tau, "sign": sign},
-    )
-
-
-def strength_duration(rng: Generator, _base: Base) -> Formulation:
-    tau, sign, drive = float(rng.uniform(15.0, 80.0)), -_sign(rng), float(rng.uniform(1.6, 3.0))
-    return Formulation(
-        "current falls, thresholds scale by Lapicque's law",
-        "Lapicque 1907; Geddes 2004",
-        lambda m: [Stage("electrode", _strength_duration, (sign * m, tau, drive))],
-        0.35,
-        "share_of_current",
-        {"tau_s": tau, "sign": sign, "current_over_rheobase": drive},
-    )
+@kernel
+def _with_charge(x, p, s, c):
+    """p: µs after a second of charge of 300 µs pulses. s[0]: charge so far. Polarisation that stays."""
+    s[0] += c[STEP_S] * c[WIDTH_US] / 300.0
+    return max(x - p[0] * s[0], 0.0) if x > 0.0 else 0.0
 
 
 def sweat(rng: Generator, _base: Base) -> Formulation:
-    spacing, sign = float(rng.uniform(10.0, 18.0)), _sign(rng)
+    spacing, sign = float(rng.uniform(10.0, 18.0)), MOSTLY_UP.draw(rng)
     steps = np.abs(rng.normal(1.0, 0.5, 199)) * np.exp(-np.arange(199) / 12.0)
     knots = np.concatenate([[0.0], np.cumsum(steps)])
     knots *= sign / knots[4]
@@ -85,16 +71,59 @@ def sweat(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-def linear(rng: Generator, _base: Base) -> Formulation:
-    sign, until = _sign(rng), float(rng.uniform(60.0, 200.0))
-    return Formulation(
+MOSTLY_UP = Sign(mostly(0.65))
+
+FORMULATIONS = (
+    Written(
+        "electrode settles like an RC",
+        "electrode-skin impedance, Dorgan and Reilly 1999",
+        "electrode",
+        _warm_up,
+        90.0,
+        "final_shift_us",
+        {"tau_s": (10.0, 60.0), "sign": MOSTLY_UP},
+    ),
+    Written(
+        "current falls, thresholds scale by Lapicque's law",
+        "Lapicque 1907; Geddes 2004",
+        "electrode",
+        _strength_duration,
+        0.35,
+        "share_of_current",
+        {
+            "tau_s": (15.0, 80.0),
+            "sign": Sign(lambda rng: -MOSTLY_UP.draw(rng)),
+            "current_over_rheobase": (1.6, 3.0),
+        },
+    ),
+    sweat,
+    Written(
         "linear, then settled",
         "sim",
-        lambda m: [Stage("electrode", _linear, (sign * m, until))],
+        "electrode",
+        _linear,
         2.0,
         "us_per_s",
-        {"sign": sign, "until_s": until},
-    )
-
-
-FORMULATIONS = (impedance, strength_duration, sweat, linear)
+        {"sign": MOSTLY_UP, "until_s": (60.0, 200.0)},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "goes with the logarithm of time",
+        "constant-phase settling of the electrode interface, McAdams and Jossinet 1995",
+        "electrode",
+        _settling,
+        90.0,
+        "us_per_decade",
+        {"first_s": (3.0, 12.0), "sign": Sign()},
+    ),
+    Written(
+        "goes with the charge delivered",
+        "electrode polarisation, Merrill, Bikson and Jefferys 2005",
+        "electrode",
+        _with_charge,
+        6.0,
+        "us_per_s_of_charge",
+        {"sign": Sign()},
+    ),
+)

@@ -7,7 +7,8 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ANGLE_RAD, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import ANGLE_RAD, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -32,39 +33,63 @@ def _moment_arm(x, p, s, c):
     return x * arm ** p[0]
 
 
-def parabola(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation(
+@kernel
+def _cubic(x, p, s, c):
+    """p: exponent, then coefficients of a cubic in rad from 90°."""
+    d = c[ANGLE_RAD] - 0.5 * math.pi
+    return x * max(1.0 + d * (p[1] + d * (p[2] + d * p[3])), 0.05) ** p[0]
+
+
+def _best_rad(rng: Generator, _base: Base) -> float:
+    return float(0.5 * math.pi + rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.6))
+
+
+def _coefficients(rng: Generator, _base: Base) -> list[float]:
+    first = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.5))
+    return [first, -float(rng.uniform(0.2, 0.8)), float(rng.uniform(-0.2, 0.2))]
+
+
+FORMULATIONS = (
+    Written(
         "parabola about 90 degrees",
         "Marion, Wexler and Hull 2010",
-        lambda m: [Stage("joint", _parabola, (m, 0.0344, 4.49e-4))],
+        "joint",
+        _parabola,
         1.3,
         "exponent",
-    )
-
-
-def force_length(rng: Generator, _base: Base) -> Formulation:
-    per_rad, best = float(rng.uniform(0.3, 0.6)), float(rng.uniform(1.0, 2.1))
-    width = math.sqrt(float(rng.uniform(0.2, 0.45)))
-    return Formulation(
+        {"_linear": 0.0344, "_quadratic": 4.49e-4},
+    ),
+    Written(
         "Gaussian force-length curve",
         "Thelen 2003 (width γ 0.45)",
-        lambda m: [Stage("joint", _force_length, (m, per_rad, best, width))],
+        "joint",
+        _force_length,
         8.0,
         "exponent",
-        {"lengths_per_rad": per_rad, "best_angle_rad": best, "width": width},
-    )
-
-
-def moment_arm(rng: Generator, _base: Base) -> Formulation:
-    at = float(0.5 * math.pi + rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.6))
-    return Formulation(
+        {
+            "lengths_per_rad": (0.3, 0.6),
+            "best_angle_rad": (1.0, 2.1),
+            "width": lambda rng, _base: math.sqrt(float(rng.uniform(0.2, 0.45))),
+        },
+    ),
+    Written(
         "moment arm goes with the sine",
         "Murray, Delp and Buchanan 1995, simplified",
-        lambda m: [Stage("joint", _moment_arm, (m, at))],
+        "joint",
+        _moment_arm,
         5.0,
         "exponent",
-        {"best_angle_rad": at},
-    )
-
-
-FORMULATIONS = (parabola, force_length, moment_arm)
+        {"best_angle_rad": _best_rad},
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "cubic in the angle",
+        "elbow torque-angle polynomials",
+        "joint",
+        _cubic,
+        4.0,
+        "exponent",
+        {"coefficients": _coefficients},
+    ),
+)

@@ -7,7 +7,8 @@ import math
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ANGLE_RAD, VELOCITY_RAD_S, Formulation, Stage, kernel, random_sign
+from hardware_sim.patients.hidden.kernels import ANGLE_RAD, VELOCITY_RAD_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.written import Sign, Written, mostly
 
 
 @kernel
@@ -37,36 +38,15 @@ def _angle_times_velocity(x, p, s, c):
     return x * max(1.0 - p[0] * bell * c[VELOCITY_RAD_S], 0.0)
 
 
-def _sign(rng: Generator) -> float:
-    return random_sign(rng, 0.7)
-
-
-def hill(rng: Generator, _base: Base) -> Formulation:
-    sign, shape, plateau = _sign(rng), float(rng.uniform(0.2, 0.6)), float(rng.uniform(1.3, 1.8))
-    return Formulation(
-        "Hill's hyperbola with an eccentric branch",
-        "Hill 1938; Katz 1939",
-        lambda m: [Stage("joint", _hill, (sign * m, shape, plateau))],
-        1.0,
-        "inverse_largest_velocity_s",
-        {"shortening": "extension" if sign > 0 else "flexion", "shape": shape, "eccentric_plateau": plateau},
-    )
-
-
-def logarithmic(rng: Generator, _base: Base) -> Formulation:
-    sign = _sign(rng)
-    return Formulation(
-        "logarithmic force-velocity curve",
-        "De Groote, Kinney, Rao and Fregly 2016",
-        lambda m: [Stage("joint", _logarithmic, (sign * m,))],
-        1.0,
-        "inverse_largest_velocity_s",
-        {"shortening": "extension" if sign > 0 else "flexion"},
-    )
+@kernel
+def _logistic(x, p, s, c):
+    """p: steepness s/rad (signed), plateau of the stretched muscle."""
+    e = math.exp(-4.0 * p[0] * c[VELOCITY_RAD_S])
+    return x * p[1] * e / (p[1] - 1.0 + e)
 
 
 def angle_times_velocity(rng: Generator, _base: Base) -> Formulation:
-    sign, v2 = _sign(rng), float(rng.uniform(0.015, 0.03))
+    sign, v2 = MOSTLY_EXTENSION(rng), float(rng.uniform(0.015, 0.03))
     return Formulation(
         "velocity times a bell of the angle",
         "Marion, Wexler and Hull 2010",
@@ -77,4 +57,38 @@ def angle_times_velocity(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-FORMULATIONS = (hill, logarithmic, angle_times_velocity)
+MOSTLY_EXTENSION = mostly(0.7)
+SHORTENING = Sign(MOSTLY_EXTENSION, "extension", "flexion")
+
+FORMULATIONS = (
+    Written(
+        "Hill's hyperbola with an eccentric branch",
+        "Hill 1938; Katz 1939",
+        "joint",
+        _hill,
+        1.0,
+        "inverse_largest_velocity_s",
+        {"shortening": SHORTENING, "shape": (0.2, 0.6), "eccentric_plateau": (1.3, 1.8)},
+    ),
+    Written(
+        "logarithmic force-velocity curve",
+        "De Groote, Kinney, Rao and Fregly 2016",
+        "joint",
+        _logarithmic,
+        1.0,
+        "inverse_largest_velocity_s",
+        {"shortening": SHORTENING},
+    ),
+    angle_times_velocity,
+)
+KEPT_BACK = (
+    Written(
+        "logistic curve",
+        "smooth stand-in for Hill's hyperbola",
+        "joint",
+        _logistic,
+        0.8,
+        "steepness_s",
+        {"sign": Sign(MOSTLY_EXTENSION), "plateau": (1.4, 1.9)},
+    ),
+)

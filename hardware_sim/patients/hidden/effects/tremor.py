@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import FORCE, STEP_S, Formulation, Stage, kernel, normal
+from hardware_sim.patients.hidden.kernels import FORCE, STEP_S, TIME_S, Formulation, Stage, kernel, normal
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -37,41 +39,59 @@ def _wandering(x, p, s, c):
     return x + size * (math.sin(s[0]) + p[3] * math.sin(2.0 * s[0] + 0.7))
 
 
-def _generator(rng: Generator) -> int:
-    return int(rng.integers(1, 2**31))
+@kernel
+def _beats(x, p, s, c):
+    """p: size, then three pairs of Hz and phase. Close lines that beat, as of a few motor units."""
+    for i in range(3):
+        x += p[0] * math.sin(2.0 * math.pi * p[1 + 2 * i] * c[TIME_S] + p[2 + 2 * i])
+    return x
 
 
-def narrow_band(rng: Generator, _base: Base) -> Formulation:
-    centre, band, seed = float(rng.uniform(3.0, 8.0)), float(rng.uniform(0.15, 0.8)), _generator(rng)
+def beats(rng: Generator, _base: Base) -> Formulation:
+    centre = float(rng.uniform(3.4, 7.5))
+    lines = np.column_stack([centre + rng.uniform(-0.35, 0.35, 3), rng.uniform(0.0, 2.0 * np.pi, 3)])
     return Formulation(
+        "three close lines",
+        "beating motor units, Elble and Koller 1990",
+        lambda m: [Stage("additive", _beats, (m, *lines.ravel()))],
+        3.0,
+        "amplitude_nm",
+        {"lines_hz": lines[:, 0].tolist()},
+    )
+
+
+OSCILLATOR = {"centre_hz": (3.0, 8.0), "spread_hz": (0.05, 0.35), "second_harmonic": (0.0, 0.3)}
+
+FORMULATIONS = (
+    Written(
         "narrow-band noise",
         "autoregressive tremor, Randall 1973",
-        lambda m: [Stage("additive", _narrow_band, (m, centre, band), (0.0, 0.0, seed))],
+        "additive",
+        _narrow_band,
         4.0,
         "sd_nm",
-        {"centre_hz": centre, "bandwidth_hz": band},
-    )
-
-
-def _oscillator(rng: Generator, name: str, source: str, with_force: float) -> Formulation:
-    centre, spread = float(rng.uniform(3.0, 8.0)), float(rng.uniform(0.05, 0.35))
-    second, seed = float(rng.uniform(0.0, 0.3)), _generator(rng)
-    return Formulation(
-        name,
-        source,
-        lambda m: [Stage("additive", _wandering, (m, centre, spread, second, with_force), (0.0, 0.0, 0.0, seed))],
+        {"centre_hz": (3.0, 8.0), "bandwidth_hz": (0.15, 0.8)},
+        seed_at=2,
+    ),
+    Written(
+        "oscillator whose frequency and size wander",
+        "Gresty and Buckwell 1990",
+        "additive",
+        _wandering,
         4.0,
         "amplitude_nm",
-        {"centre_hz": centre, "spread_hz": spread, "second_harmonic": second},
-    )
-
-
-def wandering(rng: Generator, _base: Base) -> Formulation:
-    return _oscillator(rng, "oscillator whose frequency and size wander", "Gresty and Buckwell 1990", 0.0)
-
-
-def with_action(rng: Generator, _base: Base) -> Formulation:
-    return _oscillator(rng, "action tremor, grows with force", "McAuley and Marsden 2000", 1.0)
-
-
-FORMULATIONS = (narrow_band, wandering, with_action)
+        OSCILLATOR | {"_with_force": 0.0},
+        seed_at=3,
+    ),
+    Written(
+        "action tremor, grows with force",
+        "McAuley and Marsden 2000",
+        "additive",
+        _wandering,
+        4.0,
+        "amplitude_nm",
+        OSCILLATOR | {"_with_force": 1.0},
+        seed_at=3,
+    ),
+)
+KEPT_BACK = (beats,)

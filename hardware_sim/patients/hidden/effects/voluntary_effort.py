@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
-
-EVENTS = 60
+from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Stage, kernel, normal
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -55,58 +55,85 @@ def _spasms(x, p, s, c):
     return x
 
 
+@kernel
+def _moods(x, p, s, c):
+    """p: size N·m, correlation s, threshold. s: two lags of noise, generator. Effort where the process is high."""
+    h = c[STEP_S]
+    s[0] += -h * s[0] / p[1] + math.sqrt(2.0 * h / p[1]) * normal(s, 3)
+    s[1] += h * (s[0] - s[1]) / 0.25
+    drive = max(s[1] - p[2], 0.0)
+    s[2] += h * (drive - s[2]) / 0.15
+    return x + p[0] * s[2]
+
+
+EVENTS = 60
+
+
 def _events(rng: Generator, between_s: tuple[float, float]) -> np.ndarray:
     gaps = rng.uniform(*between_s, EVENTS)
     return float(rng.uniform(0.0, 5.0)) + np.cumsum(gaps) - gaps[0] * float(rng.uniform(0.0, 0.8))
 
 
-def _formulation(rng: Generator, name: str, source: str, stage: object, table: np.ndarray, top: float) -> Formulation:
-    if rng.random() < 0.15:  # the antagonist's
-        table[:, 2] *= -1.0
-    return Formulation(
-        name,
-        source,
-        lambda m: [Stage("additive", stage, (m, *table.ravel()))],
-        top,
-        "typical_height_nm",
-        {"first_events_s": table[:6, 0].tolist(), "first_heights": table[:6, 2].tolist()},
-    )
+def _effort(
+    name: str,
+    source: str,
+    stage: object,
+    between_s: tuple[float, float],
+    lengths_s: tuple[float, float],
+    shapes: Callable[[Generator], np.ndarray],
+) -> Callable[[Generator, Base], Formulation]:
+    def write(rng: Generator, _base: Base) -> Formulation:
+        starts_s, lasts_s = _events(rng, between_s), rng.uniform(*lengths_s, EVENTS)
+        table = np.column_stack([starts_s, lasts_s, rng.uniform(0.5, 1.5, EVENTS), shapes(rng)])
+        if rng.random() < 0.15:  # the antagonist's
+            table[:, 2] *= -1.0
+        return Formulation(
+            name,
+            source,
+            lambda m: [Stage("additive", stage, (m, *table.ravel()))],
+            12.0,
+            "typical_height_nm",
+            {"first_events_s": table[:6, 0].tolist(), "first_heights": table[:6, 2].tolist()},
+        )
+
+    return write
 
 
-def bumps(rng: Generator, _base: Base) -> Formulation:
-    table = np.column_stack(
-        [
-            _events(rng, (7.0, 16.0)),
-            rng.uniform(0.6, 2.5, EVENTS),
-            rng.uniform(0.5, 1.5, EVENTS),
-            np.exp(rng.normal(0.0, 0.25, EVENTS)),
-        ]
-    )
-    return _formulation(rng, "smooth bumps", "bell-shaped efforts, Flash and Hogan 1985", _bumps, table, 12.0)
-
-
-def ramps(rng: Generator, _base: Base) -> Formulation:
-    table = np.column_stack(
-        [
-            _events(rng, (9.0, 20.0)),
-            rng.uniform(1.5, 5.0, EVENTS),
-            rng.uniform(0.5, 1.5, EVENTS),
-            rng.uniform(0.15, 0.45, EVENTS),
-        ]
-    )
-    return _formulation(rng, "held efforts with ramps", "no law", _ramps, table, 12.0)
-
-
-def spasms(rng: Generator, _base: Base) -> Formulation:
-    table = np.column_stack(
-        [
-            _events(rng, (8.0, 18.0)),
-            rng.uniform(0.4, 1.8, EVENTS),
-            rng.uniform(0.5, 1.5, EVENTS),
-            rng.uniform(0.04, 0.12, EVENTS),
-        ]
-    )
-    return _formulation(rng, "spasms that burst and decay", "no law", _spasms, table, 12.0)
-
-
-FORMULATIONS = (bumps, ramps, spasms)
+FORMULATIONS = (
+    _effort(
+        "smooth bumps",
+        "bell-shaped efforts, Flash and Hogan 1985",
+        _bumps,
+        (7.0, 16.0),
+        (0.6, 2.5),
+        lambda rng: np.exp(rng.normal(0.0, 0.25, EVENTS)),
+    ),
+    _effort(
+        "held efforts with ramps",
+        "no law",
+        _ramps,
+        (9.0, 20.0),
+        (1.5, 5.0),
+        lambda rng: rng.uniform(0.15, 0.45, EVENTS),
+    ),
+    _effort(
+        "spasms that burst and decay",
+        "no law",
+        _spasms,
+        (8.0, 18.0),
+        (0.4, 1.8),
+        lambda rng: rng.uniform(0.04, 0.12, EVENTS),
+    ),
+)
+KEPT_BACK = (
+    Written(
+        "effort whenever a slow random drive is high",
+        "no law",
+        "additive",
+        _moods,
+        20.0,
+        "size_nm",
+        {"correlation_s": (1.5, 4.0), "threshold": (0.6, 1.2)},
+        seed_at=3,
+    ),
+)

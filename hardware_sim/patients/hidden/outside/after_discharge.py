@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -25,17 +23,14 @@ def _bistable(x, p, s, c):
     return x + p[0] * c[LARGEST_NM] * s[2]
 
 
-def bistable(rng: Generator, _base: Base) -> Formulation:
-    threshold, takes = float(rng.uniform(0.4, 0.65)), float(rng.uniform(0.15, 0.5))
-    lasts = float(rng.uniform(0.5, 1.8))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "after-discharge switched on by strong stimulation",
         "plateau potentials, Bennett, Li and Siu 2001",
-        lambda m: [Stage("gain", _bistable, (m, threshold, takes, lasts))],
+        "gain",
+        _bistable,
         0.9,
         "size_share",
-        {"threshold_share": threshold, "takes_s": takes, "lasts_s": lasts},
-    )
-
-
-FORMULATIONS = (bistable,)
+        {"threshold_share": (0.4, 0.65), "takes_s": (0.15, 0.5), "lasts_s": (0.5, 1.8)},
+    ),
+)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -35,16 +33,14 @@ def _beats(x, p, s, c):
     return x + p[0] * c[LARGEST_NM] * max(s[0], -0.4) * min(s[2] * 3.0, 1.0)
 
 
-def beats(rng: Generator, _base: Base) -> Formulation:
-    hz, decay = float(rng.uniform(4.5, 7.5)), float(rng.uniform(0.4, 1.5))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "beats set off by a fall of torque",
         "Van der Pol oscillator; clonus at 5 to 7 Hz, Hidler and Rymer 1999",
-        lambda m: [Stage("additive", _beats, (m, hz, decay))],
+        "additive",
+        _beats,
         0.8,
         "size_share",
-        {"frequency_hz": hz, "decay_s": decay},
-    )
-
-
-FORMULATIONS = (beats,)
+        {"frequency_hz": (4.5, 7.5), "decay_s": (0.4, 1.5)},
+    ),
+)

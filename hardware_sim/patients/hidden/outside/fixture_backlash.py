@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -19,16 +17,14 @@ def _play(x, p, s, c):
     return s[1] if p[0] > 0.0 else x
 
 
-def backlash(rng: Generator, _base: Base) -> Formulation:
-    settling = float(rng.uniform(0.001, 0.01))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "play on torque",
         "backlash operator, Krasnosel'skii and Pokrovskii 1989",
-        lambda m: [Stage("structure", _play, (m, settling))],
+        "structure",
+        _play,
         0.4,
         "half_width_share",
-        {"settling_s": settling},
-    )
-
-
-FORMULATIONS = (backlash,)
+        {"settling_s": (0.001, 0.01)},
+    ),
+)

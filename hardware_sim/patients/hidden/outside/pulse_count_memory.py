@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import COUNT, PULSE, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import COUNT, PULSE, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -24,28 +22,23 @@ def _every_other(x, p, s, c):
     return x * (1.0 + (p[0] if group % 2 == 0 else -p[0]))
 
 
-def swing(rng: Generator, _base: Base) -> Formulation:
-    turn = float(rng.uniform(60.0, 160.0))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "gain swings with the count of pulses",
         "no physiology; made to be foreign",
-        lambda m: [Stage("gain", _all_pulses, (m, turn))],
+        "gain",
+        _all_pulses,
         0.9,
         "depth",
-        {"pulses_a_turn": turn},
-    )
-
-
-def alternans(rng: Generator, _base: Base) -> Formulation:
-    group = int(rng.integers(6, 14))
-    return Formulation(
+        {"pulses_a_turn": (60.0, 160.0)},
+    ),
+    Written(
         "groups of pulses strong and weak in turn",
         "mechanical alternans, transposed",
-        lambda m: [Stage("gain", _every_other, (m, group))],
+        "gain",
+        _every_other,
         0.9,
         "depth",
-        {"pulses_a_group": group},
-    )
-
-
-FORMULATIONS = (swing, alternans)
+        {"pulses_a_group": lambda rng, _base: int(rng.integers(6, 14))},
+    ),
+)

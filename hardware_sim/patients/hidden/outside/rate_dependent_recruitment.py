@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import STEP_S, WIDTH_US, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import STEP_S, WIDTH_US, kernel
+from hardware_sim.patients.hidden.written import Sign, Written, weighted
 
 
 @kernel
@@ -25,32 +23,26 @@ def _less_when_quick(x, p, s, c):
     return x * (1.0 - p[0] * s[1] / (s[1] + p[2]))
 
 
-def _log_uniform(rng: Generator, low: float, high: float) -> float:
-    return math.exp(rng.uniform(math.log(low), math.log(high)))
-
-
-def accommodation(rng: Generator, _base: Base) -> Formulation:
-    tau, sign = _log_uniform(rng, 0.1, 0.6), float(rng.choice([-1.0, 1.0], p=[0.3, 0.7]))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "the nerve accommodates to the width",
         "accommodation, Hill 1936, transposed to pulse width",
-        lambda m: [Stage("electrode", _accommodation, (sign * m, tau))],
+        "electrode",
+        _accommodation,
         1.5,
         "share",
-        {"time_constant_s": tau, "sign": sign},
-    )
-
-
-def less_when_quick(rng: Generator, _base: Base) -> Formulation:
-    tau, half = float(rng.uniform(0.15, 0.6)), float(rng.uniform(500.0, 2500.0))
-    return Formulation(
+        {
+            "time_constant_s": lambda rng, _base: math.exp(rng.uniform(math.log(0.1), math.log(0.6))),
+            "sign": Sign(weighted(0.3, 0.7)),
+        },
+    ),
+    Written(
         "quick changes of width recruit less",
         "no law; recruitment that depends on the rate of change",
-        lambda m: [Stage("gain", _less_when_quick, (m, tau, half))],
+        "gain",
+        _less_when_quick,
         0.95,
         "share",
-        {"time_constant_s": tau, "half_us_per_s": half},
-    )
-
-
-FORMULATIONS = (accommodation, less_when_quick)
+        {"time_constant_s": (0.15, 0.6), "half_us_per_s": (500.0, 2500.0)},
+    ),
+)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Sign, Written
 
 
 @kernel
@@ -23,17 +21,14 @@ def _residual(x, p, s, c):
     return x + p[0] * (s[0] - x) * (1.0 if c[ACTIVATION] > 0.02 else 0.0)
 
 
-def residual(rng: Generator, _base: Base) -> Formulation:
-    decay = float(rng.uniform(8.0, 40.0))
-    sign = float(rng.choice([-1.0, 1.0]))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "residual force enhancement or depression",
         "Abbott and Aubert 1952; Herzog 2004, transposed to activation",
-        lambda m: [Stage("gain", _residual, (sign * m, decay))],
+        "gain",
+        _residual,
         0.95,
         "share",
-        {"decay_s": decay, "sign": sign},
-    )
-
-
-FORMULATIONS = (residual,)
+        {"decay_s": (8.0, 40.0), "sign": Sign()},
+    ),
+)

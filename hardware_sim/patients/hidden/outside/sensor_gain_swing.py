@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import TIME_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -17,17 +15,14 @@ def _swing(x, p, s, c):
     return x * (1.0 + p[0] * math.tanh(p[3] * wave) / math.tanh(p[3]))
 
 
-def swing(rng: Generator, _base: Base) -> Formulation:
-    period, phase = float(rng.uniform(3.0, 9.0)), float(rng.uniform(0.0, 2.0 * math.pi))
-    sharp = float(rng.uniform(0.2, 4.0))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "sensitivity swings in time",
         "heating cycle; made to be foreign",
-        lambda m: [Stage("sensor", _swing, (m, period, phase, sharp))],
+        "sensor",
+        _swing,
         0.8,
         "depth",
-        {"period_s": period, "sharpness": sharp},
-    )
-
-
-FORMULATIONS = (swing,)
+        {"period_s": (3.0, 9.0), "_phase": (0.0, 2.0 * math.pi), "sharpness": (0.2, 4.0)},
+    ),
+)

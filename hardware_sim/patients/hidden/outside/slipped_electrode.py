@@ -6,9 +6,7 @@ from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
-
-MOMENTS_S = ((5.0, 12.0), (14.7, 17.7), (19.0, 25.0))
-"""Within the PRBS, between it and the ramp, within the ramp of a full test."""
+from hardware_sim.patients.hidden.written import Sign, Written, weighted
 
 
 @kernel
@@ -23,36 +21,16 @@ def _threshold_step(x, p, s, c):
     return max(x - p[0], 0.0) if x > 0.0 and c[TIME_S] >= p[1] else x
 
 
-def _moment(rng: Generator) -> float:
+MOMENTS_S = ((5.0, 12.0), (14.7, 17.7), (19.0, 25.0))
+"""Within the PRBS, between it and the ramp, within the ramp of a full test."""
+
+
+def _moment(rng: Generator, _base: Base) -> float:
     return float(rng.uniform(*MOMENTS_S[int(rng.integers(len(MOMENTS_S)))]))
 
 
-def gain_step(rng: Generator, _base: Base) -> Formulation:
-    moment, sign = _moment(rng), float(rng.choice([-1.0, 1.0], p=[0.7, 0.3]))
-    return Formulation(
-        "the gain steps once",
-        "electrode slip",
-        lambda m: [Stage("gain", _gain_step, (sign * m, moment))],
-        0.7,
-        "size",
-        {"moment_s": moment, "sign": sign},
-    )
-
-
-def threshold_step(rng: Generator, _base: Base) -> Formulation:
-    moment, sign = _moment(rng), float(rng.choice([-1.0, 1.0], p=[0.3, 0.7]))
-    return Formulation(
-        "the threshold steps once",
-        "electrode slip",
-        lambda m: [Stage("electrode", _threshold_step, (sign * m, moment))],
-        90.0,
-        "size_us",
-        {"moment_s": moment, "sign": sign},
-    )
-
-
-def both_step(rng: Generator, _base: Base) -> Formulation:
-    moment, us = _moment(rng), float(rng.uniform(30.0, 90.0))
+def both_step(rng: Generator, base: Base) -> Formulation:
+    moment, us = _moment(rng, base), float(rng.uniform(30.0, 90.0))
     return Formulation(
         "gain and threshold step once",
         "electrode slip",
@@ -63,4 +41,24 @@ def both_step(rng: Generator, _base: Base) -> Formulation:
     )
 
 
-FORMULATIONS = (gain_step, threshold_step, both_step)
+FORMULATIONS = (
+    Written(
+        "the gain steps once",
+        "electrode slip",
+        "gain",
+        _gain_step,
+        0.7,
+        "size",
+        {"moment_s": _moment, "sign": Sign(weighted(0.7, 0.3))},
+    ),
+    Written(
+        "the threshold steps once",
+        "electrode slip",
+        "electrode",
+        _threshold_step,
+        90.0,
+        "size_us",
+        {"moment_s": _moment, "sign": Sign(weighted(0.3, 0.7))},
+    ),
+    both_step,
+)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, TIME_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, TIME_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -28,14 +26,7 @@ def _coarse(x, p, s, c):
     return round(x / step) * step
 
 
-def held(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation(
-        "each reading is held", "sample and hold", lambda m: [Stage("converter", _held, (m,))], 1.2, "held_s"
-    )
-
-
-def coarse(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation("coarse steps", "quantiser", lambda m: [Stage("converter", _coarse, (m,))], 0.6, "step_share")
-
-
-FORMULATIONS = (held, coarse)
+FORMULATIONS = (
+    Written("each reading is held", "sample and hold", "converter", _held, 1.2, "held_s"),
+    Written("coarse steps", "quantiser", "converter", _coarse, 0.6, "step_share"),
+)

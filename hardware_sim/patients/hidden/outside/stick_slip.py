@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -23,16 +21,14 @@ def _stick_slip(x, p, s, c):
     return s[0] if p[0] > 0.0 else x
 
 
-def stick_slip(rng: Generator, _base: Base) -> Formulation:
-    again, slip = float(rng.uniform(0.05, 0.3)), float(rng.uniform(0.005, 0.04))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "breakaway and slip",
         "Coulomb friction with a breakaway torque",
-        lambda m: [Stage("structure", _stick_slip, (m, again, slip))],
+        "structure",
+        _stick_slip,
         0.6,
         "breakaway_share",
-        {"sticks_again_share": again, "slip_s": slip},
-    )
-
-
-FORMULATIONS = (stick_slip,)
+        {"sticks_again_share": (0.05, 0.3), "slip_s": (0.005, 0.04)},
+    ),
+)

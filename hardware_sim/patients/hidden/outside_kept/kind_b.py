@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel, uniform
+from hardware_sim.patients.hidden.kernels import TIME_S, kernel, uniform
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -19,16 +17,15 @@ def _stale(x, p, s, c):
     return s[0]
 
 
-def stale(rng: Generator, _base: Base) -> Formulation:
-    spread, seed = float(rng.choice([0.0, 0.2, 0.8])), int(rng.integers(1, 2**31))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "settings are taken up now and then",
         "a slow link between computer and stimulator",
-        lambda m: [Stage("electrode", _stale, (m, spread), (0.0, 0.0, seed))],
+        "electrode",
+        _stale,
         0.6,
         "mean_time_s",
-        {"spread": spread},
-    )
-
-
-FORMULATIONS = (stale,)
+        {"spread": [0.0, 0.2, 0.8]},
+        seed_at=2,
+    ),
+)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written, largest_width_us
 
 
 @kernel
@@ -17,16 +15,14 @@ def _slewed(x, p, s, c):
     return s[0]
 
 
-def slewed(rng: Generator, base: Base) -> Formulation:
-    down = float(rng.choice([0.0, 0.5, 1.0]))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "the width is slewed",
         "soft start of clinical stimulators",
-        lambda m: [Stage("electrode", _slewed, (m, down, float(base.largest_width_us)))],
+        "electrode",
+        _slewed,
         2.0,
         "up_s",
-        {"down_share": down},
-    )
-
-
-FORMULATIONS = (slewed,)
+        {"down_share": [0.0, 0.5, 1.0], "_largest": largest_width_us},
+    ),
+)

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, kernel
+from hardware_sim.patients.hidden.written import Sign, Written, largest_width_us
 
 
 @kernel
@@ -25,28 +23,23 @@ def _edges(x, p, s, c):
     return x + p[0] * c[LARGEST_NM] * (drive - s[0])
 
 
-def feed_through(rng: Generator, base: Base) -> Formulation:
-    sign = float(rng.choice([-1.0, 1.0]))
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "artefact proportional to the width",
         "stimulus artefact in a bridge amplifier",
-        lambda m: [Stage("sensor", _feed_through, (sign * m, float(base.largest_width_us)))],
+        "sensor",
+        _feed_through,
         1.0,
         "share",
-        {"sign": sign},
-    )
-
-
-def edges(rng: Generator, base: Base) -> Formulation:
-    sign, decay = float(rng.choice([-1.0, 1.0])), float(rng.uniform(0.05, 0.4))
-    return Formulation(
+        {"sign": Sign(), "_largest": largest_width_us},
+    ),
+    Written(
         "artefact at changes of the width",
         "stimulus artefact through a coupling capacitor",
-        lambda m: [Stage("sensor", _edges, (sign * m, float(base.largest_width_us), decay))],
+        "sensor",
+        _edges,
         1.5,
         "share",
-        {"sign": sign, "decay_s": decay},
-    )
-
-
-FORMULATIONS = (feed_through, edges)
+        {"sign": Sign(), "_largest": largest_width_us, "decay_s": (0.05, 0.4)},
+    ),
+)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -26,26 +24,22 @@ def _tracking(x, p, s, c):
     return out
 
 
-def coupled(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation(
+FORMULATIONS = (
+    Written(
         "the zero follows the reading",
         "high-pass coupling of a bridge amplifier",
-        lambda m: [Stage("sensor", _coupled, (m,))],
+        "sensor",
+        _coupled,
         1.0,
         "rate_per_s",
-    )
-
-
-def tracking(rng: Generator, _base: Base) -> Formulation:
-    window = float(rng.uniform(0.2, 0.6))
-    return Formulation(
+    ),
+    Written(
         "the zero follows small readings",
         "zero tracking of weighing indicators",
-        lambda m: [Stage("sensor", _tracking, (m, window))],
+        "sensor",
+        _tracking,
         4.0,
         "rate_per_s",
-        {"window_share": window},
-    )
-
-
-FORMULATIONS = (coupled, tracking)
+        {"window_share": (0.2, 0.6)},
+    ),
+)

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from numpy.random import Generator
-
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, Formulation, Stage, kernel
+from hardware_sim.patients.hidden.kernels import LARGEST_NM, kernel
+from hardware_sim.patients.hidden.written import Written
 
 
 @kernel
@@ -25,12 +23,7 @@ def _toe(x, p, s, c):
     return x * x / (2.0 * toe) if x < toe else x - 0.5 * toe
 
 
-def dead(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation("slack", "dead zone", lambda m: [Stage("structure", _dead, (m,))], 0.6, "slack_share")
-
-
-def toe(_rng: Generator, _base: Base) -> Formulation:
-    return Formulation("toe", "toe region of webbing", lambda m: [Stage("structure", _toe, (m,))], 1.5, "toe_share")
-
-
-FORMULATIONS = (dead, toe)
+FORMULATIONS = (
+    Written("slack", "dead zone", "structure", _dead, 0.6, "slack_share"),
+    Written("toe", "toe region of webbing", "structure", _toe, 1.5, "toe_share"),
+)

@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
+from hardware_sim.patients.hidden.base import Base, delayed
 from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Stage, kernel
 
 
 @kernel
 def _running_away(x, p, s, c):
     """p: s a s, time after which the clocks are set alike again s. s[0]: place in the ring of 1000."""
-    size = 1000
-    i = int(s[0])
-    s[10 + i] = x
-    s[0] = (i + 1) % size
-    late = min(p[0] * (c[TIME_S] % p[1]) / c[STEP_S], 990.0)
-    whole = int(late)
-    a = s[10 + (i - whole) % size]
-    b = s[10 + (i - whole - 1) % size]
-    return a + (late - whole) * (b - a)
+    return delayed(x, min(p[0] * (c[TIME_S] % p[1]) / c[STEP_S], 990.0), s, 10, 1000)
 
 
 def running_away(rng: Generator, _base: Base) -> Formulation:
