@@ -40,7 +40,7 @@ def look_up(table: Any, width_us: float) -> float:
     return table[i] + (width_us - i) * (table[i + 1] - table[i])
 
 
-@kernel
+@kernel("recruitment")
 def recruit(x, p, s, c):
     """p[0:512]: torque at every µs."""
     w = look_up(p, x)
@@ -84,7 +84,7 @@ def delayed(x, late, s, first, size):
     return a + (late - whole) * (b - a)
 
 
-@kernel
+@kernel("dynamics")
 def second_order(x, p, s, c):
     """p: 1/Tω, ζ."""
     y = second_order_step(x, p[0] * c[SPEED], p[1], s, 0, c[STEP_S])
@@ -92,7 +92,7 @@ def second_order(x, p, s, c):
     return y
 
 
-@kernel
+@kernel("delay")
 def as_pulses(x, p, s, c):
     """p: length of a pulse's drive s, latency s, period s. s[0]: place in a ring, then drives to come.
 
@@ -155,11 +155,11 @@ class Base:
     def stages(self) -> list[Stage]:
         """Recruitment and dynamics."""
         stages = [
-            Stage("recruitment", recruit, self.table_nm),
-            Stage("dynamics", second_order, (1.0 / self.t_omega_s, self.zeta)),
+            Stage(recruit, self.table_nm),
+            Stage(second_order, (1.0 / self.t_omega_s, self.zeta)),
         ]
         if self.burst_s > 0.0:
-            stages.append(Stage("delay", as_pulses, (self.burst_s, 0.5 * (PERIOD_S - self.burst_s), PERIOD_S)))
+            stages.append(Stage(as_pulses, (self.burst_s, 0.5 * (PERIOD_S - self.burst_s), PERIOD_S)))
         return stages
 
     def describe(self) -> dict[str, Any]:

@@ -72,7 +72,7 @@ class Chain:
 
     def __init__(self, stages: list[Stage], largest_nm: float, step_s: float) -> None:
         ordered = sorted(stages, key=lambda stage: SLOTS.index(stage.slot))
-        self._addresses = np.array([stage.kernel.address for stage in ordered], dtype=np.int64)
+        self._addresses = np.array([stage.kernel.compiled.address for stage in ordered], dtype=np.int64)
         rows = [stage.rows() for stage in ordered]
         self._p = np.array([p for p, _ in rows]).reshape(-1, ROW)
         self._s = np.array([s for _, s in rows]).reshape(-1, ROW)

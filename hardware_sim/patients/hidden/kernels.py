@@ -58,9 +58,17 @@ _POINTER = types.CPointer(_NUMBER)
 _SIGNATURE = _NUMBER(_NUMBER, _POINTER, _POINTER, _POINTER)
 
 
-def kernel(function: Callable[..., float]) -> Any:
+@dataclass(frozen=True)
+class Kernel:
+    """A stage's compiled function, and the slot of the muscle that it belongs to."""
+
+    slot: str
+    compiled: Any
+
+
+def kernel(slot: str) -> Callable[[Callable[..., float]], Kernel]:
     """Compile a stage's function `(x, p, s, c) -> float` to a C function."""
-    return nb.cfunc(_SIGNATURE, cache=True)(function)
+    return lambda function: Kernel(slot, nb.cfunc(_SIGNATURE, cache=True)(function))
 
 
 helper: Any = nb.njit(cache=True)
@@ -113,12 +121,16 @@ def smooth_table(p: Any, first: int, count: int, position: float) -> float:
 
 @dataclass(frozen=True)
 class Stage:
-    """A kernel with its parameters, in one slot of the muscle."""
+    """A kernel with its parameters."""
 
-    slot: str
-    kernel: Any
+    kernel: Kernel
     parameters: Any = ()
     state: Any = ()
+
+    @property
+    def slot(self) -> str:
+        """Where in the muscle it stands."""
+        return self.kernel.slot
 
     def rows(self) -> tuple[Floats, Floats]:
         """Parameters and starting state, padded to full rows."""

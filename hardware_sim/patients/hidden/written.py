@@ -9,7 +9,7 @@ from typing import Any
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import Formulation, Stage
+from hardware_sim.patients.hidden.kernels import Formulation, Kernel, Stage
 
 Draw = Any
 """How a number is drawn: `(low, high)` uniformly, a list: one of it, a number: that number, or a function of generator
@@ -66,8 +66,7 @@ class Written:
 
     name: str
     source: str
-    slot: str
-    kernel: Any
+    kernel: Kernel
     largest_magnitude: float
     magnitude_name: str
     drawn: Mapping[str, Draw] = field(default_factory=dict)
@@ -95,7 +94,7 @@ class Written:
         state = () if self.seed_at is None else (*[0.0] * self.seed_at, int(rng.integers(1, 2**31)))
 
         def build(magnitude: float) -> list[Stage]:
-            return [Stage(self.slot, self.kernel, self.arrange(sign * magnitude, *numbers), state)]
+            return [Stage(self.kernel, self.arrange(sign * magnitude, *numbers), state)]
 
         return Formulation(self.name, self.source, build, self.largest_magnitude, self.magnitude_name, revealed)
 

@@ -9,7 +9,7 @@ from hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, 
 from hardware_sim.patients.hidden.written import Sign, Written, even, two_lags
 
 
-@kernel
+@kernel("delay")
 def _by_level(x, p, s, c):
     """p: log of the speed's ratio between full and no force, lag s. s[0]: lagged force."""
     s[0] += (c[FORCE] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
@@ -17,7 +17,7 @@ def _by_level(x, p, s, c):
     return x
 
 
-@kernel
+@kernel("dynamics")
 def _calcium_pump(x, p, s, c):
     """p: saturation of the pump, τ of force, τ of calcium at half. s: calcium, force.
 
@@ -38,7 +38,7 @@ def _calcium_pump(x, p, s, c):
     return s[1]
 
 
-@kernel
+@kernel("dynamics")
 def _bound_calcium(x, p, s, c):
     """p: k, τ of calcium, τ of force. s: calcium, force. Force decays with τ1 + τ2 * (bound calcium)."""
     before = s[0]
@@ -50,7 +50,7 @@ def _bound_calcium(x, p, s, c):
     return s[1]
 
 
-@kernel
+@kernel("dynamics")
 def _cooperative(x, p, s, c):
     """p: k, τ of calcium, τ of force. s: calcium, force. Attached bridges help others attach: faster when strong."""
     before = s[0]
@@ -62,7 +62,7 @@ def _cooperative(x, p, s, c):
     return s[1]
 
 
-@kernel
+@kernel("delay")
 def _by_recruitment(x, p, s, c):
     """p: size (signed), exponent. Rates go with how many units are being stimulated, not with their force."""
     a = min(max(c[ACTIVATION], 0.0), 1.2)
@@ -74,7 +74,6 @@ FORMULATIONS = (
     Written(
         "all rates go with the level",
         "Hunt, Munih, Donaldson and Barr 1998",
-        "delay",
         _by_level,
         2.0,
         "log_speed_ratio",
@@ -83,7 +82,6 @@ FORMULATIONS = (
     Written(
         "calcium pump saturates",
         "Michaelis-Menten uptake, Westerblad and Allen 1994; Stein, Bobet, Oğuztöreli and Fryer 1988",
-        "dynamics",
         _calcium_pump,
         8.0,
         "saturation",
@@ -92,7 +90,6 @@ FORMULATIONS = (
     Written(
         "force decays more slowly with bound calcium",
         "Ding, Wexler and Binder-Macleod 2000: τ1 + τ2 CN / (Km + CN)",
-        "dynamics",
         _bound_calcium,
         8.0,
         "tau2_over_tau1",
@@ -101,7 +98,6 @@ FORMULATIONS = (
     Written(
         "cooperative attachment, faster when strong",
         "Campbell 1997",
-        "dynamics",
         _cooperative,
         8.0,
         "cooperativity",
@@ -112,7 +108,6 @@ KEPT_BACK = (
     Written(
         "rates go with the recruited share",
         "local models at several levels, Hunt, Munih, Donaldson and Barr 1998",
-        "delay",
         _by_recruitment,
         4.0,
         "speed_gain",

@@ -11,7 +11,7 @@ from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, kern
 from hardware_sim.patients.hidden.written import Sign, Written, mostly, second_order_of, two_lags
 
 
-@kernel
+@kernel("dynamics")
 def _thelen(x, p, s, c):
     """p: τ1, τ2, ratio, exponent of (0.5 + 1.5 a). s: activation, torque. Activation first, then a lag."""
     a = min(max(s[0], 0.0), 1.2)
@@ -25,7 +25,7 @@ def _thelen(x, p, s, c):
     return s[1]
 
 
-@kernel
+@kernel("dynamics")
 def _de_groote(x, p, s, c):
     """p: τ1, τ2, log ratio, b, share of the activation factor. Smooth change between the two time constants."""
     e = x / c[LARGEST_NM]
@@ -40,7 +40,7 @@ def _de_groote(x, p, s, c):
     return s[1]
 
 
-@kernel
+@kernel("dynamics")
 def _cross_bridges(x, p, s, c):
     """p: log ratio, 1/Tω, ζ, smoothing. Second order; the rate depends on whether force is being made or lost."""
     made = math.tanh((x - s[0]) / (p[3] * c[LARGEST_NM]))
@@ -50,7 +50,7 @@ def _cross_bridges(x, p, s, c):
     return y
 
 
-@kernel
+@kernel("dynamics")
 def _limited_fall(x, p, s, c):
     """p: s it takes at least to fall from the largest torque, τ1, τ2. s: two lags; the second falls no faster."""
     before = s[0]
@@ -77,7 +77,6 @@ FORMULATIONS = (
     Written(
         "activation and deactivation time constants with 0.5 + 1.5 a",
         "Winters 1995; Thelen 2003",
-        "dynamics",
         _thelen,
         2.2,
         "log_ratio",
@@ -87,7 +86,6 @@ FORMULATIONS = (
     Written(
         "tanh-smoothed activation dynamics",
         "De Groote, Kinney, Rao and Fregly 2016",
-        "dynamics",
         _de_groote,
         2.2,
         "log_ratio",
@@ -97,7 +95,6 @@ FORMULATIONS = (
     Written(
         "attachment faster than detachment, smoothed, second order",
         "McCrea, Eng and Hodgson 2003 (development and relaxation impaired apart); rates after Huxley 1957",
-        "dynamics",
         _cross_bridges,
         2.5,
         "log_ratio",
@@ -108,7 +105,6 @@ KEPT_BACK = (
     Written(
         "torque falls no faster than the bridges let go",
         "linear phase of relaxation, Tesi, Piroddi, Colomo and Poggesi 2002",
-        "dynamics",
         _limited_fall,
         3.0,
         "shortest_fall_s",

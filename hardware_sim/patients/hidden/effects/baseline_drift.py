@@ -12,31 +12,31 @@ from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, ker
 from hardware_sim.patients.hidden.written import Sign, Written, even
 
 
-@kernel
+@kernel("additive")
 def _warm_up(x, p, s, c):
     """p: final offsets, N·m, and time constants, s, of bridge and amplifier."""
     return x + p[0] * (1.0 - math.exp(-c[TIME_S] / p[1])) + p[2] * (1.0 - math.exp(-c[TIME_S] / p[3]))
 
 
-@kernel
+@kernel("additive")
 def _linear(x, p, s, c):
     """p: N·m per s."""
     return x + p[0] * c[TIME_S]
 
 
-@kernel
+@kernel("additive")
 def _wander(x, p, s, c):
     """p: size N·m, spacing of the knots s, 200 knots."""
     return x + p[0] * smooth_table(p, 2, 200, c[TIME_S] / p[1])
 
 
-@kernel
+@kernel("additive")
 def _logarithmic(x, p, s, c):
     """p: N·m a decade, first time s."""
     return x + p[0] * math.log10(1.0 + c[TIME_S] / p[1])
 
 
-@kernel
+@kernel("additive")
 def _swing(x, p, s, c):
     """p: N·m, period s, phase: half a turn or more of a slow swing of the room's temperature."""
     return x + p[0] * (math.sin(2.0 * math.pi * c[TIME_S] / p[1] + p[2]) - math.sin(p[2]))
@@ -48,7 +48,7 @@ def warm_up(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "bridge and amplifier warm up",
         "strain-gauge self-heating",
-        lambda m: [Stage("additive", _warm_up, (sign * m * share, fast, sign * m * (1.0 - share), slow))],
+        lambda m: [Stage(_warm_up, (sign * m * share, fast, sign * m * (1.0 - share), slow))],
         4.0,
         "final_offset_nm",
         {"tau_s": [fast, slow], "fast_share": share, "sign": sign},
@@ -62,11 +62,10 @@ def _knots(rng: Generator, _base: Base) -> list[float]:
 
 FORMULATIONS = (
     warm_up,
-    Written("linear", "temperature ramp", "additive", _linear, 0.2, "nm_per_s", {"sign": Sign()}),
+    Written("linear", "temperature ramp", _linear, 0.2, "nm_per_s", {"sign": Sign()}),
     Written(
         "smooth random walk",
         "limb settling in the splint",
-        "additive",
         _wander,
         4.0,
         "largest_nm",
@@ -77,7 +76,6 @@ KEPT_BACK = (
     Written(
         "creep with the logarithm of time",
         "load-cell creep",
-        "additive",
         _logarithmic,
         4.0,
         "nm_per_decade",
@@ -86,7 +84,6 @@ KEPT_BACK = (
     Written(
         "slow swing",
         "room temperature",
-        "additive",
         _swing,
         4.0,
         "amplitude_nm",

@@ -8,14 +8,14 @@ from hardware_sim.patients.hidden.kernels import ACTIVATION, COUNT, PAUSE_S, STE
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("gain")
 def _first_pulses(x, p, s, c):
     """p: gain of the first pulse, pulses it lasts, recovery s."""
     rested = 1.0 - math.exp(-c[PAUSE_S] / p[2])
     return x * (1.0 + p[0] * rested * math.exp(-(max(c[COUNT], 1.0) - 1.0) / p[1]))
 
 
-@kernel
+@kernel("gain")
 def _store(x, p, s, c):
     """p: gain, refill s, emptying s. s[0]: what the store has lost. Calcium release from a store that runs down."""
     if c[ACTIVATION] > 0.0:
@@ -24,7 +24,7 @@ def _store(x, p, s, c):
     return x * (1.0 + p[0] * (1.0 - s[0]))
 
 
-@kernel
+@kernel("gain")
 def _burst(x, p, s, c):
     """p: gain, time of its peak s, pause it needs s. s: age of the train, age of the pause, readiness.
 
@@ -43,7 +43,7 @@ def _burst(x, p, s, c):
     return x * (1.0 + p[0] * s[2] * (z + 0.3) * math.exp(-z))
 
 
-@kernel
+@kernel("gain")
 def _primed(x, p, s, c):
     """p: gain, priming s, use s. s[0]: primed share; grows at rest, used up by activity in proportion to itself."""
     a = min(max(c[ACTIVATION], 0.0), 1.0)
@@ -56,7 +56,6 @@ FORMULATIONS = (
     Written(
         "gain of the first pulses",
         "Binder-Macleod and Kesar 2005; Bickel, Slade and Dudley 2004",
-        "gain",
         _first_pulses,
         2.5,
         "first_gain",
@@ -65,7 +64,6 @@ FORMULATIONS = (
     Written(
         "calcium store that runs down",
         "store depletion as in Tsodyks and Markram 1997, for calcium release after Duchateau and Hainaut 1986",
-        "gain",
         _store,
         4.0,
         "gain",
@@ -74,7 +72,6 @@ FORMULATIONS = (
     Written(
         "burst at the onset of a train",
         "stiffness of the series elastic element, Parmiggiani and Stein 1981",
-        "gain",
         _burst,
         3.0,
         "gain",
@@ -85,7 +82,6 @@ KEPT_BACK = (
     Written(
         "rest primes the next onset",
         "Lee, Gerdom and Binder-Macleod 1999, in one state",
-        "gain",
         _primed,
         4.0,
         "gain",

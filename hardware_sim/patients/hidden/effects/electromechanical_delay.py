@@ -12,13 +12,13 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("delay")
 def _line(x, p, s, c):
     """p: delay s. s[0]: place in the ring; a transport line with linear interpolation between samples."""
     return delayed(x, min(p[0] / c[STEP_S], 690.0), s, 1, 700)
 
 
-@kernel
+@kernel("delay")
 def _lags(x, p, s, c):
     """p: delay s, number of lags (a gamma-shaped delay), each integrated in closed form."""
     if p[0] <= 0.0:
@@ -31,7 +31,7 @@ def _lags(x, p, s, c):
     return x
 
 
-@kernel
+@kernel("delay")
 def _spread(x, p, s, c):
     """p[0:10]: delay of each tenth of the pool, in recruitment order, s. s[0]: place in the ring."""
     size = 700
@@ -49,7 +49,7 @@ def _spread(x, p, s, c):
     return torque * c[LARGEST_NM] / 10.0
 
 
-@kernel
+@kernel("delay")
 def _onset(x, p, s, c):
     """p: delay s, share of it that is a lag. s[0]: place in the ring, s[1]: the lag's state."""
     x = delayed(x, min(p[0] * (1.0 - p[1]) / c[STEP_S], 690.0), s, 10, 700)
@@ -64,7 +64,7 @@ def motor_units(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "each motor unit has its own delay",
         "conduction velocity by size, Fuglevand, Winter and Patla 1993; onset times of Sinclair et al.",
-        lambda m: [Stage("delay", _spread, tuple(m * shape))],
+        lambda m: [Stage(_spread, tuple(m * shape))],
         0.12,
         "mean_delay_s",
         {"earliest": float(shape[0]), "latest": float(shape[-1])},
@@ -72,11 +72,10 @@ def motor_units(rng: Generator, _base: Base) -> Formulation:
 
 
 FORMULATIONS = (
-    Written("transport line", "Cavanagh and Komi 1979", "delay", _line, 0.12, "delay_s"),
+    Written("transport line", "Cavanagh and Komi 1979", _line, 0.12, "delay_s"),
     Written(
         "chain of equal lags",
         "linear chain trick, MacDonald 1978",
-        "delay",
         _lags,
         0.14,
         "delay_s",
@@ -88,7 +87,6 @@ KEPT_BACK = (
     Written(
         "conduction, then a lag of the series elastic element",
         "parts of the electromechanical delay, Nordez et al. 2009",
-        "delay",
         _onset,
         0.13,
         "delay_s",

@@ -19,7 +19,7 @@ from hardware_sim.patients.hidden.kernels import (
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("gain")
 def _force_driven(x, p, s, c):
     """p: α per s, τ s, slowing. s[0]: share of the gain lost. Ding's dA/dt = -(A - A0)/τ + α F, α < 0."""
     s[0] += c[STEP_S] * (p[0] * c[FORCE] - s[0] / p[1])
@@ -28,7 +28,7 @@ def _force_driven(x, p, s, c):
     return x * (1.0 - s[0])
 
 
-@kernel
+@kernel("gain")
 def _three_compartments(x, p, s, c):
     """p: F per s, R per s, r. s[0]: fatigued share. Units work, tire, and rest into use again."""
     working = c[ACTIVATION] * (1.0 - s[0])
@@ -38,7 +38,7 @@ def _three_compartments(x, p, s, c):
     return x * (1.0 - s[0])
 
 
-@kernel
+@kernel("gain")
 def _motor_units(x, p, s, c):
     """p[0:24]: rate of tiring of each unit, p[24:48]: of recovery. s: each unit's lost share, in recruitment order."""
     level = c[ACTIVATION] * 24.0
@@ -50,7 +50,7 @@ def _motor_units(x, p, s, c):
     return torque / 24.0 * c[LARGEST_NM] + max(level - 24.0, 0.0) / 24.0 * c[LARGEST_NM]
 
 
-@kernel
+@kernel("gain")
 def _phosphate(x, p, s, c):
     """p: production per s, clearance s, Hill exponent. s[0]: phosphate over the level that halves the force."""
     s[0] += c[STEP_S] * (p[0] * c[ACTIVATION] - s[0] / p[1])
@@ -66,7 +66,7 @@ def ding(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "gain falls with force, fatigue slows the muscle" if slowing else "gain falls with force",
         "Ding, Wexler and Binder-Macleod 2003",
-        lambda m: [Stage("gain", _force_driven, (m, tau, slowing))],
+        lambda m: [Stage(_force_driven, (m, tau, slowing))],
         0.25,
         "alpha_per_s",
         {"tau_s": tau, "slowing": slowing},
@@ -79,7 +79,7 @@ def motor_units(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "motor units tire one by one, the fast ones first",
         "after Potvin and Fuglevand 2017, reversed order as in Gregory and Bickel 2005",
-        lambda m: [Stage("gain", _motor_units, (*(m * rate), *recovery))],
+        lambda m: [Stage(_motor_units, (*(m * rate), *recovery))],
         0.3,
         "median_rate_per_s",
         {"fastest_over_slowest": float(rate[0] / rate[-1])},
@@ -91,7 +91,6 @@ FORMULATIONS = (
     Written(
         "three compartments: resting, active, fatigued",
         "Xia and Frey-Law 2008; rest factor Looft, Herkert and Frey-Law 2018",
-        "gain",
         _three_compartments,
         0.3,
         "F_per_s",
@@ -103,7 +102,6 @@ KEPT_BACK = (
     Written(
         "phosphate inhibits force",
         "inorganic phosphate, Allen, Lamb and Westerblad 2008",
-        "gain",
         _phosphate,
         0.5,
         "production_per_s",

@@ -12,7 +12,7 @@ from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, St
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("sensor")
 def _harmonics(x, p, s, c):
     """p: size, mains Hz, depth and Hz of a slow change of size, then amplitude and phase of five harmonics."""
     turn = 2.0 * math.pi * p[1] * c[TIME_S]
@@ -22,7 +22,7 @@ def _harmonics(x, p, s, c):
     return x
 
 
-@kernel
+@kernel("sensor")
 def _rectifier(x, p, s, c):
     """p: size, mains Hz, phase, share of the flattened sine; the rest are a rectifier's current peaks."""
     wave = math.sin(2.0 * math.pi * p[1] * c[TIME_S] + p[2])
@@ -30,7 +30,7 @@ def _rectifier(x, p, s, c):
     return x + p[0] * (p[3] * 1.2 * math.tanh(1.6 * wave) + (1.0 - p[3]) * 1.5 * peaks)
 
 
-@kernel
+@kernel("sensor")
 def _wandering(x, p, s, c):
     """p: size, mains Hz, spread of the grid's frequency Hz, its time constant s. s: phase, detuning, generator."""
     s[1] += -c[STEP_S] * s[1] / p[3] + p[2] * math.sqrt(2.0 * c[STEP_S] / p[3]) * normal(s, 2)
@@ -38,7 +38,7 @@ def _wandering(x, p, s, c):
     return x + p[0] * (math.sin(s[0]) + 0.3 * math.sin(3.0 * s[0]))
 
 
-@kernel
+@kernel("sensor")
 def _switching(x, p, s, c):
     """p: size, mains Hz, period and share of the machine's work s, third harmonic. s[0]: present size."""
     at = (c[TIME_S] / p[2]) % 1.0
@@ -59,7 +59,7 @@ def harmonics(rng: Generator, base: Base) -> Formulation:
     return Formulation(
         "fundamental and harmonics",
         "textbook",
-        lambda m: [Stage("sensor", _harmonics, (m, mains, depth, slow, *parts))],
+        lambda m: [Stage(_harmonics, (m, mains, depth, slow, *parts))],
         2.0,
         "amplitude_nm",
         {"mains_hz": mains, "harmonics": amplitude.tolist()},
@@ -71,7 +71,6 @@ FORMULATIONS = (
     Written(
         "flattened sine with current peaks",
         "capacitor-input rectifiers",
-        "sensor",
         _rectifier,
         2.0,
         "amplitude_nm",
@@ -80,7 +79,6 @@ FORMULATIONS = (
     Written(
         "the grid's frequency wanders",
         "grid frequency as an Ornstein-Uhlenbeck process",
-        "sensor",
         _wandering,
         2.0,
         "amplitude_nm",
@@ -92,7 +90,6 @@ KEPT_BACK = (
     Written(
         "a machine switches on and off",
         "compressor duty cycle",
-        "sensor",
         _switching,
         2.5,
         "amplitude_nm",

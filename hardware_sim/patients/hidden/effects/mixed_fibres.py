@@ -12,7 +12,7 @@ from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Form
 from hardware_sim.patients.hidden.written import Written, second_order_of
 
 
-@kernel
+@kernel("dynamics")
 def _two_branches(x, p, s, c):
     """p: 1/Tω fast, 1/Tω slow, ζ, fast share; last: whether the fast fibres are recruited first."""
     if p[4] > 0.5:
@@ -25,7 +25,7 @@ def _two_branches(x, p, s, c):
     return y
 
 
-@kernel
+@kernel("dynamics")
 def _spectrum(x, p, s, c):
     """p: ζ, then seven shares and seven rates."""
     y = 0.0
@@ -35,7 +35,7 @@ def _spectrum(x, p, s, c):
     return y
 
 
-@kernel
+@kernel("dynamics")
 def _slow_tail(x, p, s, c):
     """p: slow share, 1/Tω, ζ, time constant of the slow first-order fibres s."""
     fast = second_order_step(x, p[1], p[2], s, 0, c[STEP_S])
@@ -45,7 +45,7 @@ def _slow_tail(x, p, s, c):
     return y
 
 
-@kernel
+@kernel("dynamics")
 def _third_order(x, p, s, c):
     """p: slow share, 1/Tω, ζ, time constant of each of three lags s."""
     fast = second_order_step(x, p[1], p[2], s, 0, c[STEP_S])
@@ -70,7 +70,7 @@ def spectrum(rng: Generator, base: Base) -> Formulation:
     return Formulation(
         "spectrum of contraction times",
         "spread of twitch times as in Fuglevand, Winter and Patla 1993",
-        lambda m: [Stage("dynamics", _spectrum, (base.zeta, *share, *(np.exp(-m * z) / base.t_omega_s)))],
+        lambda m: [Stage(_spectrum, (base.zeta, *share, *(np.exp(-m * z) / base.t_omega_s)))],
         1.3,
         "log_spread",
         {"shares": share.tolist()},
@@ -81,7 +81,6 @@ FORMULATIONS = (
     Written(
         "fast and slow in parallel",
         "Milner-Brown, Stein and Yemm 1973",
-        "dynamics",
         _two_branches,
         2.3,
         "log_ratio",
@@ -91,7 +90,6 @@ FORMULATIONS = (
     Written(
         "fast fibres recruited before the slow ones",
         "reversed order: Trimble and Enoka 1991; Gregory and Bickel 2005",
-        "dynamics",
         _two_branches,
         2.3,
         "log_ratio",
@@ -102,7 +100,6 @@ FORMULATIONS = (
     Written(
         "second-order fast fibres, first-order slow ones",
         "sim",
-        "dynamics",
         _slow_tail,
         0.7,
         "slow_share",
@@ -116,7 +113,6 @@ KEPT_BACK = (
     Written(
         "slow fibres of third order",
         "sim",
-        "dynamics",
         _third_order,
         0.8,
         "slow_share",

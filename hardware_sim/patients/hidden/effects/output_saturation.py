@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("structure")
 def _tanh(x, p, s, c):
     """p: largest torque over the knee."""
     if p[0] <= 0.0:
@@ -17,7 +17,7 @@ def _tanh(x, p, s, c):
     return knee * math.tanh(x / knee)
 
 
-@kernel
+@kernel("structure")
 def _power(x, p, s, c):
     """p: largest torque over the limit, exponent. x / (1 + (x/limit)^p)^(1/p)."""
     if p[0] <= 0.0:
@@ -26,7 +26,7 @@ def _power(x, p, s, c):
     return x / (1.0 + (abs(x) / limit) ** p[1]) ** (1.0 / p[1])
 
 
-@kernel
+@kernel("structure")
 def _tendon(x, p, s, c):
     """p: exponent at the largest torque. Torque lost where the tendon stretches: (1 - exp(-k x)) / k."""
     if p[0] < 1e-9:
@@ -35,7 +35,7 @@ def _tendon(x, p, s, c):
     return (1.0 - math.exp(-k * x)) / k
 
 
-@kernel
+@kernel("structure")
 def _knee(x, p, s, c):
     """p: slope lost above the knee, torque of the knee over the largest torque, roundness. Softplus knee."""
     at, width = p[1] * c[LARGEST_NM], p[2] * c[LARGEST_NM]
@@ -45,7 +45,7 @@ def _knee(x, p, s, c):
     return x - p[0] * above
 
 
-@kernel
+@kernel("structure")
 def _hyperbola(x, p, s, c):
     """p: largest torque over the half-saturation torque."""
     if x <= 0.0:
@@ -53,7 +53,7 @@ def _hyperbola(x, p, s, c):
     return x / (1.0 + p[0] * x / c[LARGEST_NM])
 
 
-@kernel
+@kernel("structure")
 def _arctangent(x, p, s, c):
     """p: largest torque over the knee."""
     if p[0] <= 0.0:
@@ -63,11 +63,10 @@ def _arctangent(x, p, s, c):
 
 
 FORMULATIONS = (
-    Written("tanh", "textbook", "structure", _tanh, 4.0, "largest_over_knee"),
+    Written("tanh", "textbook", _tanh, 4.0, "largest_over_knee"),
     Written(
         "x / (1 + x^p)^(1/p)",
         "Naka and Rushton 1966, generalised",
-        "structure",
         _power,
         4.0,
         "largest_over_limit",
@@ -76,7 +75,6 @@ FORMULATIONS = (
     Written(
         "tendon with an exponential toe",
         "after the series elastic element of Zajac 1989",
-        "structure",
         _tendon,
         4.0,
         "exponent",
@@ -84,7 +82,6 @@ FORMULATIONS = (
     Written(
         "two slopes with a soft knee",
         "bilinear fixture stiffness",
-        "structure",
         _knee,
         0.97,
         "slope_lost",
@@ -92,6 +89,6 @@ FORMULATIONS = (
     ),
 )
 KEPT_BACK = (
-    Written("hyperbola", "Hill 1910", "structure", _hyperbola, 5.0, "largest_over_half"),
-    Written("arctangent", "textbook", "structure", _arctangent, 5.0, "largest_over_knee"),
+    Written("hyperbola", "Hill 1910", _hyperbola, 5.0, "largest_over_half"),
+    Written("arctangent", "textbook", _arctangent, 5.0, "largest_over_knee"),
 )

@@ -11,7 +11,7 @@ from hardware_sim.patients.hidden.kernels import ANGLE_RAD, STEP_S, VELOCITY_RAD
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("additive")
 def _exponential(x, p, s, c):
     """p: size N·m, fibre lengths per rad (signed), angle of slack, viscosity as a share of the size, per rad/s."""
     stretch = p[1] * (c[ANGLE_RAD] - p[2])
@@ -19,7 +19,7 @@ def _exponential(x, p, s, c):
     return x - p[0] * (elastic * p[4] + p[3] * c[VELOCITY_RAD_S])
 
 
-@kernel
+@kernel("additive")
 def _two_ends(x, p, s, c):
     """p: size, steepness per rad and angle of the flexed and of the extended end, viscosity share."""
     flexed = math.exp(-p[1] * (c[ANGLE_RAD] - p[2]))
@@ -27,14 +27,14 @@ def _two_ends(x, p, s, c):
     return x + p[0] * (flexed - extended - p[5] * c[VELOCITY_RAD_S])
 
 
-@kernel
+@kernel("additive")
 def _friction(x, p, s, c):
     """p: size, stiffness, viscosity and dry friction as shares."""
     v = c[VELOCITY_RAD_S]
     return x - p[0] * (p[1] * (c[ANGLE_RAD] - 0.5 * math.pi) + p[2] * v + p[3] * math.tanh(v / 0.05))
 
 
-@kernel
+@kernel("additive")
 def _relaxing(x, p, s, c):
     """p: size, lasting stiffness share, relaxation time s. s: the dashpot's angle. A standard linear solid."""
     angle = c[ANGLE_RAD] - 0.5 * math.pi
@@ -44,7 +44,7 @@ def _relaxing(x, p, s, c):
     return x - p[0] * (p[1] * angle + (1.0 - p[1]) * (angle - s[0]))
 
 
-@kernel
+@kernel("additive")
 def _tangent(x, p, s, c):
     """p: size N·m, range rad, viscous share, exponent of the velocity."""
     d = min(max((c[ANGLE_RAD] - 0.5 * math.pi) / p[1], -0.95), 0.95)
@@ -59,7 +59,7 @@ def exponential(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "exponential spring and dashpot",
         "De Groote, Kinney, Rao and Fregly 2016",
-        lambda m: [Stage("additive", _exponential, (m, per_rad, slack, viscous, 4.0 * math.copysign(1.0, per_rad)))],
+        lambda m: [Stage(_exponential, (m, per_rad, slack, viscous, 4.0 * math.copysign(1.0, per_rad)))],
         8.0,
         "size_nm",
         {"lengths_per_rad": per_rad, "slack_rad": slack, "viscous_share_s": viscous},
@@ -71,7 +71,6 @@ FORMULATIONS = (
     Written(
         "exponentials at both ends of the range",
         "Hatze 1997; Riener and Edrich 1999",
-        "additive",
         _two_ends,
         6.0,
         "size_nm",
@@ -86,7 +85,6 @@ FORMULATIONS = (
     Written(
         "spring, dashpot and some dry friction",
         "Ashworth-like stiffness, linear",
-        "additive",
         _friction,
         5.0,
         "size_nm",
@@ -95,7 +93,6 @@ FORMULATIONS = (
     Written(
         "standard linear solid",
         "Fung 1981",
-        "additive",
         _relaxing,
         6.0,
         "stiffness_nm_per_rad",
@@ -106,7 +103,6 @@ KEPT_BACK = (
     Written(
         "tangent of the angle and a power of the velocity",
         "stiffening towards both ends",
-        "additive",
         _tangent,
         4.0,
         "size_nm",

@@ -9,14 +9,14 @@ from hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, 
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("gain")
 def _phosphorylation(x, p, s, c):
     """p: gain at full phosphorylation, rates of kinase and phosphatase per s. s[0]: phosphorylated share."""
     s[0] += c[STEP_S] * (p[1] * c[ACTIVATION] * (1.0 - s[0]) - p[2] * s[0])
     return x * (1.0 + p[0] * s[0])
 
 
-@kernel
+@kernel("gain")
 def _staircase(x, p, s, c):
     """p: gain at the end, what a pulse adds of what is left, decay s. s[0]: height of the staircase."""
     if c[PULSE] > 0.0 and c[ACTIVATION] > 0.03:
@@ -25,7 +25,7 @@ def _staircase(x, p, s, c):
     return x * (1.0 + p[0] * s[0])
 
 
-@kernel
+@kernel("gain")
 def _calcium_sensitivity(x, p, s, c):
     """p: shift of the force-calcium curve, rates per s. Much at low activation, nothing at full activation."""
     a = min(max(c[ACTIVATION], 0.0), 1.0)
@@ -37,7 +37,7 @@ def _calcium_sensitivity(x, p, s, c):
     return c[LARGEST_NM] * share * (1.0 + shift) / (1.0 + shift * share)
 
 
-@kernel
+@kernel("gain")
 def _by_work(x, p, s, c):
     """p: gain, build-up s, two decays s. s: two stores filled by force."""
     fill = c[STEP_S] * max(c[FORCE], 0.0) / p[1]
@@ -54,7 +54,6 @@ FORMULATIONS = (
     Written(
         "light-chain phosphorylation",
         "Sweeney, Bowman and Stull 1993; sizes of O'Leary, Hope and Sale 1997",
-        "gain",
         _phosphorylation,
         1.2,
         "full_gain",
@@ -63,7 +62,6 @@ FORMULATIONS = (
     Written(
         "staircase, pulse by pulse",
         "treppe, Bowditch 1871; MacIntosh 2010",
-        "gain",
         _staircase,
         1.2,
         "full_gain",
@@ -72,7 +70,6 @@ FORMULATIONS = (
     Written(
         "leftward shift of the force-calcium curve",
         "Persechini, Stull and Cooke 1985",
-        "gain",
         _calcium_sensitivity,
         15.0,
         "shift",
@@ -83,7 +80,6 @@ KEPT_BACK = (
     Written(
         "two stores filled by force",
         "biexponential decay of potentiation, O'Leary, Hope and Sale 1997",
-        "gain",
         _by_work,
         1.5,
         "gain",

@@ -9,7 +9,7 @@ from hardware_sim.patients.hidden.base import Base, look_up
 from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, Formulation, Stage, kernel
 
 
-@kernel
+@kernel("electrode")
 def _bouc_wen(x, p, s, c):
     """p: amplitude µs, reach µs, β, γ, n. s: z, width before. z' = u' - β |u'| |z|^(n-1) z - γ u' |z|^n, over reach."""
     change = x - s[1]
@@ -22,7 +22,7 @@ def _bouc_wen(x, p, s, c):
     return max(x - p[0] * s[0], 0.0) if x > 0.0 else 0.0
 
 
-@kernel
+@kernel("electrode")
 def _preisach(x, p, s, c):
     """p: width of the plane µs, spread µs, then the relays' weights. s: relays, -1 or 1."""
     top, n = p[0], 20
@@ -42,7 +42,7 @@ def _preisach(x, p, s, c):
     return max(x + p[1] * shift, 0.0) if x > 0.0 else 0.0
 
 
-@kernel
+@kernel("recruitment")
 def _unit_thresholds(x, p, s, c):
     """p[0:512]: torque at every µs; p[512:1024]: half-gap of each threshold, µs. s: width each threshold still feels.
 
@@ -62,7 +62,7 @@ def _unit_thresholds(x, p, s, c):
     return w
 
 
-@kernel
+@kernel("recruitment")
 def _two_curves(x, p, s, c):
     """p[0:512]: torque at every µs; shift as a share of the width; reach µs. s: direction -1 to 1, width before."""
     s[0] = min(max(s[0] + (x - s[1]) / p[513], -1.0), 1.0)
@@ -83,7 +83,7 @@ def bouc_wen(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "Bouc-Wen hysteresis of the pulse width",
         "Bouc 1967, Wen 1976; Ikhouane and Rodellar 2007",
-        lambda m: [Stage("electrode", _bouc_wen, (m, reach, beta, 1.0 - beta, n))],
+        lambda m: [Stage(_bouc_wen, (m, reach, beta, 1.0 - beta, n))],
         40.0,
         "amplitude_us",
         {"reach_us": reach, "beta": beta, "n": n},
@@ -100,7 +100,7 @@ def preisach(rng: Generator, base: Base) -> Formulation:
     return Formulation(
         "Preisach plane of relays",
         "Preisach 1935; Mayergoyz 1991",
-        lambda m: [Stage("electrode", _preisach, (top, m, *weight))],
+        lambda m: [Stage(_preisach, (top, m, *weight))],
         60.0,
         "amplitude_us",
         {"typical_gap_us": typical},
@@ -114,7 +114,7 @@ def unit_thresholds(rng: Generator, base: Base) -> Formulation:
     return Formulation(
         "motor units with separate thresholds for joining and leaving",
         "persistent inward currents, Heckman, Gorassini and Bennett 2005; Prandtl-Ishlinskii sum of play operators",
-        lambda m: [Stage("recruitment", _unit_thresholds, (*base.table_nm, *(m * shape)))],
+        lambda m: [Stage(_unit_thresholds, (*base.table_nm, *(m * shape)))],
         30.0,
         "half_gap_us",
         {"larger_at_higher_thresholds": larger_above},
@@ -126,7 +126,7 @@ def two_curves(rng: Generator, base: Base) -> Formulation:
     return Formulation(
         "a curve for rising and one for falling widths, blended",
         "two curves of ramp deconvolution, Durfee and MacLean 1989",
-        lambda m: [Stage("recruitment", _two_curves, (*base.table_nm, m, reach))],
+        lambda m: [Stage(_two_curves, (*base.table_nm, m, reach))],
         0.25,
         "shift_share",
         {"reach_us": reach},

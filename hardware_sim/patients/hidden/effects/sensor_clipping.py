@@ -6,7 +6,7 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, TIME_S, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("converter")
 def _rail(x, p, s, c):
     """p: share of the largest torque that is cut off."""
     if p[0] <= 0.0:
@@ -14,7 +14,7 @@ def _rail(x, p, s, c):
     return min(x, (1.0 - p[0]) * c[LARGEST_NM])
 
 
-@kernel
+@kernel("converter")
 def _both_rails(x, p, s, c):
     """p: share cut off, lower rail as a share of the largest torque."""
     if p[0] <= 0.0:
@@ -22,7 +22,7 @@ def _both_rails(x, p, s, c):
     return max(min(x, (1.0 - p[0]) * c[LARGEST_NM]), -p[1] * c[LARGEST_NM])
 
 
-@kernel
+@kernel("converter")
 def _converter(x, p, s, c):
     """p: share cut off, counts up to the rail. A coarse-ish converter whose code stops at its end."""
     if p[0] <= 0.0:
@@ -32,7 +32,7 @@ def _converter(x, p, s, c):
     return min(float(round(x / count)), p[1]) * count
 
 
-@kernel
+@kernel("converter")
 def _overload(x, p, s, c):
     """p: share of the largest torque cut off, s the amplifier stays at the rail. s[0]: until when."""
     if p[0] <= 0.0:
@@ -44,11 +44,10 @@ def _overload(x, p, s, c):
 
 
 FORMULATIONS = (
-    Written("upper rail", "textbook", "converter", _rail, 0.8, "share_cut_off"),
+    Written("upper rail", "textbook", _rail, 0.8, "share_cut_off"),
     Written(
         "upper and lower rail",
         "textbook",
-        "converter",
         _both_rails,
         0.8,
         "share_cut_off",
@@ -57,7 +56,6 @@ FORMULATIONS = (
     Written(
         "converter at its last code",
         "textbook",
-        "converter",
         _converter,
         0.8,
         "share_cut_off",
@@ -68,7 +66,6 @@ KEPT_BACK = (
     Written(
         "the amplifier stays at its rail a little longer",
         "overload recovery",
-        "converter",
         _overload,
         0.8,
         "share_cut_off",

@@ -29,7 +29,7 @@ def _resonate(x, omega, damping, stiffening, s, step_s):
     return spring
 
 
-@kernel
+@kernel("structure")
 def _in_series(x, p, s, c):
     """p: 1/ω² s², ζ, stiffening at the largest torque."""
     if p[0] < 1e-8:
@@ -37,13 +37,13 @@ def _in_series(x, p, s, c):
     return _resonate(x, 1.0 / math.sqrt(p[0]), p[1], p[2] / (c[LARGEST_NM] * c[LARGEST_NM]), s, c[STEP_S])
 
 
-@kernel
+@kernel("structure")
 def _beside(x, p, s, c):
     """p: share that goes through the mode, its Hz, ζ."""
     return x + p[0] * (_resonate(x, 2.0 * math.pi * p[1], p[2], 0.0, s, c[STEP_S]) - x)
 
 
-@kernel
+@kernel("structure")
 def _anti_resonance(x, p, s, c):
     """p: size, Hz, ζ: the load cell also feels the mass's acceleration, y = x - size * x_mode'' / ω²."""
     omega = 2.0 * math.pi * p[1]
@@ -52,7 +52,7 @@ def _anti_resonance(x, p, s, c):
     return x - p[0] * (s[1] - speed) / c[STEP_S] / (omega * omega)
 
 
-@kernel
+@kernel("structure")
 def _chain(x, p, s, c):
     """p: 1/ω² s², ζ, second ω over first. s: two displacements and speeds.
 
@@ -79,7 +79,6 @@ FORMULATIONS = (
     Written(
         "mass on a spring",
         "load cell and splint as a single mode",
-        "structure",
         _in_series,
         0.02,
         "inverse_omega_squared_s2",
@@ -88,7 +87,6 @@ FORMULATIONS = (
     Written(
         "mass on a spring that stiffens",
         "tendon toe region, Zajac 1989",
-        "structure",
         _in_series,
         0.02,
         "inverse_omega_squared_s2",
@@ -97,7 +95,6 @@ FORMULATIONS = (
     Written(
         "part of the torque goes through the mode",
         "two-mode fixture",
-        "structure",
         _beside,
         1.0,
         "share",
@@ -106,7 +103,6 @@ FORMULATIONS = (
     Written(
         "the load cell feels the forearm's acceleration",
         "inertial torque of a compliant splint",
-        "structure",
         _anti_resonance,
         2.0,
         "size",
@@ -117,7 +113,6 @@ KEPT_BACK = (
     Written(
         "two masses in a row",
         "forearm and splint, a mode each",
-        "structure",
         _chain,
         0.02,
         "inverse_omega_squared_s2",

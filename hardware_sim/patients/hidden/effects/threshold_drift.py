@@ -12,13 +12,13 @@ from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, WIDTH_US, Formu
 from hardware_sim.patients.hidden.written import Sign, Written, mostly
 
 
-@kernel
+@kernel("electrode")
 def _warm_up(x, p, s, c):
     """p: shift µs, time constant s. An electrode that settles: the width lost goes to its end like an RC."""
     return max(x - p[0] * (1.0 - math.exp(-c[TIME_S] / p[1])), 0.0) if x > 0.0 else 0.0
 
 
-@kernel
+@kernel("electrode")
 def _strength_duration(x, p, s, c):
     """p: change of the current's share, time constant s, overdrive I/rheobase at the start.
 
@@ -29,7 +29,7 @@ def _strength_duration(x, p, s, c):
     return max(x * (p[2] * (1.0 + change) - 1.0) / (p[2] - 1.0), 0.0)
 
 
-@kernel
+@kernel("electrode")
 def _wander(x, p, s, c):
     """p: size µs, spacing of the knots s, then 200 knots: sweat and skin, without a law."""
     if x <= 0.0:
@@ -37,19 +37,19 @@ def _wander(x, p, s, c):
     return max(x - p[0] * smooth_table(p, 2, 200, c[TIME_S] / p[1]), 0.0)
 
 
-@kernel
+@kernel("electrode")
 def _linear(x, p, s, c):
     """p: µs per s, until (s)."""
     return max(x - p[0] * min(c[TIME_S], p[1]), 0.0) if x > 0.0 else 0.0
 
 
-@kernel
+@kernel("electrode")
 def _settling(x, p, s, c):
     """p: µs a decade of time, first time s. Charge transfer at the interface settles with the logarithm of time."""
     return max(x - p[0] * math.log10(1.0 + c[TIME_S] / p[1]), 0.0) if x > 0.0 else 0.0
 
 
-@kernel
+@kernel("electrode")
 def _with_charge(x, p, s, c):
     """p: µs after a second of charge of 300 µs pulses. s[0]: charge so far. Polarisation that stays."""
     s[0] += c[STEP_S] * c[WIDTH_US] / 300.0
@@ -64,7 +64,7 @@ def sweat(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "smooth wander in one direction",
         "sweat and gel, no law",
-        lambda m: [Stage("electrode", _wander, (m, spacing, *knots))],
+        lambda m: [Stage(_wander, (m, spacing, *knots))],
         80.0,
         "shift_at_fourth_knot_us",
         {"knots_s": spacing, "sign": sign},
@@ -77,7 +77,6 @@ FORMULATIONS = (
     Written(
         "electrode settles like an RC",
         "electrode-skin impedance, Dorgan and Reilly 1999",
-        "electrode",
         _warm_up,
         90.0,
         "final_shift_us",
@@ -86,7 +85,6 @@ FORMULATIONS = (
     Written(
         "current falls, thresholds scale by Lapicque's law",
         "Lapicque 1907; Geddes 2004",
-        "electrode",
         _strength_duration,
         0.35,
         "share_of_current",
@@ -100,7 +98,6 @@ FORMULATIONS = (
     Written(
         "linear, then settled",
         "sim",
-        "electrode",
         _linear,
         2.0,
         "us_per_s",
@@ -111,7 +108,6 @@ KEPT_BACK = (
     Written(
         "goes with the logarithm of time",
         "constant-phase settling of the electrode interface, McAdams and Jossinet 1995",
-        "electrode",
         _settling,
         90.0,
         "us_per_decade",
@@ -120,7 +116,6 @@ KEPT_BACK = (
     Written(
         "goes with the charge delivered",
         "electrode polarisation, Merrill, Bikson and Jefferys 2005",
-        "electrode",
         _with_charge,
         6.0,
         "us_per_s_of_charge",

@@ -11,14 +11,14 @@ from hardware_sim.patients.hidden.kernels import ANGLE_RAD, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("joint")
 def _parabola(x, p, s, c):
     """p: exponent, linear per degree, quadratic per degree². In degrees from 90°."""
     d = 90.0 - c[ANGLE_RAD] * 180.0 / math.pi
     return x * max(1.0 + p[1] * d - p[2] * d * d, 0.05) ** p[0]
 
 
-@kernel
+@kernel("joint")
 def _force_length(x, p, s, c):
     """p: exponent, fibre lengths per rad, angle of the best length, width of the bell."""
     stretch = p[1] * (c[ANGLE_RAD] - p[2])
@@ -26,14 +26,14 @@ def _force_length(x, p, s, c):
     return x * math.exp(-p[0] * (stretch * stretch - best * best) / (p[3] * p[3]))
 
 
-@kernel
+@kernel("joint")
 def _moment_arm(x, p, s, c):
     """p: exponent, angle of the largest arm. The tendon's moment arm goes with the sine."""
     arm = max(math.cos(c[ANGLE_RAD] - p[1]), 0.05) / math.cos(0.5 * math.pi - p[1])
     return x * arm ** p[0]
 
 
-@kernel
+@kernel("joint")
 def _cubic(x, p, s, c):
     """p: exponent, then coefficients of a cubic in rad from 90°."""
     d = c[ANGLE_RAD] - 0.5 * math.pi
@@ -53,7 +53,6 @@ FORMULATIONS = (
     Written(
         "parabola about 90 degrees",
         "Marion, Wexler and Hull 2010",
-        "joint",
         _parabola,
         1.3,
         "exponent",
@@ -62,7 +61,6 @@ FORMULATIONS = (
     Written(
         "Gaussian force-length curve",
         "Thelen 2003 (width γ 0.45)",
-        "joint",
         _force_length,
         8.0,
         "exponent",
@@ -75,7 +73,6 @@ FORMULATIONS = (
     Written(
         "moment arm goes with the sine",
         "Murray, Delp and Buchanan 1995, simplified",
-        "joint",
         _moment_arm,
         5.0,
         "exponent",
@@ -86,7 +83,6 @@ KEPT_BACK = (
     Written(
         "cubic in the angle",
         "elbow torque-angle polynomials",
-        "joint",
         _cubic,
         4.0,
         "exponent",

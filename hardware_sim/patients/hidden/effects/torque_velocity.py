@@ -11,7 +11,7 @@ from hardware_sim.patients.hidden.kernels import ANGLE_RAD, VELOCITY_RAD_S, Form
 from hardware_sim.patients.hidden.written import Sign, Written, mostly
 
 
-@kernel
+@kernel("joint")
 def _hill(x, p, s, c):
     """p: inverse of the largest velocity s/rad (signed: shortening positive), shape, eccentric plateau."""
     v = p[0] * c[VELOCITY_RAD_S]
@@ -22,7 +22,7 @@ def _hill(x, p, s, c):
     return x * (1.0 + gain * slope * -v / (gain + slope * -v))
 
 
-@kernel
+@kernel("joint")
 def _logarithmic(x, p, s, c):
     """p: inverse of the largest velocity. De Groote's d1 log(d2 v + d3 + sqrt((d2 v + d3)² + 1)) + d4."""
     v = -p[0] * c[VELOCITY_RAD_S]
@@ -30,7 +30,7 @@ def _logarithmic(x, p, s, c):
     return x * max(value / (-0.318 * math.asinh(-0.374) + 0.886), 0.0)
 
 
-@kernel
+@kernel("joint")
 def _angle_times_velocity(x, p, s, c):
     """p: share lost per rad/s at the angle where it is most, V2 per degree."""
     degrees = c[ANGLE_RAD] * 180.0 / math.pi
@@ -38,7 +38,7 @@ def _angle_times_velocity(x, p, s, c):
     return x * max(1.0 - p[0] * bell * c[VELOCITY_RAD_S], 0.0)
 
 
-@kernel
+@kernel("joint")
 def _logistic(x, p, s, c):
     """p: steepness s/rad (signed), plateau of the stretched muscle."""
     e = math.exp(-4.0 * p[0] * c[VELOCITY_RAD_S])
@@ -50,7 +50,7 @@ def angle_times_velocity(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "velocity times a bell of the angle",
         "Marion, Wexler and Hull 2010",
-        lambda m: [Stage("joint", _angle_times_velocity, (sign * m, v2))],
+        lambda m: [Stage(_angle_times_velocity, (sign * m, v2))],
         1.5,
         "share_lost_per_rad_s",
         {"V2_per_degree": v2, "sign": sign},
@@ -64,7 +64,6 @@ FORMULATIONS = (
     Written(
         "Hill's hyperbola with an eccentric branch",
         "Hill 1938; Katz 1939",
-        "joint",
         _hill,
         1.0,
         "inverse_largest_velocity_s",
@@ -73,7 +72,6 @@ FORMULATIONS = (
     Written(
         "logarithmic force-velocity curve",
         "De Groote, Kinney, Rao and Fregly 2016",
-        "joint",
         _logarithmic,
         1.0,
         "inverse_largest_velocity_s",
@@ -85,7 +83,6 @@ KEPT_BACK = (
     Written(
         "logistic curve",
         "smooth stand-in for Hill's hyperbola",
-        "joint",
         _logistic,
         0.8,
         "steepness_s",

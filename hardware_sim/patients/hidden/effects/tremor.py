@@ -12,7 +12,7 @@ from hardware_sim.patients.hidden.kernels import FORCE, STEP_S, TIME_S, Formulat
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("additive")
 def _narrow_band(x, p, s, c):
     """p: sd N·m, centre Hz, bandwidth Hz. s: last two values, generator. A second-order autoregression."""
     r = math.exp(-math.pi * p[2] * c[STEP_S])
@@ -25,7 +25,7 @@ def _narrow_band(x, p, s, c):
     return x + p[0] * value
 
 
-@kernel
+@kernel("additive")
 def _wandering(x, p, s, c):
     """p: amplitude, centre Hz, spread Hz, second harmonic, with force. s: phase, detuning, log amplitude, generator.
 
@@ -39,7 +39,7 @@ def _wandering(x, p, s, c):
     return x + size * (math.sin(s[0]) + p[3] * math.sin(2.0 * s[0] + 0.7))
 
 
-@kernel
+@kernel("additive")
 def _beats(x, p, s, c):
     """p: size, then three pairs of Hz and phase. Close lines that beat, as of a few motor units."""
     for i in range(3):
@@ -53,7 +53,7 @@ def beats(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "three close lines",
         "beating motor units, Elble and Koller 1990",
-        lambda m: [Stage("additive", _beats, (m, *lines.ravel()))],
+        lambda m: [Stage(_beats, (m, *lines.ravel()))],
         3.0,
         "amplitude_nm",
         {"lines_hz": lines[:, 0].tolist()},
@@ -66,7 +66,6 @@ FORMULATIONS = (
     Written(
         "narrow-band noise",
         "autoregressive tremor, Randall 1973",
-        "additive",
         _narrow_band,
         4.0,
         "sd_nm",
@@ -76,7 +75,6 @@ FORMULATIONS = (
     Written(
         "oscillator whose frequency and size wander",
         "Gresty and Buckwell 1990",
-        "additive",
         _wandering,
         4.0,
         "amplitude_nm",
@@ -86,7 +84,6 @@ FORMULATIONS = (
     Written(
         "action tremor, grows with force",
         "McAuley and Marsden 2000",
-        "additive",
         _wandering,
         4.0,
         "amplitude_nm",

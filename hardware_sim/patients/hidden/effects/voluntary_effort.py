@@ -9,11 +9,11 @@ import numpy as np
 from numpy.random import Generator
 
 from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Stage, kernel, normal
+from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Kernel, Stage, kernel, normal
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("additive")
 def _bumps(x, p, s, c):
     """p: size N·m, then for each event: start s, length s, height, skewness. Raised cosines."""
     for i in range(60):
@@ -26,7 +26,7 @@ def _bumps(x, p, s, c):
     return x
 
 
-@kernel
+@kernel("additive")
 def _ramps(x, p, s, c):
     """p: size, then for each event: start, length, height, share of it spent rising (and falling). Smooth ramps."""
     for i in range(60):
@@ -42,7 +42,7 @@ def _ramps(x, p, s, c):
     return x
 
 
-@kernel
+@kernel("additive")
 def _spasms(x, p, s, c):
     """p: size, then for each event: start, decay s, height, rise s. Quick rise, exponential release."""
     for i in range(60):
@@ -55,7 +55,7 @@ def _spasms(x, p, s, c):
     return x
 
 
-@kernel
+@kernel("additive")
 def _moods(x, p, s, c):
     """p: size N·m, correlation s, threshold. s: two lags of noise, generator. Effort where the process is high."""
     h = c[STEP_S]
@@ -77,7 +77,7 @@ def _events(rng: Generator, between_s: tuple[float, float]) -> np.ndarray:
 def _effort(
     name: str,
     source: str,
-    stage: object,
+    stage: Kernel,
     between_s: tuple[float, float],
     lengths_s: tuple[float, float],
     shapes: Callable[[Generator], np.ndarray],
@@ -90,7 +90,7 @@ def _effort(
         return Formulation(
             name,
             source,
-            lambda m: [Stage("additive", stage, (m, *table.ravel()))],
+            lambda m: [Stage(stage, (m, *table.ravel()))],
             12.0,
             "typical_height_nm",
             {"first_events_s": table[:6, 0].tolist(), "first_heights": table[:6, 2].tolist()},
@@ -129,7 +129,6 @@ KEPT_BACK = (
     Written(
         "effort whenever a slow random drive is high",
         "no law",
-        "additive",
         _moods,
         20.0,
         "size_nm",

@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S,
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("gain")
 def _bistable(x, p, s, c):
     """p: size share, activation that sets it off, time it takes s, how long it lasts s. s: charge, age, on."""
     s[0] += (c[ACTIVATION] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[2]))
@@ -27,7 +27,6 @@ FORMULATIONS = (
     Written(
         "after-discharge switched on by strong stimulation",
         "plateau potentials, Bennett, Li and Siu 2001",
-        "gain",
         _bistable,
         0.9,
         "size_share",

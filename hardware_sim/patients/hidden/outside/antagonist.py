@@ -10,7 +10,7 @@ from hardware_sim.patients.hidden.base import Base, second_order_step
 from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, Formulation, Stage, kernel
 
 
-@kernel
+@kernel("additive")
 def _pull_back(x, p, s, c):
     """p: largest pull as a share, threshold µs, rise µs, 1/Tω, ζ, fatigue s. s: pull and its speed, late copy."""
     w = c[WIDTH_US] - p[1]
@@ -29,7 +29,7 @@ def pull_back(rng: Generator, base: Base) -> Formulation:
     return Formulation(
         "a slow, quickly tiring antagonist at large widths",
         "spill-over to the antagonist, as in Durfee and MacLean 1989",
-        lambda m: [Stage("additive", _pull_back, (m, threshold, rise, rate, 1.1, tiring))],
+        lambda m: [Stage(_pull_back, (m, threshold, rise, rate, 1.1, tiring))],
         1.5,
         "share",
         {"threshold_us": threshold, "rise_us": rise, "slower_by": 1.0 / (rate * base.t_omega_s), "tiring_s": tiring},

@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S,
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("additive")
 def _beats(x, p, s, c):
     """p: size share, Hz, drive's decay s, delay s. s: oscillator (2), drive, activation before.
 
@@ -37,7 +37,6 @@ FORMULATIONS = (
     Written(
         "beats set off by a fall of torque",
         "Van der Pol oscillator; clonus at 5 to 7 Hz, Hidler and Rymer 1999",
-        "additive",
         _beats,
         0.8,
         "size_share",

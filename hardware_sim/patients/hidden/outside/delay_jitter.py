@@ -9,7 +9,7 @@ from hardware_sim.patients.hidden.kernels import STEP_S, kernel, normal
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("delay")
 def _jitter(x, p, s, c):
     """p: mean delay s, its correlation s. s: place in the ring of 800, delay's state, generator."""
     s[1] += -c[STEP_S] * s[1] / p[1] + math.sqrt(2.0 * c[STEP_S] / p[1]) * normal(s, 2)
@@ -20,7 +20,6 @@ FORMULATIONS = (
     Written(
         "delay wanders at random",
         "made to be foreign",
-        "delay",
         _jitter,
         0.16,
         "mean_delay_s",

@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("structure")
 def _play(x, p, s, c):
     """p: half-width of the play as a share of the largest torque, settling s. s: follower, what is read."""
     half = p[0] * c[LARGEST_NM]
@@ -21,7 +21,6 @@ FORMULATIONS = (
     Written(
         "play on torque",
         "backlash operator, Krasnosel'skii and Pokrovskii 1989",
-        "structure",
         _play,
         0.4,
         "half_width_share",

@@ -9,7 +9,7 @@ from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
 
 
-@kernel
+@kernel("gain")
 def _jumps(x, p, s, c):
     """p: size, then 60 pairs of instant and gain after it. s[0]: present pair."""
     while s[0] < 60.0 and c[TIME_S] >= p[1 + 2 * int(s[0])]:
@@ -26,7 +26,7 @@ def jumps(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "gain jumps up and down",
         "electrode shift",
-        lambda m: [Stage("gain", _jumps, (m, *table))],
+        lambda m: [Stage(_jumps, (m, *table))],
         0.6,
         "size",
         {"first_instants_s": instants[:5].tolist(), "first_gains": gains[:5].tolist()},

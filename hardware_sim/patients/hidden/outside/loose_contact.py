@@ -9,7 +9,7 @@ from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
 
 
-@kernel
+@kernel("electrode")
 def _gaps(x, p, s, c):
     """p: length of a typical gap s, then 200 pairs of instant and relative length. s[0]: present pair."""
     i = int(s[0])
@@ -27,7 +27,7 @@ def gaps(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "current is cut for moments",
         "loose electrode lead",
-        lambda m: [Stage("electrode", _gaps, (m, *table))],
+        lambda m: [Stage(_gaps, (m, *table))],
         0.35,
         "typical_gap_s",
         {"first_instants_s": instants[:5].tolist()},

@@ -8,14 +8,14 @@ from hardware_sim.patients.hidden.kernels import COUNT, PULSE, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("gain")
 def _all_pulses(x, p, s, c):
     """p: depth, pulses a turn. s[0]: pulses so far. A gain that swings with the pulses, not with time."""
     s[0] += c[PULSE]
     return x * (1.0 + p[0] * math.sin(2.0 * math.pi * s[0] / p[1]))
 
 
-@kernel
+@kernel("gain")
 def _every_other(x, p, s, c):
     """p: depth, pulses of a group. Alternans: groups of pulses of a train are strong and weak in turn."""
     group = int((max(c[COUNT], 1.0) - 1.0) / p[1])
@@ -26,7 +26,6 @@ FORMULATIONS = (
     Written(
         "gain swings with the count of pulses",
         "no physiology; made to be foreign",
-        "gain",
         _all_pulses,
         0.9,
         "depth",
@@ -35,7 +34,6 @@ FORMULATIONS = (
     Written(
         "groups of pulses strong and weak in turn",
         "mechanical alternans, transposed",
-        "gain",
         _every_other,
         0.9,
         "depth",

@@ -8,14 +8,14 @@ from hardware_sim.patients.hidden.kernels import STEP_S, WIDTH_US, kernel
 from hardware_sim.patients.hidden.written import Sign, Written, weighted
 
 
-@kernel
+@kernel("electrode")
 def _accommodation(x, p, s, c):
     """p: share, time constant s. s[0]: the width the nerve is used to. What differs from it counts more (or less)."""
     s[0] += (x - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
     return max(x + p[0] * (x - s[0]), 0.0) if x > 0.0 else 0.0
 
 
-@kernel
+@kernel("gain")
 def _less_when_quick(x, p, s, c):
     """p: share lost at most, time constant s, µs/s at which half is lost. s: width before, mean speed of change."""
     s[1] += (abs(c[WIDTH_US] - s[0]) / c[STEP_S] - s[1]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
@@ -27,7 +27,6 @@ FORMULATIONS = (
     Written(
         "the nerve accommodates to the width",
         "accommodation, Hill 1936, transposed to pulse width",
-        "electrode",
         _accommodation,
         1.5,
         "share",
@@ -39,7 +38,6 @@ FORMULATIONS = (
     Written(
         "quick changes of width recruit less",
         "no law; recruitment that depends on the rate of change",
-        "gain",
         _less_when_quick,
         0.95,
         "share",

@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, kernel
 from hardware_sim.patients.hidden.written import Sign, Written
 
 
-@kernel
+@kernel("gain")
 def _residual(x, p, s, c):
     """p: share, decay s. s[0]: highest torque of this contraction, released only by full relaxation."""
     if c[ACTIVATION] < 0.02:
@@ -25,7 +25,6 @@ FORMULATIONS = (
     Written(
         "residual force enhancement or depression",
         "Abbott and Aubert 1952; Herzog 2004, transposed to activation",
-        "gain",
         _residual,
         0.95,
         "share",

@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.kernels import TIME_S, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("sensor")
 def _swing(x, p, s, c):
     """p: depth, period s, phase, sharpness."""
     wave = math.sin(2.0 * math.pi * c[TIME_S] / p[1] + p[2])
@@ -19,7 +19,6 @@ FORMULATIONS = (
     Written(
         "sensitivity swings in time",
         "heating cycle; made to be foreign",
-        "sensor",
         _swing,
         0.8,
         "depth",

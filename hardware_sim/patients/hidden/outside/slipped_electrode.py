@@ -9,13 +9,13 @@ from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, ker
 from hardware_sim.patients.hidden.written import Sign, Written, weighted
 
 
-@kernel
+@kernel("gain")
 def _gain_step(x, p, s, c):
     """p: size with its sign, moment s."""
     return x * max(1.0 + p[0], 0.0) if c[TIME_S] >= p[1] else x
 
 
-@kernel
+@kernel("electrode")
 def _threshold_step(x, p, s, c):
     """p: size with its sign µs, moment s."""
     return max(x - p[0], 0.0) if x > 0.0 and c[TIME_S] >= p[1] else x
@@ -34,7 +34,7 @@ def both_step(rng: Generator, base: Base) -> Formulation:
     return Formulation(
         "gain and threshold step once",
         "electrode slip",
-        lambda m: [Stage("electrode", _threshold_step, (m * us, moment)), Stage("gain", _gain_step, (-m, moment))],
+        lambda m: [Stage(_threshold_step, (m * us, moment)), Stage(_gain_step, (-m, moment))],
         0.7,
         "size",
         {"moment_s": moment, "us_per_size": us},
@@ -45,7 +45,6 @@ FORMULATIONS = (
     Written(
         "the gain steps once",
         "electrode slip",
-        "gain",
         _gain_step,
         0.7,
         "size",
@@ -54,7 +53,6 @@ FORMULATIONS = (
     Written(
         "the threshold steps once",
         "electrode slip",
-        "electrode",
         _threshold_step,
         90.0,
         "size_us",

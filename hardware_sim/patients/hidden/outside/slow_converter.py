@@ -6,7 +6,7 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, TIME_S, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("converter")
 def _held(x, p, s, c):
     """p: how long a reading is held, s. s: reading, time of the next."""
     if p[0] <= 0.0:
@@ -17,7 +17,7 @@ def _held(x, p, s, c):
     return s[0]
 
 
-@kernel
+@kernel("converter")
 def _coarse(x, p, s, c):
     """p: step as a share of the largest torque."""
     if p[0] <= 0.0:
@@ -27,6 +27,6 @@ def _coarse(x, p, s, c):
 
 
 FORMULATIONS = (
-    Written("each reading is held", "sample and hold", "converter", _held, 1.2, "held_s"),
-    Written("coarse steps", "quantiser", "converter", _coarse, 0.6, "step_share"),
+    Written("each reading is held", "sample and hold", _held, 1.2, "held_s"),
+    Written("coarse steps", "quantiser", _coarse, 0.6, "step_share"),
 )

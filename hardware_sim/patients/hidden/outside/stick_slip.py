@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("structure")
 def _stick_slip(x, p, s, c):
     """p: breakaway as a share of the largest torque, share at which it sticks again, slip s. s: reading, slipping."""
     gap = p[0] * c[LARGEST_NM]
@@ -25,7 +25,6 @@ FORMULATIONS = (
     Written(
         "breakaway and slip",
         "Coulomb friction with a breakaway torque",
-        "structure",
         _stick_slip,
         0.6,
         "breakaway_share",

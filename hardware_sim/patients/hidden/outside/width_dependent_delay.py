@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.base import Base
 from hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, Formulation, Stage, kernel
 
 
-@kernel
+@kernel("delay")
 def _variable_line(x, p, s, c):
     """p: delay range s, sign. s[0]: place in the ring of 1000; each sample is put where it will come out."""
     size = 1000
@@ -29,7 +29,7 @@ def variable_line(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "transport line as long as the pulse is weak" if sign < 0 else "transport line as long as the pulse is strong",
         "conduction of small axons; made to be foreign",
-        lambda m: [Stage("delay", _variable_line, (m, sign))],
+        lambda m: [Stage(_variable_line, (m, sign))],
         0.25,
         "delay_range_s",
         {"late_when": "strong" if sign > 0 else "weak"},

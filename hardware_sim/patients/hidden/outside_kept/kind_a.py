@@ -8,7 +8,7 @@ from hardware_sim.patients.hidden.base import Base, second_order_step
 from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
 
 
-@kernel
+@kernel("additive")
 def _reflex(x, p, s, c):
     """p: torque per (largest torque a second), delay s, 1/Tω, threshold 1/s, sign. s: filter, x before, ring of 900."""
     size = 900
@@ -29,7 +29,7 @@ def reflex(rng: Generator, _base: Base) -> Formulation:
     return Formulation(
         "delayed reflex to a quick change of torque",
         "stretch reflex with threshold and delay, Kearney, Stein and Parameswaran 1997, transposed to torque",
-        lambda m: [Stage("additive", _reflex, (pull * m, delay, speed, threshold, sign))],
+        lambda m: [Stage(_reflex, (pull * m, delay, speed, threshold, sign))],
         0.6,
         "gain_s",
         {"delay_s": delay, "threshold_per_s": threshold, "answers": "rise" if sign > 0 else "fall", "pull": pull},

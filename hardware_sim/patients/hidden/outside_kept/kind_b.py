@@ -6,7 +6,7 @@ from hardware_sim.patients.hidden.kernels import TIME_S, kernel, uniform
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("electrode")
 def _stale(x, p, s, c):
     """p: mean time between settings s, spread. s: width in force, time of the next setting, generator."""
     if p[0] <= 0.0:
@@ -21,7 +21,6 @@ FORMULATIONS = (
     Written(
         "settings are taken up now and then",
         "a slow link between computer and stimulator",
-        "electrode",
         _stale,
         0.6,
         "mean_time_s",

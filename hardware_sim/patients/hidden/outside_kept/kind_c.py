@@ -6,7 +6,7 @@ from hardware_sim.patients.hidden.kernels import STEP_S, kernel
 from hardware_sim.patients.hidden.written import Written, largest_width_us
 
 
-@kernel
+@kernel("electrode")
 def _slewed(x, p, s, c):
     """p: s for the largest width up and down as a share of it, largest width µs. s[0]: width in force."""
     up = p[2] * c[STEP_S] / max(p[0], 1e-9)
@@ -19,7 +19,6 @@ FORMULATIONS = (
     Written(
         "the width is slewed",
         "soft start of clinical stimulators",
-        "electrode",
         _slewed,
         2.0,
         "up_s",

@@ -9,13 +9,13 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, k
 from hardware_sim.patients.hidden.written import Sign, Written, largest_width_us
 
 
-@kernel
+@kernel("sensor")
 def _feed_through(x, p, s, c):
     """p: share with its sign, largest width µs."""
     return x + p[0] * c[LARGEST_NM] * c[WIDTH_US] / p[1]
 
 
-@kernel
+@kernel("sensor")
 def _edges(x, p, s, c):
     """p: share with its sign, largest width µs, decay s. s: the amplifier's slow copy of the artefact."""
     drive = c[WIDTH_US] / p[1]
@@ -27,7 +27,6 @@ FORMULATIONS = (
     Written(
         "artefact proportional to the width",
         "stimulus artefact in a bridge amplifier",
-        "sensor",
         _feed_through,
         1.0,
         "share",
@@ -36,7 +35,6 @@ FORMULATIONS = (
     Written(
         "artefact at changes of the width",
         "stimulus artefact through a coupling capacitor",
-        "sensor",
         _edges,
         1.5,
         "share",

@@ -6,7 +6,7 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("sensor")
 def _coupled(x, p, s, c):
     """p: rate 1/s. s[0]: zero. Coupled through a capacitor."""
     out = x - s[0]
@@ -14,7 +14,7 @@ def _coupled(x, p, s, c):
     return out
 
 
-@kernel
+@kernel("sensor")
 def _tracking(x, p, s, c):
     """p: rate 1/s, window as a share. s[0]: zero. It follows only what lies within the window."""
     out = x - s[0]
@@ -28,7 +28,6 @@ FORMULATIONS = (
     Written(
         "the zero follows the reading",
         "high-pass coupling of a bridge amplifier",
-        "sensor",
         _coupled,
         1.0,
         "rate_per_s",
@@ -36,7 +35,6 @@ FORMULATIONS = (
     Written(
         "the zero follows small readings",
         "zero tracking of weighing indicators",
-        "sensor",
         _tracking,
         4.0,
         "rate_per_s",

@@ -7,14 +7,14 @@ from hardware_sim.patients.hidden.kernels import LARGEST_NM, kernel
 from hardware_sim.patients.hidden.written import Written
 
 
-@kernel
+@kernel("structure")
 def _dead(x, p, s, c):
     """p: slack as a share of the largest torque."""
     slack = p[0] * c[LARGEST_NM]
     return max(x - slack, 0.0) if x > 0.0 else x
 
 
-@kernel
+@kernel("structure")
 def _toe(x, p, s, c):
     """p: toe as a share of the largest torque: quadratic below, straight above."""
     toe = p[0] * c[LARGEST_NM]
@@ -24,6 +24,6 @@ def _toe(x, p, s, c):
 
 
 FORMULATIONS = (
-    Written("slack", "dead zone", "structure", _dead, 0.6, "slack_share"),
-    Written("toe", "toe region of webbing", "structure", _toe, 1.5, "toe_share"),
+    Written("slack", "dead zone", _dead, 0.6, "slack_share"),
+    Written("toe", "toe region of webbing", _toe, 1.5, "toe_share"),
 )
