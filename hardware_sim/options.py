@@ -6,6 +6,7 @@ import argparse
 import secrets
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import NoReturn
 
 from hardware_sim import stimulators
@@ -54,31 +55,11 @@ def settings(options: argparse.Namespace, patient: str) -> Settings:
     SettingsError
         A number is out of its range.
     """
-    seed = secrets.randbelow(2**31) if options.noise_seed is None else options.noise_seed
-    return Settings(
-        patient=patient,
-        stimulator=options.stimulator,
-        cell=_cell_kind(options),
-        transport=options.load_cell,
-        noise_nm=options.noise_nm,
-        noise_seed=seed,
-        torque_offset_nm=options.torque_offset_nm,
-        rate_hz=options.rate_hz,
-        speed=options.speed,
-        clock_ppm=options.clock_ppm,
-        clock_jitter_us=options.clock_jitter_us,
-        samples_per_frame=options.samples_per_frame,
-        sync=not options.no_sync,
-        angle=options.angle,
-        angle_rate_hz=options.angle_rate_hz,
-        angle_bits=options.angle_bits,
-        angle_noise_deg=options.angle_noise_deg,
-        angle_offset_deg=options.angle_offset_deg,
-        angle_direction=options.angle_direction,
-        angle_scale=options.angle_scale,
-        angle_clock_ppm=options.angle_clock_ppm,
-        angle_jitter_us=options.angle_jitter_us,
-    )
+    given = {one.name: getattr(options, one.name) for one in fields(Settings) if hasattr(options, one.name)}
+    if options.noise_seed is None:
+        given["noise_seed"] = secrets.randbelow(2**31)
+    given |= {"patient": patient, "cell": _cell_kind(options), "sync": not options.no_sync}
+    return Settings(**given)
 
 
 def _cell_kind(options: argparse.Namespace) -> str:
@@ -112,6 +93,7 @@ def _devices(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--stimulator", default=DEFAULTS.stimulator, choices=modules_with(stimulators, "Firmware"))
     group.add_argument(
         "--load-cell",
+        dest="transport",
         default=DEFAULTS.transport,
         choices=modules_with(transports, "Transport"),
         help="what carries the cell's frames: a server on 127.0.0.1, or an adapter on a pseudo-terminal "
@@ -132,43 +114,23 @@ def _devices(group: argparse._ArgumentGroup) -> None:
     )
 
 
+def _number(group: argparse._ArgumentGroup, name: str, metavar: str, what: str) -> None:
+    """A number of the settings, with their default."""
+    default = getattr(DEFAULTS, name.replace("-", "_"))
+    text = f"{what} (default: %(default)g)"
+    group.add_argument(f"--{name}", type=type(default), default=default, metavar=metavar, help=text)
+
+
 def _samples(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--noise-nm",
-        type=float,
-        default=DEFAULTS.noise_nm,
-        metavar="SD",
-        help="standard deviation of the sensor's white noise, N·m (default: %(default)s)",
-    )
+    _number(group, "noise-nm", "SD", "standard deviation of the sensor's white noise, N·m")
     group.add_argument("--noise-seed", type=int, metavar="SEED", help="of noise and faults (default: at random)")
-    group.add_argument(
-        "--torque-offset-nm", type=float, default=0.0, metavar="NM", help="the cell's zero offset (default: 0)"
-    )
-    group.add_argument(
-        "--rate-hz",
-        type=float,
-        default=DEFAULTS.rate_hz,
-        metavar="HZ",
-        help="samples per second (default: %(default)g)",
-    )
-    group.add_argument(
-        "--samples-per-frame",
-        type=int,
-        default=1,
-        metavar="N",
-        help="samples in each frame: plain takes 1 or 3 (16-bit counts of 2 mN·m and a counter of frames), "
-        "counts takes 1 to 4 (default: 1)",
-    )
-    group.add_argument(
-        "--clock-ppm", type=float, default=0.0, metavar="PPM", help="drift of the cell's clock (default: 0)"
-    )
-    group.add_argument(
-        "--clock-jitter-us",
-        type=float,
-        default=0.0,
-        metavar="SD",
-        help="standard deviation of each sample's own time, never more than 0.45 of a period (default: 0)",
-    )
+    _number(group, "torque-offset-nm", "NM", "the cell's zero offset")
+    _number(group, "rate-hz", "HZ", "samples per second")
+    frames = "plain takes 1 or 3 (16-bit counts of 2 mN·m and a counter of frames), counts takes 1 to 4"
+    _number(group, "samples-per-frame", "N", f"samples in each frame: {frames}")
+    _number(group, "clock-ppm", "PPM", "drift of the cell's clock")
+    jitter = "standard deviation of each sample's own time, never more than 0.45 of a period"
+    _number(group, "clock-jitter-us", "SD", jitter)
 
 
 def _arm(group: argparse._ArgumentGroup) -> None:
@@ -192,24 +154,13 @@ def _arm(group: argparse._ArgumentGroup) -> None:
         default=DEFAULTS.angle,
         help="the angle in frames of its own (id 0x182) or in the load cell's frame (default: %(default)s)",
     )
-    numbers = {
-        "rate-hz": ("HZ", "frames per second of its own"),
-        "bits": ("BITS", "resolution of the encoder, bits per turn"),
-        "noise-deg": ("SD", "standard deviation of its white noise, degrees"),
-        "offset-deg": ("DEG", "its reading at the straight arm"),
-        "scale": ("FACTOR", "true angle = direction × FACTOR × (reading − offset)"),
-        "clock-ppm": ("PPM", "drift of its clock"),
-        "jitter-us": ("SD", "standard deviation of each of its samples' own time"),
-    }
-    for name, (metavar, what) in numbers.items():
-        default = getattr(DEFAULTS, "angle_" + name.replace("-", "_"))
-        group.add_argument(
-            f"--angle-{name}",
-            type=type(default),
-            default=default,
-            metavar=metavar,
-            help=f"{what} (default: %(default)g)",
-        )
+    _number(group, "angle-rate-hz", "HZ", "frames per second of its own")
+    _number(group, "angle-bits", "BITS", "resolution of the encoder, bits per turn")
+    _number(group, "angle-noise-deg", "SD", "standard deviation of its white noise, degrees")
+    _number(group, "angle-offset-deg", "DEG", "its reading at the straight arm")
+    _number(group, "angle-scale", "FACTOR", "true angle = direction × FACTOR × (reading − offset)")
+    _number(group, "angle-clock-ppm", "PPM", "drift of its clock")
+    _number(group, "angle-jitter-us", "SD", "standard deviation of each of its samples' own time")
     group.add_argument(
         "--angle-direction", type=int, choices=(1, -1), default=1, help="-1: its readings fall in flexion (default: 1)"
     )

@@ -73,6 +73,20 @@ class CellProtocol(Protocol):
         ...
 
 
+class AlwaysOn:
+    """Base of cells that send from power-on and take no commands."""
+
+    def __init__(self, samples_per_frame: int = 1) -> None:
+        self.samples_per_frame = samples_per_frame
+
+    def running(self) -> bool:
+        """From power-on."""
+        return True
+
+    def received(self, can_id: int, data: bytes) -> None:
+        """Takes no commands."""
+
+
 class TransportProtocol(Protocol):
     """What connects the CAN bus to the host; its constructor takes the reactor and a `FrameHandler`."""
 

@@ -55,10 +55,10 @@ class Firmware:
         self._handlers: dict[int, Callable[[Packet], None]] = {
             LL_INIT: self._ll_init,
             LL_CHANNEL_CONFIG: self._ll_channel_config,
-            LL_STOP: self._ll_stop,
+            LL_STOP: lambda p: self._stop(p, LOW_LEVEL),
             ML_INIT: self._ml_init,
             ML_UPDATE: self._ml_update,
-            ML_STOP: self._ml_stop,
+            ML_STOP: lambda p: self._stop(p, MID_LEVEL_READY),
             ML_GET_CURRENT_DATA: self._ml_get_current_data,
             DEVICE_ID: lambda p: self._ack(p, bytes((OK,)) + b"EMULATED24"),
             RESET: self._reset_command,
@@ -161,8 +161,8 @@ class Firmware:
 
         self._later(SWITCH_TIME_S, finish)
 
-    def _ll_stop(self, packet: Packet) -> None:
-        result = OK if self._level == LOW_LEVEL else NOT_INITIALISED
+    def _stop(self, packet: Packet, level: int) -> None:
+        result = OK if self._level == level else NOT_INITIALISED
         self._end_levels()
         self._later(SWITCH_TIME_S, lambda: self._ack(packet, bytes((result,))))
 
@@ -228,8 +228,3 @@ class Firmware:
             self._ack(packet, bytes((NOT_INITIALISED, 4, 0, 0, 0, 0, 0)))
         else:
             self._ack(packet, self._mid_level.current_data(packet.data))
-
-    def _ml_stop(self, packet: Packet) -> None:
-        result = OK if self._level == MID_LEVEL_READY else NOT_INITIALISED
-        self._end_levels()
-        self._later(SWITCH_TIME_S, lambda: self._ack(packet, bytes((result,))))

@@ -8,33 +8,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import Frame, Sample
+from hardware_sim.load_cells.frames import AlwaysOn, Frame, Sample
 
 CAN_ID = 610
 ZERO_COUNTS = 32768
 COUNTS_PER_NM = 32767 / 50.0
 
 
-class Cell:
+class Cell(AlwaysOn):
     """2 bytes a sample."""
 
     layouts: tuple[int, ...] = (1, 2, 3, 4)
     has_counter = has_sync = False
 
-    def __init__(self, samples_per_frame: int = 1) -> None:
-        self.samples_per_frame = samples_per_frame
-
-    def running(self) -> bool:
-        """From power-on."""
-        return True
-
     def encode(self, samples: Sequence[Sample]) -> Frame:
         """The frame of its samples; values are limited to full scale, NaN is the lowest count."""
         data = b"".join(_counts(sample.torque_nm).to_bytes(2, "big") for sample in samples)
         return Frame(CAN_ID, data, samples[-1].time_us, time_s=samples[-1].time_s)
-
-    def received(self, can_id: int, data: bytes) -> None:
-        """Takes no commands."""
 
 
 def _counts(torque_nm: float) -> int:

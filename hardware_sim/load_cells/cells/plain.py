@@ -9,7 +9,7 @@ import math
 import struct
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import Frame, Sample
+from hardware_sim.load_cells.frames import AlwaysOn, Frame, Sample
 
 CAN_ID = 0x181
 LAYOUT = struct.Struct("<fHBB")
@@ -20,19 +20,15 @@ COUNTS_PER_NM = 500
 LARGEST_COUNTS = 32767
 
 
-class Cell:
+class Cell(AlwaysOn):
     """Little endian: torque, counter, status (bit 0 sync), spare; or three counts and a counter."""
 
     layouts: tuple[int, ...] = (1, PACKED_SAMPLES)
     has_counter = True
 
     def __init__(self, samples_per_frame: int = 1) -> None:
-        self.samples_per_frame = samples_per_frame
+        super().__init__(samples_per_frame)
         self.has_sync = samples_per_frame == 1
-
-    def running(self) -> bool:
-        """From power-on."""
-        return True
 
     def encode(self, samples: Sequence[Sample]) -> Frame:
         """The frame of its samples."""
@@ -42,9 +38,6 @@ class Cell:
         else:
             data = LAYOUT.pack(last.torque_nm, last.counter & 0xFFFF, SYNC_BIT if last.sync else 0, 0)
         return Frame(CAN_ID, data, last.time_us, False, last.time_s)
-
-    def received(self, can_id: int, data: bytes) -> None:
-        """Takes no commands."""
 
 
 def _counts(torque_nm: float) -> int:

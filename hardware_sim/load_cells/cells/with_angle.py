@@ -10,7 +10,7 @@ import math
 import struct
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import Frame, Sample
+from hardware_sim.load_cells.frames import AlwaysOn, Frame, Sample
 
 CAN_ID = 0x181
 LAYOUT = struct.Struct("<fhBB")
@@ -19,18 +19,11 @@ COUNTS_PER_DEG = 100
 LARGEST_COUNTS, NO_ANGLE = 32767, -32768
 
 
-class Cell:
+class Cell(AlwaysOn):
     """One sample a frame; an angle that is no number is the lowest count."""
 
     layouts: tuple[int, ...] = (1,)
     has_counter = has_sync = True
-
-    def __init__(self, samples_per_frame: int = 1) -> None:
-        self.samples_per_frame = samples_per_frame
-
-    def running(self) -> bool:
-        """From power-on."""
-        return True
 
     def encode(self, samples: Sequence[Sample]) -> Frame:
         """The frame of one sample."""
@@ -39,9 +32,6 @@ class Cell:
         counts = _counts(sample.angle.angle_deg if sample.angle else math.nan)
         data = LAYOUT.pack(sample.torque_nm, counts, sample.counter & 0xFF, status)
         return Frame(CAN_ID, data, sample.time_us, time_s=sample.time_s)
-
-    def received(self, can_id: int, data: bytes) -> None:
-        """Takes no commands."""
 
 
 def _counts(angle_deg: float) -> int:

@@ -125,13 +125,7 @@ def make_design(
     else:
         parts = [rest(2), prbs, rest(3), ramp, rest(2)]
         if name == "long":
-            parts += [
-                rest(2),
-                ("ramp", _ramp(top_us, 5.0)),
-                rest(2),
-                ("staircase", staircase(top_us, 5, 1.2)),
-                rest(1),
-            ]
+            parts += [rest(2), ramp, rest(2), ("staircase", staircase(top_us, 5, 1.2)), rest(1)]
             parts += [("ramp", _ramp(top_us, 1.5)), rest(2)]
         if with_validate:
             parts += [("validate", levels(rng, top_us, validate_s)), rest(2)]
