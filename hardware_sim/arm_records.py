@@ -36,7 +36,6 @@ def record(
     protocol: str = "prbs",
     duration_s: float | None = None,
     parts: Parts | None = None,
-    noise_sd_nm: float | None = None,
 ) -> dict[str, Any]:
     """One record of an arm.
 
@@ -56,8 +55,6 @@ def record(
     parts
         Of `held` or `moving`: segments in order, each a name and its pulse widths at 40 pulses/s, µs, instead of the
         kind's own.
-    noise_sd_nm
-        Of the torque; drawn if None.
 
     Returns
     -------
@@ -79,7 +76,6 @@ def record(
     drawn = str(rng.choice(["hand", "robot"]))
     chosen = mover or drawn
     sd_nm = float(rng.uniform(0.05, 0.1))
-    sd_nm = sd_nm if noise_sd_nm is None else noise_sd_nm
     design = KINDS[kind](Asked(patient, rng, chosen, angle_rad, protocol, duration_s, parts))
     clean = _simulated(patient, design)
     every = SIMULATION_HZ // RATE_HZ

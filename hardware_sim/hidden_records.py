@@ -126,7 +126,7 @@ def generate(
     return record | {"truth": scenario.truth(noise_sd_nm) | about}
 
 
-def of_patient(seed: int, moving: bool = False, rate_hz: float = 400.0) -> dict[str, Any]:
+def of_patient(seed: int, moving: bool = False) -> dict[str, Any]:
     """A record of the patient that `--hidden SEED` plays (with an arm if `moving`), by the design that sized it.
 
     White noise of 0.04 N·m, against which its strength was chosen.
@@ -134,7 +134,7 @@ def of_patient(seed: int, moving: bool = False, rate_hz: float = 400.0) -> dict[
     scenario = hidden.drawn(seed, moving)
     rng = rng_of(seed, "noise of a patient", "moving" if moving else "still")
     noise_nm = lambda count: rng.normal(0.0, hidden.NOISE_SD_NM, count)  # noqa: E731
-    return sampled(scenario, scenario.design, rate_hz, 0.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
+    return sampled(scenario, scenario.design, 400.0, 0.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
 
 
 def sampled(

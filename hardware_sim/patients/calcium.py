@@ -96,6 +96,4 @@ class CalciumMuscle:
         self._release *= decay
 
 
-def make(parameters: Parameters) -> CalciumMuscle:
-    """The muscle with these parameters, at rest."""
-    return CalciumMuscle(parameters)
+make = CalciumMuscle

@@ -203,6 +203,4 @@ def _smooth(level: float) -> float:
     return math.sin(0.5 * math.pi * level) ** 2 if level > 0.0 else 0.0
 
 
-def make(parameters: Parameters) -> ChangingMuscle:
-    """The muscle with these parameters, at rest."""
-    return ChangingMuscle(parameters)
+make = ChangingMuscle

@@ -49,6 +49,4 @@ class PaperMuscle(HeldPulses):
         return self.recruitment_nm(width_us, current_ma)
 
 
-def make(parameters: Parameters) -> PaperMuscle:
-    """The muscle with these parameters, at rest."""
-    return PaperMuscle(parameters)
+make = PaperMuscle

@@ -10,6 +10,7 @@ from typing import ClassVar, NamedTuple
 
 START, STOP, ESCAPE, KEY = 0xF0, 0x0F, 0x81, 0x55
 KEYED = bytes(byte ^ KEY for byte in range(256))
+PATIENCE_S = 0.1
 
 
 class Packet(NamedTuple):
@@ -50,16 +51,15 @@ def frame(header: bytes, body: bytes) -> bytes:
 class FrameDecoder(ABC):
     """Bytes in, packets out; bytes that form no frame are skipped and counted in `corrupt_frames`.
 
-    A piece of a frame after which nothing comes for `patience_s` is dropped. A client that dies in the middle of a
+    A piece of a frame after which nothing comes for `PATIENCE_S` is dropped. A client that dies in the middle of a
     frame therefore does not cost the next client its first command.
     """
 
     HEADER_BYTES: ClassVar[int]
     """Length of the header before its bytes are escaped."""
 
-    def __init__(self, patience_s: float = 0.1) -> None:
+    def __init__(self) -> None:
         self.corrupt_frames = 0
-        self._patience_s = patience_s
         self._buffer = bytearray()
         self._last_byte_s = 0.0
 
@@ -73,7 +73,7 @@ class FrameDecoder(ABC):
 
     def feed(self, data: bytes, time_s: float) -> list[Packet]:
         """All packets that are complete with `data`, which came at `time_s`."""
-        if self._buffer and time_s - self._last_byte_s > self._patience_s:
+        if self._buffer and time_s - self._last_byte_s > PATIENCE_S:
             self._reject()
         self._last_byte_s = time_s
         self._buffer += data

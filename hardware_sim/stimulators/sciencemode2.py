@@ -35,8 +35,8 @@ class Decoder(FrameDecoder):
 
     HEADER_BYTES = 2
 
-    def __init__(self, patience_s: float = 0.1) -> None:
-        super().__init__(patience_s)
+    def __init__(self) -> None:
+        super().__init__()
         self._damaged: list[Packet] = []
 
     def take_damaged(self) -> list[Packet]:

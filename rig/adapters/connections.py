@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
 
 GRACE_S = 2.0
 """So long after it came, or after its last request, a connection is closed for no other, unless too many come."""
@@ -24,14 +23,11 @@ class Connections:
     ----------
     max_silent, max_active
         Number of each kind that is kept.
-    monotonic
-        Seconds.
     """
 
-    def __init__(self, max_silent: int, max_active: int, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, max_silent: int, max_active: int) -> None:
         self._most = {False: max_silent, True: max_active}
         self._members: dict[bool, dict[asyncio.BaseTransport, float]] = {False: {}, True: {}}
-        self._monotonic = monotonic
 
     def __len__(self) -> int:
         return sum(len(members) for members in self._members.values())
@@ -51,7 +47,7 @@ class Connections:
             members.pop(transport, None)
 
     def _put(self, transport: asyncio.BaseTransport, spoken: bool) -> None:
-        members, now_s = self._members[spoken], self._monotonic()
+        members, now_s = self._members[spoken], time.monotonic()
         members[transport] = now_s  # the newest is last: dictionaries keep their order
         longest, since_s = next(iter(members.items()))
         many = len(members) > self._most[spoken] and now_s - since_s >= GRACE_S

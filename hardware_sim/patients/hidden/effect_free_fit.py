@@ -7,7 +7,7 @@ are not fitted. This only sets the magnitude of a hidden effect; no verdict depe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -102,9 +102,6 @@ class EffectFreeFit:
     base: Base
     width_us: Floats
     held_out: np.ndarray
-    _start: Floats = field(init=False)
-    _basis: Floats = field(init=False)
-    _bend: Floats = field(init=False)
 
     def __post_init__(self) -> None:
         knots = _knots(self.base)
