@@ -34,33 +34,12 @@ EFFECT = Effect(
     id="asymmetric_relaxation",
     name="Contraction and relaxation differ in speed",
     forms=(
-        Form(
-            "by_drive",
-            "speed",
-            "T·ratio while the drive is below the torque, else T",
-            (_RATIO,),
-            law={"ratio": SpeedLaw.RATIO_BY_DRIVE},
-            log_law=("ratio",),
-        ),
-        Form(
-            "by_rate",
-            "speed",
-            "T·ratio while the torque falls, else T",
-            (_RATIO,),
-            law={"ratio": SpeedLaw.RATIO_BY_RATE},
-            log_law=("ratio",),
-        ),
-        Form(
-            "slow_lag",
-            "speed",
-            "slower lag·ratio while the drive is below the torque",
-            (_RATIO,),
-            law={"ratio": SpeedLaw.SLOW_RATIO_BY_DRIVE},
-            log_law=("ratio",),
-        ),
         *(
             Form(name, "speed", words, (_RATIO,), law={"ratio": law}, log_law=("ratio",))
             for name, words, law in (
+                ("by_drive", "T·ratio while the drive is below the torque, else T", SpeedLaw.RATIO_BY_DRIVE),
+                ("by_rate", "T·ratio while the torque falls, else T", SpeedLaw.RATIO_BY_RATE),
+                ("slow_lag", "slower lag·ratio while the drive is below the torque", SpeedLaw.SLOW_RATIO_BY_DRIVE),
                 ("slow_lag_by_rate", "slower lag·ratio while the torque falls", SpeedLaw.SLOW_RATIO_BY_RATE),
                 ("quick_lag", "faster lag·ratio while the drive is below the torque", SpeedLaw.QUICK_RATIO_BY_DRIVE),
                 ("quick_lag_by_rate", "faster lag·ratio while the torque falls", SpeedLaw.QUICK_RATIO_BY_RATE),

@@ -39,8 +39,12 @@ def _wander(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return CubicSpline(knots, np.eye(KNOTS + 1), bc_type="natural")(place).dot(values.T).T
 
 
-_SLOPE = Parameter("slope_nm_per_s", "N·m/s", -0.04, 0.04, 0.0, (0.0,), relative="torque", about="drift per second")
-_WAVE = (-0.22, 0.22, 0.0, (0.003,), "linear", "torque")
+def _shift(name: str, reach: float, about: str = "", start: float = 0.0, unit: str = "N·m") -> Parameter:
+    """A parameter in multiples of the largest torque, as likely up as down."""
+    return Parameter(name, unit, -reach, reach, 0.0, (start,), relative="torque", about=about)
+
+
+_SLOPE = _shift("slope_nm_per_s", 0.04, "drift per second", unit="N·m/s")
 
 EFFECT = Effect(
     id="baseline_drift",
@@ -52,7 +56,7 @@ EFFECT = Effect(
             "additive",
             "y + shift (1 - exp(-t/time_constant))",
             (
-                Parameter("shift_nm", "N·m", -0.6, 0.6, 0.0, (0.0,), relative="torque", about="final shift"),
+                _shift("shift_nm", 0.6, "final shift"),
                 Parameter(
                     "time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="time constant of the shift"
                 ),
@@ -64,12 +68,7 @@ EFFECT = Effect(
             "bent",
             "additive",
             "y + slope·t + bend (t/60)²",
-            (
-                _SLOPE,
-                Parameter(
-                    "bend_nm", "N·m", -1.8, 1.8, 0.0, (0.0,), relative="torque", about="curvature over one minute"
-                ),
-            ),
+            (_SLOPE, _shift("bend_nm", 1.8, "curvature over one minute")),
             _bent,
             True,
         ),
@@ -79,8 +78,8 @@ EFFECT = Effect(
             "y + cos·(cos(2πt/period) - 1) + sin·sin(2πt/period)",
             (
                 Parameter("period_s", "s", 9.0, 90.0, 30.0, (12.0, 25.0, 50.0), "log", about="period of a slow wave"),
-                Parameter("cos_nm", "N·m", *_WAVE),
-                Parameter("sin_nm", "N·m", *_WAVE),
+                _shift("cos_nm", 0.22, start=0.003),
+                _shift("sin_nm", 0.22, start=0.003),
             ),
             _breathing,
             True,
@@ -89,19 +88,7 @@ EFFECT = Effect(
             "wander",
             "additive",
             "y + s(t), s: a natural cubic spline with six knots over the record",
-            tuple(
-                Parameter(
-                    f"knot_{i}_nm",
-                    "N·m",
-                    -0.3,
-                    0.3,
-                    0.0,
-                    (0.0,),
-                    relative="torque",
-                    about=f"shift at {i}/6 of the record",
-                )
-                for i in range(1, KNOTS + 1)
-            ),
+            tuple(_shift(f"knot_{i}_nm", 0.3, f"shift at {i}/6 of the record") for i in range(1, KNOTS + 1)),
             _wander,
             True,
         ),

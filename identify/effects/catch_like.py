@@ -9,6 +9,7 @@ import numpy as np
 from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import adapt, since_onset, train, used_up
 
+BURST_S, GAP_S = 0.06, 0.1
 ENGAGED = 0.03
 """Share of full torque from which pulses are taken to recruit the muscle."""
 _GAIN = Parameter("gain", "1", 0.0, 4.0, 0.0, (0.3, 0.8), about="extra torque at the onset")
@@ -36,10 +37,14 @@ def _form(name: str, equation: str) -> Form:
     )
 
 
-def _after_silence(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """The boost at the onset of a train grows with the silence before it."""
-    since, gap = train(scene.on, scene.step_s)
-    return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * np.exp(-since / p["decay_s"]))
+def _trains(least_gap_s: float) -> Any:
+    """The boost at the onset of a train grows with the silence before it; shorter silences do not end a train."""
+
+    def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+        since, gap = train(scene.on, scene.step_s, least_gap_s)
+        return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * np.exp(-since / p["decay_s"]))
+
+    return apply
 
 
 def _counts(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -60,22 +65,9 @@ def _flat(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * fade)
 
 
-def _trains(least_gap_s: float) -> Any:
-    """As `after_silence`, but shorter silences do not end a train."""
-
-    def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-        since, gap = train(scene.on, scene.step_s, least_gap_s)
-        return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * np.exp(-since / p["decay_s"]))
-
-    return apply
-
-
-def _burst(length_s: float, least_gap_s: float) -> Any:
-    def apply(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-        since = since_onset(scene.on, least_gap_s - 0.004, scene.step_s)
-        return drive * (1.0 + p["gain"] * np.exp(-((since / length_s) ** 4)))
-
-    return apply
+def _burst(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    since = since_onset(scene.on, GAP_S - 0.004, scene.step_s)
+    return drive * (1.0 + p["gain"] * np.exp(-((since / BURST_S) ** 4)))
 
 
 def _engaged(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
@@ -96,40 +88,25 @@ EFFECT = Effect(
     forms=(
         _form("depletes", "w = (1 + gain (1 - x)) f(u); x' = (1 - x)/decay under pulses, -x/recovery in silence"),
         _form("by_level", "w = (1 + gain (1 - x)) f(u); x' = a (1 - x)/decay - x/recovery; a = |f|/f_max"),
-        Form(
-            "after_silence",
-            "gain",
-            "w = (1 + gain (1 - exp(-silence/recovery)) exp(-t/decay)) f(u), t since the onset of the train",
-            (_GAIN, _QUICK, _RECOVERY),
-            _after_silence,
-            batched=True,
-        ),
-        Form(
-            "counts",
-            "gain",
-            "w = (1 + gain·exp(-x)) f(u); x' = 1/decay under pulses, -x/recovery in silence",
-            (_GAIN, _QUICK, _RECOVERY),
-            _counts,
-            batched=True,
-        ),
-        Form(
-            "sharp",
-            "gain",
-            "w = (1 + gain·r/(1 + r)·exp(-t/decay)) f(u), r = (silence/recovery)^2.5",
-            (_GAIN, _QUICK, _RECOVERY),
-            _sharp,
-            batched=True,
-        ),
         *(
-            Form(
-                f"trains_{gap * 1000:.0f}_ms",
-                "gain",
-                f"as after_silence, but a silence of less than {gap:g} s does not end a train",
-                (_GAIN, _QUICK, _RECOVERY),
-                _trains(gap),
-                batched=True,
+            Form(name, "gain", equation, (_GAIN, _QUICK, _RECOVERY), apply, batched=True)
+            for name, equation, apply in (
+                (
+                    "after_silence",
+                    "w = (1 + gain (1 - exp(-silence/recovery)) exp(-t/decay)) f(u), t since the onset of the train",
+                    _trains(0.0),
+                ),
+                ("counts", "w = (1 + gain·exp(-x)) f(u); x' = 1/decay under pulses, -x/recovery in silence", _counts),
+                ("sharp", "w = (1 + gain·r/(1 + r)·exp(-t/decay)) f(u), r = (silence/recovery)^2.5", _sharp),
+                *(
+                    (
+                        f"trains_{gap * 1000:.0f}_ms",
+                        f"as after_silence, but a silence of less than {gap:g} s does not end a train",
+                        _trains(gap),
+                    )
+                    for gap in (0.12, 0.22)
+                ),
             )
-            for gap in (0.12, 0.22)
         ),
         Form(
             "engaged",
@@ -152,16 +129,13 @@ EFFECT = Effect(
             _flat,
             batched=True,
         ),
-        *(
-            Form(
-                f"burst_{length * 1000:.0f}_ms",
-                "gain",
-                f"w = (1 + gain·exp(-(t/{length:g} s)^4)) f(u), t since the first pulse after {gap:g} s of silence",
-                (_GAIN,),
-                _burst(length, gap),
-                batched=True,
-            )
-            for length, gap in ((0.06, 0.1),)
+        Form(
+            f"burst_{BURST_S * 1000:.0f}_ms",
+            "gain",
+            f"w = (1 + gain·exp(-(t/{BURST_S:g} s)^4)) f(u), t since the first pulse after {GAP_S:g} s of silence",
+            (_GAIN,),
+            _burst,
+            batched=True,
         ),
     ),
     signature="Torque above the model in the first tenths of a second after every rest.",

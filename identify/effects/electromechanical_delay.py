@@ -38,8 +38,7 @@ def _spread(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
         part = np.clip(steps, 0.0, 1.0)
         late = late - part * (late - np.concatenate([np.zeros_like(late[:, :1]), late[:, :-1]], axis=1))
         steps = steps - part
-    tau = p["lag_s"][:, 0]
-    return activate(np.ascontiguousarray(late), tau, tau, scene.step_s)
+    return _lag(late, p, scene)
 
 
 EFFECT = Effect(

@@ -145,6 +145,11 @@ def since_onset(on: np.ndarray, least_gap_s: float, step_s: float) -> np.ndarray
     return out
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _moved(phi, gamma, z, v, a, b, c, d):  # pragma: no cover
+    return phi[0] * z + phi[1] * v + gamma[0] * a + gamma[1] * b + gamma[2] * c + gamma[3] * d
+
+
 @njit(cache=True, nogil=True)
 def follow(
     torque: np.ndarray, slope: np.ndarray, phi: np.ndarray, gamma: np.ndarray, step_s: float
@@ -162,18 +167,8 @@ def follow(
         for k in range(size - 1):
             a, b, c, d = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
             z, v = (
-                phi[m, 0, 0] * z
-                + phi[m, 0, 1] * v
-                + gamma[m, 0, 0] * a
-                + gamma[m, 0, 1] * b
-                + gamma[m, 0, 2] * c
-                + gamma[m, 0, 3] * d,
-                phi[m, 1, 0] * z
-                + phi[m, 1, 1] * v
-                + gamma[m, 1, 0] * a
-                + gamma[m, 1, 1] * b
-                + gamma[m, 1, 2] * c
-                + gamma[m, 1, 3] * d,
+                _moved(phi[m, 0], gamma[m, 0], z, v, a, b, c, d),
+                _moved(phi[m, 1], gamma[m, 1], z, v, a, b, c, d),
             )
             out[m, k + 1] = z
             rate[m, k + 1] = v / step_s

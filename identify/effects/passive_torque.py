@@ -11,9 +11,14 @@ from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.effects.kernels import relaxed
 
 SURFACE = "surface"
-_VISCOUS = Parameter(
-    "viscosity_nm_s_per_rad", "N·m·s/rad", -0.6, 0.6, 0.0, (0.0,), relative="torque", about="viscous part"
-)
+
+
+def _part(name: str, unit: str, reach: float, about: str, start: tuple[float, ...] = (0.0,)) -> Parameter:
+    """A parameter in multiples of the largest torque, of either sign."""
+    return Parameter(name, unit, -reach, reach, 0.0, start, relative="torque", about=about)
+
+
+_VISCOUS = _part("viscosity_nm_s_per_rad", "N·m·s/rad", 0.6, "viscous part")
 
 
 def _speed(scene: Scene) -> np.ndarray:
@@ -34,12 +39,8 @@ def _exponential(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
 
 def _two_sided(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     away = scene.away_rad
-    return (
-        p["stiffness_nm_per_rad"] * away
-        + p["bend_nm_per_rad2"] * away**2
-        + p["hardening_nm_per_rad3"] * away**3
-        + p["viscosity_nm_s_per_rad"] * _speed(scene)
-    )
+    elastic = p["stiffness_nm_per_rad"] * away + p["bend_nm_per_rad2"] * away**2 + p["hardening_nm_per_rad3"] * away**3
+    return elastic + p["viscosity_nm_s_per_rad"] * _speed(scene)
 
 
 SHAPES = 12
@@ -65,17 +66,7 @@ def _relaxing(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _surface(None, p, scene) + p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
 
 
-_STIFF = Parameter(
-    "stiffness_nm_per_rad",
-    "N·m/rad",
-    -3.0,
-    3.0,
-    0.0,
-    (0.0, 0.15),
-    "linear",
-    "torque",
-    "elastic part, at the reference angle",
-)
+_STIFF = _part("stiffness_nm_per_rad", "N·m/rad", 3.0, "elastic part, at the reference angle", (0.0, 0.15))
 
 _FREE = Form(
     SURFACE,
@@ -83,14 +74,11 @@ _FREE = Form(
     "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
     "inertia·acceleration, x: place in the fitted range, -1 to 1",
     (
-        *(
-            Parameter(f"elastic_{i}_nm", "N·m", -size, size, 0.0, (0.0,), "linear", "torque", f"polynomial {i}")
-            for i, size in enumerate(SIZES, start=1)
-        ),
+        *(_part(f"elastic_{i}_nm", "N·m", size, f"polynomial {i}") for i, size in enumerate(SIZES, start=1)),
         _VISCOUS,
         replace(_VISCOUS, name="tilt_nm_s_per_rad", about="viscosity's slope over the range"),
         replace(_VISCOUS, name="bow_nm_s_per_rad", about="viscosity's curvature over the range"),
-        Parameter("dry_nm", "N·m", -0.5, 0.5, 0.0, (0.0,), "linear", "torque", "dry friction"),
+        _part("dry_nm", "N·m", 0.5, "dry friction"),
         Parameter("dry_below_rad_s", "rad/s", 0.01, 0.5, 0.07, (0.07,), "log", about="where it is less than that"),
         Parameter("inertia_nm_s2_per_rad", "N·m·s²/rad", -0.5, 0.5, 0.0, (0.0,), about="of what the cell moves"),
     ),
@@ -127,18 +115,8 @@ EFFECT = Effect(
             "y + stiffness·Δ + bend·Δ² + hardening·Δ³ + viscosity·velocity",
             (
                 _STIFF,
-                Parameter("bend_nm_per_rad2", "N·m/rad²", -3.0, 3.0, 0.0, (0.0,), "linear", "torque", "one-sided part"),
-                Parameter(
-                    "hardening_nm_per_rad3",
-                    "N·m/rad³",
-                    -4.5,
-                    4.5,
-                    0.0,
-                    (0.0,),
-                    "linear",
-                    "torque",
-                    "stiffening at both ends",
-                ),
+                _part("bend_nm_per_rad2", "N·m/rad²", 3.0, "one-sided part"),
+                _part("hardening_nm_per_rad3", "N·m/rad³", 4.5, "stiffening at both ends"),
                 _VISCOUS,
             ),
             _two_sided,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ _RESONANCE = (
     Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="resonance of the series spring"),
     Parameter("damping", "1", 0.02, 0.7, 0.2, (0.15,), "log", about="damping of the resonance, 1 is critical"),
 )
+_STIFFENING = Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque")
 
 
 def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -38,10 +40,9 @@ def _series(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -
     frequency, damping = p["resonance_hz"][:, 0], p["damping"][:, 0]
     if np.all(np.isinf(frequency)):
         return x
-    known = {key: _steps(*key, scene.step_s) for key in set(zip(frequency.tolist(), damping.tolist(), strict=True))}
-    matrices = [known[key] for key in zip(frequency.tolist(), damping.tolist(), strict=True)]
-    phi = np.stack([m[0] for m in matrices])
-    gamma = np.stack([m[1] for m in matrices])
+    pairs = list(zip(frequency.tolist(), damping.tolist(), strict=True))
+    known = {pair: _steps(*pair, scene.step_s) for pair in set(pairs)}
+    phi, gamma = (np.stack(matrices) for matrices in zip(*(known[pair] for pair in pairs), strict=True))
     return follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)
 
 
@@ -106,10 +107,7 @@ EFFECT = Effect(
             "toe",
             "filter",
             "q'' + 2 ζ ω q' + ω² (z - y) = 0, z = q (1 + stiffening·q²/y_max²)",
-            (
-                *_RESONANCE,
-                Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
-            ),
+            (*_RESONANCE, _STIFFENING),
             _curved(toe=True),
             True,
             source="toe region of a tendon: Zajac 1989; Duffing's spring",
@@ -118,10 +116,7 @@ EFFECT = Effect(
             "stiffening",
             "filter",
             "z'' + 2 ζ ω z' + ω² (1 + stiffening·|z|/y_max) (z - y) = 0",
-            (
-                *_RESONANCE,
-                Parameter("stiffening", "1", -0.6, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque"),
-            ),
+            (*_RESONANCE, replace(_STIFFENING, lower=-0.6)),
             _curved(toe=False),
             True,
             grows=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ def _charge(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _moved(width, p["slope_us_per_s"] * used)
 
 
+_TIME = Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="time constant of the shift")
 _SLOPE = Parameter("slope_us_per_s", "µs/s", -4.0, 4.0, 0.0, (0.5, -0.5), about="shift of the threshold per second")
 
 EFFECT = Effect(
@@ -54,7 +56,7 @@ EFFECT = Effect(
             "ramp",
             (
                 Parameter("shift_us", "µs", -80.0, 80.0, 0.0, (15.0, -15.0), about="final shift"),
-                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="time constant of the shift"),
+                _TIME,
             ),
             _settling,
             True,
@@ -77,7 +79,7 @@ EFFECT = Effect(
             "w = f(u (1 - share (exp(-t_ref/time_constant) - exp(-t/time_constant))))",
             (
                 Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share of the width lost in the end"),
-                Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (12.0,), "log", about="time constant of the shift"),
+                replace(_TIME, start=(12.0,)),
             ),
             _fading,
             True,

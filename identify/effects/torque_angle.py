@@ -8,6 +8,11 @@ import numpy as np
 
 from identify.effects.base import Effect, Form, Parameter, Scene
 
+_PARABOLA = (
+    Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
+    Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
+)
+
 
 def _parabola(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     away = scene.away_rad
@@ -55,10 +60,7 @@ EFFECT = Effect(
             "parabola",
             "output",
             "y (1 + slope·Δ + bend·Δ²), Δ = angle - reference angle",
-            (
-                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
-                Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
-            ),
+            _PARABOLA,
             _parabola,
             True,
             source="Marion, Wexler, Hull: 1 - 4.49e-4 Δθ² + 0.0344 Δθ, in degrees",
@@ -68,8 +70,7 @@ EFFECT = Effect(
             "output",
             "y (1 + slope·Δ + bend·Δ² + twist·Δ³)",
             (
-                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
-                Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
+                *_PARABOLA,
                 Parameter("twist_per_rad3", "1/rad³", -12.0, 12.0, 0.0, (0.0,), about="third-order part"),
             ),
             _cubic,
@@ -119,10 +120,7 @@ EFFECT = Effect(
             "drive",
             "gain",
             "w = f(u) (1 + slope·Δ + bend·Δ²): acts on the force, before the dynamics",
-            (
-                Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
-                Parameter("bend_per_rad2", "1/rad²", -6.0, 6.0, 0.0, (0.0,), about="curvature"),
-            ),
+            _PARABOLA,
             _parabola,
             True,
         ),

@@ -27,6 +27,17 @@ def _bumps(count: int) -> Callable[..., np.ndarray]:
     return apply
 
 
+Match = tuple[float, float, int, float]
+"""How well a shape matches a residual: score, its duration, s, the interval at which it begins or lies, its height."""
+
+
+def _best(match: np.ndarray, power: np.ndarray, duration_s: float) -> Match:
+    """The place at which a shape matches best, from its products with the residual and their expected power."""
+    score = np.where(match > 0, match**2 / power, 0.0)
+    at = int(np.argmax(score))
+    return float(score[at]), duration_s, at, float(match[at] / power[at])
+
+
 def _propose(count: int, sign: float) -> Callable[..., list[dict[str, float]]]:
     def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
         """The two bumps that match the residual best, among a few widths."""
@@ -38,22 +49,15 @@ def _propose(count: int, sign: float) -> Callable[..., list[dict[str, float]]]:
             kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * scene.step_s / width_s) ** 2)
             match = np.convolve(value, kernel, "same")
             power = np.convolve(known.astype(float), kernel**2, "same") + 0.3 * np.sum(kernel**2)
-            score = np.where(match > 0, match**2 / power, 0.0)
-            at = int(np.argmax(score))
-            found.append((float(score[at]), width_s, at, float(match[at] / power[at])))
-        starts = []
-        for score, width_s, at, height in sorted(found, reverse=True)[:2]:
-            if score <= 0.0:
-                continue
-            start = {"flatness": 2.0} | dict(previous)
-            i = count - 1
-            start |= {
-                f"centre_{i}_s": float(scene.time_s[at]),
-                f"width_{i}_s": width_s,
-                f"height_{i}_nm": sign * height,
-            }
-            starts.append(start)
-        return starts
+            found.append(_best(match, power, width_s))
+        i = count - 1
+        return [
+            {"flatness": 2.0}
+            | dict(previous)
+            | {f"centre_{i}_s": float(scene.time_s[at]), f"width_{i}_s": width_s, f"height_{i}_nm": sign * height}
+            for score, width_s, at, height in sorted(found, reverse=True)[:2]
+            if score > 0.0
+        ]
 
     return propose
 
@@ -86,9 +90,7 @@ def _propose_spasm(count: int) -> Callable[..., list[dict[str, float]]]:
             kernel /= kernel.max()
             match = np.convolve(value, kernel[::-1])[kernel.size - 1 :]
             power = np.convolve(known.astype(float), (kernel**2)[::-1])[kernel.size - 1 :] + 0.3 * np.sum(kernel**2)
-            score = np.where(match > 0, match**2 / power, 0.0)
-            at = int(np.argmax(score))
-            found.append((float(score[at]), decay_s, at, float(match[at] / power[at])))
+            found.append(_best(match, power, decay_s))
         score, decay_s, at, height = max(found)
         if score <= 0.0:
             return []
