@@ -39,29 +39,23 @@ def through(drive, torque, rate, rows, even, varied, begins, initial):  # pragma
         yc, vc, yd, vd = initial[c, part, 0], initial[c, part, 1], initial[d, part, 0], initial[d, part, 1]
         for r in range(4):
             torque[rows[r], start], rate[rows[r], start] = initial[rows[r], part, 0], initial[rows[r], part, 1]
-        if varied.shape[1] == 0:
-            a1, a2, a3, a4 = even[0]
-            b1, b2, b3, b4 = even[1]
-            c1, c2, c3, c4 = even[2]
-            d1, d2, d3, d4 = even[3]
-            for k in range(start, stop):
-                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
-                ya, va = wa + a1 * (ya - wa) + a2 * va, a3 * (ya - wa) + a4 * va
-                yb, vb = wb + b1 * (yb - wb) + b2 * vb, b3 * (yb - wb) + b4 * vb
-                yc, vc = wc + c1 * (yc - wc) + c2 * vc, c3 * (yc - wc) + c4 * vc
-                yd, vd = wd + d1 * (yd - wd) + d2 * vd, d3 * (yd - wd) + d4 * vd
-                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
-                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
-        else:
-            for k in range(start, stop):
-                s1, s2, s3, s4 = varied[0, k], varied[1, k], varied[2, k], varied[3, k]
-                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
-                ya, va = wa + s1 * (ya - wa) + s2 * va, s3 * (ya - wa) + s4 * va
-                yb, vb = wb + s1 * (yb - wb) + s2 * vb, s3 * (yb - wb) + s4 * vb
-                yc, vc = wc + s1 * (yc - wc) + s2 * vc, s3 * (yc - wc) + s4 * vc
-                yd, vd = wd + s1 * (yd - wd) + s2 * vd, s3 * (yd - wd) + s4 * vd
-                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
-                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
+        a1, a2, a3, a4 = even[0]
+        b1, b2, b3, b4 = even[1]
+        c1, c2, c3, c4 = even[2]
+        d1, d2, d3, d4 = even[3]
+        for k in range(start, stop):
+            if varied.shape[1] > 0:
+                a1, a2, a3, a4 = varied[0, k], varied[1, k], varied[2, k], varied[3, k]
+                b1, b2, b3, b4 = a1, a2, a3, a4
+                c1, c2, c3, c4 = a1, a2, a3, a4
+                d1, d2, d3, d4 = a1, a2, a3, a4
+            wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
+            ya, va = wa + a1 * (ya - wa) + a2 * va, a3 * (ya - wa) + a4 * va
+            yb, vb = wb + b1 * (yb - wb) + b2 * vb, b3 * (yb - wb) + b4 * vb
+            yc, vc = wc + c1 * (yc - wc) + c2 * vc, c3 * (yc - wc) + c4 * vc
+            yd, vd = wd + d1 * (yd - wd) + d2 * vd, d3 * (yd - wd) + d4 * vd
+            torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
+            rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
 
 
 @njit(cache=True, nogil=True)

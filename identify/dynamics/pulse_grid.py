@@ -291,6 +291,11 @@ class Grid:
         return mean[0] if torque_nm.ndim == 1 else mean.T
 
 
+def ends_of(parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
+    """Starts and ends of some runs, as compiled functions take them."""
+    return np.array([part.start for part in parts], np.int64), np.array([part.stop for part in parts], np.int64)
+
+
 def runs(flags: np.ndarray) -> list[slice]:
     """Contiguous runs of true values, as slices."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0]))

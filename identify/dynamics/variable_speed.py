@@ -236,29 +236,15 @@ def run_core(
                 if lawful:
                     f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
                 turned = 1.0
-                if slow_second:
-                    second = _second(
-                        law[m],
-                        SpeedLaw.SLOW_SECOND_ACTIVATION,
-                        SpeedLaw.SLOW_SECOND_ATTACHED,
-                        y,
-                        v,
-                        last * slow_s,
-                        scale_nm,
-                    )
-                    d *= second
-                    turned, last = last / second, second
-                elif quick_second:
-                    second = _second(
-                        law[m],
-                        SpeedLaw.QUICK_SECOND_ACTIVATION,
-                        SpeedLaw.QUICK_SECOND_ATTACHED,
-                        y,
-                        v,
-                        last * quick_s,
-                        scale_nm,
-                    )
-                    q *= second
+                if slow_second or quick_second:
+                    linear = SpeedLaw.SLOW_SECOND_ACTIVATION if slow_second else SpeedLaw.QUICK_SECOND_ACTIVATION
+                    inverse = SpeedLaw.SLOW_SECOND_ATTACHED if slow_second else SpeedLaw.QUICK_SECOND_ATTACHED
+                    lag_s = last * (slow_s if slow_second else quick_s)
+                    second = _second(law[m], linear, inverse, y, v, lag_s, scale_nm)
+                    if slow_second:
+                        d *= second
+                    else:
+                        q *= second
                     turned, last = last / second, second
                 v *= turned  # y' = (a - y) / lag: a stays the same when the lag changes
                 f *= given_f

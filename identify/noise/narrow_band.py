@@ -11,8 +11,8 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
-    """Kalman gains of (slow, cos, sin) and innovation variances for a stretch of `length` from the stationary state."""
+def _system(ar1, slow, turn, keep, band):  # pragma: no cover
+    """Transition of (slow, cos, sin) over a step, the stationary covariance, and what each step adds to it."""
     c, s = keep * np.cos(turn), keep * np.sin(turn)
     f = np.zeros((3, 3))
     f[0, 0] = ar1
@@ -21,6 +21,28 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
     p[0, 0], p[1, 1], p[2, 2] = slow, band, band
     q = np.zeros(3)
     q[0], q[1], q[2] = slow * (1 - ar1 * ar1), band * (1 - keep * keep), band * (1 - keep * keep)
+    return f, p, q
+
+
+@njit(cache=True, nogil=True)
+def _ahead(f, p, q):  # pragma: no cover
+    """Covariance a step later."""
+    fresh = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for a in range(3):
+                for b in range(3):
+                    total += f[i, a] * p[a, b] * f[j, b]
+            fresh[i, j] = total
+        fresh[i, i] += q[i]
+    return fresh
+
+
+@njit(cache=True, nogil=True)
+def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
+    """Kalman gains of (slow, cos, sin) and innovation variances for a stretch of `length` from the stationary state."""
+    f, p, q = _system(ar1, slow, turn, keep, band)
     white = max(1.0 - slow - band, 1e-9)
     gains = np.empty((length, 3))
     variances = np.empty(length)
@@ -37,25 +59,11 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
         variances[k] = v
         for i in range(3):
             gains[k, i] = h[i] / v
-        fresh = np.zeros((3, 3))
         for i in range(3):
             for j in range(3):
                 p[i, j] -= gains[k, i] * h[j]
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for a in range(3):
-                    for b in range(3):
-                        total += f[i, a] * p[a, b] * f[j, b]
-                fresh[i, j] = total
-            fresh[i, i] += q[i]
-        change = 0.0
-        for i in range(3):
-            for j in range(3):
-                p[i, j] = fresh[i, j]
-        if k > 0:
-            change = abs(variances[k] - variances[k - 1])
-            settled = k > 30 and change < 1e-11
+        p = _ahead(f, p, q)
+        settled = k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11
     return gains, variances
 
 
@@ -89,14 +97,23 @@ def whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no c
 
 
 @njit(cache=True, nogil=True)
-def _cost(row, start, stop, x):  # pragma: no cover
-    """Minus the profiled log-likelihood at x = (log(1 - ar1), slow share of the rest, turn, log(1 - keep), band)."""
+def _squares(row, start, stop, x):  # pragma: no cover
+    """Sum of squared innovations, count and half the log determinant.
+
+    At x = (log(1 - ar1), slow share of the rest, turn, log(1 - keep), band).
+    """
     slow = x[1] * (1.0 - x[4])
     white, logdet = whiten_band(row, start, stop, 1.0 - np.exp(x[0]), slow, x[2], 1.0 - np.exp(x[3]), x[4])
     squares = 0.0
     for k in range(white.shape[1]):
         squares += white[0, k] * white[0, k]
-    size = white.shape[1]
+    return squares, white.shape[1], logdet
+
+
+@njit(cache=True, nogil=True)
+def _cost(row, start, stop, x):  # pragma: no cover
+    """Minus the profiled log-likelihood, up to a constant."""
+    squares, size, logdet = _squares(row, start, stop, x)
     return 0.5 * size * np.log(max(squares / size, 1e-24)) + logdet
 
 
@@ -121,14 +138,7 @@ def profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no 
                     break
         if not moved:
             scale *= 0.5
-    total = 0
-    for i in range(start.size):
-        total += stop[i] - start[i]
-    slow = x[1] * (1.0 - x[4])
-    white = whiten_band(rows, start, stop, 1.0 - np.exp(x[0]), slow, x[2], 1.0 - np.exp(x[3]), x[4])[0]
-    squares = 0.0
-    for k in range(total):
-        squares += white[0, k] * white[0, k]
+    squares, total, _ = _squares(rows, start, stop, x)
     sd = np.sqrt(max(squares / total, 1e-24))
     return x, sd, -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
 
@@ -137,11 +147,8 @@ def profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no 
 def smooth_band(row, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
     """The oscillator's part of a residual, given all of it (fixed-interval smoother); zero outside the stretches."""
     out = np.zeros(row.size)
-    c, s = keep * np.cos(turn), keep * np.sin(turn)
-    f = np.zeros((3, 3))
-    f[0, 0] = ar1
-    f[1, 1], f[1, 2], f[2, 1], f[2, 2] = c, -s, s, c
     for i in range(start.size):
+        f, p, q = _system(ar1, slow, turn, keep, band)
         length = stop[i] - start[i]
         gains, variances = _gains(length, ar1, slow, turn, keep, band)
         errors = np.empty(length)
@@ -155,27 +162,14 @@ def smooth_band(row, start, stop, ar1, slow, turn, keep, band):  # pragma: no co
                 x[a] = f[a, 0] * y[0] + f[a, 1] * y[1] + f[a, 2] * y[2]
         # Backward pass on the adjoint r: x_hat = x + P r, with P h = gain * variance; only the oscillator is wanted.
         r = np.zeros(3)
-        p = np.zeros((3, 3))
-        q = np.zeros(3)
-        q[0], q[1], q[2] = slow * (1 - ar1 * ar1), band * (1 - keep * keep), band * (1 - keep * keep)
         covariances = np.zeros((length, 3, 3))
-        p[0, 0], p[1, 1], p[2, 2] = slow, band, band
         for k in range(length):
             covariances[k] = p
             kalman = np.zeros((3, 3))
             for a in range(3):
                 for b in range(3):
                     kalman[a, b] = p[a, b] - gains[k, a] * (p[0, b] + p[1, b])
-            fresh = np.zeros((3, 3))
-            for a in range(3):
-                for b in range(3):
-                    total = 0.0
-                    for g in range(3):
-                        for h in range(3):
-                            total += f[a, g] * kalman[g, h] * f[b, h]
-                    fresh[a, b] = total
-                fresh[a, a] += q[a]
-            p = fresh
+            p = _ahead(f, kalman, q)
         for k in range(length - 1, -1, -1):
             back = np.zeros(3)
             for a in range(3):
