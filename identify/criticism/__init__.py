@@ -7,20 +7,25 @@ from typing import Any
 import numpy as np
 
 from identify.criticism.correlation import correlation_tests
-from identify.criticism.doubt import left_out, refuse_doubted
-from identify.criticism.shares import by_direction, by_frequency, by_level, by_segment, by_time
+from identify.criticism.shares import error_shares
 from identify.criticism.where import worst_places
 from identify.dynamics.make_grid import make_grid
+from identify.dynamics.pulse_grid import Grid
+from identify.errors import BadRecord
 from identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from identify.estimation.quality import range_warnings
 from identify.estimation.samples import inspect
+from identify.estimation.uncertainty import POINTWISE, prediction_band
 from identify.model import Model
 from identify.records.record import Record
 from identify.results import Comparison, FitStatistics
 
 POINTS = 4000
 """Largest number of points of a plotted series."""
-BAND = 1.959964
+TOLD_S = 5e-3
+"""Pulses at least this late are reported: a fifth of an interval, more than the jitter of a healthy computer."""
+LEAST = 8
+"""Fewer known intervals are not enough for any result."""
 
 
 def compare(model: Model, record: Record) -> Comparison:
@@ -42,10 +47,10 @@ def compare(model: Model, record: Record) -> Comparison:
     Raises
     ------
     BadRecord
-        All samples are doubted.
+        Fewer than eight pulse intervals are known.
     """
     grid = make_grid(record)
-    refuse_doubted(grid)
+    _refuse_doubted(grid)
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
     residual = record.torque_nm - predicted
@@ -56,20 +61,14 @@ def compare(model: Model, record: Record) -> Comparison:
     held = record.held_out & counted
     whole = _figures(record, predicted, noise, counted)
     held_out = _figures(record, predicted, noise, held) if held.any() else None
-    said = left_out(grid)
+    said = _left_out(grid)
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
         noise_sd_nm=noise,
         fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
-        by={
-            "segment": by_segment(record, residual, noise, counted),
-            "level": by_level(record, residual, noise, counted),
-            "direction": by_direction(record, residual, noise, counted),
-            "time": by_time(record, residual, noise, counted),
-            "frequency": by_frequency(record, residual, noise, counted),
-        },
+        by=error_shares(record, residual, noise, counted),
         tests=tests,
         where=tuple(places),
         left_out=said,
@@ -101,17 +100,15 @@ def _series(model: Model, record: Record, predicted: np.ndarray, noise: float) -
         "lower_nm": lower[pick],
         "upper_nm": upper[pick],
         "residual_nm": (record.torque_nm - predicted)[pick],
-        "noise_band_nm": BAND * noise,
+        "noise_band_nm": POINTWISE * noise,
         "segment": names[pick].tolist(),
     }
 
 
 def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """95 % band for a measured sample: noise, and the model's uncertainty if the model has a covariance."""
-    half = np.full(predicted.size, BAND * noise)
+    half = np.full(predicted.size, POINTWISE * noise)
     if model.covariance is not None:
-        from identify.estimation.uncertainty import prediction_band
-
         lower, upper = prediction_band(model, record)
         half = np.hypot(half, 0.5 * (upper - lower))
     return predicted - half, predicted + half
@@ -143,4 +140,30 @@ def _plain(
     return lines
 
 
-__all__ = ["compare"]
+def _left_out(grid: Grid) -> str:
+    """One sentence: how much is left out, since it is not known which pulses acted there; empty if nothing was."""
+    late = np.zeros(grid.size) if grid.late_s is None else np.where(grid.pulse_width_us > 0, grid.late_s, 0.0)
+    pulses = int(np.sum(np.abs(late) >= TOLD_S)) + _lost(grid)
+    seconds = float(np.sum(grid.doubted[grid.count > 0])) * grid.step_s
+    if not pulses and not seconds:
+        return ""
+    told = "1 pulse came late or was lost" if pulses == 1 else f"{pulses} pulses came late or were lost"
+    if not seconds:
+        return f"{told}; the time of each is known, so nothing is left out."
+    if not pulses:
+        return f"{seconds:.1f} s are left out: the stimulation there is not known."
+    return f"{told}; {seconds:.1f} s are left out, where the time of the pulses is not known."
+
+
+def _refuse_doubted(grid: Grid) -> None:
+    """Refuse a record of which hardly any stimulation is known."""
+    if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
+        raise BadRecord("nearly all samples are doubted", place="doubted", fix="Give a record with known pulses.")
+
+
+def _lost(grid: Grid) -> int:
+    known = grid.record.pulses
+    if known is None:
+        return 0
+    inside = (known.time_s >= grid.start_s - grid.step_s) & (known.time_s <= grid.record.time_s[-1])
+    return int(np.sum(known.lost & inside))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid, runs
+from identify.dynamics.pulse_grid import Grid, ends_of, runs
 from identify.estimation.prepare import block_means
 from identify.noise.slow_and_white import profile_noise
 
@@ -51,10 +51,9 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
     # At the times at which the pulses truly came: late pulses on even slots would spread a correlation over lags.
     width = grid.pulse_width_us
     signals = {"u": grid.held(width), "u2": grid.held(width**2), "y": torque - residual}
-    functions = {"residual": _auto(residual)} | {
-        name: _cross(white, _filtered(signal, ar1, known)) for name, signal in signals.items()
-    }
-    bands = _bands({name: _filtered(signal, ar1, known) for name, signal in signals.items()}, known)
+    filtered = {name: _filtered(signal, ar1, known) for name, signal in signals.items()}
+    functions = {"residual": _auto(residual)} | {name: _cross(white, signal) for name, signal in filtered.items()}
+    bands = _bands(filtered, known)
     tests = []
     for name, values in functions.items():
         largest = float(np.max(np.abs(values)))
@@ -79,10 +78,7 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
 
 def _innovations(residual: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, float]:
     """The residual without slow noise: cross-correlations of coloured noise become large by chance."""
-    parts = runs(known)
-    start = np.array([p.start for p in parts], np.int64)
-    stop = np.array([p.stop for p in parts], np.int64)
-    ar1, share, _, _ = profile_noise(residual, start, stop, 0.5, 0.5, True)
+    ar1, share, _, _ = profile_noise(residual, *ends_of(runs(known)), 0.5, 0.5, True)
     lag_one = ar1 * share
     if abs(lag_one) < 0.08:
         return residual, 0.0

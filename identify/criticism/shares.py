@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,88 +14,81 @@ from identify.records.record import Record
 LEVELS = 6
 SPANS = 10
 OCTAVES_HZ = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 102.4, 204.8, 409.6, 1000.0)
+Groups = list[tuple[str, np.ndarray]]
+"""Labels and rows, bool, shape (N,)."""
 
 
-def _row(label: str, rows: np.ndarray, residual_nm: np.ndarray, noise_sd_nm: float, total: float) -> dict[str, Any]:
-    """One row of a table: number of samples, error, mean, and share of the error above the noise."""
-    values = residual_nm[rows]
-    excess = float(np.sum(values**2) - values.size * noise_sd_nm**2)
-    return {
-        "label": label,
-        "samples": int(values.size),
-        "rms_nm": float(np.sqrt(np.mean(values**2))) if values.size else None,
-        "mean_nm": float(np.mean(values)) if values.size else None,
-        "share_of_excess": max(excess, 0.0) / total if total > 0 else 0.0,
+def error_shares(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
+) -> dict[str, list[dict[str, Any]]]:
+    """What `Comparison.by` holds.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    residual_nm : ndarray, shape (N,)
+        Measurement minus model, N·m.
+    noise_sd_nm : float
+        White noise of a sample, N·m.
+    counted : ndarray of bool, shape (N,)
+        Samples that count.
+    """
+    sign = direction_of(record)
+    kinds: dict[str, Groups] = {
+        "segment": [(name, record.segment == i) for i, name in enumerate(record.segment_names)],
+        "level": _levels(record.pulse_width_us),
+        "direction": [("rising", sign > 0), ("falling", sign < 0), ("held", sign == 0)],
+        "time": _spans(record.time_s - record.time_s[0]),
     }
+    tables = {kind: _table(groups, residual_nm, noise_sd_nm, counted) for kind, groups in kinds.items()}
+    return tables | {"frequency": _by_frequency(record.sample_rate_hz, residual_nm, noise_sd_nm, counted)}
 
 
-def _total(groups: list[np.ndarray], residual_nm: np.ndarray, noise_sd_nm: float) -> float:
-    return sum(max(float(np.sum(residual_nm[g] ** 2) - g.sum() * noise_sd_nm**2), 0.0) for g in groups)
+def _levels(width_us: np.ndarray) -> Groups:
+    """Zero, then equal ranges up to the largest width."""
+    found = [("0 µs", width_us <= 0)]
+    for low, high in pairwise(np.linspace(0.0, float(width_us.max()), LEVELS + 1)):
+        rows = (width_us > max(low, 0.0)) & (width_us <= high) if high > 0 else np.zeros(width_us.size, bool)
+        found.append((f"{low:.0f}-{high:.0f} µs", rows))
+    return found
 
 
-def _table(
-    labels: list[str], groups: list[np.ndarray], residual: np.ndarray, noise: float, counted: np.ndarray | None
-) -> list[dict[str, Any]]:
-    groups = groups if counted is None else [group & counted for group in groups]
-    total = _total(groups, residual, noise)
+def _spans(time_s: np.ndarray) -> Groups:
+    """Equal spans from the start."""
+    edges = np.linspace(0.0, time_s[-1] + 1e-9, SPANS + 1)
+    return [(f"{a:.1f}-{b:.1f} s", (time_s >= a) & (time_s < b)) for a, b in pairwise(edges)]
+
+
+def _table(groups: Groups, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray) -> list[dict[str, Any]]:
+    """For each group that counts: number of samples, error, mean, and share of the error above the noise."""
+    parts = [(label, residual_nm[rows & counted]) for label, rows in groups]
+    excess = [max(float(np.sum(values**2) - values.size * noise_sd_nm**2), 0.0) for _, values in parts]
+    total = sum(excess)
     return [
-        _row(label, group, residual, noise, total) for label, group in zip(labels, groups, strict=True) if group.any()
+        {
+            "label": label,
+            "samples": int(values.size),
+            "rms_nm": float(np.sqrt(np.mean(values**2))),
+            "mean_nm": float(np.mean(values)),
+            "share_of_excess": own / total if total > 0 else 0.0,
+        }
+        for (label, values), own in zip(parts, excess, strict=True)
+        if values.size
     ]
 
 
-def by_segment(
-    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
-) -> list[dict[str, Any]]:
-    """By segment, in order."""
-    groups = [record.segment == i for i in range(len(record.segment_names))]
-    return _table(list(record.segment_names), groups, residual_nm, noise_sd_nm, counted)
-
-
-def by_level(
-    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
-) -> list[dict[str, Any]]:
-    """By pulse width: zero, then equal ranges up to the largest."""
-    u, top = record.pulse_width_us, float(record.pulse_width_us.max())
-    labels, groups = ["0 µs"], [u <= 0]
-    edges = np.linspace(0.0, top, LEVELS + 1)
-    for low, high in itertools.pairwise(edges):
-        labels.append(f"{low:.0f}-{high:.0f} µs")
-        groups.append((u > max(low, 0.0)) & (u <= high) if high > 0 else np.zeros(u.size, bool))
-    return _table(labels, groups, residual_nm, noise_sd_nm, counted)
-
-
-def by_direction(
-    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
-) -> list[dict[str, Any]]:
-    """By direction: pulse width rising, falling or held over the last 0.3 s."""
-    sign = direction_of(record)
-    return _table(["rising", "falling", "held"], [sign > 0, sign < 0, sign == 0], residual_nm, noise_sd_nm, counted)
-
-
-def by_time(
-    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
-) -> list[dict[str, Any]]:
-    """By time: equal spans from the start."""
-    t = record.time_s - record.time_s[0]
-    edges = np.linspace(0.0, t[-1] + 1e-9, SPANS + 1)
-    labels = [f"{a:.1f}-{b:.1f} s" for a, b in itertools.pairwise(edges)]
-    groups = [(t >= a) & (t < b) for a, b in itertools.pairwise(edges)]
-    return _table(labels, groups, residual_nm, noise_sd_nm, counted)
-
-
-def by_frequency(
-    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray | None = None
+def _by_frequency(
+    rate: float, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
 ) -> list[dict[str, Any]]:
     """By octave: root mean square of the residual and of white noise in each."""
-    rate = record.sample_rate_hz
-    known = np.ones(residual_nm.size, bool) if counted is None else counted
-    longest = max(runs(known), key=lambda r: r.stop - r.start)
+    longest = max(runs(counted), key=lambda r: r.stop - r.start)
     values = residual_nm[longest]
     power = np.abs(np.fft.rfft(values)) ** 2 / values.size**2
     power[1:] *= 2.0
     frequency = np.fft.rfftfreq(values.size, 1.0 / rate)
     rows = []
-    for low, high in itertools.pairwise(OCTAVES_HZ):
+    for low, high in pairwise(OCTAVES_HZ):
         inside = (frequency >= low) & (frequency < high)
         if not inside.any() or low >= rate / 2:
             continue

@@ -9,6 +9,8 @@ import numpy as np
 from identify.records.record import Record
 
 STRETCH_S = 0.5
+MOST = 5
+"""Largest number of places."""
 
 
 def direction_of(record: Record) -> np.ndarray:
@@ -21,7 +23,7 @@ def direction_of(record: Record) -> np.ndarray:
 
 
 def worst_places(
-    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, *, most: int = 5, rows: np.ndarray | None = None
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, *, rows: np.ndarray
 ) -> list[dict[str, Any]]:
     """The stretches with most of the error above the noise.
 
@@ -33,22 +35,18 @@ def worst_places(
         Measurement minus model, N·m.
     noise_sd_nm : float
         White noise of a sample, N·m.
-    most : int
-        Largest number of places.
-    rows : ndarray of bool or None, shape (N,)
-        Rows to examine; all by default.
+    rows : ndarray of bool, shape (N,)
+        Rows to examine.
 
     Returns
     -------
     list of dict
         As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
     """
-    rate, size = record.sample_rate_hz, record.time_s.size
-    length = max(round(STRETCH_S * rate), 1)
-    rows = np.ones(size, bool) if rows is None else rows
+    length = max(round(STRETCH_S * record.sample_rate_hz), 1)
     rising = direction_of(record)
     excess_total, pieces = 0.0, []
-    for run in np.split(np.arange(size), np.flatnonzero(np.diff(record.segment)) + 1):
+    for run in np.split(np.arange(record.time_s.size), np.flatnonzero(np.diff(record.segment)) + 1):
         for start in range(int(run[0]), int(run[-1]) + 1, length):
             stop = min(start + length, int(run[-1]) + 1)
             take = np.arange(start, stop)[rows[start:stop]]
@@ -59,19 +57,16 @@ def worst_places(
             pieces.append([start, stop, excess, int(np.sign(np.sum(rising[take])))])
     if excess_total <= 0.0:
         return []
-    merged = _merge(pieces, record)
-    merged.sort(key=lambda piece: -piece[2])
+    merged = sorted(_merge(pieces, record), key=lambda piece: -piece[2])
     return [
         _place(record, residual_nm, rows, piece, excess_total)
-        for piece in merged[:most]
+        for piece in merged[:MOST]
         if piece[2] > 0.02 * excess_total
     ]
 
 
 def _merge(pieces: list[list[Any]], record: Record) -> list[list[Any]]:
     """Join neighbouring stretches of the same segment and direction, if each has much of the error."""
-    if not pieces:
-        return []
     level = 0.3 * max(piece[2] / (piece[1] - piece[0]) for piece in pieces)
     result: list[list[Any]] = []
     for piece in pieces:
