@@ -6,6 +6,7 @@ import numpy as np
 
 from identify.dynamics.pulse_grid import Grid, runs
 from identify.errors import BadRecord
+from identify.records import bounds
 from identify.records.pulse_phase import pulse_phase_s
 from identify.records.record import FORGOTTEN_S, Record
 
@@ -121,10 +122,9 @@ def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
 
 MOVED = 0.04
 """Share of the torque's range by which the rests before and after a gap differ if stimulation was cut out."""
+LONGEST_LATE_S = bounds.LARGEST["late_s"]
 LONGEST_DELAY_S = 0.25
 """Longest time from a pulse to the first response; a longer memory is part of the state."""
-LONGEST_S = 24 * 3600.0
-LONGEST_LATE_S = 1.0
 
 
 def check_arrays(record: Record) -> None:
@@ -135,8 +135,7 @@ def check_arrays(record: Record) -> None:
     BadRecord
         Not finite, negative widths, time that does not rise, an impossible pulse rate, or longer than a day.
     """
-    if not 1.0 <= record.pulse_rate_hz <= 200.0:
-        raise BadRecord(f"{record.pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", fix="Give 1 to 200 Hz.")
+    bounds.check_rate(record.pulse_rate_hz, "pulse_rate_hz")
     columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
     for name, column in columns.items():
         finite = np.isfinite(column)
@@ -158,5 +157,5 @@ def check_arrays(record: Record) -> None:
     if np.any(np.diff(record.time_s) <= 0):
         place = f"time_s, sample {int(np.argmax(np.diff(record.time_s) <= 0)) + 1}"
         raise BadRecord("time does not rise", place=place, fix="Sort the samples by time; each time once.")
-    if record.time_s[-1] - record.time_s[0] > LONGEST_S:
+    if record.time_s[-1] - record.time_s[0] > bounds.LONGEST_S:
         raise BadRecord("longer than a day", place="time_s", fix="Give the time in seconds.")

@@ -73,7 +73,8 @@ def parsed(given: Mapping[str, str] | Iterable[str] | None) -> Given:
     """
     if given is None:
         return {}
-    pairs = list(given.items()) if isinstance(given, Mapping) else [_pair(text) for text in _texts(given)]
+    given = [given] if isinstance(given, str) else given
+    pairs = list(given.items()) if isinstance(given, Mapping) else [_pair(text) for text in given]
     found: dict[str, Asked] = {}
     for target, text in pairs:
         if target not in TARGETS:
@@ -85,10 +86,6 @@ def parsed(given: Mapping[str, str] | Iterable[str] | None) -> Given:
             raise BadRecord(f"no name for {target}", place="--map", fix=f"Give --map {target}=NAME:UNIT.")
         found[target] = Asked(target, str(text).strip())
     return found
-
-
-def _texts(given: Iterable[str]) -> list[str]:
-    return [given] if isinstance(given, str) else list(given)
 
 
 def _pair(text: str) -> tuple[str, str]:

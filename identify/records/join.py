@@ -130,9 +130,7 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
         # A plain record's clock is its own.
         shift_s = 0.0 if alone and part.begun_s is None else part.own_s - float(record.time_s[part.first])
         names = record.segment[rows]
-        changes: dict[str, object] = {
-            name: column[rows] for name in OPTIONAL if (column := getattr(record, name)) is not None
-        }
+        changes: dict[str, object] = {name: column[rows] for name, column in record.columns().items()}
         if record.pulses is not None:
             changes["pulses"] = _pulses(record.pulses, shift_s, -np.inf, np.inf)
         changes |= {

@@ -15,7 +15,7 @@ import numpy as np
 from identify.errors import BadRecord
 from identify.records import bounds
 from identify.records.cells import quoted
-from identify.records.record import OPTIONAL, Part, Record, Source
+from identify.records.record import Part, Record, Source
 
 CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "recording_id", "sha256")
 """Columns of which only a part's first row is filled; all but `pause_s` may be missing or empty."""
@@ -32,15 +32,11 @@ def write(record: Record, path: Path) -> None:
     BadRecord
         The file would be larger than what can be read.
     """
-    optional = [name for name in OPTIONAL if getattr(record, name) is not None]
     names = [_cell(name) for name in record.segment_names]
-    header = ("time_s", "pulse_width_us", "torque_nm", "segment", *optional, "part", *CELLS)
-    columns: list[Iterator[str]] = [
-        map(repr, np.asarray(getattr(record, name), float).tolist())
-        for name in ("time_s", "pulse_width_us", "torque_nm")
-    ]
-    columns.append(names[index] for index in record.segment.tolist())
-    columns += [map(repr, np.asarray(getattr(record, name), float).tolist()) for name in optional]
+    header = ("time_s", "pulse_width_us", "torque_nm", "segment", *record.columns(), "part", *CELLS)
+    numbers = (record.time_s, record.pulse_width_us, record.torque_nm, *record.columns().values())
+    columns: list[Iterator[str]] = [map(repr, np.asarray(column, float).tolist()) for column in numbers]
+    columns.insert(3, (names[index] for index in record.segment.tolist()))
     columns.append(map(str, record.part.tolist()))
     empty = "," * len(CELLS)
     described = {part.first: "," + cells for part, cells in zip(record.parts, _descriptions(record), strict=True)}
