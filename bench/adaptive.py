@@ -31,8 +31,8 @@ from identify.diagnosis import diagnose
 from identify.estimation.fit_statistics import best_fit_percent
 from identify.estimation.prepare import prepare
 from identify.experiments.adaptive import Target
+from identify.experiments.designs import pieces
 from identify.experiments.knowledge import Knowledge, step_responses, whole_band
-from identify.experiments.pieces import pieces
 from identify.model import Model
 from identify.records.record import Record
 from rig import protocols

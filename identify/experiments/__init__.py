@@ -158,6 +158,3 @@ def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.nda
     full = np.zeros((fitted.theta.size, mean.size))
     full[place] = slopes
     return mean, full
-
-
-__all__ = ["Design", "designs", "next_experiment", "separation"]

@@ -16,15 +16,14 @@ import numpy as np
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest, IdentifyError
 from identify.estimation.averaged import averaged
-from identify.estimation.earlier import Change, Earlier, learn_change
+from identify.estimation.earlier import Change, Earlier
 from identify.estimation.prepare import prepare
 from identify.estimation.residual_tests import residual_tests
 from identify.estimation.short_record import fit_short
 from identify.estimation.short_result import Short
-from identify.experiments.designs import Segment
+from identify.experiments.designs import Piece, Segment, pieces
 from identify.experiments.foresight import Foresight
 from identify.experiments.knowledge import Knowledge, knowledge
-from identify.experiments.pieces import Piece, pieces
 from identify.experiments.target import Target
 from identify.model import Model
 from identify.records.record import Record
@@ -151,7 +150,7 @@ def decide(
         return Decision("misfit", words=f"{wrong} The rest of the fixed test is played.", knowledge=known, short=short)
     there = known.curve.percent <= target.curve_percent and known.step.percent <= target.step_percent
     if there and _settled(short):
-        return Decision("enough", words=_enough(known), knowledge=known, short=short)
+        return Decision("enough", words=f"Enough is known. {_state(known)}", knowledge=known, short=short)
     return _next(short, known, played, target, left_s, left_nm_s, largest_us)
 
 
@@ -248,10 +247,3 @@ def _state(known: Knowledge) -> str:
     return (
         f"The curve is known within {known.curve.percent:.1f} %, the step response within {known.step.percent:.1f} %."
     )
-
-
-def _enough(known: Knowledge) -> str:
-    return f"Enough is known. {_state(known)}"
-
-
-__all__ = ["Change", "Decision", "Knowledge", "Target", "decide", "learn_change"]

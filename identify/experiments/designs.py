@@ -1,11 +1,15 @@
 """Tests that the rig can do, as segments with settings, and their pulse widths for simulation.
 
 `identify` does not import the rig. These shapes repeat the meaning of the rig's settings; a test compares both.
+
+An adaptive test is made of pieces of one to two seconds: holds, steps, ramps and random steps between levels. Each is a
+list of pulse widths, which the rig's sequence `widths` plays as it is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -53,29 +57,25 @@ class Design:
         return np.concatenate([SHAPES[s.sequence](s.settings, pulse_rate_hz) for s in self.segments])
 
 
-def _pulses(seconds: float, rate: float) -> int:
-    return round(seconds * rate)
-
-
 def _rest(s: dict[str, Any], rate: float) -> np.ndarray:
-    return np.zeros(_pulses(s["duration_s"], rate))
+    return np.zeros(round(s["duration_s"] * rate))
 
 
 def _ramp(s: dict[str, Any], rate: float) -> np.ndarray:
-    up, down = _pulses(s["up_s"], rate), _pulses(s["down_s"], rate)
+    up, down = round(s["up_s"] * rate), round(s["down_s"] * rate)
     shape = np.r_[np.arange(1, up + 1) / up, np.arange(down - 1, -1, -1) / down]
     return shape * s["max_pulse_width_us"]
 
 
 def _steps(s: dict[str, Any], rate: float) -> np.ndarray:
-    on = np.full(_pulses(s["on_s"], rate), s["max_pulse_width_us"])
-    return np.tile(np.r_[on, np.zeros(_pulses(s["off_s"], rate))], s["repeats"])
+    on = np.full(round(s["on_s"] * rate), s["max_pulse_width_us"])
+    return np.tile(np.r_[on, np.zeros(round(s["off_s"] * rate))], s["repeats"])
 
 
 def _staircase(s: dict[str, Any], rate: float) -> np.ndarray:
     up = np.arange(1, s["levels"] + 1) / s["levels"]
     shape = np.r_[up, up[-2::-1], 0.0] if s.get("down", True) else up
-    return np.repeat(shape * s["max_pulse_width_us"], _pulses(s["hold_s"], rate))
+    return np.repeat(shape * s["max_pulse_width_us"], round(s["hold_s"] * rate))
 
 
 def _prbs(s: dict[str, Any], rate: float) -> np.ndarray:
@@ -109,12 +109,12 @@ def designs(largest_us: float) -> list[Design]:
         settings = {"max_pulse_width_us": round(share * top, 1), "on_s": on, "off_s": off, "repeats": repeats}
         return Segment("steps", "steps", settings)
 
-    def prbs(share: float, chips: int = 40) -> Segment:
+    def prbs(share: float) -> Segment:
         settings = {
             "max_pulse_width_us": round(share * top, 1),
             "bits": 7,
             "clock_pulses": 4,
-            "chips": chips,
+            "chips": 40,
             "seed": 3,
         }
         return Segment("prbs", "prbs", settings)
@@ -148,3 +148,55 @@ def designs(largest_us: float) -> list[Design]:
         ),
         Design("sham", "A test without stimulation", (rest(10, "sham"),)),
     ]
+
+
+PIECE_S = 1.0
+LONG_S = 2.0
+HALF_S = 0.5
+CHIP_S = 0.1
+CHIPS = (1, 0, 0, 1, 1, 0, 1, 0, 1, 1)
+"""Signs of a random piece: runs of different lengths, as often high as low or nearly so."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A candidate for the next segment.
+
+    Parameters
+    ----------
+    kind : str
+        hold, step, ramp or prbs.
+    pulse_width_us : ndarray, shape (P,)
+        One width for each pulse, µs.
+    """
+
+    kind: str
+    pulse_width_us: np.ndarray
+
+    def segment(self, number: int) -> Segment:
+        """As the rig plays it."""
+        widths = [float(np.floor(10.0 * u) / 10.0) for u in self.pulse_width_us]
+        return Segment(f"{self.kind} {number}", "widths", {"pulse_width_us": widths, "jumps": True})
+
+
+def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:
+    """All pieces between some levels.
+
+    Parameters
+    ----------
+    levels_us : ndarray
+        Levels to move between, µs, 0 among them.
+    pulse_rate_hz : float
+        Pulses a second.
+    """
+    levels = np.unique(np.round(np.floor(10.0 * levels_us) / 10.0, 1))
+    one, half, two = (max(round(s * pulse_rate_hz), 2) for s in (PIECE_S, HALF_S, LONG_S))
+    chip = max(round(CHIP_S * pulse_rate_hz), 1)
+    found = [Piece("hold", np.full(one, level)) for level in levels]
+    for first, second in permutations(levels, 2):
+        found.append(Piece("step", np.repeat([first, second], half)))
+        ramps = [first + (second - first) * np.arange(1, size + 1) / size for size in (one, two)]
+        found += [Piece("ramp", ramp) for ramp in ramps]
+        if first > second:
+            found.append(Piece("prbs", np.repeat(np.where(CHIPS, first, second), chip)))
+    return found

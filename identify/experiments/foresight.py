@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from identify.dynamics.boundary import step_matrix
+from identify.dynamics.boundary import FROM_START, held_states, step_matrix
 from identify.estimation.short_result import Short
+from identify.experiments.designs import Piece
 from identify.experiments.knowledge import POINTS, knowledge, step_responses
-from identify.experiments.pieces import Piece
 from identify.experiments.target import Target
 
 DIRECTIONS = 24
@@ -77,8 +77,10 @@ class Foresight:
             ]
         )
         design = short.basis.design(played_us)
-        states = _end_states(np.ascontiguousarray(curves @ design.T), cores, short.grid.step_s)
-        return cls(curves, cores, states, targets, short.noise.sd_nm, short)
+        even = np.array([step_matrix(t, z, short.grid.step_s) for t, z in cores[:, :2]])
+        drive = np.ascontiguousarray(curves @ design.T)
+        torque, rate = held_states(drive, even, FROM_START, np.zeros((len(cores), 1, 2)))
+        return cls(curves, cores, np.c_[torque[:, -1], rate[:, -1]], targets, short.noise.sd_nm, short)
 
     @property
     def now(self) -> float:
@@ -111,20 +113,6 @@ def _norm(variance: np.ndarray) -> np.ndarray:
     half = np.sqrt(variance)
     first, second = half[:, :POINTS], half[:, POINTS:]
     return np.sum(first**NORM, axis=1) ** (1 / NORM) + np.sum(second**NORM, axis=1) ** (1 / NORM)
-
-
-@njit(cache=True, nogil=True)
-def _end_states(drive, cores, step_s):  # pragma: no cover
-    """State of each row at the end of its drive, from rest, shape (M, 2)."""
-    out = np.zeros((drive.shape[0], 2))
-    for m in range(drive.shape[0]):
-        a, b, c, d = step_matrix(cores[m, 0], cores[m, 1], step_s)
-        y, v = 0.0, 0.0
-        for k in range(drive.shape[1]):
-            w = drive[m, k]
-            y, v = w + a * (y - w) + b * v, c * (y - w) + d * v
-        out[m, 0], out[m, 1] = y, v
-    return out
 
 
 @njit(cache=True, nogil=True)

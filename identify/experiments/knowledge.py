@@ -86,12 +86,12 @@ class Knowledge:
         }
 
 
-def knowledge(short: Short, points: int = POINTS) -> Knowledge:
+def knowledge(short: Short) -> Knowledge:
     """The bands that the draws of a fit give."""
-    width = np.linspace(0.0, short.basis.largest_us, points)
+    width = np.linspace(0.0, short.basis.largest_us, POINTS)
     plateau = max(short.plateau_nm, 1e-9)
     curves = short.coefficients_nm @ short.basis.design(width).T / plateau
-    time_s = np.linspace(0.0, min(short.linear.memory_s, 12.0), points)
+    time_s = np.linspace(0.0, min(short.linear.memory_s, 12.0), POINTS)
     return Knowledge(
         curve=whole_band(width, curves, 1.0 + HIDDEN * short.strange),
         step=whole_band(time_s, step_responses(short.dynamics, time_s), 1.0 + HIDDEN),

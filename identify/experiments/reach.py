@@ -162,6 +162,3 @@ def _reached(decision: Decision, target: Target, seconds: float, torque_time_nm_
             f"would be known within {curve:.1f} % and the step response within {step:.1f} %."
         )
     return Reach(there, curve, step, seconds, torque_time_nm_s, words)
-
-
-__all__ = ["Reach", "reach"]

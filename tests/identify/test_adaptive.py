@@ -12,7 +12,7 @@ import identify
 from identify.errors import BadRequest
 from identify.estimation.earlier import USUAL, learn_change
 from identify.experiments.adaptive import SETTLED_S, Target, decide
-from identify.experiments.pieces import pieces
+from identify.experiments.designs import pieces
 from identify.experiments.reach import Reach, reach, worse
 from identify.records.record import Record
 from rig.sequences import build
