@@ -12,8 +12,7 @@ from identify import model_schema
 from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
 from identify.errors import BadModel
 from identify.json_values import json_value
-from identify.recruitment.curve import Curve, basis_from_dict
-from identify.recruitment.landmarks import landmarks
+from identify.recruitment.curve import Curve, basis_from_dict, landmarks
 from identify.shown import Sheet, Shown, estimate, fit_words, held_out_label, quantity
 from identify.strict_json import BadJson, parse
 
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = "1.0"
 LARGEST_TEXT = 16 * 2**20
 """Characters. A model with 1000 knots and all effects has two million."""
+WRITTEN_AS_THEY_ARE = ("fit", "residual_tests", "valid_for", "quality", "data", "joint", "extra", "software")
 SOFTWARE = {"name": "stimrig", "version": "0.1.0"}
 
 
@@ -275,18 +275,11 @@ def _from_dict(data: dict[str, Any]) -> Model:
         noise=Noise(**data.get("noise", {})),
         effects=tuple(data.get("effects", ())),
         covariance=_covariance(uncertainty.get("covariance")),
-        fit=data.get("fit", {}),
-        residual_tests=data.get("residual_tests", {}),
-        valid_for=data.get("valid_for", {}),
-        quality=data.get("quality", {}),
         bands=uncertainty.get("bands", {}),
-        data=data.get("data", {}),
-        joint=data.get("joint", {}),
         reasons=tuple(data.get("reasons", ())),
-        extra=data.get("extra", {}),
         model_id=str(data.get("model_id", "")),
         created=str(data.get("created", "")),
-        software=data.get("software", {}),
+        **{name: data.get(name, {}) for name in WRITTEN_AS_THEY_ARE},
     )
 
 

@@ -27,7 +27,7 @@ SENTENCES = (
     "identify/estimation/quality.py", "identify/effects/*.py", "identify/experiments/*.py", "identify/records/*.py",
     "identify/fitting.py", "identify/dynamics/make_grid.py", "identify/estimation/rows.py",
     "identify/estimation/effect_fit.py", "identify/estimation/pilot.py", "identify/methods/**/*.py",
-    "identify/simulation/predict.py",
+    "identify/simulation/joint_surface.py", "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/adapters/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py",
     "rig/intended.py", "rig/journal.py", "rig/limits.py", "rig/pieces.py", "rig/plan.py", "rig/protocols/*.py",
     "rig/score.py", "rig/sequences/*.py", "rig/trial.py", "api/models/*.py", "api/people/*.py", "api/sessions/*.py",

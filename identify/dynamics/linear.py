@@ -41,6 +41,14 @@ class SecondOrder:
         """T, s, and ζ."""
         return self.time_constant_s, self.damping
 
+    def bounded(self, delay_bounds_s: tuple[float, float]) -> SecondOrder:
+        """Within the bounds of a search."""
+        return SecondOrder(
+            float(np.clip(self.time_constant_s, *TIME_CONSTANT_BOUNDS_S)),
+            float(np.clip(self.damping, *DAMPING_BOUNDS)),
+            float(np.clip(self.delay_s, *delay_bounds_s)),
+        )
+
     @property
     def memory_s(self) -> float:
         """Time after which the response to an impulse has fallen to about 1/1000, s."""
@@ -51,11 +59,6 @@ class SecondOrder:
         """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
         torque, rate = grid.states(self.core, drive_nm)
         return grid.block_mean(torque, rate, self.delay_s, grid.curve(self.core))
-
-    def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """The response at the record's samples, shape (N,)."""
-        torque, rate = grid.states(self.core, drive_nm)
-        return grid.at_samples(torque, rate, self.delay_s / grid.step_s, grid.curve(self.core))
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.

@@ -8,7 +8,7 @@ import numpy as np
 
 from identify.estimation.gram import gram
 from identify.estimation.joint import Fitted
-from identify.estimation.movement import joint_of
+from identify.estimation.rows import joint_of
 from identify.estimation.short_result import Short
 from identify.noise.level import profile, whitened
 from identify.simulation.problem import Problem
@@ -101,13 +101,13 @@ def _setup(short: Short) -> Setup:
 def _parameters(short: Short, setup: Setup) -> np.ndarray:
     """Draws in the order and on the scale of the problem's parameters, shape (S, P)."""
     others = short.others_nm.copy()
-    others[:, : setup.begins.size] -= setup.sign * setup.zero_nm
+    others[:, : setup.grid.begins.size] -= setup.sign * setup.zero_nm
     return np.c_[np.log(short.dynamics[:, :2]), short.dynamics[:, 2], others, short.coefficients_nm]
 
 
 def _likely(short: Short, setup: Setup) -> np.ndarray:
     others = short.likely[short.basis.size :].copy()
-    others[: setup.begins.size] -= setup.sign * setup.zero_nm
+    others[: setup.grid.begins.size] -= setup.sign * setup.zero_nm
     t, z = short.linear.core
     return np.r_[np.log(t), np.log(z), short.linear.delay_s, others, np.cumsum(short.likely[: short.basis.size])]
 

@@ -14,7 +14,6 @@ from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.narx import run
 from identify.dynamics.pulse_grid import Grid, runs
 from identify.estimation.band_effect import band_as_effect
-from identify.estimation.clustered import clustered_covariance
 from identify.estimation.evaluation import evaluate
 from identify.estimation.fit_statistics import fit_statistics, white_sd
 from identify.estimation.joint import Fitted
@@ -23,6 +22,7 @@ from identify.estimation.residual_tests import residual_tests
 from identify.estimation.uncertainty import bands
 from identify.model import Covariance, Model, Noise
 from identify.noise.ar1 import ar1_or_white
+from identify.noise.level import whitened
 from identify.recruitment.curve import Curve
 from identify.simulation.joint_surface import Surfaces, joint_tables
 from identify.simulation.predict import fingerprint, predict_on
@@ -30,6 +30,8 @@ from identify.simulation.predict import fingerprint, predict_on
 AT_WORK = 0.05
 EASED = 0.98
 """Share of the penalty that is removed to see how far it holds the curve back."""
+BLOCK_S = 3.0
+"""Longer than a contraction's rise: within a block, what is wrong stays wrong."""
 
 
 def finish(
@@ -89,22 +91,44 @@ def _joint(model: Model, fitted: Fitted, known: int) -> dict[str, Any]:
     Rows with less than `AT_WORK` of the largest torque show the passive part alone.
     """
     grid, rows = fitted.problem.setup.grid, fitted.problem.setup.fitted
-    if grid.angle_rad is None or grid.velocity_rad_s is None or Surfaces.of(model) is None:
+    if grid.angle_rad is None or grid.velocity_rad_s is None or Surfaces.of(model.effects) is None:
         return {}
     assert model.covariance is not None
-    wide = replace(model.covariance, matrix=clustered_covariance(fitted)[:known, :known])
+    wide = replace(model.covariance, matrix=_clustered_covariance(fitted)[:known, :known])
     level = np.abs(model.recruitment(grid.pulse_width_us[rows]))
     at_work = level > AT_WORK * float(level.max())
-    return joint_tables(model, wide, grid.angle_rad[rows], grid.velocity_rad_s[rows], at_work)
+    return joint_tables(model.effects, wide, grid.angle_rad[rows], grid.velocity_rad_s[rows], at_work)
+
+
+def _clustered_covariance(fitted: Fitted) -> np.ndarray:
+    """Covariance of the parameters, in their units, that also holds what the model has a little wrong, shape (P, P).
+
+    If the model is right, the gradients of the log likelihood by blocks vary as much as the information says. What the
+    model has wrong lasts longer than a sample and makes them vary more (White 1982; Liang and Zeger 1986, clusters).
+    """
+    problem, setup = fitted.problem, fitted.problem.setup
+    rows = np.vstack([fitted.residual_nm, fitted.slopes]) / setup.spread
+    white = whitened(rows, setup.stretches, fitted.noise)
+    at = np.concatenate([np.arange(start, stop) for start, stop in zip(*setup.stretches, strict=True)])
+    block = (at * setup.grid.step_s / BLOCK_S).astype(np.int64) + 10**6 * setup.grid.part[at]
+    borders = np.flatnonzero(np.r_[True, block[1:] != block[:-1]])
+    gradients = np.add.reduceat(white[1:] * white[0], borders, axis=1)
+    information = white[1:] @ white[1:].T
+    more = gradients @ gradients.T
+    inverse = np.linalg.pinv(fitted.hessian, hermitian=True)
+    values, vectors = np.linalg.eigh(inverse @ (more - information) @ inverse)
+    wider = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    slope = np.where(problem.log, fitted.physical, 1.0)
+    return (inverse + wider) * slope[:, None] * slope[None, :]
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:
     """Baseline, torque, N·m, and rate, N·m/s, of every initial state, if the record has more than one."""
     problem, setup, values = fitted.problem, fitted.problem.setup, fitted.physical
-    if setup.starts.size == 1:
+    if setup.grid.starts.size == 1:
         return {}
     states = setup.sign * values[list(problem.initials)].reshape(-1, 2)
-    baselines = setup.to_record(values[list(problem.baselines)])[setup.grid.part[setup.starts]]
+    baselines = setup.to_record(values[list(problem.baselines)])[setup.grid.part[setup.grid.starts]]
     return {"parts": np.c_[baselines, states].tolist()}
 
 

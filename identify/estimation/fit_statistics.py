@@ -74,6 +74,15 @@ def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:
     return 100.0 * (1.0 - sd_nm / float(np.std(measured_nm)))
 
 
+def figures(measured_nm: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, prefix: str = "") -> dict[str, float]:
+    """Best fit, the best one that the noise allows, and error of some rows."""
+    return {
+        f"{prefix}fit_percent": best_fit_percent(measured_nm, predicted_nm, sd_nm),
+        f"{prefix}ceiling_percent": ceiling_percent(measured_nm, sd_nm),
+        f"{prefix}rms_nm": rms(measured_nm - predicted_nm),
+    }
+
+
 def fit_statistics(
     grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, held_out_change: np.ndarray | None = None
 ) -> dict[str, Any]:
@@ -99,9 +108,7 @@ def fit_statistics(
     used = rows[grid.interval] & ~record.held_out & grid.counted
     held = record.held_out & grid.counted
     result: dict[str, Any] = {
-        "fit_percent": best_fit_percent(measured[used], predicted_nm[used], sd_nm),
-        "ceiling_percent": ceiling_percent(measured[used], sd_nm),
-        "rms_nm": rms((measured - predicted_nm)[used]),
+        **figures(measured[used], predicted_nm[used], sd_nm),
         "noise_sd_nm": sd_nm,
         "held_out_fit_percent": None,
         "held_out_ceiling_percent": None,
@@ -112,21 +119,11 @@ def fit_statistics(
         "segments": segment_statistics(grid, predicted_nm, sd_nm),
     }
     if held.any():
-        result |= {
-            "held_out_fit_percent": best_fit_percent(measured[held], predicted_nm[held], sd_nm),
-            "held_out_ceiling_percent": ceiling_percent(measured[held], sd_nm),
-            "held_out_rms_nm": rms((measured - predicted_nm)[held]),
-            "held_out_by": "validate",
-        }
+        result |= figures(measured[held], predicted_nm[held], sd_nm, "held_out_") | {"held_out_by": "validate"}
     elif held_out_change is not None:
         left_out = predicted_nm[used] + held_out_change[grid.interval[used]]
-        result |= {
-            "held_out_fit_percent": best_fit_percent(measured[used], left_out, sd_nm),
-            "held_out_ceiling_percent": result["ceiling_percent"],
-            "held_out_rms_nm": rms(measured[used] - left_out),
-            "held_out_by": "cross-validation",
-            "held_out_samples": int(used.sum()),
-        }
+        result |= figures(measured[used], left_out, sd_nm, "held_out_")
+        result |= {"held_out_by": "cross-validation", "held_out_samples": int(used.sum())}
     return result
 
 

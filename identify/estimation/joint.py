@@ -95,10 +95,6 @@ def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray
     return whitened(rows / problem.setup.spread, problem.setup.stretches, noise)
 
 
-def _residual(problem: Problem, mean: np.ndarray) -> np.ndarray:
-    return problem.setup.target_nm - mean
-
-
 def _penalty(problem: Problem, theta: np.ndarray) -> float:
     mean, precision = problem.prior
     away = theta - mean
@@ -193,7 +189,7 @@ def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = Fal
     mean, slopes = problem.run(theta, derivatives=True)
     if slopes is None or not np.all(np.isfinite(mean)):
         return None
-    residual = _residual(problem, mean)
+    residual = problem.setup.target_nm - mean
     level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
     return _Point(theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
 
@@ -281,7 +277,7 @@ def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.n
     mean, jacobian = problem.run(theta, derivatives=True)
     assert jacobian is not None
     free = np.arange(problem.baselines.start, problem.coefficients.stop)
-    white = _whiten(problem, np.vstack([_residual(problem, mean), jacobian[free]]), noise)
+    white = _whiten(problem, np.vstack([problem.setup.target_nm - mean, jacobian[free]]), noise)
     prior_mean, precision = problem.prior
     part = precision[np.ix_(free, free)]
     products = gram(white)

@@ -7,7 +7,7 @@ import numpy as np
 from identify.dynamics.linear import SecondOrder
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import NotIdentifiable
-from identify.estimation.projected_search import assess, bounded, descend, search
+from identify.estimation.projected_search import State, bounded, descend, search
 from identify.estimation.projection import Projection, Solution
 from identify.noise.ar1 import ar1_or_white, whiten
 from identify.recruitment.knots import (
@@ -16,7 +16,6 @@ from identify.recruitment.knots import (
     QUIET_KNOTS,
     adapted_knots,
     bending_order,
-    even_knots,
     knots_for,
     spline_roughness,
 )
@@ -48,14 +47,14 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
         )
     if np.ptp(grid.torque_nm[rows]) <= 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
-    basis = SplineBasis(even_knots(largest, PILOT_KNOTS))
+    basis = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
     order = bending_order(grid.pulse_width_us[rows])
     projection = Projection(grid, basis, spline_roughness(basis, order=order), rows, delay_s)
     target = whiten(projection.target, projection.stretches, 0.0)
     delay = 0.0 if delay_s is None else delay_s
-    starts = [assess(projection, bounded(projection, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
+    starts = [State(projection, bounded(projection, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
     best = min(starts, key=lambda state: state.cost)
-    return descend(best, None, most=12, tolerance=0.5)
+    return descend(best, most=12, tolerance=0.5)
 
 
 def designed(first: Solution, count: int | None = None) -> tuple[Projection, SecondOrder]:
@@ -72,7 +71,7 @@ def designed(first: Solution, count: int | None = None) -> tuple[Projection, Sec
     projection = Projection(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.delay_s)
     target = whiten(projection.target, projection.stretches, 0.0)
     for _ in range(2):
-        coefficients = assess(projection, first.linear, target, 0.0, None).coefficients[: basis.size]
+        coefficients = State(projection, first.linear, target, 0.0, None).coefficients[: basis.size]
         projection, basis = _redesigned(projection, basis, coefficients, count)
     return projection, first.linear
 

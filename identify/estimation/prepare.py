@@ -10,9 +10,9 @@ from identify.dynamics.make_grid import make_grid
 from identify.dynamics.pulse_grid import Grid
 from identify.errors import NotIdentifiable
 from identify.estimation.joint import Fitted, solve
-from identify.estimation.movement import joint_of, still_rows
 from identify.estimation.pilot import estimate
 from identify.estimation.projection import Solution
+from identify.estimation.rows import joint_of, refuse_few, still_rows
 from identify.estimation.samples import Raw, inspect, white_noise
 from identify.noise.level import NoiseLevel
 from identify.records.record import Record
@@ -21,7 +21,6 @@ from identify.simulation.setup import Setup
 
 LEAST_SPREAD = 0.2
 """The noise of a part is taken as at least this share of the largest one."""
-LEAST_ROWS = 8
 NEGLIGIBLE_LAG_S, QUICK_S = 1e-3, 3e-3
 """A second lag below the first value hardly changes the torque, and a search stops there: it is restarted at
 QUICK_S."""
@@ -39,31 +38,16 @@ def prepare(record: Record) -> tuple[Grid, Raw]:
     Raises
     ------
     BadRecord, NotIdentifiable
-        No grid can be made, or there is no stimulation or no change of torque in the record.
+        No grid can be made, too few rows may be fitted, there is no pulse, or the torque never changes.
     """
     grid = make_grid(record)
-    check_activity(grid)
-    raw = inspect(record, grid.start_s)
-    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm), raw
-
-
-def check_activity(grid: Grid) -> None:
-    """Refuse a record without stimulation or without any change of torque.
-
-    Raises
-    ------
-    NotIdentifiable
-        Too few rows may be fitted, there is no pulse, or the torque never changes.
-    """
-    if grid.fitted.sum() < LEAST_ROWS:
-        raise NotIdentifiable(
-            f"only {int(grid.fitted.sum())} pulse intervals may be fitted",
-            fix="Give rows of segments other than `validate`.",
-        )
+    refuse_few(grid.fitted)
     if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
         raise NotIdentifiable("the record has no pulse", fix="Record a PRBS and a ramp.")
     if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
+    raw = inspect(record, grid.start_s)
+    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm), raw
 
 
 def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
@@ -86,7 +70,7 @@ def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20) -> Fitted:
     size, linear = solution.projection.basis.size, solution.linear
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
-    parts = setup.begins.size
+    parts = setup.grid.begins.size
     values[list(problem.baselines)] = setup.to_muscle(solution.coefficients[size : size + parts])
     values[list(problem.initials)] = setup.sign * solution.coefficients[size + parts :]
     values[problem.coefficients] = setup.sign * solution.coefficients[:size]

@@ -7,6 +7,7 @@ Gauss-Newton step of the joint problem).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -26,9 +27,7 @@ def search(
     start: SecondOrder,
     *,
     ar1: float = 0.0,
-    weight: float | None = None,
     most: int = 25,
-    tolerance: float = 0.01,
 ) -> Solution:
     """Gauss-Newton on the dynamics with the coefficients projected out, damped where a step fails.
 
@@ -40,19 +39,15 @@ def search(
         Start.
     ar1 : float
         Correlation of the noise.
-    weight : float, optional
-        Weight of the roughness; None to choose it by REML during the search.
     most : int
         Largest number of steps.
-    tolerance : float
-        Stop when a step is smaller than this many standard errors.
     """
     target = whiten(projection.target, projection.stretches, ar1)
-    state = assess(projection, bounded(projection, start), target, ar1, weight)
-    return descend(state, weight, most, tolerance)
+    return descend(State(projection, bounded(projection, start), target, ar1, None), most, tolerance=0.01)
 
 
-def descend(state: _State, weight: float | None, most: int, tolerance: float) -> Solution:
+def descend(state: State, most: int, tolerance: float) -> Solution:
+    """The same from a state. It ends when a step is smaller than `tolerance` standard errors."""
     projection, linear, target, ar1 = state.projection, state.linear, state.target, state.ar1
     damping, taken = 0.0, 0
     while taken < most:
@@ -64,8 +59,8 @@ def descend(state: _State, weight: float | None, most: int, tolerance: float) ->
         size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * target.size / state.squares))
         if size < tolerance or np.max(np.abs(moved)) < 1e-9:
             break
-        keep = None if (weight is None and taken <= REWEIGHTED) else state.weight
-        attempt = assess(projection, trial, target, ar1, keep)
+        keep = None if taken <= REWEIGHTED else state.weight
+        attempt = State(projection, trial, target, ar1, keep)
         against = state.cost if keep is not None else state.cost_at(attempt.weight)
         if attempt.cost <= against * (1 + 1e-9):
             linear, state, damping = trial, attempt, damping / 10 if damping > 1e-4 else 0.0
@@ -78,11 +73,11 @@ def descend(state: _State, weight: float | None, most: int, tolerance: float) ->
 
 def project(projection: Projection, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:
     """Coefficients for given dynamics: only the linear part of the problem."""
-    return assess(projection, linear, whiten(projection.target, projection.stretches, ar1), ar1, weight).solution()
+    return State(projection, linear, whiten(projection.target, projection.stretches, ar1), ar1, weight).solution()
 
 
-class _State:
-    """The joint linear problem at one point of the search."""
+class State:
+    """The joint linear problem at one point of the search; without a weight of the roughness, the one by REML."""
 
     def __init__(
         self, projection: Projection, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None
@@ -93,11 +88,9 @@ class _State:
         self.zz, self.zy = white.T @ white, white.T @ target
         self.energy = float(target @ target)
         size = projection.basis.size
-        if weight is None:
-            weight = self._chosen(size)
-        self.weight = weight
+        self.weight = self._chosen(size) if weight is None else weight
         self.penalty = np.zeros_like(self.zz)
-        self.penalty[:size, :size] = weight * projection.roughness
+        self.penalty[:size, :size] = self.weight * projection.roughness
         self.penalty[size:, size:] = np.diag(projection.ridge)
         self.coefficients = _solve(self.zz + self.penalty, self.zy)
         self.cost = self.energy - float(self.zy @ self.coefficients)
@@ -149,11 +142,8 @@ class _State:
         energy = self.energy - float(self.zy[size:] @ inner[:, -1])
         if not np.any(self.projection.roughness):
             return 0.0
-        known = {"free": self.projection.extras, "null": self.projection.null}
-        size_fitted = self.target.size
-        return choose_weight(
-            (gram + gram.T) / 2, moment, energy, size_fitted, self.projection.roughness, **known
-        ).weight
+        roughness, free, null = self.projection.roughness, self.projection.extras, self.projection.null
+        return choose_weight((gram + gram.T) / 2, moment, energy, self.target.size, roughness, free, null).weight
 
     def cost_at(self, weight: float) -> float:
         """The penalised cost at this point with another weight."""
@@ -188,10 +178,6 @@ class _State:
         )
 
 
-def assess(projection: Projection, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None) -> _State:
-    return _State(projection, linear, target, ar1, weight)
-
-
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve a symmetric system, scaled to a unit diagonal, with a very small ridge for empty columns."""
     solved = _scaled_solve(np.ascontiguousarray(matrix), np.ascontiguousarray(right.reshape(len(right), -1)))
@@ -214,13 +200,8 @@ def _moved(linear: SecondOrder, step: np.ndarray) -> SecondOrder:
 
 
 def _difference(before: SecondOrder, after: SecondOrder) -> np.ndarray:
-    return np.array(
-        [
-            np.log(after.time_constant_s / before.time_constant_s),
-            np.log(after.damping / before.damping),
-            after.delay_s - before.delay_s,
-        ]
-    )
+    longer = np.log(after.time_constant_s / before.time_constant_s)
+    return np.array([longer, np.log(after.damping / before.damping), after.delay_s - before.delay_s])
 
 
 def _held(projection: Projection, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
@@ -232,13 +213,6 @@ def _held(projection: Projection, linear: SecondOrder, gradient: np.ndarray) -> 
 
 
 def bounded(projection: Projection, linear: SecondOrder) -> SecondOrder:
-    delay = (
-        float(np.clip(linear.delay_s, *projection.grid.delay_bounds_s))
-        if projection.delay_s is None
-        else projection.delay_s
-    )
-    return SecondOrder(
-        float(np.clip(linear.time_constant_s, *TIME_CONSTANT_BOUNDS_S)),
-        float(np.clip(linear.damping, *DAMPING_BOUNDS)),
-        delay,
-    )
+    """The dynamics within the bounds of the search, with the delay that is given."""
+    found = linear.bounded(projection.grid.delay_bounds_s)
+    return found if projection.delay_s is None else replace(found, delay_s=projection.delay_s)

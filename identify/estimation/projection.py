@@ -165,11 +165,6 @@ class Solution:
     variance: float
 
     @cached_property
-    def fitted_nm(self) -> np.ndarray:
-        """Interval means of the model, N·m, shape (K,)."""
-        return self.columns @ self.coefficients
-
-    @cached_property
     def residual_nm(self) -> np.ndarray:
         """Measured minus model on the grid, N·m, shape (K,); meaningful in rows with samples only."""
-        return self.projection.target - self.fitted_nm
+        return self.projection.target - self.columns @ self.coefficients

@@ -149,9 +149,8 @@ def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:
 
 def _stable(model: Model) -> dict[str, Any]:
     linear = model.linear
-    if isinstance(linear, Discrete):
-        return _gate(linear.stable, "refuse", "the dynamics are unstable")
-    return _gate(linear.time_constant_s > 0 and linear.damping > 0, "refuse", "the dynamics are unstable")
+    stable = linear.stable if isinstance(linear, Discrete) else linear.time_constant_s > 0 and linear.damping > 0
+    return _gate(stable, "refuse", "the dynamics are unstable")
 
 
 def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 from identify.effects import get
 from identify.estimation.gram import gram
 from identify.estimation.joint import Fitted, solve
-from identify.estimation.movement import still_rows
+from identify.estimation.rows import still_rows
 from identify.noise.level import whitened
 from identify.recruitment.knots import QUIET_KNOTS, adapted_knots, bending_order, spline_roughness
 from identify.recruitment.smoothing import choose_weight

@@ -6,12 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.effects.mains_hum import line
-from identify.estimation.hum import find_hum, hum_variation
+from identify.dynamics.pulse_grid import runs
+from identify.effects.mains_hum import HARMONICS, line
 from identify.records.record import Record
 
 LEAST_EQUAL = 20
 """Number of samples at exactly the largest (or smallest) value from which they count as clipping."""
+LEAST_LINE = 30.0
+"""A line counts as hum if its power is this many times the mean power of its neighbours."""
+FOLLOWED_S = 1.0
+"""Window in which amplitude and phase of the hum are taken as constant."""
+MOST_HARMONICS = 8
 
 
 @dataclass(frozen=True)
@@ -80,3 +85,101 @@ def white_noise(record: Record, torque: np.ndarray) -> float:
     difference = np.diff(torque, order)
     gain = {3: 20.0, 4: 70.0}[order]
     return float(np.sqrt(np.median(difference**2) / 0.4549 / gain))
+
+
+def find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> dict[str, float] | None:
+    """Parameters of the mains hum: a line at 50 or 60 Hz and its harmonics; None if there is none."""
+    rate_hz = record.sample_rate_hz
+    if rate_hz < 99.0 or kept.sum() < 4 * rate_hz:
+        return None
+    longest = max(runs(kept), key=lambda run: run.stop - run.start)
+    # Differences whiten the spectrum of the muscle, so that neighbouring frequencies can be compared.
+    signal = np.diff(record.torque_nm[longest], 2)
+    # The FFT is slow for lengths with a large prime factor: up to 1 % of the samples are left out.
+    signal = signal[: signal.size - signal.size % (1 << max(signal.size.bit_length() - 7, 0))]
+    window = np.hanning(signal.size)
+    power = np.abs(np.fft.rfft((signal - signal.mean()) * window)) ** 2
+    frequency = np.fft.rfftfreq(signal.size, 1.0 / rate_hz)
+    best: tuple[float, float] = (0.0, 0.0)
+    for mains in (50.0, 60.0):
+        ratio = max(
+            _line(power, frequency, h * mains, h * 0.3) / (1.0 if h == 1 else 1.5)
+            for h in range(1, HARMONICS + 1)
+            if h * mains < 0.5 * rate_hz - 1e-6 or h == 1
+        )
+        best = max(best, (ratio, mains))
+    ratio, mains = best
+    if ratio < LEAST_LINE or mains > 0.5 * rate_hz + 1e-6:
+        return None
+    return _fit_hum(record, own_s, mains, kept)
+
+
+def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: float) -> float:
+    """Power of a line divided by the mean power of its neighbours."""
+    inside = np.abs(frequency - centre_hz) <= reach_hz
+    # Neighbours within 8 Hz only, since the pulses at 40 Hz have harmonics, too.
+    around = (np.abs(frequency - centre_hz) <= 8.0) & (np.abs(frequency - centre_hz) > 2 * reach_hz + 0.2)
+    if not inside.any() or not around.any():
+        return 0.0
+    return float(power[inside].max() / max(np.mean(power[around]), 1e-30))
+
+
+def hum_variation(record: Record, torque: np.ndarray, mains_hz: float, kept: np.ndarray) -> np.ndarray:
+    """Hum that remains because its amplitude and phase vary, N·m: each harmonic is tracked with a window of 1 s."""
+    rate_hz = record.sample_rate_hz
+    width = 2 * max(round(rate_hz / record.pulse_rate_hz), 2) + 1
+    box = np.ones(width) / width
+    window = np.hanning(max(round(FOLLOWED_S * rate_hz), 8) + 2)[1:-1]
+    found = np.zeros(torque.size)
+    for run in runs(kept):
+        part = torque[run]
+        if part.size < 2 * window.size:
+            continue
+        high = part - np.convolve(np.convolve(part, box, "same"), box, "same")
+        high[: 2 * width] = high[-2 * width :] = 0.0
+        weight = np.convolve(np.abs(high) > 0, window, "same")
+        h = 1
+        while h * mains_hz < 0.5 * rate_hz - 1.0 and h <= MOST_HARMONICS:
+            turn = np.exp(2j * np.pi * h * mains_hz * record.time_s[run])
+            half = np.pi * h * mains_hz / rate_hz
+            passed = 1.0 - (np.sin(width * half) / (width * np.sin(half))) ** 2
+            slow = np.convolve(high * np.conj(turn), window, "same") / np.maximum(weight, 1e-9)
+            found[run] += 2.0 * np.real(slow * turn) / passed
+            h += 1
+    return found
+
+
+def _fit_hum(record: Record, time_s: np.ndarray, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
+    """Frequency and amplitudes, by least squares on the high-pass filtered torque."""
+    rate_hz = record.sample_rate_hz
+    width = max(round(rate_hz / record.pulse_rate_hz), 2)
+    harmonics = [h for h in range(1, HARMONICS + 1) if h * mains_hz <= 0.5 * rate_hz + 1e-6]
+    # Rows next to excluded ones are left out, since the filter would mix them.
+    kept = np.convolve(~kept, np.ones(4 * width + 1), "same") < 0.5
+
+    def smooth_out(values: np.ndarray) -> np.ndarray:
+        box = np.ones(2 * width + 1) / (2 * width + 1)
+        return values - np.apply_along_axis(lambda c: np.convolve(np.convolve(c, box, "same"), box, "same"), 0, values)
+
+    target = smooth_out(record.torque_nm)[kept]
+
+    def design(frequency_hz: float) -> np.ndarray:
+        turn = 2 * np.pi * frequency_hz * time_s[:, None] * np.array(harmonics)
+        return np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
+
+    def remaining(frequency_hz: float) -> tuple[float, np.ndarray]:
+        columns = smooth_out(design(frequency_hz))[kept]
+        solution = np.linalg.lstsq(columns, target, rcond=1e-6)[0]
+        return float(np.sum((target - columns @ solution) ** 2)), solution
+
+    centre, reach = mains_hz, 0.3
+    for _ in range(3):
+        trials = np.linspace(centre - reach, centre + reach, 13)
+        centre = float(trials[np.argmin([remaining(f)[0] for f in trials])])
+        reach /= 5.0
+    _, solution = remaining(centre)
+    hum = {"frequency_hz": centre}
+    for h in range(1, HARMONICS + 1):
+        for offset, part in ((0, "cos"), (len(harmonics), "sin")):
+            hum[f"{part}_{h}_nm"] = float(solution[harmonics.index(h) + offset]) if h in harmonics else 0.0
+    return hum

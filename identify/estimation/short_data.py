@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.dynamics.pulse_grid import Grid
+from identify.dynamics.linear import SecondOrder
+from identify.dynamics.pulse_grid import Grid, ends_of
 from identify.estimation.curve_posterior import Quadratic
 from identify.estimation.earlier import Earlier
 from identify.estimation.projection import Projection
@@ -41,8 +41,7 @@ class ShortData:
         scale = self.scale_nm = max(float(np.percentile(np.abs(torque - np.median(torque[:8])), 98)), 1e-9)
         each = max(float(np.median(grid.count[rows])), 1.0)
         self.first_sd_nm = max(grid.noise_sd_nm / np.sqrt(each), 1e-4 * scale)
-        runs = grid.stretches(rows)
-        self.stretches = np.array([r.start for r in runs], np.int64), np.array([r.stop for r in runs], np.int64)
+        self.stretches = ends_of(grid.stretches(rows))
         states = grid.starts.size
         sd = np.r_[np.full(grid.begins.size, 0.5 * scale), np.tile([0.3 * scale, 2.0 * scale], states)]
         lower, upper = grid.delay_bounds_s
@@ -85,8 +84,7 @@ class ShortData:
         """Dynamics moved by changes of log T, log ζ and the delay, within their bounds."""
         t = linear.time_constant_s * float(np.exp(np.clip(moved[0], -0.7, 0.7)))
         z = linear.damping * float(np.exp(np.clip(moved[1], -0.7, 0.7)))
-        delay = float(np.clip(linear.delay_s + moved[2], *self.grid.delay_bounds_s))
-        return SecondOrder(float(np.clip(t, *TIME_CONSTANT_BOUNDS_S)), float(np.clip(z, *DAMPING_BOUNDS)), delay)
+        return SecondOrder(t, z, linear.delay_s + float(moved[2])).bounded(self.grid.delay_bounds_s)
 
     def residual(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray) -> np.ndarray:
         """Measured minus model, N·m, shape (K,)."""

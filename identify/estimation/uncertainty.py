@@ -13,7 +13,6 @@ import numpy as np
 
 from identify.dynamics.linear import SecondOrder
 from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import Grid
 from identify.model import Covariance, Model
 from identify.records.record import Record
 from identify.recruitment.curve import Basis
@@ -23,10 +22,11 @@ POINTWISE = 1.959964
 BENT = 2.0
 """Factor on the change without penalty; the whole band then contains 95 % of 120 development curves."""
 DRAWS = 256
+POINTS = 41
 DYNAMICS = ("time_constant_s", "damping", "delay_s")
 
 
-def bands(model: Model, unpenalised_change_nm: np.ndarray | None = None, points: int = 41) -> dict[str, Any]:
+def bands(model: Model, unpenalised_change_nm: np.ndarray) -> dict[str, Any]:
     """Bands on both curves, as in MODEL.json; empty if the method gives no covariance.
 
     `unpenalised_change_nm` is the change of the recruitment coefficients if most of the penalty were removed, N·m.
@@ -34,11 +34,10 @@ def bands(model: Model, unpenalised_change_nm: np.ndarray | None = None, points:
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):
         return {}
-    width = np.linspace(0.0, model.recruitment.basis.largest_us, points)
-    time_s = np.linspace(0.0, linear.memory_s, points)
+    width = np.linspace(0.0, model.recruitment.basis.largest_us, POINTS)
+    time_s = np.linspace(0.0, linear.memory_s, POINTS)
     curve = _band(model.recruitment(width), recruitment_slopes(model.recruitment.basis, covariance, width), covariance)
-    if unpenalised_change_nm is not None:
-        _widen(curve, model.recruitment.basis.design(width) @ unpenalised_change_nm)
+    _widen(curve, model.recruitment.basis.design(width) @ unpenalised_change_nm)
     step = _band(linear.step_response(time_s), step_slopes(linear, covariance, time_s), covariance)
     return {
         "level_percent": 95,
@@ -85,11 +84,7 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     if covariance is None or not isinstance(linear, SecondOrder):
         raise ValueError("this model has no covariance")
     grid = make_grid(record)
-    return _around(model, record, grid, _sd(slopes(model, grid, covariance.names), covariance))
-
-
-def _around(model: Model, record: Record, grid: Grid, sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The band at the samples, from the standard deviation of each interval's mean."""
+    sd = _sd(slopes(model, grid, covariance.names), covariance)
     middle = grid.start_s + (np.arange(grid.size) + float(np.mean(grid.fraction))) * grid.step_s
     half = POINTWISE * np.interp(record.time_s, middle, sd)
     predicted = model.predict(record)

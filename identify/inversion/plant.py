@@ -12,7 +12,7 @@ from identify.dynamics.second_order import recursion, transition
 from identify.errors import BadModel, BadRequest
 from identify.inversion.reference import Reference
 from identify.model import Model
-from identify.recruitment.landmarks import THRESHOLD_SHARE
+from identify.recruitment.curve import THRESHOLD_SHARE
 from identify.simulation.joint_surface import Surfaces
 from identify.simulation.predict import LARGEST_RATE_CHANGE
 from identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest
@@ -178,7 +178,7 @@ def _later(model: Model, rate_hz: float, widest_us: float) -> float:
     size = round(PROBE_S * rate_hz)
     plain = model.with_(effects=())
     half_s = []
-    surfaces = Surfaces.of(model)
+    surfaces = Surfaces.of(model.effects)
     held = None if surfaces is None else Motion.held(surfaces.reference_rad, size)
     for one in (model, plain):
         step = np.abs(above_rest(one, np.full(size, widest_us), rate_hz, held))

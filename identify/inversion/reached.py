@@ -90,12 +90,7 @@ class Inversion:
                 "pulse_width_us": self.pulse_width_us,
                 "predicted_torque_nm": self.predicted_nm.round(6),
                 "unreachable": [
-                    {
-                        "begin_s": round(one.begin_s, 6),
-                        "end_s": round(one.end_s, 6),
-                        "reason": one.reason,
-                        "shortfall_nm": round(one.shortfall_nm, 6),
-                    }
+                    {name: value if name == "reason" else round(value, 6) for name, value in vars(one).items()}
                     for one in self.unreachable
                 ],
                 "fit_percent": self.fit_percent,

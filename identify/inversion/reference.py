@@ -87,22 +87,17 @@ class Reference:
                 fix=f"Give {RATES_HZ[0]:g} to {RATES_HZ[1]:g}, the rate at which the model was identified.",
             )
         torque = _column(torque_nm, name)
-        large = np.flatnonzero(~(np.abs(torque) <= LARGEST_NM))
-        if large.size:
-            raise BadRequest(
-                f"{torque[large[0]]:g} N·m",
-                place=f"{name}[{large[0]}]",
-                fix=f"At most {LARGEST_NM:g} N·m; is it in mN·m?",
-            )
-        angle = None if angle_rad is None else _angles(angle_rad, torque.size, name)
+        _refuse_larger(torque, LARGEST_NM, "N·m", name, f"At most {LARGEST_NM:g} N·m; is it in mN·m?")
+        angle = None
+        if angle_rad is not None:
+            angle = _beside(angle_rad, "angle_rad", "angle", torque.size, name)
+            _refuse_larger(angle, LARGEST_RAD, "rad", "angle_rad", f"At most {LARGEST_RAD:g}; is it in degrees?")
         if time_s is not None:
             times_s = _times(time_s, torque.size, name)
             torque = _on_pulses(times_s, torque, pulse_rate_hz)
             angle = None if angle is None else _on_pulses(times_s, angle, pulse_rate_hz)
         if torque.size > LONGEST_S * pulse_rate_hz:
-            raise BadRequest(
-                f"{torque.size / pulse_rate_hz:.5g} s long", place=name, fix=f"Give at most {LONGEST_S:g} s, one trial."
-            )
+            raise _too_long(torque.size / pulse_rate_hz, name)
         return cls(torque, float(pulse_rate_hz), angle)
 
 
@@ -127,28 +122,27 @@ def _column(values: object, name: str) -> np.ndarray:
     return column
 
 
-def _angles(values: object, size: int, name: str) -> np.ndarray:
-    angle = _column(values, "angle_rad")
-    if angle.size != size:
-        raise BadRequest(
-            f"{angle.size} angles for {size} of {name}", place="angle_rad", fix="Give one angle for each torque."
-        )
-    large = np.flatnonzero(~(np.abs(angle) <= LARGEST_RAD))
+def _beside(values: object, place: str, what: str, size: int, name: str) -> np.ndarray:
+    """A column with one value for each torque."""
+    column = _column(values, place)
+    if column.size != size:
+        message = f"{column.size} {what}s for {size} of {name}"
+        raise BadRequest(message, place=place, fix=f"Give one {what} for each torque.")
+    return column
+
+
+def _refuse_larger(column: np.ndarray, largest: float, unit: str, name: str, fix: str) -> None:
+    large = np.flatnonzero(~(np.abs(column) <= largest))
     if large.size:
-        raise BadRequest(
-            f"{angle[large[0]]:g} rad",
-            place=f"angle_rad[{large[0]}]",
-            fix=f"At most {LARGEST_RAD:g}; is it in degrees?",
-        )
-    return angle
+        raise BadRequest(f"{column[large[0]]:g} {unit}", place=f"{name}[{large[0]}]", fix=fix)
+
+
+def _too_long(seconds: float, place: str) -> BadRequest:
+    return BadRequest(f"{seconds:.5g} s long", place=place, fix=f"Give at most {LONGEST_S:g} s, one trial.")
 
 
 def _times(values: object, size: int, name: str) -> np.ndarray:
-    time_s = _column(values, "time_s")
-    if time_s.size != size:
-        raise BadRequest(
-            f"{time_s.size} times for {size} of {name}", place="time_s", fix="Give one time for each torque."
-        )
+    time_s = _beside(values, "time_s", "time", size, name)
     if size < 2:
         raise BadRequest("one time only", place="time_s", fix="Give two or more, or leave the times out.")
     step_s = np.diff(time_s)
@@ -161,9 +155,7 @@ def _times(values: object, size: int, name: str) -> np.ndarray:
             fix=f"Times must rise, by at least {LEAST_GAP_S:g} s and at most {LONGEST_GAP_S:g} s.",
         )
     if time_s[-1] - time_s[0] > LONGEST_S:
-        raise BadRequest(
-            f"{time_s[-1] - time_s[0]:.5g} s long", place="time_s", fix=f"Give at most {LONGEST_S:g} s, one trial."
-        )
+        raise _too_long(time_s[-1] - time_s[0], "time_s")
     return time_s
 
 

@@ -16,13 +16,11 @@ from identify.dynamics.pulse_grid import Grid
 from identify.errors import BadRequest
 from identify.estimation.finish import finish
 from identify.estimation.joint import Fitted
-from identify.estimation.movement import still_rows
 from identify.estimation.pilot import estimate
 from identify.estimation.prepare import to_fitted
-from identify.estimation.rows import fitted_rows
-from identify.methods.support.alternatives import monotone, power_series, sigmoid
+from identify.estimation.rows import fitted_rows, still_rows
+from identify.methods.support.alternatives import monotone, near_sigmoid, power_series, sigmoid
 from identify.methods.support.common import flag, order_option
-from identify.methods.support.near_sigmoid import near_sigmoid
 from identify.methods.two_stage import general
 from identify.model import Model
 from identify.recruitment.knots import KNOTS

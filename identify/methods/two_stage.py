@@ -21,19 +21,20 @@ import numpy as np
 
 from identify.dynamics.linear import Discrete, SecondOrder
 from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRequest
+from identify.dynamics.second_order import recursion
+from identify.errors import BadRequest, NotIdentifiable
 from identify.estimation.finish import finish, finish_discrete
 from identify.estimation.pilot import pilot_curve, pilot_solution
 from identify.estimation.prepare import to_fitted
 from identify.estimation.projected_search import project, search
 from identify.estimation.projection import Projection, Solution
-from identify.methods.support.common import active_level, flag, near_rest, order_option, quiet_level, segment_rows
+from identify.methods.support.common import flag, near_rest, order_option, quiet_level, segment_rows
 from identify.methods.support.output_error import OutputError, choose_order, equation_error, output_error, stable
 from identify.model import Model
-from identify.recruitment.curve import Curve
-from identify.recruitment.fixed import FixedShape
-from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, even_knots, spline_roughness
+from identify.recruitment.curve import Curve, FixedShape
+from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, spline_roughness
 from identify.recruitment.power import PowerBasis
+from identify.recruitment.smoothing import choose_weight
 from identify.recruitment.spline import SplineBasis
 
 STARTS_S = (0.06, 0.15, 0.35, 0.8)
@@ -115,7 +116,7 @@ def physical(
 def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) -> Solution:
     """Stage one: the spline for given dynamics, fitted to the output of G."""
     largest = float(np.max(grid.pulse_width_us))
-    coarse = SplineBasis(even_knots(largest, PILOT_KNOTS))
+    coarse = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
     pilot = project(Projection(grid, coarse, spline_roughness(coarse), rows), linear)
     first = SplineBasis(adapted_knots(pilot_curve(pilot), largest, knots))
     rough = project(Projection(grid, first, spline_roughness(first), rows), linear)
@@ -172,7 +173,10 @@ def general(
 
 def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
     """Drive of the preliminary experiment: proportional to the pulse width (15)."""
-    return grid.pulse_width_us / active_level(grid, prbs)
+    widths = grid.pulse_width_us[prbs]
+    if not np.ptp(widths) > 0:
+        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", fix="Record a PRBS.")
+    return grid.pulse_width_us / float(np.max(widths))
 
 
 def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
@@ -185,6 +189,45 @@ def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
 def _curve_through(
     grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float, inverse: bool
 ) -> Curve:
-    from identify.methods.support.discrete_recruitment import from_inverse, from_output
+    """The recruitment spline for a given discrete linear block: fitted to its output, or by inverting it."""
+    return (_from_inverse if inverse else _from_output)(grid, block, rows, knots, baseline_nm)
 
-    return (from_inverse if inverse else from_output)(grid, block, rows, knots, baseline_nm)
+
+def _from_output(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
+    """Least squares on the output: the columns of the spline are filtered, the torque is not."""
+    target = grid.torque_nm[rows] - baseline_nm
+    return _penalised(grid, lambda columns: block.filter(grid.held(columns))[rows], target, knots)
+
+
+def _from_inverse(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
+    """Equations (26) to (28) as printed: w = G⁻¹ y, then the spline by least squares on w.
+
+    The inverse diverges if G has a zero on or outside the unit circle; it is then limited to ±1e6 N·m.
+    """
+    torque = np.nan_to_num(grid.torque_nm) - baseline_nm
+    b = np.asarray(block.b) / block.b[0]
+    moved = np.r_[torque[block.delay_samples :], np.zeros(block.delay_samples)]
+    driven = np.convolve(moved, block.a)[: moved.size] / block.b[0]
+    start = int(np.flatnonzero(rows)[0])
+    driven[:start] = 0.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        w = np.clip(np.nan_to_num(recursion(b, driven)), -1e6, 1e6)
+    return _penalised(grid, lambda columns: grid.held(columns)[rows], w[rows], knots)
+
+
+def _penalised(grid: Grid, respond, target: np.ndarray, knots: int) -> Curve:
+    largest = float(np.max(grid.pulse_width_us))
+    basis = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
+    roughness = spline_roughness(basis)
+    curve = Curve(basis, np.zeros(basis.size))
+    for last in (False, True):
+        design = respond(basis.design(grid.pulse_width_us))
+        gram, moment = design.T @ design, design.T @ target
+        weight = choose_weight(gram, moment, float(target @ target), target.size, roughness).weight
+        ridge = 1e-12 * float(np.trace(gram)) / len(gram) * np.eye(len(gram))
+        curve = Curve(basis, np.linalg.solve(gram + weight * roughness + ridge, moment))
+        if not last:
+            u = np.linspace(0.0, largest, 201)
+            first, basis = basis, SplineBasis(adapted_knots((u, curve(u)), largest, knots))
+            roughness = spline_roughness(basis, (first, curve.coefficients_nm))
+    return curve

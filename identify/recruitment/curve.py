@@ -1,4 +1,4 @@
-"""A recruitment curve: basis and coefficients, with its table and its inverse."""
+"""A recruitment curve: basis and coefficients, with its table, its inverse and its landmarks."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Curve:
                 return u, torque
             size = 2 * size - 1
 
-    def inverse(self, size: int = 201) -> tuple[np.ndarray, np.ndarray]:
+    def inverse(self) -> tuple[np.ndarray, np.ndarray]:
         """Torques, N·m, strictly rising from 0, and the smallest pulse width that reaches each, µs.
 
         The running maximum is inverted, so a curve that falls somewhere still has one answer: the smallest charge that
@@ -73,7 +73,7 @@ class Curve:
         top = np.maximum.accumulate(sign * torque)
         if not top[-1] > 0.0:
             return np.zeros(1), np.zeros(1)
-        level = np.linspace(0.0, float(top[-1]), size)
+        level = np.linspace(0.0, float(top[-1]), 201)
         reached = np.searchsorted(top, level, side="left")
         before = np.maximum(reached - 1, 0)
         rise = np.where(reached > before, top[reached] - top[before], 1.0)
@@ -82,6 +82,32 @@ class Curve:
 
     def to_dict(self) -> dict:
         return {"basis": self.basis.to_dict() | {"coefficients_nm": [float(x) for x in self.coefficients_nm]}}
+
+
+@dataclass(frozen=True)
+class FixedShape:
+    """A gain times a given curve, as a basis: for steps that estimate only the dynamics."""
+
+    curve: Curve
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return 1
+
+    @property
+    def largest_us(self) -> float:
+        """Pulse width beyond which the curve is held, µs."""
+        return self.curve.basis.largest_us
+
+    def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Shape (..., 1)."""
+        return (self.curve.basis.design(np.asarray(pulse_width_us, float), derivative) @ self.curve.coefficients_nm)[
+            ..., None
+        ]
+
+    def to_dict(self) -> dict:
+        return self.curve.to_dict()
 
 
 def basis_from_dict(data: dict[str, Any]) -> Basis:
@@ -102,3 +128,61 @@ def basis_from_dict(data: dict[str, Any]) -> Basis:
             f"unknown basis {data.get('kind')!r}", place="recruitment.basis.kind", fix=f"Known: {', '.join(kinds)}."
         )
     return kinds[data["kind"]].from_dict(data)
+
+
+THRESHOLD_SHARE = 0.05
+"""At the threshold the curve has gone this share of its way to the plateau; at saturation all but this share."""
+
+
+def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[str, dict[str, Any]]:
+    """The landmarks by name, each with `value`, `sd` and `unit`.
+
+    A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients.
+
+    Parameters
+    ----------
+    curve : Curve
+        f(u); where it falls, its plateau is below zero.
+    covariance_nm2 : ndarray, shape (basis.size, basis.size), optional
+        Covariance of the coefficients, N²·m².
+    """
+    width_us, torque_nm = curve.table()
+    top = int(np.argmax(np.abs(torque_nm)))
+    plateau_nm = float(torque_nm[top])
+    at_top = curve.basis.design(width_us[top : top + 1])[0]
+
+    def crossing(share: float) -> dict[str, Any]:
+        at_us = _crossing(width_us, torque_nm, share * plateau_nm)
+        if at_us is None:
+            return _estimate(None, None, "µs")
+        place = np.array([at_us])
+        # The width at which f(u) = share · plateau moves by the change of that difference over the curve's slope.
+        moved = _sd(curve.basis.design(place)[0] - share * at_top, covariance_nm2)
+        slope = abs(float(curve.slope(place)[0]))
+        return _estimate(at_us, moved / slope if moved is not None and slope > 0.0 else None, "µs")
+
+    return {
+        "threshold_us": crossing(THRESHOLD_SHARE),
+        "plateau_nm": _estimate(plateau_nm, _sd(at_top, covariance_nm2), "N·m"),
+        "saturation_us": crossing(1.0 - THRESHOLD_SHARE),
+    }
+
+
+def _crossing(width_us: np.ndarray, torque_nm: np.ndarray, level_nm: float) -> float | None:
+    """The first width at which the curve reaches a torque, linear between the table's rows."""
+    sign = 1.0 if level_nm >= 0 else -1.0
+    reached = np.flatnonzero(sign * torque_nm[1:] >= sign * level_nm)
+    if reached.size == 0 or level_nm == 0.0:
+        return None
+    first = int(reached[0])
+    low, high = torque_nm[first], torque_nm[first + 1]
+    share = (level_nm - low) / (high - low)
+    return float(width_us[first] + share * (width_us[first + 1] - width_us[first]))
+
+
+def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:
+    return None if covariance is None else float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
+
+
+def _estimate(value: float | None, sd: float | None, unit: str) -> dict[str, Any]:
+    return {"value": value, "sd": sd, "unit": unit}

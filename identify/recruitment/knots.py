@@ -17,11 +17,6 @@ STRAIGHTEST = 0.003
 """The penalty expects at least this share of the strongest bending everywhere, so no part is forced to be straight."""
 
 
-def even_knots(largest_us: float, count: int) -> np.ndarray:
-    """Evenly spaced knots from 0 to the largest pulse width, µs."""
-    return np.linspace(0.0, largest_us, count)
-
-
 def knots_for(pilot_curve: tuple[np.ndarray, np.ndarray]) -> int:
     """Number of knots that a curve needs, from the width of its rise (10 to 90 %) in a pilot fit."""
     u, torque = pilot_curve

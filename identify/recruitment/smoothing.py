@@ -19,14 +19,11 @@ class Choice:
     ----------
     weight : float
         Factor of the roughness in the sum of squares, N²m² per unit of roughness.
-    freedom : float
-        Effective number of coefficients.
     variance : float
         Noise variance at that weight, N²m².
     """
 
     weight: float
-    freedom: float
     variance: float
 
 
@@ -66,8 +63,8 @@ def choose_weight(
     # This dimension is computed from the penalty, not from the data, which do not cover all shapes.
     straight = straight_lines(roughness) if null is None else null
     freedom_left = max(rows - free - straight, 1)
-    weight, freedom, left = _weighed(gram, moment, energy, freedom_left, roughness, straight)
-    return Choice(weight, freedom, left / freedom_left)
+    weight, left = _weighed(gram, moment, energy, freedom_left, roughness, straight)
+    return Choice(weight, left / freedom_left)
 
 
 @njit(cache=True, nogil=True)
@@ -95,4 +92,4 @@ def _weighed(gram, moment, energy, freedom_left, roughness, straight):  # pragma
         chosen = weight[best] * (weight[1] / weight[0]) ** shift
     bottom = np.maximum(1.0 + (chosen - floor) * bent, 1e-12)
     left = max(energy - (part / bottom).sum(), 1e-14 * energy)
-    return chosen, ((1.0 - floor * bent) / bottom).sum(), left
+    return chosen, left

@@ -68,10 +68,6 @@ class SplineBasis:
     def from_dict(cls, data: dict) -> SplineBasis:
         return cls(np.asarray(data["knots_us"], float))
 
-    def torque_nm(self, coefficients_nm: np.ndarray, pulse_width_us: np.ndarray) -> np.ndarray:
-        """f(u) for coefficients of shape (size,)."""
-        return self.design(pulse_width_us) @ coefficients_nm
-
 
 def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 0) -> np.ndarray:
     """B-splines, or their derivative, by the recursion of Cox and de Boor (de Boor 1978, ch. X); shape (N, size).

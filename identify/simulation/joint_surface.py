@@ -7,7 +7,7 @@ effects multiply the torque by, h the sum of what they add to it; whatever form 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -16,6 +16,7 @@ import numpy as np
 from identify.effects import get
 from identify.effects.base import Effect, Form, Scene
 from identify.errors import BadModel
+from identify.model_schema import parameter_value
 
 ANGLES = 61
 SPEEDS = (0.0, 0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75, 1.0)
@@ -29,13 +30,6 @@ STEP = 1e-4
 FORMULA = "T = baseline + g(x, v) y + h(x, v) + inertia a; y = G f(u); x: angle, v: velocity, a: acceleration"
 
 
-class Muscle(Protocol):
-    """The attribute of a model that its surfaces need."""
-
-    @property
-    def effects(self) -> tuple[dict[str, Any], ...]: ...
-
-
 class Covariance(Protocol):
     """What bands need of a covariance: the parameters' names, and the matrix."""
 
@@ -47,12 +41,29 @@ class Covariance(Protocol):
 
 
 @dataclass(frozen=True)
-class _Acting:
-    """One effect of the joint, with its values."""
+class Acting:
+    """One effect of a model, with its values."""
 
     effect: Effect
     form: Form
     values: dict[str, float]
+
+    @classmethod
+    def of(cls, entry: Mapping[str, Any]) -> Acting:
+        """From its row in MODEL.json.
+
+        Raises
+        ------
+        BadModel
+            The effect or its form is unknown here, or a parameter is missing.
+        """
+        try:
+            effect = get(entry["id"])
+            form = effect.form(entry.get("form", ""))
+            values = {p.name: float(parameter_value(entry["parameters"][p.name])) for p in form.parameters}
+        except Exception as error:
+            raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file.") from error
+        return cls(effect, form, values)
 
     @property
     def adds(self) -> bool:
@@ -71,33 +82,22 @@ class Surfaces:
         Those that the effects were fitted with.
     """
 
-    acting: tuple[_Acting, ...]
+    acting: tuple[Acting, ...]
     settings: Mapping[str, Any]
 
     @classmethod
-    def of(cls, model: Muscle) -> Surfaces | None:
-        """Those of a model; None if nothing of it depends on the joint.
+    def of(cls, effects: Sequence[Mapping[str, Any]]) -> Surfaces | None:
+        """Those of a model's effects; None if none of them depends on the joint.
 
         Raises
         ------
         BadModel
             An effect or its form is unknown here, or an older version fitted it, without its own angle.
         """
-        acting = []
-        for entry in model.effects:
-            try:
-                effect = get(entry["id"])
-                form = effect.form(entry.get("form", ""))
-                values = {p.name: float(_value(entry["parameters"][p.name])) for p in form.parameters}
-            except Exception as error:
-                raise BadModel(
-                    f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file."
-                ) from error
-            if effect.moves_with_joint:
-                acting.append(_Acting(effect, form, values))
+        acting = [one for one in map(Acting.of, effects) if one.effect.moves_with_joint]
         if not acting:
             return None
-        settings = model.effects[0].get("settings", {})
+        settings = effects[0].get("settings", {})
         if "reference_rad" not in settings:
             raise BadModel("the model does not say at which angle its curve holds", fix="Fit its record again.")
         return cls(tuple(acting), settings)
@@ -140,7 +140,6 @@ class Surfaces:
 
     def _scene(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> Scene:
         angle, velocity = (np.ravel(np.asarray(values, float)) for values in (angle_rad, velocity_rad_s))
-        known = self.settings.get("angle_range_rad")
         return Scene(
             time_s=np.zeros(angle.size),
             pulse_width_us=np.zeros(angle.size),
@@ -150,7 +149,7 @@ class Surfaces:
             angle_rad=angle,
             velocity_rad_s=velocity,
             reference_rad=self.reference_rad,
-            angle_range_rad=None if known is None else (float(known[0]), float(known[1])),
+            angle_range_rad=angle_range(self.settings),
             begins=np.ones(angle.size, bool),
         )
 
@@ -158,7 +157,7 @@ class Surfaces:
         """With one parameter, by its name in the covariance, changed."""
         effect, _, parameter = name.partition(".")
         acting = [
-            _Acting(one.effect, one.form, one.values | {parameter: value}) if one.effect.id == effect else one
+            replace(one, values=one.values | {parameter: value}) if one.effect.id == effect else one
             for one in self.acting
         ]
         return Surfaces(tuple(acting), self.settings)
@@ -180,7 +179,7 @@ class Surfaces:
 
 
 def joint_tables(
-    model: Muscle,
+    effects: Sequence[Mapping[str, Any]],
     covariance: Covariance | None,
     angle_rad: np.ndarray,
     velocity_rad_s: np.ndarray,
@@ -190,8 +189,8 @@ def joint_tables(
 
     Parameters
     ----------
-    model : Muscle
-        The model.
+    effects : sequence of mapping
+        Those of the model.
     covariance : Covariance or None
         Of its parameters; without it there are no bands.
     angle_rad, velocity_rad_s : ndarray, shape (K,)
@@ -205,7 +204,7 @@ def joint_tables(
         Empty if nothing of the model depends on the joint. Tables have one row for each angle and one column for each
         velocity; `seen_g` and `seen_h` count the pulse intervals nearest to each.
     """
-    surfaces = Surfaces.of(model)
+    surfaces = Surfaces.of(effects)
     if surfaces is None:
         return {}
     low, high = surfaces.settings.get("angle_range_rad", (float(angle_rad.min()), float(angle_rad.max())))
@@ -254,9 +253,11 @@ def _seen(angles: np.ndarray, velocities: np.ndarray, angle_rad: np.ndarray, vel
     return np.histogram2d(angle_rad, velocity_rad_s, bins=edges)[0].astype(int)
 
 
+def angle_range(settings: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Smallest and largest angle that a model was fitted on, rad; None if it does not say."""
+    known = settings.get("angle_range_rad")
+    return None if known is None else (float(known[0]), float(known[1]))
+
+
 def _rows(values: Mapping[str, float]) -> dict[str, np.ndarray]:
     return {name: np.array([[value]]) for name, value in values.items()}
-
-
-def _value(entry: Any) -> float:
-    return entry["value"] if isinstance(entry, dict) else entry

@@ -19,6 +19,7 @@ from identify.effects.base import Form
 from identify.errors import BadModel
 from identify.records.record import Record
 from identify.recruitment.curve import Curve
+from identify.simulation.joint_surface import Acting, angle_range
 from identify.simulation.problem import Problem
 from identify.simulation.setup import Setup
 
@@ -121,26 +122,19 @@ def problem_of(
         states={} if same_data(model, grid.record) else states_of(model),
     )
     effects = [(form.name, form) for form, _ in further if form.stage == "gain"]
-    parameters = [value for form, own in further if form.stage == "gain" for value in own]
+    parameters = [value for form, values in further if form.stage == "gain" for value in values]
     for entry in model.effects:
-        try:
-            effect = get(entry["id"])
-            form = effect.form(entry.get("form", ""))
-            parameters += [float(_value(entry["parameters"][p.name])) for p in form.parameters]
-        except Exception as error:
-            raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file.") from error
-        for need in effect.needs:
+        own = Acting.of(entry)
+        for need in own.effect.needs:
             if getattr(grid.record, need) is None:
-                raise BadModel(
-                    f"{effect.id} needs the column {need}",
-                    place=need,
-                    fix="Record this column, or fit without the effect.",
-                )
-        effects.append((effect.id, form))
-    for form, own in further:
+                fix = "Record this column, or fit without the effect."
+                raise BadModel(f"{own.effect.id} needs the column {need}", place=need, fix=fix)
+        effects.append((own.effect.id, own.form))
+        parameters += own.values.values()
+    for form, values in further:
         if form.stage != "gain":
             effects.append((form.name, form))
-            parameters += own
+            parameters += values
     problem = Problem(setup, effects)
     values = np.zeros(problem.size)
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s
@@ -168,11 +162,7 @@ def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> d
         The model depends on the joint and does not say at which angle its curve holds.
     """
     if "reference_rad" in settings:
-        known = settings.get("angle_range_rad")
-        return {
-            "reference_rad": settings["reference_rad"],
-            "angle_range_rad": None if known is None else (float(known[0]), float(known[1])),
-        }
+        return {"reference_rad": settings["reference_rad"], "angle_range_rad": angle_range(settings)}
     if moves_with_joint(model) and not same_data(model, record):
         raise BadModel(
             "the model does not say at which angle its curve holds",
@@ -234,10 +224,6 @@ def refuse_rate(model: Muscle, record: Record) -> None:
             place="pulse_rate_hz",
             fix="Fit a model at that rate.",
         )
-
-
-def _value(entry: Any) -> float:
-    return entry["value"] if isinstance(entry, dict) else entry
 
 
 def same_data(model: Muscle, record: Record) -> bool:

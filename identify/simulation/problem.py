@@ -64,7 +64,7 @@ class Problem:
 
     def __init__(self, setup: Setup, effects: list[tuple[str, Form]]) -> None:
         self.setup = setup
-        parts, span = setup.begins.size, 6.0 * setup.scale_nm
+        parts, span = setup.grid.begins.size, 6.0 * setup.scale_nm
         table = [
             Parameter("time_constant_s", "s", *TIME_CONSTANT_BOUNDS_S, 0.3, (0.2,), "log"),
             Parameter("damping", "1", *DAMPING_BOUNDS, 1.0, (0.9,), "log"),
@@ -72,7 +72,7 @@ class Problem:
         ]
         numbers = ["", *(f"_{part}" for part in range(2, parts + 1))]
         table += [Parameter(f"baseline{number}_nm", "N·m", -span, span) for number in numbers]
-        states = setup.starts.size
+        states = setup.grid.starts.size
         for number in ["", *(f"_{state}" for state in range(2, states + 1))]:
             table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))
             table.append(Parameter(f"initial_rate{number}_nm_s", "N·m/s", -10 * span, 10 * span))
@@ -123,7 +123,7 @@ class Problem:
         sd[2] = max((self.upper[2] - self.lower[2]) / 2.0, 1e-5)
         scale = self.setup.scale_nm
         sd[list(self.baselines)] = 0.5 * scale
-        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.starts.size)
+        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.grid.starts.size)
         mean[self.coefficients] = self.setup.curve_nm
         precision = np.diag(1.0 / sd**2)
         precision[self.coefficients, self.coefficients] = self.setup.penalty
@@ -330,7 +330,7 @@ class _StagePass:
                 np.ascontiguousarray(core[:, 1]),
                 law,
                 multiplier,
-                setup.starts,
+                setup.grid.starts,
                 begin,
                 setup.scale_nm,
                 setup.grid.step_s,

@@ -80,7 +80,7 @@ def above_rest(
     """
     rest = round(REST_S * pulse_rate_hz)
     widths = np.asarray(pulse_width_us, float)
-    if motion is None and Surfaces.of(model) is not None:
+    if motion is None and Surfaces.of(model.effects) is not None:
         raise BadModel(
             "the model depends on the angle of the joint", place="angle_rad", fix="Give the angle at each pulse."
         )

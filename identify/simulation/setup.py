@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid
+from identify.dynamics.pulse_grid import Grid, ends_of
 from identify.effects.base import Scene
 from identify.recruitment.curve import Basis
 
@@ -80,22 +80,11 @@ class Setup:
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
         """Starts and ends of the runs of fitted intervals, each within one part."""
-        runs = self.grid.stretches(self.fitted)
-        return np.array([r.start for r in runs], np.int64), np.array([r.stop for r in runs], np.int64)
-
-    @cached_property
-    def begins(self) -> np.ndarray:
-        """Intervals at which the parts of the record begin, shape (B,), the first 0."""
-        return self.grid.begins
-
-    @property
-    def starts(self) -> np.ndarray:
-        """Intervals at whose start the state is unknown, shape (S,)."""
-        return self.grid.starts
+        return ends_of(self.grid.stretches(self.fitted))
 
     def part_of(self, at_samples: bool) -> np.ndarray | None:
         """Index of the part of each sample or interval; None if there is one part only."""
-        if self.begins.size == 1:
+        if self.grid.begins.size == 1:
             return None
         return self.grid.part[self.grid.interval] if at_samples else self.grid.part
 

@@ -1,18 +1,14 @@
 """Following an approved model from trial to trial: gain, threshold and time scale, with bands."""
 
-from identify.tracking.carried import passed, slow_forms
+from identify.tracking.carried import moved_model, passed, slow_forms
 from identify.tracking.follow import Outcome, Step, begin, follow, levels_of, model_for_next
 from identify.tracking.rates import learn_rates
-from identify.tracking.served import moved_model
-from identify.tracking.state import QUANTITIES, USUAL, Rates, State, Values
-from identify.tracking.trial import Seen, look
+from identify.tracking.state import QUANTITIES, USUAL, State, Values
 
 __all__ = [
     "QUANTITIES",
     "USUAL",
     "Outcome",
-    "Rates",
-    "Seen",
     "State",
     "Step",
     "Values",
@@ -20,7 +16,6 @@ __all__ = [
     "follow",
     "learn_rates",
     "levels_of",
-    "look",
     "model_for_next",
     "moved_model",
     "passed",

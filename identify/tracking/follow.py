@@ -12,8 +12,7 @@ import numpy as np
 from identify.model import Model
 from identify.records.record import Record
 from identify.simulation.predict import refuse_rate
-from identify.tracking.carried import passed, rest_before, rested, with_states
-from identify.tracking.served import largest_change, moved_model
+from identify.tracking.carried import largest_change, moved_model, passed, rest_before, rested, with_states
 from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, Values, updated
 from identify.tracking.trial import Seen, curve_covariance, look
 

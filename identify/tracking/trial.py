@@ -181,7 +181,7 @@ def _asked(model: Model, expected: State, grid: Grid) -> _Asked:
     target = problem.setup.to_muscle(grid.torque_nm)
     scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
     theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
-    states = np.tile([0.1, 1.0], problem.setup.starts.size)
+    states = np.tile([0.1, 1.0], problem.setup.grid.starts.size)
     own_sd = np.r_[OWN, np.r_[np.ones(len(problem.baselines)), DRIFTS, states] * scale_nm]
     free = np.array([gain, shift, 0, *curve, *own])
     return _Asked(problem, theta, free, target, _precision(expected, own_sd), own_sd)

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -80,7 +79,7 @@ def test_g_and_h_hold_to_the_models_schema(model: Path) -> None:
     bent = {"id": "torque_angle", "form": "parabola", "parameters": values, "settings": settings}
     covariance = Covariance(tuple(f"torque_angle.{name}" for name in values), np.array([0.1, -0.4]), np.eye(2) * 1e-4)
     angle_rad, work = np.linspace(1.0, 2.0, 50), np.ones(50, bool)
-    tables = joint_tables(SimpleNamespace(effects=(bent,)), covariance, angle_rad, np.full(50, 0.2), work)
+    tables = joint_tables((bent,), covariance, angle_rad, np.full(50, 0.2), work)
     document = json.loads(model.read_text())
     whole = document | {"joint": json_value(tables)}
     assert set(whole["joint"]) == set(ALL["model"]["properties"]["joint"]["properties"])

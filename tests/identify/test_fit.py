@@ -9,7 +9,7 @@ import pytest
 
 import identify
 from identify.dynamics.linear import SecondOrder
-from identify.estimation.cross_validation import BLOCK_S, FOLDS, held_out_change
+from identify.estimation.evaluation import BLOCK_S, FOLDS, held_out_change
 from identify.estimation.fit_statistics import best_fit_percent
 from identify.estimation.joint import solve
 from identify.estimation.prepare import fit_plain, prepare

@@ -59,7 +59,7 @@ def model() -> Model:
 
 
 def surfaces(of: Model) -> Surfaces:
-    found = Surfaces.of(of)
+    found = Surfaces.of(of.effects)
     assert found is not None
     return found
 

@@ -1,20 +1,33 @@
-"""Other recruitment bases and constraints for the joint estimate: power series (6), sigmoid (30), monotone spline."""
+"""Other curves for the joint estimate: power series (6), sigmoid (30), a monotone spline, near-sigmoid."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
+from identify.dynamics.pulse_grid import Grid
+from identify.errors import BadRequest
+from identify.estimation.averaged import averaged
+from identify.estimation.earlier import Change, Earlier
+from identify.estimation.joint import Fitted
 from identify.estimation.projected_search import project, search
 from identify.estimation.projection import Projection, Solution
+from identify.estimation.short_record import fit_short
+from identify.estimation.short_result import Short
+from identify.model import Model
 from identify.noise.ar1 import log_likelihood, whiten
+from identify.recruitment.near_shape import DEVIATIONS
 from identify.recruitment.power import PowerBasis
 from identify.recruitment.sigmoid import SigmoidBasis
 from identify.recruitment.sigmoid_fit import basis_at
 
 HIGHEST_POWER = 9
+DRAWS = 1500
+NEAR_SIGMOID_OPTIONS = {"recruitment", "earlier", "order"}
 
 
 def power_series(first: Solution, order: int | None = None) -> tuple[Solution, str]:
@@ -95,3 +108,30 @@ def monotone(solution: Solution) -> Solution:
         steps[size + extra, size + 2 * extra : size + 2 * extra + 2] = 1.0, -1.0
     coefficients = steps @ nnls(root @ steps, right, maxiter=50 * steps.shape[1])[0]
     return replace(solution, coefficients=coefficients)
+
+
+def near_sigmoid(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
+    """A curve that never falls, near a sigmoid or near the person's last curve, and why it is as it is.
+
+    Raises
+    ------
+    BadRequest
+        Options that belong to another kind of curve, or an earlier model that is none.
+    """
+    others = sorted(set(options) - NEAR_SIGMOID_OPTIONS)
+    if others or options.get("recruitment", "near-sigmoid") != "near-sigmoid":
+        against = ", ".join(others) or f"recruitment={options['recruitment']}"
+        raise BadRequest(f"not with {against}", place="recruitment", fix="Give near-sigmoid, and earlier or nothing.")
+    model = options.get("earlier")
+    if model is not None and not isinstance(model, Model):
+        raise BadRequest("not a model", place="earlier", fix="Give the person's last model, or none.")
+    last = None if model is None else Earlier(model, Change())
+    short = fit_short(grid, rows, last=last, fine=True, draws=DRAWS)
+    return averaged(short), [_why(short, last)]
+
+
+def _why(short: Short, last: Earlier | None) -> str:
+    if last is not None:
+        return "a curve that never falls, near that of the last model"
+    kind = DEVIATIONS[int(np.argmax(short.weights))]
+    return f"a curve that never falls; its slope is a sigmoid's times a factor of {np.exp(kind.sd):.1f} or less, mostly"

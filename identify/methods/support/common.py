@@ -60,20 +60,6 @@ def quiet_level(grid: Grid) -> float:
     return float(np.percentile(grid.torque_nm[some], 5))
 
 
-def active_level(grid: Grid, rows: np.ndarray) -> float:
-    """Largest pulse width in the rows, µs.
-
-    Raises
-    ------
-    NotIdentifiable
-        There is no pulse, or the width never changes.
-    """
-    widths = grid.pulse_width_us[rows]
-    if not np.ptp(widths) > 0:
-        raise NotIdentifiable("the pulse width never changes in the segment for the dynamics", fix="Record a PRBS.")
-    return float(np.max(widths))
-
-
 def order_option(value: object) -> str | tuple[int, int, int]:
     """`second-order`, `auto`, or (l, n, d) from `2,1,1` or a sequence.
 

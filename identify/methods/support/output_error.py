@@ -15,6 +15,7 @@ from identify.dynamics.second_order import recursion
 from identify.errors import NotIdentifiable
 
 LARGEST_POLE = 0.9995
+MOST_DELAYS = 4
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,7 @@ def _steiglitz_mcbride(
 
 
 def choose_order(
-    torque: np.ndarray, drive: np.ndarray, rows: np.ndarray, earliest: int, longest: int = 4
+    torque: np.ndarray, drive: np.ndarray, rows: np.ndarray, earliest: int
 ) -> tuple[OutputError, list[str]]:
     """(l, n, d) with the smallest BIC among l = 1 … 3 poles, n = l - 1 zeros and a few delays, with the reasons.
 
@@ -195,13 +196,11 @@ def choose_order(
         As for `output_error`.
     earliest : int
         Smallest possible delay: 1 for a sample taken at the pulse, 0 for means over the interval.
-    longest : int
-        Largest number of delays to try.
     """
     tried: dict[tuple[int, int, int], OutputError] = {}
     for poles in (1, 2, 3):
         zeros = poles - 1
-        for delay in range(earliest, earliest + longest):
+        for delay in range(earliest, earliest + MOST_DELAYS):
             tried[poles, zeros, delay] = output_error(torque, drive, rows, (poles, zeros, delay))
             better = [fit.bic for (p, _, d), fit in tried.items() if p == poles and d < delay]
             if better and tried[poles, zeros, delay].bic > min(better) + 10:
