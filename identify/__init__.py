@@ -30,27 +30,22 @@ if TYPE_CHECKING:
     from identify.simulation.predict import predict
 
 _PLACES = {
-    "read": "identify.records.read",
-    "Record": "identify.records.record",
-    "fit": "identify.fitting",
-    "predict": "identify.simulation.predict",
-    "Model": "identify.model",
-    "Carried": "identify.results",
-    "Comparison": "identify.results",
-    "Diagnosis": "identify.results",
-    "Improvement": "identify.results",
-    "compare": "identify.criticism",
-    "carry": "identify.diagnosis.carrying",
-    "diagnose": "identify.diagnosis",
-    "next_experiment": "identify.diagnosis.experiment",
-    "Experiment": "identify.diagnosis.experiment",
-    "improve": "identify.diagnosis.improvement",
-    "BadModel": "identify.errors",
-    "BadRecord": "identify.errors",
-    "BadRequest": "identify.errors",
-    "Cancelled": "identify.errors",
-    "IdentifyError": "identify.errors",
-    "NotIdentifiable": "identify.errors",
+    name: f"identify.{module}"
+    for module, names in {
+        "criticism": ("compare",),
+        "diagnosis": ("diagnose",),
+        "diagnosis.carrying": ("carry",),
+        "diagnosis.experiment": ("Experiment", "next_experiment"),
+        "diagnosis.improvement": ("improve",),
+        "errors": ("BadModel", "BadRecord", "BadRequest", "Cancelled", "IdentifyError", "NotIdentifiable"),
+        "fitting": ("fit",),
+        "model": ("Model",),
+        "records.read": ("read",),
+        "records.record": ("Record",),
+        "results": ("Carried", "Comparison", "Diagnosis", "Improvement"),
+        "simulation.predict": ("predict",),
+    }.items()
+    for name in names
 }
 _MODULES = {"effects", "methods"}
 

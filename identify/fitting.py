@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.diagnosis.candidates import Progress
+from identify.diagnosis.candidates import Progress, silent
 from identify.diagnosis.improvement import helpful
 from identify.diagnosis.search import search_effects
 from identify.effects import get
@@ -87,7 +87,7 @@ def fit(
             if against:
                 message = f"effects cannot be fitted with {' and '.join(against)}"
                 raise BadRequest(message, place="effects", fix="Use maximum-likelihood without this option.")
-            return _with_effects(record, wanted, names, options, progress or _quiet)
+            return _with_effects(record, wanted, names, options, progress or silent)
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
             f"{method} finds no solution on this record ({error})", fix="Check that torque follows the pulses."
@@ -137,7 +137,3 @@ def _with_effects(
     model = finish(MAXIMUM_LIKELIHOOD.id, base, reasons)
     progress(1.0, "done")
     return model
-
-
-def _quiet(_share: float, _text: str) -> None:
-    pass

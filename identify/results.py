@@ -38,7 +38,9 @@ class FitStatistics(TypedDict):
     samples: int
 
 
-class _Result(Shown):
+class Result(Shown):
+    """A dataclass that is shown, and written as JSON."""
+
     def to_dict(self) -> dict[str, Any]:
         """All fields as dicts, lists, numbers and texts; None for a number that is not finite."""
         return {item.name: _document(getattr(self, item.name)) for item in fields(self)}  # pyright: ignore[reportArgumentType]
@@ -51,7 +53,7 @@ def _document(value: Any) -> Any:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Comparison(_Result):
+class Comparison(Result):
     """A model compared with a measurement.
 
     Parameters
@@ -102,31 +104,24 @@ class Comparison(_Result):
     plain: tuple[str, ...]
 
     def _sheet(self) -> Sheet:
-        whole: FitStatistics = {
-            "fit_percent": self.fit_percent,
-            "ceiling_percent": self.ceiling_percent,
-            "rms_nm": self.rms_nm,
-            "excess_rms_nm": self.excess_rms_nm,
-            "samples": self.samples,
-        }
         alarms = [
             CORRELATED_WITH.get(test["with"], str(test["with"])) for test in self.tests["tests"] if not test["passed"]
         ]
         rows = [
-            ("all rows", _figures(whole)),
+            ("all rows", _figures(vars(self))),
             ("fitted rows", _figures(self.fitted)),
             ("held out", "no rows of `validate`" if self.held_out is None else _figures(self.held_out)),
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
             ("residual", f"not noise: correlated with {', '.join(alarms)}" if alarms else "looks like noise"),
         ]
-        rows += [("worst place" if number == 0 else "", row["text"]) for number, row in enumerate(self.where[:FEW])]
+        rows += _listed("worst place", [row["text"] for row in self.where[:FEW]])
         rows += [(f"by {kind}", _shares(self.by[kind])) for kind in ("segment", "direction") if self.by.get(kind)]
         reached, most = quantity(self.fit_percent, "%"), quantity(self.ceiling_percent, "%")
         return Sheet(f"Comparison: fit {reached} where the noise allows {most}", tuple(rows))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Diagnosis(_Result):
+class Diagnosis(Result):
     """What the model of a record lacks.
 
     Parameters
@@ -193,7 +188,7 @@ class Diagnosis(_Result):
         rows += [("next test", row["next_experiment"]) for row in told[:1]]
         # If nothing is missing, the places of the largest noise do not matter.
         places = () if self.verdict == "nothing_missing" else self.where[:FEW]
-        rows += [("error in" if number == 0 else "", row["text"]) for number, row in enumerate(places)]
+        rows += _listed("error in", [row["text"] for row in places])
         rows += [("note", text) for text in (*self.notes, caution(vars(self))) if text]
         verdict = VERDICTS.get(self.verdict, self.verdict)
         named = "".join(f", {row['effect']}" for row in self.missing)
@@ -201,7 +196,7 @@ class Diagnosis(_Result):
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Improvement(_Result):
+class Improvement(Result):
     """Models of a record, each with one more effect than the one before.
 
     Parameters
@@ -234,10 +229,7 @@ class Improvement(_Result):
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
             ("at first", VERDICTS.get(self.verdict, self.verdict)),
         ]
-        rows += [
-            ("refused" if number == 0 else "", f"{row['effect']}: {row['reason']}")
-            for number, row in enumerate(self.refused[:FEW])
-        ]
+        rows += _listed("refused", [f"{row['effect']}: {row['reason']}" for row in self.refused[:FEW]])
         if len(self.refused) > FEW:
             rows.append(("", f"and {len(self.refused) - FEW} more effects"))
         added = ", ".join(str(step["added"]) for step in self.steps[1:]) or "no effect"
@@ -246,7 +238,7 @@ class Improvement(_Result):
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Carried(_Result):
+class Carried(Result):
     """The structure of an earlier model on a new record, beside the plain structure.
 
     Parameters
@@ -301,11 +293,16 @@ class Carried(_Result):
         return Sheet(f"Structure carried over from {self.carried_from[:8]}: {self.offered} offered", tuple(rows))
 
 
+def _listed(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
+    """Rows of which the first one has the label."""
+    return list(zip([label, *[""] * len(texts)], texts, strict=False))
+
+
 def _held(model: Model) -> str:
     return ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
 
 
-def _figures(figures: FitStatistics) -> str:
+def _figures(figures: Mapping[str, Any]) -> str:
     above = quantity(figures["excess_rms_nm"], "N·m")
     return f"{fit_words(figures)}, above the noise {above}, {figures['samples']} samples"
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.result import diagnosis_of
-from identify.diagnosis.search import EffectSearch, search_effects
-from identify.diagnosis.verdict import Verdict, judge
+from identify.diagnosis.search import search_effects
+from identify.diagnosis.verdict import judge
 from identify.dynamics.linear import SecondOrder
 from identify.errors import BadRequest
 from identify.model import Model
@@ -63,6 +63,3 @@ def structure_of(model: Model | None) -> list[str]:
             fix="Give a model of maximum-likelihood or two-stage.",
         )
     return [f"{effect['id']}:{effect.get('form', '')}" for effect in model.effects]
-
-
-__all__ = ["EffectSearch", "Verdict", "diagnose", "judge", "search_effects", "structure_of"]

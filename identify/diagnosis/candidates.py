@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from identify.diagnosis.side_by_side import side_by_side
-from identify.effects.base import Effect, Form
+from identify.effects.base import Effect, Form, Parameter, Scene
 from identify.estimation.effect_fit import Candidate, effect_names, try_effect
 from identify.estimation.joint import Fitted
 from identify.simulation.problem import Problem
@@ -21,6 +24,10 @@ FORMS = 3
 Progress = Callable[[float, str], None]
 _Tried = tuple[str, Fitted, float, dict[str, float]]
 """Form, fit without its problem (it holds functions, which cannot be sent between processes), gain, gains by form."""
+
+
+def silent(_share: float, _text: str) -> None:
+    """A `Progress` that tells nobody."""
 
 
 def applicable(effect: Effect, setup: Setup, present: Iterable[str]) -> bool:
@@ -70,3 +77,37 @@ def scan(
             problem = Problem(base.problem.setup, [*base.effects, *added])
             found.append(Candidate(effect, form, replace(result[1], problem=problem), *result[2:]))
     return sorted(found, key=lambda candidate: (-candidate.gain, candidate.effect.id))
+
+
+KNOTS = 36
+
+
+def _free_gain(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    place = np.clip(scene.time_s / max(scene.span_s, 1e-9), 0.0, 1.0) * (KNOTS - 1)
+    first = np.minimum(place.astype(np.int64), KNOTS - 2)
+    part = place - first
+    values = np.concatenate([p[f"log_gain_{i}"] for i in range(KNOTS)], axis=1)
+    return drive * np.exp(values[:, first] * (1.0 - part) + values[:, first + 1] * part)
+
+
+FREE_GAIN = Effect(
+    id="free_gain",
+    name="Gain that varies without a law",
+    forms=(
+        Form(
+            "free",
+            "gain",
+            "w = g(t) f(u), log g linear between knots",
+            tuple(
+                Parameter(f"log_gain_{i}", "1", -0.45, 0.45, 0.0, (0.0,), about="log gain at a knot")
+                for i in range(KNOTS)
+            ),
+            _free_gain,
+            batched=True,
+        ),
+    ),
+    signature="",
+    resembles=(),
+    separated_by="",
+    plain="",
+)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from identify.diagnosis.candidates import Progress
+from identify.diagnosis.candidates import Progress, silent
 from identify.diagnosis.carried_effects import LAST, Judged, Reason, prior, rise, still_needed
 from identify.diagnosis.thresholds import FIRST_MARGIN
 from identify.effects import get, registry
@@ -49,7 +49,7 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     BadRecord, NotIdentifiable
         The record gives no model in the plain structure either.
     """
-    say = progress or _quiet
+    say = progress or silent
     say(0.05, LAST)
     grid, raw = prepare(record)
     plain = fit_plain(grid, fitted_rows(grid, None))
@@ -67,10 +67,6 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     against = _against(plain, last, raw) or _less_usable(plain_model, carried_model)
     say(1.0, "done")
     return _result(model, [plain_model, carried_model], rows, against is None, against or _better(plain, last, raw))
-
-
-def _quiet(_share: float, _text: str) -> None:
-    pass
 
 
 def _refused(model: Model) -> Reason | None:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from identify import experiments
 from identify.diagnosis import diagnose
 from identify.records.record import Record
-from identify.results import Diagnosis
-from identify.shown import Sheet, Shown
+from identify.results import Diagnosis, Result
+from identify.shown import Sheet
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Experiment(Shown):
+class Experiment(Result):
     """A test that tells rival effects apart.
 
     Parameters
@@ -42,10 +42,6 @@ class Experiment(Shown):
     expected_log_evidence: float
     decides: bool
     text: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """All fields as lists, dicts, numbers and texts."""
-        return {**asdict(self), "rivals": list(self.rivals), "segments": [dict(row) for row in self.segments]}
 
     def _sheet(self) -> Sheet:
         rows = [("test", self.text), ("pulses", f"{self.dose['pulses']:.0f}")]
@@ -93,15 +89,8 @@ def planned(missing: Sequence[Mapping[str, Any]]) -> Experiment | None:
 
 
 def _experiment(rivals: Sequence[str], plan: Mapping[str, Any]) -> Experiment:
-    return Experiment(
-        rivals=tuple(rivals),
-        segments=tuple(plan["segments"]),
-        duration_s=plan["duration_s"],
-        dose=plan["dose"],
-        expected_log_evidence=plan["expected_log_evidence"],
-        decides=plan["decides"],
-        text=plan["text"],
-    )
+    told = {name: plan[name] for name in ("duration_s", "dose", "expected_log_evidence", "decides", "text")}
+    return Experiment(rivals=tuple(rivals), segments=tuple(plan["segments"]), **told)
 
 
 def _short(value: Any) -> str:

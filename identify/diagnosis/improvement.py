@@ -8,8 +8,8 @@ from typing import Any
 from identify.diagnosis import structure_of
 from identify.diagnosis.candidates import Progress
 from identify.diagnosis.held_out_error import held_out_rise
+from identify.diagnosis.result import Step, steps
 from identify.diagnosis.search import MOST, EffectSearch, search_effects
-from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.verdict import judge
 from identify.effects import get
 from identify.estimation.effect_fit import add_effect, effect_names

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.diagnosis.thresholds import COUNTS, QUIET, STRUCTURE, STRUCTURE_SHARE
-from identify.dynamics.pulse_grid import runs
+from identify.dynamics.pulse_grid import ends_of, runs
 from identify.estimation.joint import Fitted
 from identify.noise.level import band_part
 from identify.noise.slow_and_white import profile_noise
@@ -99,9 +99,7 @@ def _long(flags: np.ndarray, least: int) -> list[slice]:
 def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, float, float]:
     if not parts:
         return (0.0, 0.0, 0.0, 0.0)
-    start = np.array([p.start for p in parts], np.int64)
-    stop = np.array([p.stop for p in parts], np.int64)
-    return profile_noise(residual, start, stop, 0.5, 0.5, True)
+    return profile_noise(residual, *ends_of(parts), 0.5, 0.5, True)
 
 
 def _rms(residual: np.ndarray, parts: list[slice]) -> float:

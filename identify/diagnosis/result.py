@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,21 +10,59 @@ import numpy as np
 from identify.caution import OPEN
 from identify.criticism.where import worst_places
 from identify.diagnosis.search import EffectSearch
-from identify.diagnosis.steps import Step, steps
 from identify.diagnosis.thresholds import CLOSE, RIVAL
 from identify.diagnosis.verdict import Verdict
 from identify.effects import get
 from identify.estimation.band_effect import band_as_effect, predict_fitted
 from identify.estimation.effect_fit import effect_names
+from identify.estimation.evaluation import evaluate
 from identify.estimation.finish import describe_parameters
+from identify.estimation.joint import Fitted
+from identify.estimation.renewed_curve import knows_joint, renewed_curve
 from identify.experiments import plan
 from identify.results import Diagnosis
 from identify.shown import probability, sure
 
+MOST_PARAMETERS = 24
+"""The wave of a tremor has hundreds."""
 STATISTICS = (
     "fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent",
     "held_out_by",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Step:
+    """One of the models of a search, each with one effect more than the one before.
+
+    Parameters
+    ----------
+    added : str or None
+        The effect that this model has more than the one before; None for the base.
+    fitted : Fitted
+        The model.
+    statistics : dict
+        See `identify.estimation.evaluation`.
+    """
+
+    added: str | None
+    fitted: Fitted
+    statistics: dict[str, Any]
+
+
+def steps(search: EffectSearch) -> list[Step]:
+    """The base, then the detected effects, then the effects found, in this order.
+
+    The search compares models with one and the same curve. Once it is over, those in which it found what the joint
+    does choose their curve with all rows; a base that knew of the joint has done so before.
+    """
+    models = [search.base, *search.with_detected, *search.chain[1:]]
+    if not knows_joint(search.base):
+        models = list(map(renewed_curve, models))
+    return [
+        Step(name, fitted, evaluate(fitted))
+        for name, fitted in zip([None, *search.detected, *search.added], models, strict=True)
+    ]
 
 
 def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
@@ -95,7 +134,7 @@ def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step
         "next_experiment_plan": experiment,
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
-        "parameters": _few(describe_parameters(fitted, index)),
+        "parameters": dict(list(describe_parameters(fitted, index).items())[:MOST_PARAMETERS]),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }
@@ -129,11 +168,6 @@ PARTS = {
     "g": "g(x, ẋ), the active torque over angle and velocity",
     "h": "h(x, ẋ), the passive torque over angle and velocity",
 }
-
-
-def _few(parameters: dict[str, Any]) -> dict[str, Any]:
-    """The first 24 parameters: the wave of a tremor has hundreds."""
-    return dict(list(parameters.items())[:24])
 
 
 def _candidates(search: EffectSearch) -> list[list[dict[str, Any]]]:

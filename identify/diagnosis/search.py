@@ -7,23 +7,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from identify.diagnosis.candidates import Progress, scan
-from identify.diagnosis.free_gain import FREE_GAIN
+from identify.diagnosis import thresholds
+from identify.diagnosis.candidates import FREE_GAIN, Progress, scan
 from identify.diagnosis.residual_structure import ResidualStructure, quiet_rows, residual_structure
-from identify.diagnosis.thresholds import (
-    CONFIRMED_SHARE,
-    DYNAMIC,
-    EFFORT_WEIGHT,
-    EFFORT_WEIGHT_ONLY_AT_WORK,
-    FIRST_MARGIN,
-    FREE_GAIN_CONFIRMS,
-    NEXT_MARGIN,
-    NEXT_SHARE,
-    SEEN_AT_REST,
-    SIMILAR_SHARE,
-    SLOWEST_AR1,
-    UNPREDICTABLE_SHARE,
-)
 from identify.effects import get, registry
 from identify.effects.base import Effect
 from identify.estimation.effect_fit import (
@@ -185,19 +171,22 @@ def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
     if candidate.effect.predictable or candidate.effect.band:
         return candidate
     seen = candidate.form.stage != "additive" or _at_rest(search, candidate)
-    return replace(candidate, gain=(EFFORT_WEIGHT if seen else EFFORT_WEIGHT_ONLY_AT_WORK) * candidate.gain)
+    return replace(
+        candidate, gain=(thresholds.EFFORT_WEIGHT if seen else thresholds.EFFORT_WEIGHT_ONLY_AT_WORK) * candidate.gain
+    )
 
 
 def _at_rest(search: EffectSearch, candidate: Candidate) -> bool:
-    return seen_at_rest(search.quiet, candidate.fitted, candidate.effect.id) >= SEEN_AT_REST
+    return seen_at_rest(search.quiet, candidate.fitted, candidate.effect.id) >= thresholds.SEEN_AT_REST
 
 
 def _margin(search: EffectSearch, number: int, candidate: Candidate | None = None) -> float:
     """Log evidence that an effect must gain in a round: more where it may only repair the first one's inexact form."""
     if not number and not search.held:
-        return FIRST_MARGIN
+        return thresholds.FIRST_MARGIN
     return max(
-        NEXT_MARGIN, (NEXT_SHARE if candidate is None else _required_share(search, candidate)) * _first_gain(search)
+        thresholds.NEXT_MARGIN,
+        (thresholds.NEXT_SHARE if candidate is None else _required_share(search, candidate)) * _first_gain(search),
     )
 
 
@@ -214,19 +203,19 @@ def _required_share(search: EffectSearch, candidate: Candidate) -> float:
     """Share of the first effect's gain that a further effect must gain."""
     effect, stage = candidate.effect, candidate.form.stage
     if not effect.predictable:
-        return UNPREDICTABLE_SHARE
+        return thresholds.UNPREDICTABLE_SHARE
     if stage == "additive":
-        return 0.5 * CONFIRMED_SHARE
-    if stage in ("gain", "pulse_width") and search.free_gain[-1] > FREE_GAIN_CONFIRMS * candidate.gain:
-        return CONFIRMED_SHARE
+        return 0.5 * thresholds.CONFIRMED_SHARE
+    if stage in ("gain", "pulse_width") and search.free_gain[-1] > thresholds.FREE_GAIN_CONFIRMS * candidate.gain:
+        return thresholds.CONFIRMED_SHARE
     for name, form in search.last.effects:
         if name in search.detected:
             continue
-        if form.stage in DYNAMIC and stage in DYNAMIC:
-            return SIMILAR_SHARE
+        if form.stage in thresholds.DYNAMIC and stage in thresholds.DYNAMIC:
+            return thresholds.SIMILAR_SHARE
         if name in effect.resembles or effect.id in get(name).resembles:
-            return SIMILAR_SHARE
-    return NEXT_SHARE
+            return thresholds.SIMILAR_SHARE
+    return thresholds.NEXT_SHARE
 
 
 def _append(search: EffectSearch, fitted: Fitted, effect: str) -> None:
@@ -238,9 +227,9 @@ def _append(search: EffectSearch, fitted: Fitted, effect: str) -> None:
 def _exhausted(search: EffectSearch) -> bool:
     """Whether no further effect can gain enough: the residual is nearly as small and as white as noise can be."""
     left, last = search.residuals[-1], search.last
-    if last.noise.ar1 > SLOWEST_AR1 and left.slow_nm > left.white_nm:
+    if last.noise.ar1 > thresholds.SLOWEST_AR1 and left.slow_nm > left.white_nm:
         return False  # such slow noise may be a drift: the rests cannot tell how small the residual could be
-    least = max(NEXT_MARGIN, CONFIRMED_SHARE * _first_gain(search))
+    least = max(thresholds.NEXT_MARGIN, thresholds.CONFIRMED_SHARE * _first_gain(search))
     return left.ideal - last.log_likelihood < least and left.ratio < least
 
 

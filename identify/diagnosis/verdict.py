@@ -6,32 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from identify.diagnosis import thresholds
 from identify.diagnosis.held_out_error import HeldOutError, held_out_error, held_out_rise
 from identify.diagnosis.residual_structure import held_readings
 from identify.diagnosis.search import EffectSearch, seen_at_rest
-from identify.diagnosis.thresholds import (
-    APART_S,
-    DOUBTED,
-    EFFORTS_LAST,
-    EXPLAINED_BY_LAWS,
-    FIRST_MARGIN,
-    FORM_ERROR,
-    FORM_ERROR_WITH_EFFECTS,
-    FREE_GAIN_MARGIN,
-    HELD_OUT_RATIO,
-    HELD_OUT_SHARE,
-    LEAST_EXPLAINED,
-    LEAST_EXPLAINED_BY_BAND,
-    LEAST_EXPLAINED_BY_EFFORTS,
-    MANY_EFFORTS,
-    ONLY_AT_WORK_PROBABILITY,
-    RELATIVE,
-    REPEATED_SHARE,
-    SEEN_AT_REST,
-    STRUCTURE_BESIDE_BAND,
-    TEMPERATURE,
-    UNKNOWN_FORM,
-)
 from identify.effects import get
 from identify.estimation.effect_fit import Candidate
 
@@ -78,28 +56,31 @@ def shares(candidates: list[Candidate]) -> dict[str, float]:
     if not candidates:
         return {"": 1.0}
     top = candidates[0].gain
-    spread = TEMPERATURE + RELATIVE * max(top, 0.0)
+    spread = thresholds.TEMPERATURE + thresholds.RELATIVE * max(top, 0.0)
     weights = {c.effect.id: float(np.exp(max((c.gain - top) / spread, -60.0))) for c in candidates}
     # An effect whose gain equals the margin has a probability of one half.
-    weights[""] = float(np.exp(np.clip(FIRST_MARGIN - top, -60.0, 60.0)))
+    weights[""] = float(np.exp(np.clip(thresholds.FIRST_MARGIN - top, -60.0, 60.0)))
     total = sum(weights.values())
-    return {name: (1.0 - UNKNOWN_FORM) * weight / total for name, weight in weights.items()}
+    return {name: (1.0 - thresholds.UNKNOWN_FORM) * weight / total for name, weight in weights.items()}
 
 
 def _nothing(candidates: list[Candidate]) -> float:
     """Probability that none of the candidates is there."""
-    return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - FIRST_MARGIN, 60.0))) for c in candidates))
+    return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - thresholds.FIRST_MARGIN, 60.0))) for c in candidates))
 
 
 def _no_effort(search: EffectSearch, explained: float, structure: bool) -> bool:
     """Whether what looks like efforts is more likely caused by the stimulation."""
-    if explained < LEAST_EXPLAINED_BY_EFFORTS and structure:
+    if explained < thresholds.LEAST_EXPLAINED_BY_EFFORTS and structure:
         return True
     effort = search.added[0]
     holder = search.chain[1]
-    if seen_at_rest(search.quiet, holder, effort) >= SEEN_AT_REST:
+    if seen_at_rest(search.quiet, holder, effort) >= thresholds.SEEN_AT_REST:
         return False
-    return "resisting" in dict(holder.effects)[effort].name or _efforts(holder.parameters_of(effort)) >= MANY_EFFORTS
+    return (
+        "resisting" in dict(holder.effects)[effort].name
+        or _efforts(holder.parameters_of(effort)) >= thresholds.MANY_EFFORTS
+    )
 
 
 def _only_at_work(search: EffectSearch, number: int) -> bool:
@@ -108,7 +89,7 @@ def _only_at_work(search: EffectSearch, number: int) -> bool:
     form = dict(holder.effects).get(effect)
     if form is None or form.stage != "additive" or get(effect).predictable:
         return False
-    return seen_at_rest(search.quiet, holder, effect) < SEEN_AT_REST
+    return seen_at_rest(search.quiet, holder, effect) < thresholds.SEEN_AT_REST
 
 
 def _everywhere(search: EffectSearch) -> bool:
@@ -117,20 +98,20 @@ def _everywhere(search: EffectSearch) -> bool:
     holder = search.chain[1]
     widths = [value for name, value in holder.parameters_of(effort).items() if name.startswith(("width_", "decay_"))]
     setup = holder.problem.setup
-    return 2.0 * sum(widths) > EFFORTS_LAST * float(setup.fitted.sum()) * setup.grid.step_s
+    return 2.0 * sum(widths) > thresholds.EFFORTS_LAST * float(setup.fitted.sum()) * setup.grid.step_s
 
 
 def _efforts(parameters: dict[str, float]) -> int:
     """Number of efforts: bumps close to one another count as one."""
     centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
-    return int(np.sum(np.diff(centres) > APART_S)) + 1 if centres.size else 0
+    return int(np.sum(np.diff(centres) > thresholds.APART_S)) + 1 if centres.size else 0
 
 
 def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
     """Whether the error on held-out rows shows that structure is left."""
-    if after.ratio < HELD_OUT_RATIO:
+    if after.ratio < thresholds.HELD_OUT_RATIO:
         return False
-    return before is None or after.excess_nm > HELD_OUT_SHARE * before.excess_nm
+    return before is None or after.excess_nm > thresholds.HELD_OUT_SHARE * before.excess_nm
 
 
 def judge(search: EffectSearch) -> Verdict:
@@ -151,30 +132,32 @@ def judge(search: EffectSearch) -> Verdict:
         # A later effect is at most as probable as those before it.
         found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in search.added[:number] if e in found)])
         if _only_at_work(search, number):
-            found[effect] = min(found[effect], ONLY_AT_WORK_PROBABILITY)
+            found[effect] = min(found[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
         if held_out_rise(search.chain[number], search.chain[number + 1]) is not None:
-            found[effect] = min(found[effect], DOUBTED)
+            found[effect] = min(found[effect], thresholds.DOUBTED)
             notes.append(f"{get(effect).name}: it raises the error on held-out rows.")
     structure = left.ratio
     if last.noise.band > 0.0:
         # The narrow band itself is not structure: what counts is what remains beside it.
         before = max(search.residuals[0].busy_nm ** 2 - left.white_nm**2, 1e-12)
         explained = 1.0 - max(left.busy_nm**2 - left.white_nm**2, 0.0) / before
-    strange = held > REPEATED_SHARE
+    strange = held > thresholds.REPEATED_SHARE
     if strange:
         notes.append(f"{100 * held:.0f} % of the readings equal the one before: the converter repeats values.")
     if effects:
-        strange = strange or (explained < LEAST_EXPLAINED and left.left)
-        lawless = search.free_gain[0] > search.rounds[0][0].gain + FREE_GAIN_MARGIN
-        strange = strange or (lawless and explained < EXPLAINED_BY_LAWS)
+        strange = strange or (explained < thresholds.LEAST_EXPLAINED and left.left)
+        lawless = search.free_gain[0] > search.rounds[0][0].gain + thresholds.FREE_GAIN_MARGIN
+        strange = strange or (lawless and explained < thresholds.EXPLAINED_BY_LAWS)
         if get(effects[0]).band:
-            strange = strange or (explained < LEAST_EXPLAINED_BY_BAND and structure > STRUCTURE_BESIDE_BAND)
+            strange = strange or (
+                explained < thresholds.LEAST_EXPLAINED_BY_BAND and structure > thresholds.STRUCTURE_BESIDE_BAND
+            )
         elif search.added and not get(search.added[0]).predictable:
             strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
     else:
         strange = strange or left.left
     # Naming an effect claims more than naming none, so less error is allowed.
-    form = FORM_ERROR_WITH_EFFECTS if effects else FORM_ERROR
+    form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR
     before, after = (held_out_error(fitted, form, last) for fitted in (first, last))
     contradicted = after is not None and _contradicted(before, after)
     if after is not None and contradicted:
@@ -184,7 +167,7 @@ def judge(search: EffectSearch) -> Verdict:
             "allow: something is still missing."
         )
     if strange:
-        found = {effect: min(p, DOUBTED) for effect, p in found.items()}
+        found = {effect: min(p, thresholds.DOUBTED) for effect, p in found.items()}
         kind = "unexplained_structure"
         probability = 0.9
     elif found:

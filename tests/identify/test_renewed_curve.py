@@ -10,8 +10,8 @@ import pytest
 import identify
 from hardware_sim.arm_patient import ArmPatient, arm_patient
 from hardware_sim.arm_records import record
+from identify.diagnosis.result import steps
 from identify.diagnosis.search import search_effects
-from identify.diagnosis.steps import steps
 from identify.effects import get
 from identify.estimation.effect_fit import fitted_with, with_effects
 from identify.estimation.joint import Fitted
