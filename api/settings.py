@@ -19,10 +19,10 @@ SECRET = ("_KEY", "_TOKEN")
 """How the names of settings end whose values are not shown."""
 
 
-class Settings(BaseSettings):
-    """Settings of the service.
+class ServerSettings(BaseSettings):
+    """Settings of whatever listens: a rig's service, a centre.
 
-    Every field has an environment variable: ``data_dir`` is ``STIMRIG_DATA_DIR``.
+    Every field has an environment variable, its name behind a prefix.
 
     Raises
     ------
@@ -30,22 +30,9 @@ class Settings(BaseSettings):
         A value does not hold; the message names its environment variable.
     """
 
-    model_config = SettingsConfigDict(env_prefix="STIMRIG_", extra="ignore")
-
-    data_dir: Path = Field(default=Path("var"), description="database, recordings, journals and logs")
-    database_url: str | None = Field(
-        default=None, description="URL of a SQLite or PostgreSQL database; default: SQLite in the data folder"
-    )
+    data_dir: Path
     host: str = Field(default="127.0.0.1", description="address to listen on")
-    port: Annotated[int, Field(ge=0, le=65535)] = 8000
     admin_token: SecretStr | None = Field(default=None, description="first administrator's token; default: drawn")
-    rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
-    rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
-    emulated: bool = Field(default=False, description="True: no person is connected, an emulator stands in for the rig")
-    rig_name: str | None = Field(
-        default=None, description="services of one rig on one database give it one name; default: machine and folder"
-    )
-    workers: Annotated[int, Field(ge=1, le=16)] = 2
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
     idle_lock_min: Annotated[float, Field(ge=0, le=720)] = Field(
         default=10.0, description="a session locks after so many minutes without a person's action; 0: never"
@@ -53,6 +40,44 @@ class Settings(BaseSettings):
     time_zone: str | None = Field(default=None, description="as Europe/Berlin; default: the machine's")
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
     tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
+
+    def __init__(self, **given: Any) -> None:
+        try:
+            super().__init__(**given)
+        except ValidationError as error:
+            raise SettingsError(refusal(error, self.model_config.get("env_prefix", ""))) from error
+
+    @field_validator("time_zone")
+    @classmethod
+    def _known_zone(cls, given: str | None) -> str | None:
+        """A zone that this machine knows."""
+        if given and given not in available_timezones():
+            raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
+        return given or None
+
+    @property
+    def exports_dir(self) -> Path:
+        """Where a file lies while it is handed out; emptied at each start."""
+        return self.data_dir / "exports"
+
+
+class Settings(ServerSettings):
+    """Settings of the service: ``data_dir`` is ``STIMRIG_DATA_DIR``."""
+
+    model_config = SettingsConfigDict(env_prefix="STIMRIG_", extra="ignore")
+
+    data_dir: Path = Field(default=Path("var"), description="database, recordings, journals and logs")
+    database_url: str | None = Field(
+        default=None, description="URL of a SQLite or PostgreSQL database; default: SQLite in the data folder"
+    )
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
+    rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
+    emulated: bool = Field(default=False, description="True: no person is connected, an emulator stands in for the rig")
+    rig_name: str | None = Field(
+        default=None, description="services of one rig on one database give it one name; default: machine and folder"
+    )
+    workers: Annotated[int, Field(ge=1, le=16)] = 2
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
     lsl: bool = Field(default=False, description="True: torque and pulses go to Lab Streaming Layer, see docs/lsl.md")
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
@@ -67,12 +92,6 @@ class Settings(BaseSettings):
         default=None, validate_default=True, description="this rig's key, as the centre has made it"
     )
 
-    def __init__(self, **given: Any) -> None:
-        try:
-            super().__init__(**given)
-        except ValidationError as error:
-            raise SettingsError(refusal(error)) from error
-
     @field_validator("structure", mode="before")
     @classmethod
     def _separated(cls, given: object) -> object:
@@ -85,14 +104,6 @@ class Settings(BaseSettings):
         if odd is not None:
             raise ValueError(f"{odd} is no effect's id (see `stimrig effects`); give ids, separated by commas")
         return tuple(dict.fromkeys(named))
-
-    @field_validator("time_zone")
-    @classmethod
-    def _known_zone(cls, given: str | None) -> str | None:
-        """A zone that this machine knows."""
-        if given and given not in available_timezones():
-            raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
-        return given or None
 
     @field_validator("centre_url")
     @classmethod
@@ -138,20 +149,15 @@ class Settings(BaseSettings):
         return self.data_dir / "recordings"
 
     @property
-    def exports_dir(self) -> Path:
-        """Where a file lies while it is handed out; emptied at each start."""
-        return self.data_dir / "exports"
-
-    @property
     def logs_dir(self) -> Path:
         """Where each process writes its log."""
         return self.data_dir / "logs"
 
 
-def refusal(error: ValidationError) -> str:
+def refusal(error: ValidationError, prefix: str) -> str:
     """Which setting does not hold, in one line, by the name of its environment variable."""
     first = error.errors()[0]
-    name = "STIMRIG_" + "_".join(str(part) for part in first["loc"]).upper()
+    name = prefix + "_".join(str(part) for part in first["loc"]).upper()
     says = first["msg"].removeprefix("Value error, ")
     shown = re.sub(r"//[^/]*@", "//…@", repr(first["input"]))
     return f"{name}: {says}" if name.endswith(SECRET) else f"{name}: {says}, not {shown}"

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from starlette.types import Receive, Scope, Send
 
 from api.centre import pages, routes
 from api.centre.chain import MOST_ITEM_BYTES
-from api.centre.context import Context, build
+from api.centre.context import build
 from api.centre.pages.face import FACE
 from api.centre.settings import CentreSettings
 from api.centre.spool import MOST_PIECE_BYTES
 from api.clock import Clock
-from api.version import software_version
 from api.web import openapi, problems
 from api.web import pages as web_pages
 from api.web import routes as web_routes
 from api.web.app import Service
 from api.web.body_limit import BODY_BYTES, BODY_S, BodyLimit
+from api.web.scan import routers
 from api.web.strict_body import StrictBody
 
 DESCRIPTION = """
@@ -74,15 +71,12 @@ def create_app(settings: CentreSettings | None = None, clock: Clock | None = Non
         The bucket is not there, or a package is missing.
     """
     context = build(settings or CentreSettings(), clock)
-    app = Service(
-        title="stimrig centre", version=software_version(), summary="What rigs have pushed.", description=DESCRIPTION,
-        lifespan=_lifespan(context), docs_url=None, redoc_url=None, openapi_url="/openapi.json",
-    )  # fmt: skip
-    app.state.context, app.state.face = context, FACE
+    app = Service(context, title="stimrig centre", summary="What rigs have pushed.", description=DESCRIPTION)
+    app.state.face = FACE
     app.add_middleware(CentreStrictBody)
     app.add_middleware(CentreBodyLimit, context=context)  # the last one added stands outside
     problems.install(app)
-    for router in [*routes.routers(), *pages.routers()]:
+    for router in routers(routes, pages):
         app.include_router(router)
     app.router.routes.extend(shared())
     openapi.describe(app)
@@ -91,17 +85,5 @@ def create_app(settings: CentreSettings | None = None, clock: Clock | None = Non
 
 def shared() -> list[APIRoute]:
     """The routes of a rig's service that the centre has, too."""
-    there = [route for router in [*web_routes.routers(), *web_pages.routers()] for route in router.routes]
+    there = [route for router in routers(web_routes, web_pages) for route in router.routes]
     return [route for route in there if isinstance(route, APIRoute) and route.path in SHARED]
-
-
-def _lifespan(context: Context):
-    @asynccontextmanager
-    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        await context.open()
-        try:
-            yield
-        finally:
-            await context.close()
-
-    return lifespan

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from functools import cache
+from typing import Any
 
 from fastapi import APIRouter, FastAPI
 from starlette.routing import BaseRoute
@@ -16,15 +17,26 @@ from api.store.lock import ServiceLock
 from api.version import software_version
 from api.web import openapi, pages, problems, routes, strict_body
 from api.web.body_limit import BodyLimit
-from api.web.dependencies import Context, build
+from api.web.dependencies import build
 from api.web.headers import Headers
 from api.web.look_again import LookAgain
 from api.web.page_language import PageLanguage
+from api.web.scan import routers
 from api.workers.pool import WORKER
 
 
 class Service(FastAPI):
-    """The application, with its headers and language outermost: an unexpected error's answer has them, too."""
+    """The application of some parts, which are opened and closed with it; `more` goes to FastAPI.
+
+    Its headers and language are outermost: an unexpected error's answer has them, too.
+    """
+
+    def __init__(self, context: Any, **more: Any) -> None:
+        super().__init__(
+            version=software_version(), lifespan=_lifespan(context), docs_url=None, redoc_url=None,
+            openapi_url="/openapi.json", **more,
+        )  # fmt: skip
+        self.state.context = context
 
     def build_middleware_stack(self) -> ASGIApp:
         """Starlette's, within the headers and the language."""
@@ -57,17 +69,12 @@ def create_app(
     """
     context = build(settings or Settings(), clock, worker, lock)
     app = Service(
+        context,
         title="stimrig",
-        version=software_version(),
         summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",
         description=openapi.DESCRIPTION,
-        lifespan=_lifespan(context),
-        docs_url=None,
-        redoc_url=None,
-        openapi_url="/openapi.json",
         routes=list(_routes()),
     )
-    app.state.context = context
     app.add_middleware(LookAgain, context=context)
     app.add_middleware(strict_body.StrictBody)
     app.add_middleware(BodyLimit, context=context)  # the last one added stands outside
@@ -80,12 +87,12 @@ def create_app(
 def _routes() -> Sequence[BaseRoute]:
     """All routes, made once a process: FastAPI examines every endpoint anew for each application it is included in."""
     whole = APIRouter()
-    for router in [*routes.routers(), *pages.routers()]:
+    for router in routers(routes, pages):
         whole.include_router(router)
     return whole.routes
 
 
-def _lifespan(context: Context):
+def _lifespan(context: Any):
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
         await context.open()

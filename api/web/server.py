@@ -11,7 +11,6 @@ import json
 import os
 import socket
 import sys
-from typing import Protocol
 
 import uvicorn
 from starlette.types import ASGIApp
@@ -19,7 +18,7 @@ from starlette.types import ASGIApp
 from api import logs
 from api.errors import ApiError, SettingsError
 from api.models import carried_structure
-from api.settings import Settings, loopback
+from api.settings import ServerSettings, Settings, loopback
 from api.store.lock import ServiceLock
 from api.web.app import create_app
 from api.web.connections import protocol, raise_file_limit
@@ -60,20 +59,7 @@ def configuration(app: ASGIApp) -> uvicorn.Config:
     )  # fmt: skip
 
 
-class Door(Protocol):
-    """Settings of whatever listens: a rig's service, a centre."""
-
-    @property
-    def host(self) -> str: ...
-
-    @property
-    def tls_proxy(self) -> bool: ...
-
-    @property
-    def secure_cookies(self) -> bool: ...
-
-
-def refuse_open_door(settings: Door) -> None:
+def refuse_open_door(settings: ServerSettings) -> None:
     """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
 
     Raises

@@ -18,6 +18,7 @@ from api.centre import pages as centre_pages
 from api.centre import routes as centre_routes
 from api.decisions import DECISIONS
 from api.web import pages, routes
+from api.web.scan import routers
 from tests.api.conftest import Service, run_test, shared_service, soon
 from tests.api.fake_arm import still
 
@@ -36,10 +37,10 @@ def doors(kind: str) -> list[str]:
 
 
 def test_every_route_and_button_that_changes_something_is_in_the_table_once() -> None:
-    routers = [*routes.routers(), *pages.routers(), *centre_routes.routers(), *centre_pages.routers()]
+    found = routers(routes, pages, centre_routes, centre_pages)
     there = {
         f"{method} {route.path}"
-        for router in routers
+        for router in found
         for route in router.routes
         if isinstance(route, APIRoute)
         for method in route.methods - {"GET", "HEAD"}

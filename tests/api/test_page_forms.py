@@ -9,6 +9,7 @@ import pytest
 from fastapi.routing import APIRoute
 
 from api.web import pages
+from api.web.scan import routers
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 
 HTML = {"Accept": "text/html"}
@@ -81,7 +82,7 @@ def posts() -> list[str]:
     """Every address of the page that takes a POST; a calibration first, while one is open."""
     found = {
         route.path
-        for router in pages.routers()
+        for router in routers(pages)
         for route in router.routes
         if isinstance(route, APIRoute) and "POST" in route.methods
     }

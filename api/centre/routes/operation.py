@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse, Response
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
-from prometheus_client.registry import Collector
 from sqlalchemy import text
 
 from api.centre import warnings
@@ -39,20 +39,14 @@ def health(context: Ctx) -> dict[str, Any]:
 @router.get("/metrics", response_class=PlainTextResponse)
 def metrics(context: Ctx) -> Response:
     """Figures in Prometheus' text format."""
-    registry = CollectorRegistry()
-    registry.register(_Figures(context))
-    return Response(generate_latest(registry), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    return Response(generate_latest(_Figures(context)), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
-class _Figures(Collector):
+@dataclass
+class _Figures:
     """The centre's figures, read when they are asked for."""
 
-    def __init__(self, context: Context) -> None:
-        self.context = context
-
-    def describe(self) -> Iterable[Metric]:
-        """Nothing: else each figure would be read once more when it is registered."""
-        return ()
+    context: Context
 
     def collect(self) -> Iterator[Metric]:
         """One family after the other."""
@@ -71,10 +65,10 @@ class _Figures(Collector):
             ("stimrig_centre_recordings", "Recordings that rigs told of", sum(row.recordings for row in rigs)),
             ("stimrig_centre_warnings", "Warnings that nobody has acknowledged", warnings.open_count(context.store)),
             ("stimrig_centre_bucket_ok", "1 where the bucket can be used", float(context.bucket.trouble is None)),
-            ("stimrig_centre_free_disk_bytes", "Free where files come in", _free_bytes(context)),
+            (
+                "stimrig_centre_free_disk_bytes",
+                "Free where files come in",
+                shutil.disk_usage(context.settings.data_dir).free,
+            ),
         ):
             yield GaugeMetricFamily(name, words, value)
-
-
-def _free_bytes(context: Context) -> int:
-    return shutil.disk_usage(context.settings.data_dir).free

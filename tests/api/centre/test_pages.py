@@ -17,6 +17,7 @@ from api.centre import app as centre_app
 from api.centre import pages, routes
 from api.centre.pages.rigs_view import doubts
 from api.store.centre_tables import CentreRig
+from api.web.scan import routers
 from rig.messages import RigState
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller
@@ -91,7 +92,7 @@ def filled(path: str) -> str:
 
 
 def test_the_table_names_every_route() -> None:
-    there = [route for router in [*routes.routers(), *pages.routers()] for route in router.routes]
+    there = [route for router in routers(routes, pages) for route in router.routes]
     named = {
         (method, filled(route.path))
         for route in [*there, *centre_app.shared()]
