@@ -15,7 +15,7 @@ from api.errors import ApiError
 from api.outbox.chain import NOWHERE, Position
 from api.store import Store
 from api.store.centre_tables import CentreChain, CentreItem, CentreRig
-from api.store.texts import storable
+from api.store.hashes import storable
 
 MOST_CLOCK_S = 2.0
 LEAST_DISK_SHARE, LEAST_DISK_BYTES = 0.05, 5_000_000_000

@@ -8,9 +8,8 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from api.store import seen
-from api.store.hashes import GENESIS, digest
+from api.store.hashes import GENESIS, digest, storable
 from api.store.tables import AuditEntry
-from api.store.texts import storable
 
 
 def entry_hash(entry: dict[str, Any]) -> str:

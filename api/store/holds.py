@@ -13,7 +13,6 @@ import secrets
 from collections import defaultdict
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
-from typing import Protocol
 
 from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import OperationalError, SQLAlchemyError
@@ -33,60 +32,37 @@ DEAD_AFTER = 2
 """A service is dead that was seen neither at this look nor at the one before: it may just be connecting again."""
 
 
-class Holds(Protocol):
-    """A service among those that share a database."""
-
-    me: str
-    """Drawn when the service starts."""
-
-    def turn(self, name: str) -> Turn:
-        """Around what no two may do at once. Raises ApiError: 503 where the database does not answer."""
-        ...
-
-    def keep(self) -> None:
-        """Show that this service lives; to be called again and again."""
-        ...
-
-    def dead(self, services: set[str]) -> set[str]:
-        """Those that live no more; this one is asked for again and again, too."""
-        ...
-
-    def close(self) -> None:
-        """Let everything go."""
-        ...
-
-
-class Alone:
-    """The one service of a SQLite database: every other is dead."""
+class Holds:
+    """A service among those that share a database. On SQLite it is the only one, and every other is dead."""
 
     def __init__(self) -> None:
         self.me = secrets.token_hex(8)
+        """Drawn when the service starts."""
         self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
 
     def turn(self, name: str) -> Turn:
-        """As `Holds`."""
+        """Around what no two may do at once. Raises ApiError: 503 where the database does not answer."""
         return self._turns[name]
 
     def keep(self) -> None:
-        """As `Holds`."""
+        """Show that this service lives; to be called again and again."""
 
     def dead(self, services: set[str]) -> set[str]:
-        """As `Holds`."""
+        """Those that live no more; this one is asked for again and again, too."""
         return services - {self.me}
 
     def close(self) -> None:
-        """As `Holds`."""
+        """Let everything go."""
 
 
-class Among:
+class Among(Holds):
     """One of several services on a PostgreSQL database."""
 
     def __init__(self, engine: Engine) -> None:
-        self.me = secrets.token_hex(8)
+        super().__init__()
         self._engine = engine.execution_options(isolation_level="AUTOCOMMIT")
         self._alive: Connection | None = None
         self._missed: defaultdict[str, int] = defaultdict(int)
-        self._turns: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self.keep()
 
     @asynccontextmanager
@@ -171,7 +147,7 @@ class Among:
 
 def of(store: Store) -> Holds:
     """What a service on this database has."""
-    return Among(store.engine) if store.several else Alone()
+    return Among(store.engine) if store.several else Holds()
 
 
 def key(name: str) -> int:

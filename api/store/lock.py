@@ -24,9 +24,6 @@ from api.clock import Clock
 from api.settings import Settings
 from api.store.engines import sqlite_file
 
-FOLDER_MEND = "stop it, or take another folder: --data, STIMRIG_DATA_DIR"
-DATABASE_MEND = "stop it, or take another database: STIMRIG_DATABASE_URL"
-
 
 class HeldError(OSError):
     """Another service holds the place, or it cannot be held; one line with the fix."""
@@ -46,9 +43,9 @@ class ServiceLock:
         Another service holds one of them.
     """
 
-    def __init__(self, settings: Settings, clock: Clock | None = None) -> None:
+    def __init__(self, settings: Settings) -> None:
         self._files: list[IO[str]] = []
-        self._since_utc = (clock or Clock()).utc()
+        self._since_utc = Clock().utc()
         try:
             for place, shown, fix in _places(settings):
                 self._files.append(_held(place, shown, fix))
@@ -79,7 +76,7 @@ def refuse_if_held(settings: Settings) -> None:
 
 def _places(settings: Settings) -> Iterator[tuple[Path, Path, str]]:
     folder = owner_only.folder(settings.data_dir)
-    yield folder / "service.lock", folder, FOLDER_MEND
+    yield folder / "service.lock", folder, "stop it, or take another folder: --data, STIMRIG_DATA_DIR"
     try:
         url = make_url(settings.database)
     except ArgumentError:
@@ -91,7 +88,7 @@ def _places(settings: Settings) -> Iterator[tuple[Path, Path, str]]:
     if real.exists() and real.stat().st_nlink > 1:
         raise HeldError(f"{real}: the file has {real.stat().st_nlink} names (hard links), SQLite needs one; keep one")
     owner_only.folder(real.parent)
-    yield real.with_name(f"{real.name}.lock"), database, DATABASE_MEND
+    yield real.with_name(f"{real.name}.lock"), database, "stop it, or take another database: STIMRIG_DATABASE_URL"
 
 
 def _held(place: Path, shown: Path, fix: str) -> IO[str]:

@@ -20,7 +20,7 @@ from api.sessions.following import Follower
 from api.sessions.lifecycle import Lifecycle
 from api.sessions.rig_client import RigClient
 from api.store import Store
-from api.store.holds import Alone
+from api.store.holds import Holds
 from api.store.tables import Model, Participant, Recording, Test
 from rig.messages import Reply, StartRequest, StateEvent, Status
 from tests.api.conftest import Service, let_go, run_test, soon, wait_done
@@ -153,7 +153,7 @@ def store_with_a_test(folder: Path, followed_by: str) -> Store:
 
 @pytest.mark.parametrize("taken_up", [False, True])
 def test_a_test_that_was_taken_up_during_the_fit_is_left_to_who_did(tmp_path: Path, taken_up: bool) -> None:
-    holds, added = Alone(), []
+    holds, added = Holds(), []
     store = store_with_a_test(tmp_path, holds.me)
 
     async def fit(*_given: Any, **_how: Any) -> tuple[dict[str, str], str]:
