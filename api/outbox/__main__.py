@@ -35,7 +35,9 @@ def main() -> int:
             raise SettingsError(
                 "STIMRIG_CENTRE_URL: names no centre; set it and STIMRIG_CENTRE_KEY, or start no outbox"
             )
-        refuse_missing(settings)
+        place = settings.data_dir / "stimrig.db"
+        if settings.database_url is None and not place.exists():  # the service makes it, and a restore puts it there
+            raise FileNotFoundError(f"{place}: no database there yet; start the service first")
         store = Store(settings.database)
     except FileNotFoundError as error:  # it is looked again: whoever started this starts it again
         print(f"outbox: {error}", file=sys.stderr)
@@ -48,19 +50,6 @@ def main() -> int:
     with contextlib.suppress(KeyboardInterrupt):
         Pusher(store, settings, clock, link).run()
     return 0
-
-
-def refuse_missing(settings: Settings) -> None:
-    """The service makes its database, and a restore puts it into its place: not this process.
-
-    Raises
-    ------
-    FileNotFoundError
-        There is none yet.
-    """
-    place = settings.data_dir / "stimrig.db"
-    if settings.database_url is None and not place.exists():
-        raise FileNotFoundError(f"{place}: no database there yet; start the service first")
 
 
 if __name__ == "__main__":

@@ -16,13 +16,11 @@ from typing import Any
 from sqlalchemy.exc import SQLAlchemyError
 
 from api.clock import Clock, utc_label
-from api.outbox import reconcile, rig_state, status
-from api.outbox.backoff import Backoff
+from api.outbox import feed, rig_state, status
 from api.outbox.collecting import Collecting
-from api.outbox.errors import KeyRefusedError, PushError, UnreachableError
-from api.outbox.files import Files
+from api.outbox.errors import Backoff, KeyRefusedError, PushError, UnreachableError
+from api.outbox.files import Files, Sending
 from api.outbox.link import Link
-from api.outbox.sending import Sending
 from api.outbox.status import Status
 from api.outbox.telling import Telling
 from api.settings import Settings
@@ -65,7 +63,7 @@ class Pusher:
         self.line, self.bucket, self.database = Backoff(chance), Backoff(chance), Backoff(chance)
         self.share = 1.0
         """Of the largest batch or chunk: less on a line that breaks."""
-        self._missing: Iterator[int] | None = reconcile.batches(store, clock)
+        self._missing: Iterator[int] | None = feed.batches(store, clock)
         self._hello_s = self._line_s = self._files_s = self._database_s = self.clock.monotonic_s()
         """When each may be tried next."""
         self._wrong: PushError | None = None
@@ -90,13 +88,14 @@ class Pusher:
                 busy = self._put_in_missing()
                 busy = self._push() or busy
                 self._database_words = ""
-            self._tell()
+            if self._told is None or self.clock.monotonic_s() >= self._told[0] + POLL_S:
+                self._write_status()
             if not self._database_words:
                 self.database.reset()
         except SQLAlchemyError as error:
             first = self.database.failures == 0
             self._database_s = self.clock.monotonic_s() + self.database.next_s()
-            self._missing = reconcile.batches(self.store, self.clock)
+            self._missing = feed.batches(self.store, self.clock)
             self._database_words = str(error).splitlines()[0][:200]
             if first:
                 log.warning("the rig's database: %s", self._database_words)
@@ -111,12 +110,9 @@ class Pusher:
         return min(max(wait_s, POLL_S), TOLD_S)
 
     def _put_in_missing(self) -> bool:
-        if self._missing is None:
-            return False
-        if next(self._missing, None) is None:
+        if self._missing is not None and next(self._missing, None) is None:
             self._missing = None
-            return False
-        return True
+        return self._missing is not None
 
     # ---- the line ----------------------------------------------------------------------------------------------
 
@@ -150,7 +146,7 @@ class Pusher:
 
     def _hello(self) -> None:
         if self.telling.hello():
-            self._missing = reconcile.batches(self.store, self.clock)
+            self._missing = feed.batches(self.store, self.clock)
         self._hello_s = self.clock.monotonic_s() + HELLO_S
         if not self.sending.queue:
             self.sending.asked = False  # the centre may have lost one
@@ -221,10 +217,6 @@ class Pusher:
         if before is not None:
             self._contact_utc = before.last_contact_utc
             self.telling.reached = (before.chain, before.seq) if before.chain else None
-
-    def _tell(self) -> None:
-        if self._told is None or self.clock.monotonic_s() >= self._told[0] + POLL_S:
-            self._write_status()
 
     def _write_status(self) -> None:
         """Write it where it has changed, or is old."""

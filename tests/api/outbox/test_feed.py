@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import inspect
 
-from api.outbox import chain, items, reconcile
+from api.outbox import chain, feed, items
 from api.outbox.feed import Feed
 from api.store import audit, uploads
 from api.store.tables import Approval, Model, Note, OutboxItem, Participant, Recording, Test
@@ -116,7 +116,7 @@ def test_a_row_that_cannot_be_told_keeps_nobody_from_working(rig: Rig, monkeypat
         patch.setattr(items, "_bounded", broken)
         rig.participant("P1")
     assert rig.store.get(Participant, "P1") is not None and [kind for kind, _ in rig.told()] == ["begin", "audit"]
-    assert sum(reconcile.batches(rig.store, rig.clock)) == 1, "it is found the next time"
+    assert sum(feed.batches(rig.store, rig.clock)) == 1, "it is found the next time"
 
 
 def test_every_audit_entry_is_told_by_its_hash(rig: Rig) -> None:
@@ -187,7 +187,7 @@ def test_nothing_is_fed_without_a_centre_and_all_of_it_later(tmp_path: Path) -> 
     some_days(without)
     some_days(fed)
     assert without.items() == []
-    for _ in reconcile.batches(without.store, without.clock):
+    for _ in feed.batches(without.store, without.clock):
         pass
     assert newest(without) == newest(fed)
     assert_chain([item.as_dict() for item in without.items()])
@@ -199,7 +199,7 @@ def test_nothing_is_fed_without_a_centre_and_all_of_it_later(tmp_path: Path) -> 
         )
     assert times == sorted(times), "in order of time"
     count = len(without.items())
-    assert sum(reconcile.batches(without.store, without.clock)) == 0 and len(without.items()) == count
+    assert sum(feed.batches(without.store, without.clock)) == 0 and len(without.items()) == count
     for rig in (without, fed):
         rig.close()
 
@@ -213,7 +213,7 @@ def test_what_was_changed_while_no_centre_was_configured_is_put_in(tmp_path: Pat
         session.get(Participant, "P2").archived_utc = again.now  # pyright: ignore[reportOptionalMemberAccess]
         audit.write(session, again.now, "Ada", "archive", "P2")
     before = again.told()
-    assert sum(reconcile.batches(again.store, again.clock)) == 2
+    assert sum(feed.batches(again.store, again.clock)) == 2
     assert {kind for kind, _ in again.told()[len(before) :]} == {"participant", "audit"}
     again.close()
 
@@ -226,10 +226,10 @@ def test_a_recording_whose_file_comes_back_is_told_with_it(rig: Rig) -> None:
     rig.add(row)
     assert (rig.items()[-1].file, rig.items()[-1].file_bytes) == (None, None)
     path.write_bytes(data)
-    assert sum(reconcile.batches(rig.store, rig.clock)) == 1
+    assert sum(feed.batches(rig.store, rig.clock)) == 1
     assert (rig.items()[-1].file, rig.items()[-1].file_bytes) == (sha256(data), 6)
     path.unlink()
-    assert sum(reconcile.batches(rig.store, rig.clock)) == 0, "a file that is gone is no news of the row"
+    assert sum(feed.batches(rig.store, rig.clock)) == 0, "a file that is gone is no news of the row"
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -260,7 +260,7 @@ def test_whatever_is_done_in_whatever_order_the_newest_items_are_the_rows(tmp_pa
             rig.close()
             rig = Rig(tmp_path, feed=chance.random() < 0.5, seed=seed + 1000 * number)
             rig.number = 1000 * number
-    for _ in reconcile.batches(rig.store, rig.clock):
+    for _ in feed.batches(rig.store, rig.clock):
         pass
     assert_chain(as_items(rig))
     told = newest(rig)

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from sqlalchemy.exc import OperationalError
 
 from api.outbox import status
+from api.outbox.files import CHUNK
 from api.outbox.pusher import HELLO_S, REVOKED_S
-from api.outbox.sending import CHUNK
 from api.store import audit
 from api.store.tables import AuditEntry, Participant, Recording
 from tests.api.outbox.rigs import Rig, assert_chain, assert_told, run, sha256
