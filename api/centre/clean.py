@@ -7,8 +7,6 @@ import re
 from datetime import date, datetime, timedelta
 from typing import Any
 
-from api.clock import local_day
-
 CODE = re.compile(r"[A-Za-z0-9_-]{1,32}")
 EFFECT = re.compile(r"[a-z0-9_]{1,64}")
 FIGURE = re.compile(r"threshold_us|plateau_nm|time_constant_s|damping|delay_s|[a-z0-9_]{1,64}\.[a-z0-9_]{1,64}")
@@ -87,11 +85,6 @@ def fit(value: Any) -> dict[str, Any]:
         if FIGURE.fullmatch(name) and isinstance(one, dict)
     }
     return found
-
-
-def day(at_utc: str) -> str:
-    """The day of a time, where the centre stands."""
-    return local_day(at_utc)
 
 
 def days_later(given: str, days: int) -> str:

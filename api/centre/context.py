@@ -18,7 +18,7 @@ from fastapi import Depends, Request
 from sqlalchemy.exc import SQLAlchemyError
 
 from api import owner_only
-from api.centre import warnings, watch
+from api.centre import check, warnings
 from api.centre.bucket import Bucket, BucketError
 from api.centre.heads import Heads
 from api.centre.ingest import Ingest
@@ -73,7 +73,7 @@ class Context:
 
     async def open(self) -> None:
         """Begin to look after what nobody asks for."""
-        every = ((FLUSH_S, self.auth.idle.flush), (watch.EVERY_S, lambda: watch.look(self)))
+        every = ((FLUSH_S, self.auth.idle.flush), (check.EVERY_S, lambda: check.look(self.spool)))
         self.tasks = [asyncio.create_task(_again(every_s, what)) for every_s, what in every]
 
     @contextlib.contextmanager

@@ -9,6 +9,7 @@ from typing import Any
 from sqlalchemy import Select, exists, select, tuple_
 
 from api.centre import clean
+from api.clock import local_day
 from api.errors import ApiError
 from api.store import Store
 from api.store.centre_tables import (
@@ -113,22 +114,18 @@ def _fill(store: Store, code: str, found: list[dict[str, Any]]) -> None:
         "models": (CentreModel, CentreModel.created_utc),
         "decisions": (CentreDecision, CentreDecision.at_utc),
     }
+    # two days later is behind all of a day's labels, in whatever time zone the day is
     by_day = {(one["day"], one["rig_id"]): one for one in found}
     for name, (table, at) in parts.items():
         for one in found:
             one[name] = []
-        held = select(table).where(table.participant == code, at >= first, at < _day_after(last))
+        held = select(table).where(table.participant == code, at >= first, at < f"{clean.days_later(last, 2)}T")
         with store.read() as session:
             rows = session.scalars(held.order_by(at.desc()).limit(MOST_IN_A_SESSION)).all()
         for row in rows:
-            one = by_day.get((clean.day(getattr(row, at.key)), row.rig_id))
+            one = by_day.get((local_day(getattr(row, at.key)), row.rig_id))
             if one is not None:
                 one[name].append(row)
-
-
-def _day_after(day: str) -> str:
-    """A label behind all of a day's, in whatever time zone the day is."""
-    return f"{clean.days_later(day, 2)}T"
 
 
 def stood(store: Store, code: str, limit: int = 200) -> list[dict[str, Any]]:

@@ -104,10 +104,10 @@ class Cluster:
         import psycopg
 
         assert self.process is not None
-        end = time.monotonic() + STARTS_S
+        end, address = time.monotonic() + STARTS_S, self.url.replace("+psycopg", "").removesuffix(DATABASE)
         while True:
             try:
-                with psycopg.connect(self._address("postgres"), autocommit=True) as connection:
+                with psycopg.connect(f"{address}postgres", autocommit=True) as connection:
                     known = connection.execute("SELECT 1 FROM pg_database WHERE datname = %s", (DATABASE,)).fetchone()
                     if known is None:
                         connection.execute(f"CREATE DATABASE {DATABASE}")
@@ -118,9 +118,6 @@ class Cluster:
                     log = self.folder.parent / "postgres.log"
                     raise SettingsError(f"{self.folder}: PostgreSQL does not start (log: {log})") from error
                 time.sleep(0.1)
-
-    def _address(self, database: str) -> str:
-        return self.url.replace("+psycopg", "").removesuffix(DATABASE) + database
 
     def stop(self) -> None:
         """End it, what is written kept."""

@@ -15,7 +15,7 @@ from sqlalchemy import delete, select
 
 from api import owner_only
 from api.centre import rigs, warnings
-from api.centre.bucket import PIECE, Bucket, BucketError, failed, first_line
+from api.centre.bucket import Bucket, BucketError, failed, first_line
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
 from api.store import Store
@@ -104,7 +104,9 @@ class Spool:
         return have + len(data)
 
     def _finish(self, part: Path, sha256: str, length: int) -> None:
-        if hash_of(part) != sha256:
+        with part.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+        if found != sha256:
             part.unlink(missing_ok=True)
             raise _differs("Its content is another than its name says")
         self.bucket.put(part, sha256)
@@ -155,15 +157,6 @@ class Spool:
             return part.stat().st_size
         except FileNotFoundError:
             return 0
-
-
-def hash_of(path: Path) -> str:
-    """SHA-256 of a file."""
-    found = hashlib.sha256()
-    with path.open("rb") as file:
-        while piece := file.read(PIECE):
-            found.update(piece)
-    return found.hexdigest()
 
 
 def _differs(why: str) -> ApiError:

@@ -12,10 +12,6 @@ from api.errors import NotFoundError
 from api.store import Store, audit
 from api.store.centre_tables import CentreRig, CentreWarning
 
-KINDS = (
-    "restored", "forked", "damaged-at-rig", "damaged", "changed", "unreadable", "too-long", "audit", "clock", "disk",
-    "unseen", "bucket",
-)  # fmt: skip
 MOST_OPEN = 1000
 """Of a rig and a kind, as long as nobody has acknowledged them: a hostile rig fills no page."""
 SHOWN = 200
@@ -23,8 +19,7 @@ SHOWN = 200
 
 def tell(session: Session, now_utc: str, rig_id: int | None, kind: str, subject: str = "", **detail: Any) -> None:
     """Note it, in the caller's transaction; what is known already is counted."""
-    of = (CentreWarning.rig_id.is_(rig_id) if rig_id is None else CentreWarning.rig_id == rig_id,
-          CentreWarning.kind == kind)  # fmt: skip
+    of = (CentreWarning.rig_id == rig_id, CentreWarning.kind == kind)
     known = select(CentreWarning).where(*of, CentreWarning.subject == subject, CentreWarning.ended_utc.is_(None))
     row = session.scalars(known.limit(1)).first()
     if row is not None:
@@ -43,7 +38,7 @@ def tell(session: Session, now_utc: str, rig_id: int | None, kind: str, subject:
 
 def end(session: Session, now_utc: str, rig_id: int | None, kind: str) -> None:
     """It holds no longer: what comes after is told anew."""
-    _end(session, now_utc, kind, CentreWarning.rig_id.is_(rig_id) if rig_id is None else CentreWarning.rig_id == rig_id)
+    _end(session, now_utc, kind, CentreWarning.rig_id == rig_id)
 
 
 def mended(session: Session, now_utc: str, kind: str, subject: str) -> None:

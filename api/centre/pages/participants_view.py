@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import asyncio
 from typing import Any
-from urllib.parse import urlencode
+from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 from sqlalchemy import select
 
-from api.centre import directory, trend
+from api.centre import directory
 from api.centre.context import Context, Ctx
 from api.centre.routes.participants import VERDICT_NAMES, asked, page_key
 from api.charts import trend_charts
 from api.effect_words import effect_words
 from api.errors import ApiError, NotFoundError
+from api.models import changes
+from api.models.followed import followed
 from api.store.centre_tables import CentreEffect
 from api.web.dependencies import ModelReader
 from api.web.pages.render import page
@@ -40,17 +42,14 @@ async def participants(
             raise
         problem = error
     await context.count_warnings()
-    choices = await asyncio.to_thread(_choices, context)
+    rigs = await asyncio.to_thread(context.rigs.all)
+    effects = await asyncio.to_thread(known_effects, context)
     more = urlencode({**given, "after": last}) if last else None
     status = problem.status if problem else 200
     return page(
         request, "participants.html", status, found=found, more=more, given=given, problem=problem, after=after,
-        verdicts=VERDICT_NAMES, **choices,
+        verdicts=VERDICT_NAMES, rigs=[row.name for row in rigs], effects=effects,
     )  # fmt: skip
-
-
-def _choices(context: Context) -> dict[str, Any]:
-    return {"rigs": [row.name for row in context.rigs.all()], "effects": known_effects(context)}
 
 
 def known_effects(context: Context) -> list[tuple[str, str]]:
@@ -77,10 +76,10 @@ async def participant(request: Request, context: Ctx, _who: ModelReader, code: s
     found, more = await asyncio.to_thread(directory.sessions, context.store, code, page_key(before))
     stood = await asyncio.to_thread(directory.stood, context.store, code)
     await context.count_warnings()
-    documents = trend.documents(code, stood)
+    told = documents(code, stood)
     return page(
         request, "participant.html", code=code, people=people, sessions=found, before=before,
-        more=f"{more[0]}~{more[1]}" if more else None, panels=_panels(documents),
+        more=f"{more[0]}~{more[1]}" if more else None, panels=_panels(told),
         count=sum(one["sessions"] for one in people), recordings=sum(one["recordings"] for one in people),
     )  # fmt: skip
 
@@ -89,3 +88,31 @@ def _panels(documents: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The pictures of what is known in any session."""
     known = {name for one in documents for name, figure in one["figures"].items() if figure["value"] is not None}
     return [trend_charts.panel(name, documents) for name in trend_charts.order(documents) if name in known]
+
+
+def documents(code: str, stood: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Models of a participant's sessions, oldest first, as the trend's charts take them (`api.charts.trend_charts`)."""
+    return [_document(code, **one) for one in stood]
+
+
+def _document(code: str, session: Any, model: Any, rig: str) -> dict[str, Any]:
+    told = model.fit.get("figures") or {}
+    figures = {
+        name: {**one, "uncertainty": None if (one.get("sd") or 0.0) < 0.0 else changes.uncertainty(name, one)}
+        for name, one in told.items()
+    }
+    found = followed(model.fit)
+    figures["follows_percent"] = {**_plain(found.percent, "%"), "where": found.where}
+    figures["noise_sd_nm"] = _plain(model.fit.get("noise_sd_nm"), "N·m")
+    figures["current_ma"] = _plain(session.current_ma, "mA")
+    known = {name: one for name, one in figures.items() if one["value"] is not None or name == "current_ma"}
+    here = f"{session.day}~{session.rig_id}"
+    return {
+        "at_utc": session.at_utc, "model_id": model.id, "approved": session.approved_by is not None,
+        "approved_by": session.approved_by, "figures": known, "rig": rig,
+        "notes": [], "href": f"/participants/{quote(code)}?before={session.day}~{session.rig_id + 1}#s-{here}",
+    }  # fmt: skip
+
+
+def _plain(value: float | None, unit: str) -> dict[str, Any]:
+    return {"value": value, "sd": None, "uncertainty": None, "unit": unit}

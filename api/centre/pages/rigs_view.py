@@ -1,4 +1,4 @@
-"""The first page: rigs; adding one, revoking its key."""
+"""The first page: rigs; adding one, revoking its key. And what a person has to know of."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
+from api.centre import warnings
+from api.centre.check import UNSEEN_S
 from api.centre.context import Context, Ctx
 from api.centre.ingest import LEAST_DISK_BYTES, LEAST_DISK_SHARE, MOST_CLOCK_S
 from api.centre.routes.rigs import made
-from api.centre.watch import UNSEEN_S
 from api.clock import unix_of
 from api.errors import ApiError
 from api.people.auth import LOCKED, Scope
 from api.store.centre_tables import CentreRig
-from api.web.dependencies import Administrator
+from api.web.dependencies import Administrator, ModelReader
 from api.web.guards import identified
 from api.web.pages.home import sign_in_page
 from api.web.pages.render import page, problem_page
@@ -75,3 +76,19 @@ async def revoke(context: Ctx, who: Administrator, name: str) -> Response:
     """Its key opens nothing any more."""
     await asyncio.to_thread(context.rigs.revoke, name, who.name)
     return RedirectResponse("/", 303)
+
+
+@router.get("/warnings")
+async def list_warnings(request: Request, context: Ctx, _who: ModelReader) -> Response:
+    """Those that wait, and the last ones that somebody has acknowledged."""
+    waiting = await asyncio.to_thread(warnings.listed, context.store)
+    await context.count_warnings()
+    seen = await asyncio.to_thread(warnings.listed, context.store, True)
+    return page(request, "warnings.html", waiting=waiting, seen=seen[:50])
+
+
+@router.post("/warnings/{warning_id}/acknowledge")
+async def acknowledge(context: Ctx, who: Administrator, warning_id: int) -> Response:
+    """A person has seen it."""
+    await asyncio.to_thread(warnings.acknowledge, context.store, context.clock, warning_id, who.name)
+    return RedirectResponse("/warnings", 303)

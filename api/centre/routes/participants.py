@@ -97,11 +97,8 @@ def page_key(before: str | None) -> tuple[str, int] | None:
 @router.get("/rigs/{rig}/models/{model_id}/file", response_class=Response)
 async def model_file(context: Ctx, _who: ModelReader, rig: str, model_id: str) -> Response:
     """MODEL.json, as the rig made it; refused where it differs from its hash."""
-    row = await asyncio.to_thread(_model, context, rig, model_id[:64])
+    key = (await asyncio.to_thread(the_rig, context, rig)).id, model_id[:64]
+    row = await asyncio.to_thread(context.store.get, CentreModel, key)
     if row is None:
         raise NotFoundError("model", model_id[:64])
     return await handed_out.file(context, row.file, f"{row.participant}-{row.id}.json", "application/json")
-
-
-def _model(context: Context, rig: str, model_id: str) -> CentreModel | None:
-    return context.store.get(CentreModel, (the_rig(context, rig).id, model_id))

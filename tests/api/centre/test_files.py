@@ -15,7 +15,7 @@ import httpx
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from api.centre import check, watch
+from api.centre import check
 from api.centre.bucket import Bucket, BucketError
 from api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
 from api.store.centre_tables import CentreFile, CentreItem, CentreModel, CentreWanted
@@ -124,7 +124,7 @@ def test_the_same_file_of_two_rigs_is_kept_once_and_no_rig_spoils_anothers(
     listed = http.get("/v1/recordings").json()["recordings"]
     assert [(one["rig"], one["file"]) for one in listed] == [("Ward 1", name), ("Ward 2", name)]
     assert {http.get(one["url"]).content for one in listed} == {data}
-    watch.look(centre.context)
+    check.look(centre.context.spool)
     assert list(centre.data.glob("spool/*/*.part")) == [], "what nobody waits for is thrown away"
 
 
@@ -167,14 +167,14 @@ def test_a_bucket_that_is_full_or_gone_loses_nothing(troubled: Centre, trouble: 
         assert os.strerror(trouble) in refused.json()["detail"] and "\n" not in refused.json()["detail"]
         told.session(number=1)
         assert rig.post("/v1/rig/items", json=told.batch()).json()["seq"] == 11, "items are taken all the same"
-        watch.look(troubled.context)
+        check.look(troubled.context.spool)
         assert (None, "bucket") in troubled.warnings()
         assert http.get("/health").json()["status"] == "degraded"
         lacking = rig.get("/v1/rig/files").json()["files"]
         assert lacking[0] == {"sha256": sha256(data), "bytes": len(data), "have_bytes": len(data)}, "it is kept here"
         assert not troubled.context.store.all(CentreFile)
         TroubledFiles.trouble = None
-        watch.look(troubled.context)  # by itself, also if the rig does not come back
+        check.look(troubled.context.spool)  # by itself, also if the rig does not come back
         assert len(rig.get("/v1/rig/files").json()["files"]) == 3
         told.push(rig)
         assert http.get("/health").json()["status"] == "ok"
@@ -209,7 +209,7 @@ def test_a_folder_that_is_not_mounted_any_more_takes_nothing(centre: Centre, rig
         assert refused.status_code in (507, 409)
         bucket.mkdir(exist_ok=True)  # the place where it was mounted
     assert list(bucket.iterdir()) == []
-    watch.look(centre.context)
+    check.look(centre.context.spool)
     assert (None, "bucket") in centre.warnings()
 
 

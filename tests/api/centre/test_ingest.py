@@ -238,14 +238,14 @@ def test_a_greeting_warns_of_clock_disk_and_damage_until_it_is_over(
 
 
 def test_a_rig_that_is_not_seen_for_a_day_is_told_once(centre: Centre, rig: httpx.Client) -> None:
-    from api.centre import watch
+    from api.centre import check
 
     rig.post("/v1/rig/hello", json=Teller().hello(centre.clock.utc()))
-    watch.look(centre.context)
+    check.look(centre.context.spool)
     assert centre.warnings() == []
     centre.clock.later_s = 25 * 3600
     for _ in range(2):
-        watch.look(centre.context)
+        check.look(centre.context.spool)
     assert centre.warnings() == [("Ward 1", "unseen")]
     rig.post("/v1/rig/hello", json=Teller().hello(centre.clock.utc()))
     assert [one["ended_utc"] is not None for one in centre.client().get("/v1/warnings").json()] == [True]
