@@ -7,8 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+
+import identify
 from api.workers.json_values import clean
 from api.workers.live_record import record_of
 
@@ -32,8 +36,6 @@ def outlook(
 
     `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
-    from dataclasses import asdict
-
     from identify.experiments.adaptive import decide
     from identify.experiments.reach import reach
     from identify.experiments.target import Target
@@ -60,7 +62,6 @@ def known(models: Sequence[str]) -> dict[str, Any]:
     A model that cannot be read here is left out. A last model that cannot be read, or that is of another kind than the
     adaptive test fits, is no help, and none is taken in its place.
     """
-    import identify
     from identify.estimation.earlier import Earlier, learn_change
 
     read, last = [], None
@@ -79,19 +80,12 @@ def known(models: Sequence[str]) -> dict[str, Any]:
     return {"earlier": last, "change": change}
 
 
-def begin(
-    progress: Progress,
-    target: dict[str, float],
-    playable_s: float,
-    max_torque_time_nm_s: float,
-    largest_us: float,
-    pulse_rate_hz: float,
-    models: Sequence[str] = (),
-) -> dict[str, Any]:
-    """A test begins: what was known of another one is forgotten."""
+def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any) -> dict[str, Any]:
+    """A test begins, within the limits that `Running` has: what was known of another one is forgotten."""
+    from identify.experiments.target import Target
+
     progress(0.5, "beginning")
-    _running.clear()
-    _running.append(Running(target, playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models)))
+    _running[:] = [Running(Target(**target), known(models), **limits)]
     return {}
 
 
@@ -101,25 +95,18 @@ def advise(progress: Progress, **news: Any) -> dict[str, Any]:
     return clean(_running[0].advise(**news))
 
 
+@dataclass(eq=False)
 class Running:
     """One adaptive test, as far as it was measured."""
 
-    def __init__(
-        self,
-        target: dict[str, float],
-        playable_s: float,
-        max_torque_time_nm_s: float,
-        largest_us: float,
-        pulse_rate_hz: float,
-        known: dict[str, Any],
-    ) -> None:
-        from identify.experiments.target import Target
-
-        self.target = Target(**target)
-        self.playable_s, self.max_torque_time_nm_s = playable_s, max_torque_time_nm_s
-        self.largest_us, self.rate_hz, self.known = largest_us, pulse_rate_hz, known
-        self.samples: tuple[list[float], list[int], list[float | None]] = ([], [], [])
-        self.before: Any = None
+    target: Any
+    known: dict[str, Any]
+    playable_s: float
+    max_torque_time_nm_s: float
+    largest_us: float
+    pulse_rate_hz: float
+    samples: tuple[list[float], list[int], list[float | None]] = field(default_factory=lambda: ([], [], []))
+    before: Any = None
 
     def advise(
         self,
@@ -151,16 +138,16 @@ class Running:
             held.extend(new)  # pyright: ignore[reportArgumentType]
         for index in not_sent:
             laid_us[index] = 0.0
-        record = record_of(*self.samples, laid_us, late, segments, self.rate_hz)
-        committed_nm_s = self._expected(laid_us[round(measured_s * self.rate_hz) :])
+        record = record_of(*self.samples, laid_us, late, segments, self.pulse_rate_hz)
+        committed_nm_s = self._expected(laid_us[round(measured_s * self.pulse_rate_hz) :])
         found = decide(
             record,
             laid_us,
             target=self.target,
-            left_s=max(0.0, self.playable_s - len(laid_us) / self.rate_hz),
+            left_s=max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz),
             left_nm_s=max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s),
             largest_us=self.largest_us,
-            pulse_rate_hz=self.rate_hz,
+            pulse_rate_hz=self.pulse_rate_hz,
             before=self.before,
             **self.known,
         )
@@ -177,22 +164,15 @@ class Running:
 
     def _expected(self, widths_us: list[float]) -> float:
         """Torque-time of pulses that are laid and not yet measured, N·m·s, by the mean curve; 0 before there is one."""
-        import numpy as np
-
         if self.before is None or self.before.knowledge is None:
             return 0.0
-        curve = self.before.knowledge.curve
-        return float(np.sum(np.interp(widths_us, curve.at, curve.value))) * self._plateau_nm / self.rate_hz
-
-    @property
-    def _plateau_nm(self) -> float:
-        return self.before.knowledge.plateau_nm
+        knowledge = self.before.knowledge
+        shares = np.interp(widths_us, knowledge.curve.at, knowledge.curve.value)
+        return float(np.sum(shares)) * knowledge.plateau_nm / self.pulse_rate_hz
 
 
 def least_known(knowledge: Any) -> dict[str, Any]:
     """Where each curve is known least: pulse width, µs, and time after a step, s."""
-    import numpy as np
-
     curve, step = knowledge.curve, knowledge.step
     return {
         "pulse_width_us": round(float(curve.at[int(np.argmax(curve.half))]), 1),

@@ -25,8 +25,7 @@ PROCESSOR_S = 900.0
 def main() -> None:
     """Serve calls until the input closes."""
     confinement.end_with_parent()
-    out = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # whatever a library prints must not fall into the protocol
+    out = own_output()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second
     os.nice(5)  # the rig's sender goes first
     say(out, {"ready": True, "left_open": shut_in()})
@@ -34,6 +33,13 @@ def main() -> None:
         request = json.loads(line)
         confinement.limit_time(request.get("processor_s", PROCESSOR_S))
         say(out, {"call": request["call"], **run(request, out)})
+
+
+def own_output() -> TextIO:
+    """Standard output for the protocol alone: whatever a library prints must not fall into it."""
+    out = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    return out
 
 
 def shut_in() -> dict[str, str]:
@@ -63,8 +69,7 @@ def describe(error: Exception) -> dict[str, Any]:
     import traceback
 
     if isinstance(error, IdentifyError):
-        place, fix = error.place, error.fix
-        return {"expected": True, "detail": one_line(error), "place": text_or_none(place), "fix": text_or_none(fix)}
+        return {"expected": True, "detail": one_line(error), "place": error.place, "fix": error.fix}
     if isinstance(error, MemoryError):
         megabytes = confinement.MEMORY_BYTES // 2**20
         fix = "Cut the record, or resample it to a lower rate."
@@ -72,11 +77,6 @@ def describe(error: Exception) -> dict[str, Any]:
         return {"expected": True, "detail": detail, "place": None, "fix": fix}
     traceback.print_exc(file=sys.stderr)
     return {"expected": False, "detail": f"{type(error).__name__}: {one_line(error)}"}
-
-
-def text_or_none(value: Any) -> str | None:
-    """A value as text, None left alone."""
-    return None if value is None else str(value)
 
 
 def one_line(error: Exception) -> str:

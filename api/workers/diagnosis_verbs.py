@@ -5,12 +5,17 @@ Imported by the worker and the command line only.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+import identify
 from api.structure import held_by
 from api.workers.json_values import clean
+from identify.records import parts_csv
 
 Progress = Callable[[float, str], None]
 POINTS = 900
@@ -24,31 +29,22 @@ def diagnosis(
 
     Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis.
     """
-    import identify
-
     return diagnosed(identify.read(Path(data), map=columns), progress, model_json)
 
 
 def diagnosed(record: Any, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
     """The same of a record that was read."""
-    import identify
+    from identify import effects
 
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
     found = identify.diagnose(record, model, lambda share, text="": progress(0.8 * share, text)).to_dict()
     found["structure"] = structure
-    found["library"] = {entry["id"]: entry for entry in library() if entry["id"] in mentioned(found)}
+    found["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(found)}
     progress(0.82, "what each effect would explain")
     found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]], structure)
     found["experiment"] = experiment(found["missing"])
     return clean(found)
-
-
-def library() -> list[dict[str, Any]]:
-    """The library of effects as plain data."""
-    from identify import effects
-
-    return effects.library()
 
 
 def mentioned(found: dict[str, Any]) -> set[str]:
@@ -64,10 +60,6 @@ def signatures(record: Any, effects: Sequence[str], structure: Sequence[str] = (
     ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
     The first model is the structure criticised. An effect whose model cannot be fitted alone has none.
     """
-    import numpy as np
-
-    import identify
-
     pick = slice(None, None, max(1, -(-record.time_s.size // POINTS)))
     found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
     held = list(structure)
@@ -87,8 +79,6 @@ def signatures(record: Any, effects: Sequence[str], structure: Sequence[str] = (
 
 def smooth(record: Any, values: Any) -> Any:
     """Running mean over a tenth of a second, so that a slow signature is seen through the noise."""
-    import numpy as np
-
     width = max(1, round(0.1 * record.sample_rate_hz))
     padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
     return np.convolve(padded, np.ones(width) / width, "valid")
@@ -104,8 +94,6 @@ def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
 
 def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json: str | None = None) -> dict[str, Any]:
     """Effects added to a model's structure one by one while the evidence lasts, each step with its model."""
-    import identify
-
     record = identify.read(Path(data))
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
@@ -117,10 +105,7 @@ def joined(parts: Sequence[str], out: str, progress: Progress, needs: Sequence[s
 
     `needs` are columns that each of them must have.
     """
-    import hashlib
-
     from api.workers import several
-    from identify.records import parts_csv
 
     progress(0.1, "joining the recordings")
     whole = several.read([Path(part) for part in parts], needs=needs, name=lambda number: f"recording {number + 1}")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 EARLIEST = 0.02
 """Share of the samples that arrive earliest: what comes later waited somewhere."""
 BINS = 5
@@ -21,8 +23,6 @@ def record_of(
     rate_hz: float,
 ) -> Any:
     """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet."""
-    import numpy as np
-
     from identify.records.record import Pulses, Record
 
     if len(host_time_s) < 2:
@@ -53,8 +53,6 @@ def record_of(
 
 def means(time_s: Any, torque_nm: Any, rate_hz: float) -> tuple[Any, Any]:
     """Means over even bins, each at the middle of its bin; the samples themselves where there are not two for each."""
-    import numpy as np
-
     if time_s.size < 2 * rate_hz * (time_s[-1] - time_s[0]):
         return time_s, torque_nm
     number = np.floor(time_s * rate_hz + 1e-9).astype(int)
@@ -69,8 +67,6 @@ def sample_times(host_time_s: list[float], counter: list[int]) -> Any:
     Samples arrive late and never early, so the line through their arrivals is drawn twice, the second time through
     those below the first.
     """
-    import numpy as np
-
     host = np.array(host_time_s, float)
     number = np.array(counter, float)
     if number.min() < 0:  # the cell has none

@@ -53,7 +53,9 @@ class Pool:
     ) -> Call:
         """Queue a call; await ``call.result``."""
         call = Call(next(self._numbers), verb, arguments, urgent, background, on_progress=on_progress)
-        call.result.add_done_callback(_retrieve)
+        call.result.add_done_callback(  # a failed call that nobody waits for is in the log already
+            lambda done: done.cancelled() or done.exception()
+        )
         if urgent:
             self.queue.appendleft(call)
         else:
@@ -136,9 +138,3 @@ class Pool:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await asyncio.gather(*(worker.close() for worker in self.workers))
-
-
-def _retrieve(future: asyncio.Future[dict[str, Any]]) -> None:
-    """A failed call nobody waits for is in the log already."""
-    if not future.cancelled():
-        future.exception()

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+import identify
 from api.workers.json_values import clean
 
 Progress = Callable[[float, str], None]
@@ -21,9 +24,6 @@ def forecast(
 
     `angle_rad`: of the joint in each pulse's period, where it moves.
     """
-    import numpy as np
-
-    import identify
     from identify.simulation.pulses import Motion, above_rest
 
     progress(0.1, "predicting")
@@ -49,7 +49,6 @@ def invert(
 
     The reference comes as numbers, or as the text of a CSV file (`table`).
     """
-    import identify
     from identify.inversion import Reference
     from identify.inversion import invert as widths_for
     from identify.inversion.table import read_reference

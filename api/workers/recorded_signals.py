@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 BINS = 1000
 """Each bin keeps its lowest and its highest torque: no peak is lost."""
 
@@ -22,8 +24,6 @@ def recorded(data: str, progress: Callable[[float, str], None]) -> dict[str, Any
 
     With an angle sensor also the joint's angle, °.
     """
-    import numpy as np
-
     progress(0.1, "reading the recording")
     held = _columns(Path(data))
     time_s, torque_nm = held["torque/time_s"], held["torque/torque_nm"]
@@ -44,7 +44,6 @@ def recorded(data: str, progress: Callable[[float, str], None]) -> dict[str, Any
 
 def _columns(path: Path) -> dict[str, Any]:
     import h5py
-    import numpy as np
 
     found: dict[str, Any] = {}
     with h5py.File(path) as file:
@@ -59,8 +58,6 @@ def _columns(path: Path) -> dict[str, Any]:
 
 def _angle(held: dict[str, Any]) -> dict[str, Any]:
     """The joint's angle, °, thinned; nothing where it was not recorded."""
-    import numpy as np
-
     if not set(held) >= set(ANGLES) or not held[ANGLES[0]].size:
         return {}
     time_s, angle_rad = (held[name] for name in ANGLES)
@@ -72,8 +69,6 @@ def _angle(held: dict[str, Any]) -> dict[str, Any]:
 def _changes(due_s: Any, sent_us: Any, rate_hz: float) -> list[tuple[float, float | None]]:
     """When the pulse width became another one, and at last when the pulses ended; what was before a dropped pulse
     reaches to it."""
-    import numpy as np
-
     if not due_s.size:
         return []
     kept = np.flatnonzero(np.append(True, np.diff(np.nan_to_num(sent_us, nan=-1.0)) != 0))
@@ -88,8 +83,6 @@ def _changes(due_s: Any, sent_us: Any, rate_hz: float) -> list[tuple[float, floa
 
 def _envelope(time_s: Any, torque_nm: Any) -> tuple[list[float], list[float]]:
     """The lowest and the highest sample of each bin, in their order."""
-    import numpy as np
-
     if time_s.size > 2 * BINS:
         parts = np.array_split(np.arange(time_s.size), BINS)
         picked = sorted({int(part[pick(torque_nm[part])]) for part in parts for pick in (np.argmin, np.argmax)})

@@ -6,8 +6,13 @@ Imported by the worker and the command line only.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
+
+import identify
+from identify.records.join import join
+from identify.records.recording import attributes
 
 JOINT = ("angle_rad", "velocity_rad_s")
 
@@ -37,9 +42,6 @@ def read(
     BadRecord
         A file cannot be read or lacks a column, or they do not go together: names the file.
     """
-    import identify
-    from identify.records.join import join
-
     called = name or (lambda number: str(paths[number]))
     records = [identify.read(path, map=columns) for path in paths]
     say = note or (lambda _words: None)
@@ -59,8 +61,6 @@ def read(
 
 def _by_name(error: Any, count: int, called: Callable[[int], str]) -> Any:
     """The same error, the file called by its name and not by its number."""
-    import identify
-
     numbers = {f"recording {number + 1}": number for number in range(count)}
     if error.place not in numbers:
         return error
@@ -69,8 +69,6 @@ def _by_name(error: Any, count: int, called: Callable[[int], str]) -> Any:
 
 def check_columns(records: Sequence[Any], needs: Sequence[str], called: Callable[[int], str]) -> None:
     """Refuse a record that lacks a column which the model needs. Raises BadRecord, which names the record."""
-    import identify
-
     for number, record in enumerate(records):
         lacking = [column for column in needs if getattr(record, column) is None]
         if lacking:
@@ -93,11 +91,6 @@ def _dropped(records: Sequence[Any], called: Callable[[int], str]) -> list[str]:
 
 def begun(path: Path) -> float | None:
     """When a sealed recording's clock was 0, as Unix time; None for CSV: a joined one says it of its parts."""
-    from datetime import datetime
-
-    import identify
-    from identify.records.recording import attributes
-
     try:
         return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()
     except (identify.IdentifyError, ValueError, OverflowError):

@@ -8,6 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+import identify
 from api.workers.json_values import clean
 from api.workers.several import begun
 
@@ -57,7 +60,6 @@ def track(
         `error_percent`, None without a reference; `step` and the text of the `model` for the next trial, or the
         `reason` why the trial was not followed.
     """
-    import identify
     from identify.tracking import State, begin, follow, learn_rates, model_for_next
 
     progress(0.1, "reading the recording")
@@ -80,8 +82,6 @@ def track(
 
 def dated(path: Path) -> Any:
     """A recording that knows when it began, if its file says so."""
-    import identify
-
     record = identify.read(path)
     part = record.parts[0]
     if len(record.parts) > 1 or part.begun_s is not None:
@@ -91,7 +91,6 @@ def dated(path: Path) -> Any:
 
 def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
     """The state after what the muscle did in these recordings; of one that cannot be read nobody knows what it did."""
-    import identify
     from identify.tracking import passed, slow_forms
 
     for path in between if slow_forms(model) else ():
@@ -108,7 +107,6 @@ def second_order(model: Any) -> Any:
     BadModel
         Its dynamics are not of second order.
     """
-    import identify
     from identify.dynamics.linear import SecondOrder
 
     if not isinstance(model.linear, SecondOrder):
@@ -122,8 +120,6 @@ def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> f
 
     The torque is its mean in each pulse's period, above the rest before the first pulse.
     """
-    import numpy as np
-
     reference = np.asarray(reference_torque_nm or [], float)
     size_nm = float(np.sqrt(np.mean(reference**2))) if reference.size else 0.0
     if not size_nm > 0.0:
@@ -146,9 +142,6 @@ def warm(progress: Progress, model_json: str) -> dict[str, Any]:
     """Load all that `track` needs, and follow two seconds of the model's own torque: then a trial waits for nothing."""
     import importlib
 
-    import numpy as np
-
-    import identify
     from identify.tracking import follow, model_for_next
 
     progress(0.1, "loading")

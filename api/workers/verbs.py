@@ -5,16 +5,23 @@ Imported by the worker only; the web process never loads numpy, and never fits.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+import identify
 from api.workers import adaptive_verbs, tracking_verbs
 from api.workers.diagnosis_verbs import diagnosis, improve, joined
 from api.workers.json_values import clean
 from api.workers.prediction import forecast, invert
 from api.workers.recorded_signals import recorded
+from identify.records import parts_csv
+from identify.records.cells import quoted
+from identify.records.recording import attributes
 
 Progress = Callable[[float, str], None]
 POINTS = 2400
@@ -34,8 +41,6 @@ def fit(
 
     With `recruitment` near-sigmoid, `models` are the person's approved ones, oldest first.
     """
-    import identify
-
     progress(0.05, "reading the recording")
     record = identify.read(Path(data))
     progress(0.2, "identifying")
@@ -57,16 +62,12 @@ def fit(
 
 def figures(progress: Progress, model_json: str) -> dict[str, Any]:
     """Threshold, plateau and dynamics with their standard deviations, of a model from before these were stored."""
-    import identify
-
     progress(0.1, "reading the model")
     return clean({"figures": identify.Model.from_json(model_json).figures()})
 
 
 def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """The structure of an earlier model on a new recording: the finding, and the carried model where there is one."""
-    import identify
-
     record = identify.read(Path(data))
     found = identify.carry(record, identify.Model.from_json(model_json), progress)
     return {"json": found.models[1].to_json() if len(found.models) > 1 else None, "found": clean(found.finding())}
@@ -74,8 +75,6 @@ def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
 
 def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """The curves a page draws: measured, predicted, commanded, and the step response."""
-    import identify
-
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     progress(0.5, "predicting")
@@ -84,8 +83,6 @@ def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
 
 def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """Measurement against model: identify's comparison, its series thinned."""
-    import identify
-
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     model = identify.Model.from_json(model_json)
@@ -108,10 +105,6 @@ def _rounded(values: list[Any]) -> list[Any]:
 
 def curves(model: Any, record: Any) -> dict[str, Any]:
     """The measured, predicted and commanded curves, thinned to what a screen shows."""
-    import numpy as np
-
-    import identify
-
     predicted = np.asarray(identify.predict(model, record))
     time_s, torque_nm = np.asarray(record.time_s), np.asarray(record.torque_nm)
     step = max(1, math.ceil(len(time_s) / POINTS))
@@ -139,7 +132,6 @@ def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:
 
 def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, list[float]]:
     """The linear part's answer to a unit step (eq. 2 of the paper: B(q)/A(q)), thinned."""
-    import numpy as np
     from scipy.signal import lfilter
 
     linear, rate_hz = document["linear"], float(document["sample_rate_hz"])
@@ -162,7 +154,6 @@ def effects(progress: Progress) -> dict[str, Any]:
 
 def warm(progress: Progress) -> dict[str, Any]:
     """Load identify and its compiled parts, so that the fit after a test starts at once."""
-    import identify
     from identify.records.csv import read_csv
 
     progress(0.1, "loading")
@@ -188,9 +179,6 @@ def _warm_csv() -> str:
 
 def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> dict[str, Any]:
     """A table or MAT file of another tool as a CSV file in our own layout, by what `--map` says of its columns."""
-    import identify
-    from identify.records import parts_csv
-
     progress(0.1, "reading the recording")
     record = identify.read(Path(data), map=columns)
     progress(0.7, "writing")
@@ -200,10 +188,6 @@ def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> di
 
 def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     """A recording as a CSV file in the layout that `identify.read` takes in (docs/recording.md's times and widths)."""
-    import identify
-    from identify.records import parts_csv
-    from identify.records.cells import quoted
-
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     if len(record.parts) > 1:
@@ -229,11 +213,7 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
 
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
     """The sealed recording of a test, when the service did not hear of its end."""
-    import hashlib
-
-    import identify
     from api.store.uploads import PREFIX
-    from identify.records.recording import attributes
 
     progress(0.1, "looking through the recordings")
     for path in sorted(Path(folder).glob("**/*.h5")):
@@ -249,23 +229,14 @@ def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, A
     return {"found": None}
 
 
+OWN = (
+    fit, carry, comparison, figures, diagnosis, improve, effects, warm, forecast, invert, export_csv, plain_csv,
+    find_recording, recorded,
+)  # fmt: skip
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {
-    "fit": fit,
-    "carry": carry,
-    "comparison": comparison,
+    **{verb.__name__: verb for verb in OWN},
     "curves": drawn,
-    "figures": figures,
-    "diagnosis": diagnosis,
-    "improve": improve,
     "join": joined,
-    "effects": effects,
-    "warm": warm,
-    "forecast": forecast,
-    "invert": invert,
-    "export_csv": export_csv,
-    "plain_csv": plain_csv,
-    "find_recording": find_recording,
-    "recorded": recorded,
     **adaptive_verbs.VERBS,
     **tracking_verbs.VERBS,
 }
