@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from api.language import _, lazy
@@ -74,6 +74,23 @@ TEST_STATES: dict[str, Any] = {
 DECISIONS: dict[str, Any] = {"approved": lazy("approved"), "rejected": lazy("rejected")}
 
 
+def _by(words: dict[str, Any]) -> Callable[[str], str]:
+    """What people call a thing, in the page's language, by its name; a name that is not known as it is."""
+    return lambda name: str(words.get(name, name))
+
+
+verdict_words = _by(VERDICTS)
+"""A verdict in the page's language."""
+test_kind_words = _by(TEST_KINDS)
+"""What a person calls a kind of test."""
+test_state_words = _by(TEST_STATES)
+"""How a test stands."""
+adaptive_end_words = _by(ADAPTIVE_ENDS)
+"""Why a test that stops itself ended."""
+joint_end_words = _by(JOINT_ENDS)
+"""Why a guided test of a joint ended."""
+
+
 def segment_words(name: str | None) -> str:
     """What a person calls a segment, a number behind it kept; a user's own name as it is."""
     kind, _space, number = (name or "").partition(" ")
@@ -81,34 +98,9 @@ def segment_words(name: str | None) -> str:
     return (name or "") if known is None else f"{known} {number}".strip()
 
 
-def verdict_words(verdict: str) -> str:
-    """A verdict in the page's language."""
-    return str(VERDICTS.get(verdict, verdict))
-
-
-def test_kind_words(kind: str) -> str:
-    """What a person calls a kind of test."""
-    return str(TEST_KINDS.get(kind, kind))
-
-
 def test_title(kind: str) -> str:
     """The title of a test's page."""
     return str(TITLES.get(kind, TITLES["pre-session"]))
-
-
-def test_state_words(state: str) -> str:
-    """How a test stands."""
-    return str(TEST_STATES.get(state, state))
-
-
-def adaptive_end_words(ended: str) -> str:
-    """Why a test that stops itself ended."""
-    return str(ADAPTIVE_ENDS.get(ended, ended))
-
-
-def joint_end_words(ended: str) -> str:
-    """Why a guided test of a joint ended."""
-    return str(JOINT_ENDS.get(ended, ended))
 
 
 def missing_words(missing: Sequence[Mapping[str, Any]] | None) -> list[str]:

@@ -8,18 +8,13 @@ if TYPE_CHECKING:
     from rig.messages import Problem as RigProblem
 
 RIG_STATUS = {
-    "busy": 409,
-    "latched": 409,
-    "latch-changed": 409,
-    "withdrawn": 409,
-    "uncertain": 409,
     "refused": 422,
     "rest-needed": 422,
     "bad-plan": 422,
     "disconnected": 503,
     "internal": 502,
 }
-"""Which HTTP status answers each of the rig's refusals; an unknown code is 409."""
+"""Which HTTP status answers each of the rig's refusals; every other one is answered by 409."""
 
 
 class ApiError(Exception):
