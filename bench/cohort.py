@@ -31,7 +31,7 @@ from api.cohort.cluster import Workers, connected
 from api.cohort.parts import Results
 from api.cohort.run import Run
 from api.cohort.sources.addresses import sources_of
-from api.cohort.tasks import checked
+from api.cohort.tasks import Task, checked
 from api.cohort.worker import Bounds
 from api.version import software_version
 from bench.stamp import written_by
@@ -91,7 +91,7 @@ def run(
 
 def once(client: Any, folder: Path, output: Path, verb: str, bounds: Bounds, watch: Any = None) -> float:
     """One run over a folder with workers that are there; its time, s."""
-    task = checked(verb, software=software_version())
+    task = checked(Task(verb, software=software_version()))
     with Results(output, task) as results:
         began_s = time.perf_counter()
         Run(client, sources_of([str(folder)]), task, bounds, results, watch or (lambda _tally: None)).go(keep=True)
@@ -119,7 +119,7 @@ def throughput(folder: Path, place: Path, verb: str, count: int, **more: Any) ->
 
 def plain(folder: Path, warm: Path, verb: str, processes: int) -> float:
     """The reference, s: the same records computed by bare processes, no Dask, no results written."""
-    document = checked(verb, software=software_version()).document()
+    document = checked(Task(verb, software=software_version())).document()
     jobs, first = ([(str(path), document) for path in sorted(place.rglob("*.h5"))] for place in (folder, warm))
     with multiprocessing.get_context("spawn").Pool(processes, initializer=child.load) as pool:
         pool.starmap(bare, first, chunksize=1)

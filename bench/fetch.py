@@ -20,7 +20,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from api.cli.launcher import Child
+from api.cli.child import Child
 from api.client.connection import SendsVersions
 from api.settings import Settings
 from tests.harness.patients import Patient, make_record

@@ -7,7 +7,6 @@ import secrets
 import socket
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 from api import owner_only
@@ -15,8 +14,9 @@ from api.centre.context import opened
 from api.centre.postgres import Cluster
 from api.centre.rigs import Rigs
 from api.centre.settings import CentreSettings
+from api.cli.child import Child
 from api.cli.errors import LaunchError
-from api.cli.launcher import Child, Ended, Endings
+from api.cli.launcher import Ended, Endings
 from api.cli.terminal import say
 from api.client.errors import ServiceError
 from api.client.rest import Client
@@ -97,7 +97,8 @@ def play(folder: Path, port: int) -> None:
             stack.callback(rig.stop)
             rig.start()
             rigs.append(rig)
-        say(f"the centre's page: {url}/sign-in#token={token}", *_rig_lines(rigs), f"files and logs in {folder}")
+        pages = [f"{rig.name}: {rig.url}/sign-in#token={rig.token}" for rig in rigs]
+        say(f"the centre's page: {url}/sign-in#token={token}", *pages, f"files and logs in {folder}")
         say("each rig plays a test of about a minute, and pushes it by itself; Ctrl-C ends all")
         _watch([centre, *(rig.child for rig in rigs)])
     say("ended; what was recorded is kept")
@@ -116,19 +117,11 @@ def _centre(folder: Path, port: int, database: str, token: str) -> Child:
 
 def _key(folder: Path, database: str, name: str) -> str:
     """A new key for a rig; one from before is revoked."""
-    store = opened(CentreSettings(data_dir=folder / "centre", database_url=database))
-    try:
+    with contextlib.closing(opened(CentreSettings(data_dir=folder / "centre", database_url=database))) as store:
         rigs = Rigs(store, Clock(), Guesses(Clock()))
         if rigs.named(name) is not None:
             rigs.revoke(name, "demo")
         return rigs.add(name, "demo")
-    finally:
-        store.close()
-
-
-def _rig_lines(rigs: list[EmulatedRig]) -> Iterator[str]:
-    for rig in rigs:
-        yield f"{rig.name}: {rig.url}/sign-in#token={rig.token}"
 
 
 def _watch(children: list[Child]) -> None:

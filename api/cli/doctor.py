@@ -19,7 +19,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from api.settings import Settings
 
@@ -63,10 +63,7 @@ def checks() -> dict[str, Callable[[Settings], Iterator[Finding]]]:
 
 def as_dict(found: list[Finding]) -> dict[str, Any]:
     """The findings as one object."""
-    worst: Verdict = "ok"
-    for verdict in ("care", "fails"):
-        if any(finding.verdict == verdict for finding in found):
-            worst = verdict
+    worst = max((finding.verdict for finding in found), key=get_args(Verdict).index, default="ok")
     return {"verdict": worst, "findings": [asdict(finding) for finding in found]}
 
 

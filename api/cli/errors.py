@@ -28,7 +28,3 @@ class InputError(CommandError):
 
 class LaunchError(CommandError):
     """A process did not come up, or ended."""
-
-
-class ReportedError(CommandError):
-    """A step that the service was asked for failed."""

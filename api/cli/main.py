@@ -45,7 +45,11 @@ def build(verb: str = "") -> typer.Typer:
     )
     app.callback()(_options)  # one verb alone stays a verb
     for name in [verb] if verb in VERBS else VERBS:
-        importlib.import_module(f"{commands.__name__}.{name}").register(app)
+        module = importlib.import_module(f"{commands.__name__}.{name}")
+        if hasattr(module, "register"):
+            module.register(app)
+        else:
+            app.command(name)(getattr(module, name))
     return app
 
 

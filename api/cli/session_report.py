@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from api.cli.errors import ReportedError
+from api.cli.errors import CommandError
 from api.cli.terminal import carried_lines, model_report, number
 from api.client.documents import SessionTest
 from api.client.errors import Unreachable
@@ -38,7 +38,7 @@ def run_test(
 
     Raises
     ------
-    ReportedError
+    CommandError
         A process has ended.
     ServiceError
         The test was refused, or did not complete.
@@ -47,7 +47,7 @@ def run_test(
 
     def watch(test: SessionTest) -> None:
         for event in events():
-            raise ReportedError(event)
+            raise CommandError(event)
         if test["state"] not in ("requested", "running"):
             over()
         show(test)
@@ -57,7 +57,7 @@ def run_test(
         return client.run_test(participant, watch, **more)
     except Unreachable as error:
         for event in events():
-            raise ReportedError(event) from error
+            raise CommandError(event) from error
         raise
 
 

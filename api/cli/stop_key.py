@@ -111,12 +111,7 @@ def in_foreground(descriptor: int) -> bool:
         return True
 
 
-def always() -> bool:
-    """Nothing is about to play that the rig does not know of."""
-    return True
-
-
-def at_rig(path: Path, stray: Callable[[], bool] = always) -> Callable[[], str]:
+def at_rig(path: Path, stray: Callable[[], bool] = lambda: True) -> Callable[[], str]:
     """What stops the rig at a socket, past the service: it need not be alive.
 
     Parameters
@@ -147,7 +142,7 @@ async def _stop(rig: RigClient, stray: bool) -> str:
     return CONFIRMED if evidence.confirmed else f"{DOUBT} The rig says: {evidence.detail}"
 
 
-def at_service(url: str, token: str, stray: Callable[[], bool] = always) -> Callable[[], str]:
+def at_service(url: str, token: str, stray: Callable[[], bool] = lambda: True) -> Callable[[], str]:
     """What stops the rig of a service elsewhere; `stray` as in `at_rig`."""
     return lambda: _stop_through(url, token, stray())
 

@@ -2,37 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
-from typing import Protocol
+
+from api.cli.child import Child
 
 AGAIN_S = (1.0, 5.0, 30.0)
 """Real seconds until they are started again; the last one for every further time."""
 LASTED_S = 300.0
-
-
-class Startable(Protocol):
-    """What is asked of the launcher's `Child`."""
-
-    command: list[str]
-    process: subprocess.Popen[bytes] | None
-    started_s: float
-
-    def start_unheard(self) -> None:
-        """Start it and wait for nothing."""
-        ...
-
-    def alive(self) -> bool:
-        """Whether it runs."""
-        ...
-
-    def end(self) -> None:
-        """End it."""
-        ...
-
-    def last_words(self) -> str:
-        """The last line of its log."""
-        ...
 
 
 class Streams:
@@ -44,7 +20,7 @@ class Streams:
         How it is started.
     """
 
-    def __init__(self, child: Startable) -> None:
+    def __init__(self, child: Child) -> None:
         self.child = child
         self._deaths = 0
         self._again_s: float | None = None

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+import identify
 from api.cli.errors import InputError
 
 LARGEST_MODEL_BYTES = 32 * 2**20
@@ -55,6 +56,11 @@ HeldModel = Annotated[
 ]
 
 
+def given(**options: Any) -> dict[str, Any]:
+    """The options that somebody gave; of the others the environment is asked."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
 def names(text: str | None) -> tuple[str, ...]:
     """A comma-separated list."""
     return tuple(part.strip() for part in (text or "").split(",") if part.strip())
@@ -68,8 +74,6 @@ def load_model(path: Path) -> Any:
     InputError
         The file cannot be read, or holds no model.
     """
-    import identify
-
     if path.suffix.lower() == ".mat":
         raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
     try:
@@ -79,22 +83,6 @@ def load_model(path: Path) -> Any:
         raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
     except identify.IdentifyError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def load_record(data: Path, columns: list[str] | None = None) -> Any:
-    """A record from its file; what was assumed when it was read goes to standard error.
-
-    Raises
-    ------
-    IdentifyError
-        It cannot be read.
-    """
-    import identify
-
-    record = identify.read(data, map=columns)
-    for note in record.notes:
-        print(f"{data}: {note}", file=sys.stderr)
-    return record
 
 
 def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects: Sequence[str] = ()) -> Any:
@@ -118,7 +106,6 @@ def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects:
 
 def _needed(effects: Sequence[str]) -> list[str]:
     """The columns that effects need; of an unknown one the fit says so."""
-    import identify
     from identify import effects as library
 
     found: list[str] = []
@@ -147,7 +134,6 @@ def load_held(path: Path | None, data: Sequence[Path], columns: list[str] | None
     InputError
         As `load_model`; the model is one of another pulse rate, or one that effects do not stand on.
     """
-    import identify
     from api.structure import held_by
 
     model = None if path is None else load_model(path)
@@ -215,7 +201,7 @@ def writing(path: Path) -> Iterator[None]:
 
 def say_json(found: dict[str, Any]) -> None:
     """One JSON object, nothing else."""
-    from api.workers.verbs import clean
+    from api.workers.json_values import clean
 
     print(json.dumps(clean(found), ensure_ascii=False, allow_nan=False))
 
@@ -223,6 +209,15 @@ def say_json(found: dict[str, Any]) -> None:
 def say(*lines: str) -> None:
     """Lines for people."""
     print("\n".join(lines))
+
+
+def sign_in_lines(url: str, drawn: str | None, configured: bool, setting: str) -> list[str]:
+    """How to get in: with the token that was drawn just now, the one in the setting, or one from before."""
+    if drawn:
+        return [f"first administrator's token, shown this once: {drawn}", f"sign in: {url}/sign-in#token={drawn}"]
+    if configured:
+        return [f"the administrator's token is the one in {setting}"]
+    return [f"sign in with a token issued before (set {setting} to replace a lost one)"]
 
 
 def number(value: float | None, digits: int = 2, unit: str = "") -> str:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import identify
 from api.cohort.tasks import Task
 
 FIGURES = (
     "fit_percent", "ceiling_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm", "held_out_by",
 )  # fmt: skip
+OF_EFFECT = ("probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm")
+OF_STEP = ("fit_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm")
 MODEL = "model"
 """What a parameter belongs to where it is none of an effect's."""
 Row = dict[str, Any]
@@ -27,8 +30,6 @@ def answer(record: Any, task: Task) -> Row:
 
 
 def _fit(record: Any, task: Task) -> Row:
-    import identify
-
     document = identify.fit(record, method=task.method, effects=task.effects).to_dict()
     fit, quality = document["fit"], document["quality"]
     return {
@@ -42,7 +43,6 @@ def _fit(record: Any, task: Task) -> Row:
 
 
 def _diagnose(record: Any, _task: Task) -> Row:
-    import identify
     from identify.diagnosis.experiment import planned
 
     found = identify.diagnose(record).to_dict()
@@ -63,8 +63,6 @@ def _diagnose(record: Any, _task: Task) -> Row:
 
 
 def _improve(record: Any, _task: Task) -> Row:
-    import identify
-
     improved = identify.improve(record)
     found = improved.to_dict()
     steps, document = found["steps"], improved.models[-1].to_dict()
@@ -75,10 +73,7 @@ def _improve(record: Any, _task: Task) -> Row:
         "reasons": [step["reason"] for step in steps[1:]],
         "effects": [_effect(effect) for effect in document["effects"]],
         "parameters": _of_model(document),
-        "steps": [
-            {name: step[name] for name in ("added", "fit_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm")}
-            for step in steps
-        ],
+        "steps": [{name: step[name] for name in ("added", *OF_STEP)} for step in steps],
         "refused": [{name: row[name] for name in ("effect", "log_evidence_gain")} for row in found["refused"]],
     }  # fmt: skip
 
@@ -88,11 +83,10 @@ VERBS = {"fit": _fit, "diagnose": _diagnose, "improve": _improve}
 
 def _effect(found: Mapping[str, Any]) -> Row:
     """An effect of a model, or one that a diagnosis found missing."""
-    numbers = ("probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm")
     return {
         "effect": found.get("effect") or found["id"],
         "form": found.get("form"),
-        **{name: found.get(name) for name in numbers},
+        **{name: found.get(name) for name in OF_EFFECT},
         "confused_with": list(found.get("confused_with") or []),
     }
 

@@ -16,100 +16,85 @@ import numpy as np
 
 from api.cohort.bids_words import DESCRIPTION, EVENTS, PARTICIPANTS, PHYSIO, README, SCANS, STIM
 from api.cohort.export_state import FOLDER, State
-from api.cohort.handed_on import ERRORS, Days, NoExport, Put, Who, hidden
+from api.cohort.handed_on import ERRORS, NoExport, Put, Who
 from api.cohort.opened import Opened
 from api.cohort.parquet_files import STATUS, record_row, segment_at
 from api.version import software_version
 from identify.records.cells import told
 
+NAME: str = "bids"
 MOST_ROWS = 20_000_000
 EVEN_S = 1e-6
 """Samples further from an even grid than this have a column of their own with their times."""
 SCAN_COLUMNS = ("kind", "outcome", "duration_s", "sample_rate_hz", "record_id", "sha256")
 
 
-class Bids:
-    """Writes the folder.
+def write(record: Opened, who: Who, put: Put) -> dict[str, Any]:
+    """The record's files; its row of `scans.tsv`."""
+    task = "".join(c for c in str(record.about.get("kind") or "") if c.isascii() and c.isalnum()) or "test"
+    stem = f"sub-{who.label}_ses-{who.session}_task-{task}_acq-{who.key}"
+    folder = f"sub-{who.label}/ses-{who.session}/beh"
+    rate_hz, start_s, at, exact = grid(record)
+    head = {
+        "SamplingFrequency": rate_hz,
+        "StartTime": start_s,
+        "TaskName": record.about.get("kind") or "test",
+        "RecordingID": who.record_id,
+        "SHA256": record.sha256,
+        "PulseRate": record.about.get("pulse_rate_hz"),
+        **{f"Alignment_{key.removeprefix('alignment_')}": value for key, value in record.about.items()
+           if key.startswith("alignment_")},
+    }  # fmt: skip
+    physio = [name for name in PHYSIO if name in record.samples and (name != "time_s" or not exact)]
+    _continuous(put, f"{folder}/{stem}_physio", record, physio, at, {**head, **_described(PHYSIO, physio)})
+    stim = [name for name in STIM if name in record.samples]
+    _continuous(put, f"{folder}/{stem}_stim", record, stim, at, {**head, **_described(STIM, stim)})
+    with put(f"{folder}/{stem}_events.tsv") as file:
+        file.writelines(line.encode() for line in tsv(EVENTS, events(record)))
+    _json(put, f"{folder}/{stem}_events.json", {**EVENTS, "TaskName": head["TaskName"]})
+    return {**record_row(record, who), "label": who.label, "file": f"beh/{stem}_physio.tsv.gz"}
 
-    Parameters
-    ----------
-    days : Days
-        What becomes of dates.
-    """
 
-    name = "bids"
+def _continuous(put: Put, place: str, record: Opened, names: list[str], at: np.ndarray, head: dict[str, Any]) -> None:
+    columns = []
+    for name in names:
+        cells = np.full(int(at[-1]) + 1, "n/a", object)
+        cells[at] = [cell(value) for value in record.samples[name].tolist()]
+        columns.append(cells)
+    with put(f"{place}.tsv.gz") as file, gzip.GzipFile("", "wb", 6, file, mtime=0) as packed:
+        packed.write(("\n".join(map("\t".join, zip(*columns, strict=True))) + "\n").encode())
+    _json(put, f"{place}.json", head)
 
-    def __init__(self, days: Days) -> None:
-        self._days = days
 
-    def write(self, record: Opened, who: Who, put: Put) -> dict[str, Any]:
-        """The record's files; its row of `scans.tsv`."""
-        record = hidden(record, self._days)
-        task = "".join(c for c in str(record.about.get("kind") or "") if c.isascii() and c.isalnum()) or "test"
-        stem = f"sub-{who.label}_ses-{who.session}_task-{task}_acq-{who.key}"
-        folder = f"sub-{who.label}/ses-{who.session}/beh"
-        rate_hz, start_s, at, exact = grid(record)
-        head = {
-            "SamplingFrequency": rate_hz,
-            "StartTime": start_s,
-            "TaskName": record.about.get("kind") or "test",
-            "RecordingID": who.record_id,
-            "SHA256": record.sha256,
-            "PulseRate": record.about.get("pulse_rate_hz"),
-            **{f"Alignment_{key.removeprefix('alignment_')}": value for key, value in record.about.items()
-               if key.startswith("alignment_")},
-        }  # fmt: skip
-        physio = [name for name in PHYSIO if name in record.samples and (name != "time_s" or not exact)]
-        self._continuous(put, f"{folder}/{stem}_physio", record, physio, at, {**head, **_described(PHYSIO, physio)})
-        stim = [name for name in STIM if name in record.samples]
-        self._continuous(put, f"{folder}/{stem}_stim", record, stim, at, {**head, **_described(STIM, stim)})
-        with put(f"{folder}/{stem}_events.tsv") as file:
-            file.writelines(line.encode() for line in tsv(EVENTS, events(record)))
-        _json(put, f"{folder}/{stem}_events.json", {**EVENTS, "TaskName": head["TaskName"]})
-        return {**record_row(record, who), "label": who.label, "file": f"beh/{stem}_physio.tsv.gz"}
+def finish(state: State, put: Put) -> None:
+    """What describes the whole, and the lists of participants and scans."""
+    codes = {code: label for label, code in state.labels()}
+    people: list[dict[str, Any]] = []
+    for participant, sessions in groupby(state.rows(), key=lambda row: row[0]):
+        label, number, count = codes[participant], 0, 0
+        for session, rows in groupby(sessions, key=lambda row: row[1]):
+            scans = list(_scans(rows))
+            number, count = number + 1, count + len(scans)
+            stem = f"sub-{label}/ses-{session}/sub-{label}_ses-{session}_scans"
+            with put(f"{stem}.tsv") as file:
+                file.writelines(line.encode() for line in tsv(SCANS, scans))
+            _json(put, f"{stem}.json", SCANS)
+        people.append({"participant_id": f"sub-{label}", "code": participant, "sessions": number, "recordings": count})
+    with put("participants.tsv") as file:
+        file.writelines(line.encode() for line in tsv(PARTICIPANTS, people))
+    _json(put, "participants.json", PARTICIPANTS)
+    made_by = [{"Name": "stimrig", "Version": software_version()}]
+    _json(put, "dataset_description.json", {**DESCRIPTION, "GeneratedBy": made_by})
+    for name, text in (("README", README), (".bidsignore", f"{ERRORS}\n{FOLDER}/\n")):
+        with put(name) as file:
+            file.write(text.encode())
 
-    def _continuous(
-        self, put: Put, place: str, record: Opened, names: list[str], at: np.ndarray, head: dict[str, Any]
-    ) -> None:
-        columns = []
-        for name in names:
-            cells = np.full(int(at[-1]) + 1, "n/a", object)
-            cells[at] = [cell(value) for value in record.samples[name].tolist()]
-            columns.append(cells)
-        with put(f"{place}.tsv.gz") as file, gzip.GzipFile("", "wb", 6, file, mtime=0) as packed:
-            packed.write(("\n".join(map("\t".join, zip(*columns, strict=True))) + "\n").encode())
-        _json(put, f"{place}.json", head)
 
-    def finish(self, state: State, put: Put) -> None:
-        """What describes the whole, and the lists of participants and scans."""
-        codes = {code: label for label, code in state.labels()}
-        people: list[dict[str, Any]] = []
-        for participant, sessions in groupby(state.rows(), key=lambda row: row[0]):
-            label, number, count = codes[participant], 0, 0
-            for session, rows in groupby(sessions, key=lambda row: row[1]):
-                scans = list(self._scans(rows))
-                number, count = number + 1, count + len(scans)
-                stem = f"sub-{label}/ses-{session}/sub-{label}_ses-{session}_scans"
-                with put(f"{stem}.tsv") as file:
-                    file.writelines(line.encode() for line in tsv(SCANS, scans))
-                _json(put, f"{stem}.json", SCANS)
-            people.append(
-                {"participant_id": f"sub-{label}", "code": participant, "sessions": number, "recordings": count}
-            )
-        with put("participants.tsv") as file:
-            file.writelines(line.encode() for line in tsv(PARTICIPANTS, people))
-        _json(put, "participants.json", PARTICIPANTS)
-        made_by = [{"Name": "stimrig", "Version": software_version()}]
-        _json(put, "dataset_description.json", {**DESCRIPTION, "GeneratedBy": made_by})
-        for name, text in (("README", README), (".bidsignore", f"{ERRORS}\n{FOLDER}/\n")):
-            with put(name) as file:
-                file.write(text.encode())
-
-    def _scans(self, rows: Iterable[tuple[str, str, dict[str, Any]]]) -> Iterator[dict[str, Any]]:
-        for _, _, row in sorted(rows, key=lambda row: str(row[2]["begun_utc"])):
-            begun = row["begun_utc"]
-            told = {name: row[name] for name in SCAN_COLUMNS}
-            yield {"filename": row["file"], "acq_time": begun and begun.replace("+00:00", "Z"), **told}
+def _scans(rows: Iterable[tuple[str, str, dict[str, Any]]]) -> Iterator[dict[str, Any]]:
+    for _, _, row in sorted(rows, key=lambda row: str(row[2]["begun_utc"])):
+        begun = row["begun_utc"]
+        told = {name: row[name] for name in SCAN_COLUMNS}
+        yield {"filename": row["file"], "acq_time": begun and begun.replace("+00:00", "Z"), **told}
 
 
 def grid(record: Opened) -> tuple[float, float, np.ndarray, bool]:

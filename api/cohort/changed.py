@@ -141,8 +141,6 @@ def _share(file: Path, share: int, shares: int) -> Iterator[Row]:
 
 def _options(file: Path) -> dict[str, Any]:
     options = options_of(file)
-    if options is None:
-        raise CohortError(f"{file}: no such file. Give the -o of `stimrig cohort fit`, `diagnose` or `improve`.")
     return {name: options.get(name) for name in OPTIONS}
 
 

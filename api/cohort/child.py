@@ -19,17 +19,21 @@ import threading
 import time
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
+import identify
 from api.cohort.answers import answer
 from api.cohort.fields import as_day
 from api.cohort.select import Selection
 from api.cohort.tasks import Task
 from api.version import software_version
 from api.workers import confinement
+from api.workers.child import own_output, say
 from api.workers.json_values import clean
 from identify.diagnosis import candidates
 from identify.errors import BadRecord, BadRequest, IdentifyError, NotIdentifiable
+from identify.records import bounds
+from identify.records.hdf5 import StrictFile
 from identify.records.read import HDF5_MAGIC
 
 IDLE_S = 600.0
@@ -55,11 +59,11 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="where records are put, all that may be read")
     parser.add_argument("--memory", type=int, required=True, help="bytes beyond what the libraries take")
     options = parser.parse_args()
-    out = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # whatever a library prints must not fall into the protocol
+    out = own_output()
     load()
     os.chdir(options.folder)
-    left_open = confinement.confine([options.folder], memory_bytes=address_space() + options.memory)
+    before, _ = taken() or (confinement.MEMORY_BYTES, 0)
+    left_open = confinement.confine([options.folder], memory_bytes=before + options.memory)
     say(out, {"ready": True, "left_open": left_open, "software": software_version()})
     calls: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=listen, args=(calls,), daemon=True).start()
@@ -85,22 +89,13 @@ def load() -> None:
     candidates.WORKERS = 1
 
 
-def address_space() -> int:
-    """Bytes of addresses this process has taken."""
+def taken() -> tuple[int, int] | None:
+    """Bytes of addresses, and of memory, that this process has taken; None where the system does not tell."""
     try:
-        pages = int(Path("/proc/self/statm").read_text("ascii").split()[0])
-    except OSError:
-        return confinement.MEMORY_BYTES
-    return pages * resource.getpagesize()
-
-
-def memory_mb() -> float | None:
-    """Memory this process holds now, MB."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+        addresses, memory = Path("/proc/self/statm").read_text("ascii").split()[:2]
     except OSError:
         return None
-    return round(pages * resource.getpagesize() / 1e6, 1)
+    return int(addresses) * resource.getpagesize(), int(memory) * resource.getpagesize()
 
 
 def run(call: dict[str, Any]) -> dict[str, Any]:
@@ -122,18 +117,17 @@ def run(call: dict[str, Any]) -> dict[str, Any]:
         row |= failed("unexpected", "too deeply nested")
     except Exception as error:
         row |= failed("unexpected", f"{type(error).__name__}: {error}")
+    now = taken()
     row |= {
         "took_s": round(time.perf_counter() - began_s, 4),
         "processor_s": round(time.process_time() - processor_s, 4),
-        "worker_memory_mb": memory_mb(),
+        "worker_memory_mb": now and round(now[1] / 1e6, 1),
     }
     return {"row": clean(row)}
 
 
 def found(path: Path, task: Task, row: dict[str, Any]) -> bool:
     """Read, judge and do the verb, into the row; False where the selection does not mean the record."""
-    import identify
-
     with path.open("rb") as file:
         sealed = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
     selection = Selection(task.select)
@@ -158,9 +152,6 @@ def found(path: Path, task: Task, row: dict[str, Any]) -> bool:
 
 def about(path: Path) -> dict[str, Any]:
     """What a sealed recording says of itself."""
-    from identify.records import bounds
-    from identify.records.hdf5 import StrictFile
-
     file = StrictFile(bounds.content_of(path), str(path))
     given: dict[str, Any] = {column: file.text(name, "") for name, column in ABOUT.items()}
     given["day"] = as_day(given["begun_utc"])
@@ -170,12 +161,6 @@ def about(path: Path) -> dict[str, Any]:
 def failed(kind: str, line: str) -> dict[str, Any]:
     """The columns of a record that failed."""
     return {"status": "error", "error_kind": kind, "error": " ".join(line.split())[:1000]}
-
-
-def say(out: TextIO, message: dict[str, Any]) -> None:
-    """One object, one line."""
-    out.write(json.dumps(message) + "\n")
-    out.flush()
 
 
 if __name__ == "__main__":

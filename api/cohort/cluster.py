@@ -17,6 +17,7 @@ from dask import config
 from dask.utils import parse_bytes
 from distributed import Client, LocalCluster
 from distributed.comm.core import CommClosedError
+from distributed.security import Security
 
 from api.cohort.errors import SCHEDULER_GONE, CohortError, CutOffError
 from api.version import software_version
@@ -117,7 +118,7 @@ def _local(workers: Workers) -> Iterator[Client]:
             memory_limit=max(WORKER_BYTES, workers.memory_bytes),
             dashboard_address="127.0.0.1:0" if workers.dashboard else None,  # pyright: ignore[reportArgumentType]
             silence_logs=logging.CRITICAL,
-            security=_keys(),
+            security=Security.temporary(),  # whoever reaches an open scheduler's port runs programs as its user
         )
     with config.set(settings), cluster, Client(cluster) as client:
         yield client
@@ -135,13 +136,6 @@ def _without_ctrl_c() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _keys() -> Any:
-    """Keys for this run alone: whoever reaches an open scheduler's port runs programs as its user."""
-    from distributed.security import Security
-
-    return Security.temporary()
 
 
 @contextmanager

@@ -9,8 +9,7 @@ from typing import Any
 from api.charts.config import said
 from api.charts.model_charts import axis, layout
 from api.charts.palette import role
-from api.cohort.gathered import Gathered, Series
-from api.cohort.statistics import wilson
+from api.cohort.gathered import Gathered, wilson
 
 LEAST_CASES = 5
 """Of fewer an interval says next to nothing; it is drawn, and said so."""
@@ -101,7 +100,7 @@ def over_sessions(found: Gathered, key: tuple[str, str]) -> Figure | None:
             "line": {"color": colour, "width": 1.4, "dash": DASHES[number // len(COLOURS) % len(DASHES)]},
             "marker": {"color": colour, "size": 5},
         })  # fmt: skip
-    title = f"{title_of(key)} ({unit_of(series)})"
+    title = f"{title_of(key)} ({series.unit})"
     return _figure(traces, 340, xaxis=axis("day of the session (date, UTC)", type="date"), yaxis=axis(title))
 
 
@@ -113,7 +112,7 @@ def repeats(found: Gathered) -> list[dict[str, Any]]:
         one = series.repeats()
         if one is not None:
             few = one.participants < LEAST_CASES
-            rows.append({"parameter": title_of(key), "unit": unit_of(series), "few": few, **vars(one)})
+            rows.append({"parameter": title_of(key), "unit": series.unit, "few": few, **vars(one)})
     return rows
 
 
@@ -123,11 +122,6 @@ def title_of(key: tuple[str, str]) -> str:
     for end in UNITS:
         name = name.removesuffix(f"_{end}")
     return _plain(name) if of == "model" else f"{_plain(of)}: {_plain(name)}"
-
-
-def unit_of(series: Series) -> str:
-    """Its unit; 1 is said, too: an axis without a unit is none."""
-    return series.unit
 
 
 def _plain(name: str) -> str:

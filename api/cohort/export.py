@@ -8,14 +8,14 @@ import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import IO
 
 from api.cohort.errors import CutOffError
 from api.cohort.export_state import State
-from api.cohort.handed_on import ERRORS, Days, NoExport, Who, Writer
+from api.cohort.handed_on import ERRORS, Days, NoExport, Who, Writer, hidden
 from api.cohort.opened import Opened, opened, said_of
 from api.cohort.select import Selection
 from api.cohort.sources import Entry, Source, SourceError
@@ -37,6 +37,7 @@ class Tally:
     copies: int = 0
 
 
+@dataclass
 class Export:
     """One export.
 
@@ -58,21 +59,18 @@ class Export:
         Called with the tally after every record.
     """
 
-    def __init__(
-        self,
-        sources: Sequence[Source],
-        selection: Selection,
-        state: State,
-        writer: Writer,
-        days: Days,
-        columns: Sequence[str] = (),
-        tell: Callable[[Tally], None] = lambda _: None,
-    ) -> None:
-        self._sources, self._selection, self._state, self._writer = sources, selection, state, writer
-        self._days, self._columns, self._tell = days, columns, tell
-        self._salt = state.option("salt", secrets.token_hex(16))
+    sources: Sequence[Source]
+    selection: Selection
+    state: State
+    writer: Writer
+    days: Days
+    columns: Sequence[str] = ()
+    tell: Callable[[Tally], None] = lambda _: None
+    tally: Tally = field(default_factory=Tally)
+
+    def __post_init__(self) -> None:
+        self._salt = self.state.option("salt", secrets.token_hex(16))
         self._places: list[str] = []
-        self.tally = Tally()
 
     def go(self) -> Tally:
         """Export all, and what is made of all.
@@ -84,22 +82,22 @@ class Export:
         CutOffError
             The disk is full, or the like; the same command goes on.
         """
-        for source in self._sources:
+        for source in self.sources:
             source.check()
         with tempfile.TemporaryDirectory(prefix="stimrig-export-") as folder, self._on_the_disk():
-            for source in self._sources:
-                for entry in source.entries(self._selection):
+            for source in self.sources:
+                for entry in source.entries(self.selection):
                     self._one(source, entry, Path(folder))
-                    self._tell(self.tally)
-            self._writer.finish(self._state, self.put)
+                    self.tell(self.tally)
+            self.writer.finish(self.state, self.put)
             self._write_errors()
         return self.tally
 
     def _one(self, source: Source, entry: Entry, folder: Path) -> None:
         known = {**entry.known}
-        if self._selection(known) is False:
+        if self.selection(known) is False:
             self.tally.left_out += 1
-        elif self._state.is_done(entry.address, entry.stamp):
+        elif self.state.is_done(entry.address, entry.stamp):
             self.tally.before += 1
         else:
             try:
@@ -124,7 +122,7 @@ class Export:
             raise NoExport(
                 "hash differs", f"its content differs from its hash: {sha256[:12]}…, not {entry.sha256[:12]}…"
             )
-        if self._state.is_copy(entry.address, sha256):
+        if self.state.is_copy(entry.address, sha256):
             self.tally.copies += 1
             return
         path = folder / f"record{Path(entry.name).suffix.lower()[:8]}"
@@ -137,44 +135,44 @@ class Export:
             path.unlink(missing_ok=True)
 
     def _write(self, entry: Entry, content: bytes, sha256: str, path: Path) -> None:
-        if self._selection(said_of(content, path, entry.known)) is False:
+        if self.selection(said_of(content, path, entry.known)) is False:
             self.tally.left_out += 1
             return
-        record = opened(content, path, entry.known, self._columns)
-        if self._selection(record.about) is False:
+        record = opened(content, path, entry.known, self.columns)
+        if self.selection(record.about) is False:
             self.tally.left_out += 1
             return
         record.about["address"] = entry.address
         who = self._who(record)
-        before = self._state.files(entry.address)
+        before = self.state.files(entry.address)
         self._places = []
-        row = self._writer.write(record, who, self.put)
+        row = self.writer.write(hidden(record, self.days), who, self.put)
         row["files"] = self._places
-        self._state.done(entry.address, entry.stamp, sha256, (who.participant, who.session), row)
+        self.state.done(entry.address, entry.stamp, sha256, (who.participant, who.session), row)
         for place in set(before) - set(self._places):  # of the record as it was
-            (self._state.folder / place).unlink(missing_ok=True)
+            (self.state.folder / place).unlink(missing_ok=True)
         self.tally.written += 1
 
     def _who(self, record: Opened) -> Who:
         code = record.about.get("participant") or UNKNOWN
         try:
-            label = self._state.label(code)
+            label = self.state.label(code)
         except ValueError as error:
             raise NoExport("label", str(error)) from None
-        session = self._days.session(record.about.get("day"), code, self._salt)
-        begun = self._days.begun(record.about.get("begun_utc"))
+        session = self.days.session(record.about.get("day"), code, self._salt)
+        begun = self.days.begun(record.about.get("begun_utc"))
         key = record.sha256[:16]
         return Who(code, label, session, record.about.get("record_id") or key, key, begun)
 
     def _fail(self, entry: Entry, kind: str, reason: str) -> None:
         self.tally.failed += 1
-        self._state.failed(entry.address, kind, reason)
+        self.state.failed(entry.address, kind, reason)
 
     @contextmanager
     def put(self, place: str) -> Iterator[IO[bytes]]:
         """A file in the export: written aside, and renamed when it is whole."""
-        target = self._state.folder / place
-        aside = self._state.place / f"{secrets.token_hex(4)}.part"
+        target = self.state.folder / place
+        aside = self.state.place / f"{secrets.token_hex(4)}.part"
         try:
             with aside.open("wb") as file:
                 yield file
@@ -188,7 +186,7 @@ class Export:
 
     def _write_errors(self) -> None:
         with self.put(ERRORS) as file:
-            rows = chain([("address", "kind", "reason")], self._state.failures())
+            rows = chain([("address", "kind", "reason")], self.state.failures())
             file.writelines(line.encode("utf-8", "replace") for line in lines(rows))
 
     @contextmanager
@@ -197,6 +195,6 @@ class Export:
             yield
         except OSError as error:
             raise CutOffError(
-                f"{self._state.folder}: {error.strerror or error}; what is done is kept, and the same command goes on "
+                f"{self.state.folder}: {error.strerror or error}; what is done is kept, and the same command goes on "
                 "with it."
             ) from None

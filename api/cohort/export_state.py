@@ -53,27 +53,16 @@ class State:
             raise CohortError(f"{folder}: {error.strerror}. Give a folder that can be written.") from None
         except sqlite3.Error as error:
             raise CohortError(f"{self.place}: {error}. Remove the folder and begin again.") from None
-        before = self._option("options")
-        if before is not None and json.loads(before) != options:
+        begun = self.option("options", json.dumps(options))
+        if json.loads(begun) != options:
             self._db.close()
-            raise CohortError(f"{folder}: was begun with other options ({before}). Give these, or a new folder.")
-        self.set_option("options", json.dumps(options))
-
-    def _option(self, name: str) -> str | None:
-        row = self._db.execute("SELECT value FROM options WHERE name = ?", (name,)).fetchone()
-        return None if row is None else str(row[0])
+            raise CohortError(f"{folder}: was begun with other options ({begun}). Give these, or a new folder.")
 
     def option(self, name: str, default: str) -> str:
         """What is kept under a name; the default is kept from now on where nothing is."""
-        found = self._option(name)
-        if found is None:
-            self.set_option(name, default)
-        return default if found is None else found
-
-    def set_option(self, name: str, value: str) -> None:
-        """Keep a text."""
         with self._db:
-            self._db.execute("INSERT OR REPLACE INTO options VALUES (?, ?)", (name, value))
+            self._db.execute("INSERT OR IGNORE INTO options VALUES (?, ?)", (name, default))
+        return str(self._db.execute("SELECT value FROM options WHERE name = ?", (name,)).fetchone()[0])
 
     def is_done(self, address: str, stamp: str) -> bool:
         """Whether that record was exported as it is now."""

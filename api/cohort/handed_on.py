@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from typing import Any, Protocol
@@ -71,16 +72,14 @@ class Who:
     begun_utc: str | None
 
 
-class Put(Protocol):
-    """Gives a file to write, which takes its place as a whole or not at all."""
-
-    def __call__(self, place: str) -> Any: ...
+Put = Callable[[str], Any]
+"""Gives a file to write at a place, which takes it as a whole or not at all."""
 
 
 class Writer(Protocol):
-    """A format."""
+    """A format: a module."""
 
-    name: str
+    NAME: str
 
     def write(self, record: Opened, who: Who, put: Put) -> dict[str, Any]:
         """Write a record's files; its row for `finish`. Raises NoExport."""

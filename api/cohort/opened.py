@@ -9,23 +9,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+import identify
 from api.cohort.child import SAID, about
 from api.cohort.fields import Known
+from identify.records.hdf5 import StrictFile
 from identify.records.read import HDF5_MAGIC
 
-TORQUE = {"counter": "/torque/counter", "host_time_s": "/torque/host_time_s", "sync": "/torque/sync"}
-PULSES = {
-    "planned_time_s": "/pulses/planned_time_s",
-    "pulse_width_us": "/pulses/pulse_width_us",
-    "sent_pulse_width_us": "/pulses/sent_pulse_width_us",
-    "current_ma": "/pulses/current_ma",
-    "written_time_s": "/pulses/written_time_s",
-    "acknowledged_time_s": "/pulses/acknowledged_time_s",
-    "status": "/pulses/status",
-}
+TORQUE = ("counter", "host_time_s", "sync")
+PULSES = (
+    "planned_time_s", "pulse_width_us", "sent_pulse_width_us", "current_ma", "written_time_s", "acknowledged_time_s",
+    "status",
+)  # fmt: skip
+"""What a recording holds of its torque's samples, and of its pulses."""
 NUMBERS = ("pulse_rate_hz", "sample_rate_hz", "sample_rate_measured_hz", "current_ma")
 TEXTS = ("reason", "content_sha256", "journal_note", "ended_by", "laid", "events", "configuration")
 ALIGNMENT = ("error_ms", "delay_ms", "rate_ppm")
@@ -76,8 +75,6 @@ def opened(content: bytes, path: Path, known: Mapping[str, Any], columns: Sequen
     BadRecord
         As `identify.read` does.
     """
-    import identify
-
     sealed = content.startswith(HDF5_MAGIC)
     record = identify.read(path, map=list(columns) if columns and not sealed else None)
     said: dict[str, Any] = {**known, **(about(path) if sealed else {})}
@@ -107,8 +104,6 @@ def said_of(content: bytes, path: Path, known: Known) -> dict[str, Any]:
 
 def _sealed(found: Opened, record: Any, content: bytes, path: Path) -> None:
     """Everything that the file holds; what `identify` made of it beside the samples that it took."""
-    from identify.records.hdf5 import StrictFile
-
     file = StrictFile(content, str(path))
     found.about |= {name: number for name in NUMBERS if np.isfinite(number := file.number(name, np.nan))}
     found.about |= {name: text for name in TEXTS if (text := file.text(name, ""))}
@@ -125,12 +120,12 @@ def _sealed(found: Opened, record: Any, content: bytes, path: Path) -> None:
         "doubted": _spread(np.zeros(len(taken)) if record.doubted is None else record.doubted, taken, size, np.nan),
         "part": np.zeros(size),
     }
-    for name, place in TORQUE.items():
-        if file.has(place) and len(column := file.numbers(place)) == size:
+    for name in TORQUE:
+        if file.has(place := f"/torque/{name}") and len(column := file.numbers(place)) == size:
             found.samples[name] = np.where(column == {"sync": NO_SYNC, "counter": -1}.get(name), np.nan, column)
     planned = file.numbers("/pulses/planned_time_s") if file.has("/pulses/planned_time_s") else np.empty(0)
-    for name, place in PULSES.items():
-        if file.has(place) and len(column := file.numbers(place)) == len(planned):
+    for name in PULSES:
+        if file.has(place := f"/pulses/{name}") and len(column := file.numbers(place)) == len(planned):
             found.pulses[name] = column
     names = tuple(record.segment_names)
     rows = zip(
@@ -168,8 +163,6 @@ def _spread(values: NDArray[Any], places: NDArray[np.int64], size: int, elsewher
 
 def _alignment(content: bytes) -> dict[str, Any]:
     """How exact the times are; nothing where the file does not plainly say it."""
-    import h5py
-
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
             linked = isinstance(file.get("alignment", getlink=True), h5py.HardLink)

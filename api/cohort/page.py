@@ -10,8 +10,7 @@ from markupsafe import Markup, escape
 from api.charts.local_figure import LocalFigure
 from api.charts.palette import in_light
 from api.cohort import drawn
-from api.cohort.gathered import PROBABLE, Gathered
-from api.cohort.statistics import wilson
+from api.cohort.gathered import PROBABLE, Gathered, wilson
 
 STYLE = """
 body { font: 15px/1.5 system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif; color: #1b2733;
@@ -44,7 +43,7 @@ def html(found: Gathered, name: str) -> str:
         "<h2>Repeatability between sessions</h2>",
         *_repeats(found),
         "<h2>Records without a result</h2>",
-        *_errors(found, pictures),
+        "<p>None.</p>" if (figure := drawn.errors(found)) is None else pictures(figure),
     ]
     title = escape(f"Cohort: {name}")
     return (
@@ -136,11 +135,6 @@ def _repeats(found: Gathered) -> list[str]:
         "what the muscle did as well as the method's error.</p>"
     )
     return [words, _table(head, table)]
-
-
-def _errors(found: Gathered, pictures: _Pictures) -> list[str]:
-    figure = drawn.errors(found)
-    return ["<p>None.</p>"] if figure is None else [pictures(figure)]
 
 
 def _number(value: float | None) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
 from itertools import islice
 from typing import Any
 
@@ -13,9 +12,11 @@ import pyarrow.parquet as pq
 
 from api.cohort import dictionary
 from api.cohort.export_state import State
-from api.cohort.handed_on import Days, Put, Who, hidden
+from api.cohort.handed_on import Put, Who
 from api.cohort.opened import Opened
+from api.cohort.table import table_of
 
+NAME: str = "parquet"
 STATUS = ("acknowledged", "rest", "dropped", "refused", "unacknowledged", "device error")
 HELD_OUT = "validate"
 ROWS = 2000
@@ -23,55 +24,29 @@ ROWS = 2000
 KEPT_NAN = ("time_s", "torque_nm")
 
 
-class Parquet:
-    """Writes the tables of `api.cohort.dictionary`.
-
-    Parameters
-    ----------
-    days : Days
-        What becomes of dates.
-    """
-
-    name = "parquet"
-
-    def __init__(self, days: Days) -> None:
-        self._days = days
-
-    def write(self, record: Opened, who: Who, put: Put) -> dict[str, Any]:
-        """The record's samples and pulses; its row of `records`."""
-        record = hidden(record, self._days)
-        place = f"sub={who.label}/ses={who.session}/{who.key}.parquet"
-        with put(f"samples/{place}") as file:
-            pq.write_table(samples(record, who), file, compression="zstd")
-        with put(f"pulses/{place}") as file:
-            pq.write_table(pulses(record, who), file, compression="zstd")
-        return record_row(record, who)
-
-    def finish(self, state: State, put: Put) -> None:
-        """`records.parquet` and the dictionary."""
-        schema = dictionary.schema("records")
-        with put("records.parquet") as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
-            rows = (row for _, _, row in state.rows())
-            while batch := list(islice(rows, ROWS)):
-                for row in batch:
-                    begun = row.get("begun_utc")
-                    row["begun_utc"] = None if begun is None else _instant(begun)
-                columns = [pa.array([row.get(field.name) for row in batch], field.type) for field in schema]
-                writer.write_table(pa.Table.from_arrays(columns, schema=schema))
-        for name, text in (
-            ("data_dictionary.json", dictionary.as_json("stimrig export, Parquet")),
-            ("data_dictionary.csv", dictionary.as_csv()),
-        ):
-            with put(name) as file:
-                file.write(text.encode())
+def write(record: Opened, who: Who, put: Put) -> dict[str, Any]:
+    """The record's samples and pulses; its row of `records`."""
+    place = f"sub={who.label}/ses={who.session}/{who.key}.parquet"
+    with put(f"samples/{place}") as file:
+        pq.write_table(samples(record, who), file, compression="zstd")
+    with put(f"pulses/{place}") as file:
+        pq.write_table(pulses(record, who), file, compression="zstd")
+    return record_row(record, who)
 
 
-def _instant(text: str) -> datetime | None:
-    found = datetime.fromisoformat(text)
-    try:
-        return (found if found.tzinfo else found.replace(tzinfo=UTC)).astimezone(UTC)
-    except OverflowError:  # the first or the last day of the calendar
-        return None
+def finish(state: State, put: Put) -> None:
+    """`records.parquet` and the dictionary."""
+    schema = dictionary.schema("records")
+    with put("records.parquet") as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
+        rows = (row for _, _, row in state.rows())
+        while batch := list(islice(rows, ROWS)):
+            writer.write_table(table_of(batch, schema))
+    for name, text in (
+        ("data_dictionary.json", dictionary.as_json("stimrig export, Parquet")),
+        ("data_dictionary.csv", dictionary.as_csv()),
+    ):
+        with put(name) as file:
+            file.write(text.encode())
 
 
 def samples(record: Opened, who: Who) -> pa.Table:

@@ -23,7 +23,7 @@ from api.cohort.errors import CohortError, CutOffError
 from api.cohort.read import KEYS, groups, kept_rows, options_of, rows_of
 from api.cohort.sources import Entry
 from api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, table_of
-from api.cohort.tasks import Task
+from api.cohort.tasks import Task, differing
 from api.cohort.worker import COPY, LEFT_OUT, digest
 
 ROWS_A_PART = 500
@@ -136,8 +136,11 @@ class Results:
     def _begin(self) -> None:
         """Compare the options with those of what is there, and read which records are done."""
         about = self.folder / "run.json"
-        for place, options in ((self.output, options_of(self.output)), (about, _stored(about))):
-            if options is not None and (differs := self.task.differs(options)):
+        for place, options in (
+            (self.output, options_of(self.output) if self.output.exists() else None),
+            (about, _stored(about)),
+        ):
+            if options is not None and (differs := differing(options, self.task.document())):
                 raise CohortError(f"{place}: made with other options ({differs}). Give another -o, or remove it.")
         _whole(about, json.dumps(self.task.document()).encode())
         for part in self.folder.glob("*.new"):

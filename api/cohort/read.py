@@ -93,16 +93,16 @@ def groups(files: Sequence[Path], kept: set[int]) -> Iterator[pa.Table]:
         yield pa.concat_tables(waiting)
 
 
-def options_of(file: Path) -> dict[str, Any] | None:
-    """The options that a table of results was made with; None where there is no file.
+def options_of(file: Path) -> dict[str, Any]:
+    """The options that a table of results was made with.
 
     Raises
     ------
     CohortError
-        It is no table of results.
+        It is no table of results, or there is no such file.
     """
     if not file.exists():
-        return None
+        raise CohortError(f"{file}: no such file. Give the -o of `stimrig cohort fit`, `diagnose` or `improve`.")
     fix = "Give a file written by `stimrig cohort fit`, `diagnose` or `improve`."
     try:
         schema = pq.read_schema(file)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import islice
 from typing import Any
@@ -56,6 +56,7 @@ class Tally:
         return self.now + self.before
 
 
+@dataclass(eq=False)
 class Run:
     """One run over a cohort.
 
@@ -77,21 +78,18 @@ class Run:
         The clock.
     """
 
-    def __init__(
-        self,
-        client: Client,
-        sources: Sequence[Source],
-        task: Task,
-        bounds: Bounds,
-        results: Results,
-        tell: Tell = lambda _tally: None,
-        monotonic_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.client, self.sources, self.task, self.bounds = client, sources, task, bounds
-        self.results, self.tell, self.monotonic_s = results, tell, monotonic_s
-        self.selection = Selection(task.select)
-        self.tally = Tally()
-        self.flight = Flight(client, task, bounds)
+    client: Client
+    sources: Sequence[Source]
+    task: Task
+    bounds: Bounds
+    results: Results
+    tell: Tell = lambda _tally: None
+    monotonic_s: Callable[[], float] = time.monotonic
+    tally: Tally = field(default_factory=Tally)
+
+    def __post_init__(self) -> None:
+        self.selection = Selection(self.task.select)
+        self.flight = Flight(self.client, self.task, self.bounds)
         self._ended = threading.Event()
 
     def go(self, keep: bool = False) -> Tally:

@@ -8,34 +8,24 @@ from typing import Any
 
 import pyarrow as pa
 
+from api.cohort.answers import OF_EFFECT, OF_STEP
+
 FORMAT = "stimrig-cohort"
 FORMAT_VERSION = "1"
+TEXTS = pa.list_(pa.string())
 EFFECT = pa.struct(
     [
         ("effect", pa.string()),
         ("form", pa.string()),
-        ("probability", pa.float64()),
-        ("rms_before_nm", pa.float64()),
-        ("rms_after_nm", pa.float64()),
-        ("held_out_rms_before_nm", pa.float64()),
-        ("held_out_rms_after_nm", pa.float64()),
-        ("confused_with", pa.list_(pa.string())),
+        *((name, pa.float64()) for name in OF_EFFECT),
+        ("confused_with", TEXTS),
     ]
 )
 PARAMETER = pa.struct(
     [("of", pa.string()), ("name", pa.string()), ("value", pa.float64()), ("sd", pa.float64()), ("unit", pa.string())]
 )
-STEP = pa.struct(
-    [
-        ("added", pa.string()),
-        ("fit_percent", pa.float64()),
-        ("rms_nm", pa.float64()),
-        ("held_out_fit_percent", pa.float64()),
-        ("held_out_rms_nm", pa.float64()),
-    ]
-)
+STEP = pa.struct([("added", pa.string()), *((name, pa.float64()) for name in OF_STEP)])
 REFUSED = pa.struct([("effect", pa.string()), ("log_evidence_gain", pa.float64())])
-TEXTS = pa.list_(pa.string())
 INSTANT = pa.timestamp("us", tz="UTC")
 
 COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
@@ -95,10 +85,10 @@ SCHEMA = pa.schema(
 )
 
 
-def table_of(rows: Sequence[dict[str, Any]]) -> pa.Table:
+def table_of(rows: Sequence[dict[str, Any]], schema: pa.Schema = SCHEMA) -> pa.Table:
     """Rows as a table; keys that are no column are dropped."""
-    arrays = [_array([_cell(row.get(field.name), field.type) for row in rows], field.type) for field in SCHEMA]
-    return pa.Table.from_arrays(arrays, schema=SCHEMA)
+    arrays = [_array([_cell(row.get(field.name), field.type) for row in rows], field.type) for field in schema]
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def _array(values: list[Any], kind: pa.DataType) -> pa.Array:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from api.cohort.errors import CohortError
 from identify.errors import IdentifyError
 
-VERBS = ("fit", "diagnose", "improve")
 AUTO, METHOD = "auto", "maximum-likelihood"
 
 
@@ -45,10 +43,6 @@ class Task:
         }
         return cls(**given)
 
-    def differs(self, other: dict[str, Any]) -> str:
-        """Words on how the options of another run differ; empty if they don't."""
-        return differing(other, self.document())
-
 
 OPTIONS = tuple(field.name for field in fields(Task))
 
@@ -63,15 +57,8 @@ def _shown(value: Any) -> str:
     return ", ".join(map(str, value)) or "none" if isinstance(value, list) else str(value) if value else "none"
 
 
-def checked(
-    verb: str,
-    select: str = "",
-    method: str = METHOD,
-    effects: Sequence[str] = (),
-    columns: Sequence[str] = (),
-    software: str = "",
-) -> Task:
-    """A task whose options can be used on some record.
+def checked(task: Task) -> Task:
+    """The task, whose options can be used on some record.
 
     Raises
     ------
@@ -83,11 +70,11 @@ def checked(
     from identify.records.columns import parsed
 
     try:
-        method_of(method)
-        for name in effects:
+        method_of(task.method)
+        for name in task.effects:
             if name != AUTO:
                 get(name.partition(":")[0])
-        parsed(list(columns) or None)
+        parsed(list(task.columns) or None)
     except IdentifyError as error:
         raise CohortError(str(error)) from error
-    return Task(verb, select, method, tuple(effects), tuple(columns), software)
+    return task

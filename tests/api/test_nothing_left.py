@@ -52,10 +52,10 @@ main.main()
 BIRTH = """
 import os, sys, time
 from pathlib import Path
-from api.cli import launcher
+from api.cli import child, launcher
 
 folder, when = Path(sys.argv[1]), sys.argv[2]
-born = launcher.die_with_parent
+born = child.die_with_parent
 
 def held(*given):
     if when == "after":
@@ -67,9 +67,9 @@ def held(*given):
     if when == "before":
         born(*given)
 
-launcher.die_with_parent = held
+child.die_with_parent = held
 with launcher.Endings():
-    launcher.Child("child", ["sleep", "3600"], folder / "log").start_unheard()
+    child.Child("child", ["sleep", "3600"], folder / "log").start_unheard()
     time.sleep(3600)
 """
 """A child that is held between fork and exec, before or after the launcher has readied it."""

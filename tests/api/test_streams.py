@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from api.cli import streams as streams_module
-from api.cli.launcher import LAST_BYTES, Child, Services
+from api.cli.child import LAST_BYTES, Child
+from api.cli.launcher import Services
 from api.cli.streams import Streams
 from api.settings import Settings
 from tests.harness.lsl_recorder import on_this_machine

@@ -1,1 +1,1 @@
-"""The verbs: one file each, with `register(app)`; a new file here is a new verb."""
+"""The verbs: one file each, with a function of its name, or `register(app)` where it has verbs of its own."""

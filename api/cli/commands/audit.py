@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from api.cli.errors import InputError
-from api.cli.terminal import Json, say, say_json, write
+from api.cli.terminal import Json, given, say, say_json, write
 from api.clock import Clock
 from api.errors import ApiError
 from api.outbox import receipts
@@ -144,15 +144,13 @@ def from_centre(settings: Settings) -> tuple[list[Receipt], str]:
     """What the centre countersigned, and whether it answered."""
     if settings.centre_url is None or settings.centre_key is None:
         return [], "none is configured"
-    link = Link(settings.centre_url, settings.centre_key.get_secret_value(), Clock())
     noted: list[Receipt] = []
-    try:
-        while given := link.heads(noted[-1].chain if noted else "", noted[-1].item if noted else 0):
-            noted += given
-    except PushError as error:
-        return noted, str(error)
-    finally:
-        link.close()
+    with closing(Link(settings.centre_url, settings.centre_key.get_secret_value(), Clock())) as link:
+        try:
+            while given := link.heads(noted[-1].chain if noted else "", noted[-1].item if noted else 0):
+                noted += given
+        except PushError as error:
+            return noted, str(error)
     return noted, "asked"
 
 
@@ -168,12 +166,11 @@ def export(
 
 def settings_of(data: Path | None) -> Settings:
     """The service's settings, perhaps with another data folder."""
-    return Settings() if data is None else Settings(data_dir=data)
+    return Settings(**given(data_dir=data))
 
 
-@contextmanager
-def opened(settings: Settings) -> Iterator[Store]:
-    """The database.
+def opened(settings: Settings) -> closing[Store]:
+    """The database, let go at the end of a `with` statement.
 
     Raises
     ------
@@ -184,13 +181,9 @@ def opened(settings: Settings) -> Iterator[Store]:
     if settings.database_url is None and not place.is_file():
         raise InputError(f"{place}: there is no database. Give the data folder with --data.")
     try:
-        store = Store(settings.database)
+        return closing(Store(settings.database))
     except ApiError as error:
         raise InputError(str(error)) from error
-    try:
-        yield store
-    finally:
-        store.close()
 
 
 def stored(settings: Settings) -> list[AuditEntry]:

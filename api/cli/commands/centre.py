@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from tqdm import tqdm
 
-from api.cli.errors import InputError, ReportedError
-from api.cli.terminal import say, say_json
+from api.cli.errors import CommandError, InputError
+from api.cli.terminal import given, say, say_json, sign_in_lines
 
 DataOption = Annotated[Path | None, typer.Option(help="data folder; default ./centre, or STIMRIG_CENTRE_DATA_DIR")]
 DatabaseOption = Annotated[
@@ -44,9 +45,9 @@ def serve(
     demo: Annotated[bool, typer.Option("--demo", help="with PostgreSQL and two emulated rigs of its own")] = False,
 ) -> None:
     """The centre and its page, until Ctrl-C or SIGTERM."""
+    named = given(port=port, host=host, data_dir=data, database_url=database, files=files)
     if context.invoked_subcommand is not None:
-        given = {"port": port, "host": host, "data_dir": data, "database_url": database, "files": files}
-        context.obj = given
+        context.obj = named
         return
     if demo:
         from api.cli.centre_demo import play
@@ -57,44 +58,28 @@ def serve(
         return
     from api.centre.server import prepared, run
 
-    settings = settings_of(port=port, host=host, data_dir=data, database_url=database, files=files)
+    settings = settings_of(**named)
     try:
         app, listener = prepared(settings)
     except OSError as error:
         raise InputError(str(error)) from error
-    drawn = app.state.context.drawn_token
-    run(app, listener, lambda url: say(*welcome(url, drawn, bool(settings.admin_token), settings.bucket)))
+    how = (app.state.context.drawn_token, bool(settings.admin_token), "STIMRIG_CENTRE_ADMIN_TOKEN")
+    head = f"with files in {settings.bucket}"
+    run(app, listener, lambda url: say(f"stimrig centre: {url}/ {head}", *sign_in_lines(url, *how)))
 
 
-def settings_of(**given):
-    """The centre's settings. Raises InputError, SettingsError."""
+def settings_of(**named):
+    """The centre's settings. Raises SettingsError."""
     from api.centre.settings import CentreSettings
 
-    return CentreSettings(**{name: value for name, value in given.items() if value is not None})
-
-
-def welcome(url: str, drawn: str | None, configured: bool, bucket: str) -> list[str]:
-    """Where it is, and how to get in."""
-    lines = [f"stimrig centre: {url}/ with files in {bucket}"]
-    if drawn:
-        lines += [f"first administrator's token, shown this once: {drawn}", f"sign in: {url}/sign-in#token={drawn}"]
-    elif configured:
-        lines.append("the administrator's token is the one in STIMRIG_CENTRE_ADMIN_TOKEN")
-    else:
-        lines.append("sign in with a token issued before (set STIMRIG_CENTRE_ADMIN_TOKEN to replace a lost one)")
-    return lines
+    return CentreSettings(**named)
 
 
 def _opened(context: typer.Context, data: Path | None, database: str | None):
     """Settings, and the database of the centre."""
     from api.centre.context import opened
 
-    outer = context.obj or {}
-    given = {
-        **outer,
-        **{name: one for name, one in (("data_dir", data), ("database_url", database)) if one is not None},
-    }
-    settings = settings_of(**given)
+    settings = settings_of(**{**(context.obj or {}), **given(data_dir=data, database_url=database)})
     if not {"data_dir", "database_url"} & settings.model_fields_set and not (settings.data_dir / "centre.db").exists():
         raise InputError(
             "no centre in ./centre. Give --data or --database as the centre has it, or its settings (docs/centre.md)."
@@ -102,12 +87,15 @@ def _opened(context: typer.Context, data: Path | None, database: str | None):
     return settings, opened(settings)
 
 
-def _rigs(store):
+@contextmanager
+def _rigs(context: typer.Context, data: Path | None, database: str | None):
+    """The rigs of the centre; in the end its database is let go."""
     from api.centre.rigs import Rigs
     from api.clock import Clock
     from api.people.pace import Guesses
 
-    return Rigs(store, Clock(), Guesses(Clock()))
+    with closing(_opened(context, data, database)[1]) as store:
+        yield Rigs(store, Clock(), Guesses(Clock()))
 
 
 def add_rig(
@@ -118,11 +106,8 @@ def add_rig(
     database: DatabaseOption = None,
 ) -> None:
     """A new rig, or a new key for a revoked one; prints the key this once."""
-    _settings, store = _opened(context, data, database)
-    try:
-        key = _rigs(store).add(name, WHO)
-    finally:
-        store.close()
+    with _rigs(context, data, database) as rigs:
+        key = rigs.add(name, WHO)
     say("settings for the rig's service, shown this once:", f"STIMRIG_CENTRE_URL={url}", f"STIMRIG_CENTRE_KEY={key}")
 
 
@@ -131,11 +116,8 @@ def revoke_rig(
     database: DatabaseOption = None,
 ) -> None:  # fmt: skip
     """The rig's key opens nothing any more; what it pushed stays."""
-    _settings, store = _opened(context, data, database)
-    try:
-        _rigs(store).revoke(name, WHO)
-    finally:
-        store.close()
+    with _rigs(context, data, database) as rigs:
+        rigs.revoke(name, WHO)
     say(f"the key of {name} is revoked; what it pushed stays")
 
 
@@ -174,7 +156,7 @@ def check(
                     lost.append({"sha256": found.sha256, "says": found.words})
                     tqdm.write(f"{found.sha256}: {found.words}", file=sys.stderr if as_json else sys.stdout)
     except BucketError as error:
-        raise ReportedError(f"{error}; {count} files were checked, go on with --since {begun}") from error
+        raise CommandError(f"{error}; {count} files were checked, go on with --since {begun}") from error
     finally:
         store.close()
     if as_json:

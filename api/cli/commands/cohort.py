@@ -6,14 +6,16 @@ Dask and pyarrow are an extra (`pip install stimrig[cohort]`): loaded where they
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from api.cli.cohort_report import changed_lines, run_lines
+from api.cli.cohort_report import changed_lines, run_lines, telling
 from api.cli.errors import CommandError, InputError
 from api.cli.terminal import Json, names, say, say_json, write
 
@@ -29,9 +31,6 @@ Given = Annotated[
         show_default=False,
     ),
 ]
-Output = Annotated[
-    Path, typer.Option("-o", "--output", help="results (Parquet); a run that is cut off goes on with the same command")
-]
 Select = Annotated[
     str,
     typer.Option(
@@ -39,111 +38,82 @@ Select = Annotated[
         "(docs/cohorts.md lists the fields)"
     ),
 ]
-Scheduler = Annotated[
-    str, typer.Option(help="address of a Dask scheduler, as tcp://host:8786; default: processes of this machine")
-]
-Workers = Annotated[int, typer.Option(min=1, max=1024, help="processes on this machine, one thread each")]
-Memory = Annotated[str, typer.Option(help="what a record may take beyond the libraries")]
-Limit = Annotated[float, typer.Option(min=1.0, max=86400.0, help="what a record may take, s; then it is a row")]
-Renew = Annotated[int, typer.Option(min=1, help="after so many records a worker's computing process is started anew")]
-Dashboard = Annotated[bool, typer.Option("--dashboard", help="Dask's dashboard on this machine; its address is shown")]
-Wait = Annotated[float, typer.Option(min=0.1, help="with --scheduler: how long to wait for its first worker, s")]
-Again = Annotated[bool, typer.Option("--again", help="do anew what timed out, was killed or could not be read")]
 Token = Annotated[str, typer.Option(help="of a centre", envvar="STIMRIG_TOKEN", show_envvar=True, show_default=False)]
 Columns = Annotated[
     list[str] | None,
     typer.Option("--map", help="columns of another tool's files, as in `stimrig fit`", show_default=False),
 ]
-Results = Annotated[Path, typer.Argument(metavar="RESULTS.parquet", show_default=False)]
+
+
+RUNS = {
+    "fit": ("Fit a model to every selected record; one row each in Parquet.", ()),
+    "diagnose": (
+        "What is missing in the plain structure, for every selected record; one row each in Parquet.",
+        ("method", "effects"),
+    ),
+    "improve": (
+        "Add effects as long as the evidence lasts, for every selected record; one row each in Parquet.",
+        ("method", "effects"),
+    ),
+}
+"""What each verb over records does, and the options of `run` that it lacks."""
 
 
 def register(app: typer.Typer) -> None:
     """Add the verb and what it can do."""
     verbs = typer.Typer(no_args_is_help=True, help="Fit or diagnose many recordings, compare two runs, draw a cohort.")
-    for command in (fit, diagnose, improve, changed, figures):
+    for verb, (words, lacks) in RUNS.items():
+        verbs.command(verb, help=words)(run_of(verb, lacks))
+    for command in (changed, figures):
         verbs.command(command.__name__)(command)
     app.add_typer(verbs, name="cohort")
 
 
-def fit(
+def run_of(verb: str, lacks: tuple[str, ...]) -> Callable[..., None]:
+    """`run` with one verb, as the command line sees it: with the options that the verb has."""
+    whole = inspect.signature(run, eval_str=True)
+    options = [option for name, option in whole.parameters.items() if name not in ("verb", *lacks)]
+
+    def command(**given: Any) -> None:
+        run(verb, **given)
+
+    command.__signature__ = whole.replace(parameters=options)  # pyright: ignore[reportFunctionMemberAccess]
+    return command
+
+
+def run(
+    verb: str,
     data: Given,
-    output: Output,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="results (Parquet); a run that is cut off goes on with the same command"),
+    ],
     select: Select = "",
     method: Annotated[str, typer.Option(help="as in `stimrig fit`")] = METHOD,
     effects: Annotated[str, typer.Option(help="effects of the models, comma-separated, or `auto`")] = "",
-    scheduler: Scheduler = "",
-    workers: Workers = 2,
-    memory: Memory = "1GB",
-    limit: Limit = 600.0,
-    renew: Renew = 500,
-    dashboard: Dashboard = False,
-    wait: Wait = 60.0,
-    again: Again = False,
+    scheduler: Annotated[
+        str, typer.Option(help="address of a Dask scheduler, as tcp://host:8786; default: processes of this machine")
+    ] = "",
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="processes on this machine, one thread each")] = 2,
+    memory: Annotated[str, typer.Option(help="what a record may take beyond the libraries")] = "1GB",
+    limit: Annotated[
+        float, typer.Option(min=1.0, max=86400.0, help="what a record may take, s; then it is a row")
+    ] = 600.0,
+    renew: Annotated[
+        int, typer.Option(min=1, help="after so many records a worker's computing process is started anew")
+    ] = 500,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Dask's dashboard on this machine; its address is shown")
+    ] = False,
+    wait: Annotated[
+        float, typer.Option(min=0.1, help="with --scheduler: how long to wait for its first worker, s")
+    ] = 60.0,
+    again: Annotated[
+        bool, typer.Option("--again", help="do anew what timed out, was killed or could not be read")
+    ] = False,
     token: Token = "",
     columns: Columns = None,
     as_json: Json = False,
-) -> None:
-    """Fit a model to every selected record; one row each in Parquet."""
-    chosen = {"method": method, "effects": names(effects), "columns": columns or ()}
-    where = {"scheduler": scheduler, "count": workers, "dashboard": dashboard, "wait_s": wait}
-    go("fit", data, output, select, chosen, where, memory, limit, renew, again, token, as_json)
-
-
-def diagnose(
-    data: Given,
-    output: Output,
-    select: Select = "",
-    scheduler: Scheduler = "",
-    workers: Workers = 2,
-    memory: Memory = "1GB",
-    limit: Limit = 600.0,
-    renew: Renew = 500,
-    dashboard: Dashboard = False,
-    wait: Wait = 60.0,
-    again: Again = False,
-    token: Token = "",
-    columns: Columns = None,
-    as_json: Json = False,
-) -> None:
-    """What is missing in the plain structure, for every selected record; one row each in Parquet."""
-    where = {"scheduler": scheduler, "count": workers, "dashboard": dashboard, "wait_s": wait}
-    go("diagnose", data, output, select, {"columns": columns or ()}, where, memory, limit, renew, again, token, as_json)
-
-
-def improve(
-    data: Given,
-    output: Output,
-    select: Select = "",
-    scheduler: Scheduler = "",
-    workers: Workers = 2,
-    memory: Memory = "1GB",
-    limit: Limit = 600.0,
-    renew: Renew = 500,
-    dashboard: Dashboard = False,
-    wait: Wait = 60.0,
-    again: Again = False,
-    token: Token = "",
-    columns: Columns = None,
-    as_json: Json = False,
-) -> None:
-    """Add effects as long as the evidence lasts, for every selected record; one row each in Parquet."""
-    where = {"scheduler": scheduler, "count": workers, "dashboard": dashboard, "wait_s": wait}
-    go("improve", data, output, select, {"columns": columns or ()}, where, memory, limit, renew, again, token, as_json)
-
-
-def go(
-    verb: str,
-    data: list[str],
-    output: Path,
-    select: str,
-    chosen: dict[str, Any],
-    where: dict[str, Any],
-    memory: str,
-    limit_s: float,
-    records: int,
-    again: bool,
-    token: str,
-    as_json: bool,
 ) -> None:
     """One run."""
     need_extra()
@@ -153,15 +123,15 @@ def go(
     from api.cohort.run import Run
     from api.cohort.select import Selection
     from api.cohort.sources.addresses import sources_of
-    from api.cohort.tasks import checked
-    from api.cohort.tells import telling
+    from api.cohort.tasks import Task, checked
     from api.cohort.worker import Bounds
     from api.version import software_version
 
-    task = checked(verb, select=Selection(select).text, software=software_version(), **chosen)
-    place = cluster.Workers(memory_bytes=cluster.memory_of(memory), **where)
+    given = (verb, Selection(select).text, method, names(effects), tuple(columns or ()), software_version())
+    task = checked(Task(*given))
+    place = cluster.Workers(scheduler, workers, cluster.memory_of(memory), dashboard, wait)
     sources = sources_of(data, token, place.scheduler)
-    bounds = Bounds(limit_s, place.memory_bytes, records)
+    bounds = Bounds(limit, place.memory_bytes, renew)
     for source in sources:
         source.check()
     began_s = time.monotonic()
@@ -208,7 +178,7 @@ def changed(
 
 
 def figures(
-    results: Results,
+    results: Annotated[Path, typer.Argument(metavar="RESULTS.parquet", show_default=False)],
     html: Annotated[Path, typer.Option("-o", "--html", help="file to write: works offline, in any browser")],
     as_json: Json = False,
 ) -> None:

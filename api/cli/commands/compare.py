@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+import identify
 from api.cli.terminal import (
     ColumnMap,
     Json,
@@ -23,11 +24,6 @@ from api.cli.terminal import (
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("compare")(compare)
-
-
 def compare(
     model_json: ModelFile,
     data: SeveralData,
@@ -39,7 +35,6 @@ def compare(
 
     The model runs free: it is given the pulse widths alone, never the measured torque.
     """
-    import identify
     from api.web.pages.report_file import comparison_html
     from api.workers.verbs import clean, curves, thinned
 

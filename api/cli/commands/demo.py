@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.errors import ReportedError
+from api.cli.errors import CommandError
 from api.cli.launcher import Services
 from api.cli.session_report import report_lines, run_test
 from api.cli.terminal import Json, number, say, say_json
@@ -20,11 +20,6 @@ from api.client.rest import Client
 from api.settings import Settings
 
 PARTICIPANT = "DEMO"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("demo")(demo)
 
 
 def demo(
@@ -46,7 +41,8 @@ def demo(
     if as_json:
         say_json(found)
         return
-    say("", *report_lines(found["test"], found["model"]), *cpu_lines(found["cpu_percent"]))
+    shares = ", ".join(f"{name} {number(share, 1)} %" for name, share in found["cpu_percent"].items())
+    say("", *report_lines(found["test"], found["model"]), f"processor      {shares} of a core during the test")
     say("", *[f"{name:14} {path}" for name, path in found["files"].items()])
     say(f"{'done in':14} {found['seconds']} s")
 
@@ -74,7 +70,7 @@ def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
 
     Raises
     ------
-    ReportedError
+    CommandError
         The controller did not get the approved model, or no 304.
     """
     client.approve(model_id, "demo")
@@ -82,21 +78,15 @@ def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
         first = controller.approved_model(PARTICIPANT)
         again = controller.approved_model(PARTICIPANT, first)
     if first.document.get("model_id") != model_id:
-        raise ReportedError("the controller got another model than the approved one")
+        raise CommandError("the controller got another model than the approved one")
     if again.changed:
-        raise ReportedError("the service sent the model a second time, although nothing had changed")
+        raise CommandError("the service sent the model a second time, although nothing had changed")
     return first.document
 
 
 def cpu(services: Services) -> dict[str, Any]:
     """Processor time of emulator and rig so far, s."""
     return {child.name: child.cpu_s() for child in (services.emulator, services.rig) if child is not None}
-
-
-def cpu_lines(shares: dict[str, float | None]) -> list[str]:
-    """Processor time in words."""
-    words = ", ".join(f"{name} {number(share, 1)} %" for name, share in shares.items())
-    return [f"processor      {words} of a core during the test"]
 
 
 def write_files(folder: Path, found: dict[str, Any]) -> dict[str, str]:

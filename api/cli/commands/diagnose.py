@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import typer
-
+import identify
 from api.cli.terminal import ColumnMap, HeldModel, Json, SeveralData, load_held, number, percent, say, say_json
 from api.progress_bar import progress_bar
 from api.structure import in_words, worded
@@ -15,11 +14,6 @@ VERDICTS = {
     "nothing_missing": "Nothing is missing: what is left looks like noise.",
     "unexplained_structure": "The error has structure that no effect of the library explains.",
 }
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("diagnose")(diagnose)
 
 
 def diagnose(
@@ -32,15 +26,10 @@ def diagnose(
 
     Takes 5 to 30 s. DATA decides: a model given with --model lends its structure, not its numbers.
     """
-    import identify
-
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
         found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
-    if as_json:
-        say_json(found)
-        return
-    say(*diagnosis_lines(found))
+    say_json(found) if as_json else say(*diagnosis_lines(found))
 
 
 def diagnosis_lines(found: dict[str, Any]) -> list[str]:

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from api.cli import doctor as checks
-from api.cli.terminal import Json, say, say_json
+from api.cli.terminal import Json, given, say, say_json
 from api.settings import Settings
 
 MARKS = {"ok": "ok   ", "care": "care ", "fails": "FAILS"}
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("doctor")(doctor)
 
 
 def doctor(
@@ -26,9 +21,7 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check devices, permissions, clock, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
-    given: dict[str, Any] = {"rig_file": rig, "data_dir": data, "rig_socket": socket}
-    settings = Settings(**{key: value for key, value in given.items() if value is not None})
-    found = checks.examine(settings)
+    found = checks.examine(Settings(**given(rig_file=rig, data_dir=data, rig_socket=socket)))
     report = checks.as_dict(found)
     if as_json:
         say_json(report)

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import typer
-
 from api.cli.terminal import Json, say, say_json
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("effects")(effects)
 
 
 def effects(as_json: Json = False) -> None:

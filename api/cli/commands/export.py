@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,11 +11,6 @@ import typer
 from api.cli.commands.cohort import Columns, Given, Select, Token, need_extra
 from api.cli.errors import CommandError, InputError
 from api.cli.terminal import Json, say, say_json
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("export")(export)
 
 
 def export(
@@ -34,53 +30,35 @@ def export(
         raise InputError("give --parquet FOLDER or --bids FOLDER, one of them.")
     if no_dates and shift_days:
         raise InputError("give --no-dates or --shift-days, not both.")
+    from api.cohort import bids as bids_files
+    from api.cohort import parquet_files
     from api.cohort.errors import CutOffError
-    from api.cohort.handed_on import Days
-
-    try:
-        found = go(data, parquet, bids, select, Days(no_dates, shift_days), columns or [], token)
-    except CutOffError as error:
-        raise CommandError(f"{error}") from error
-    say_json(found) if as_json else say(*report(found))
-
-
-def go(
-    data: list[str],
-    parquet: Path | None,
-    bids: Path | None,
-    select: str,
-    days: Any,
-    columns: list[str],
-    token: str,
-) -> dict[str, Any]:
-    """One export; what is told of it."""
-    from api.cohort.bids import Bids
     from api.cohort.export import Export
     from api.cohort.export_state import State
-    from api.cohort.handed_on import ERRORS
-    from api.cohort.parquet_files import Parquet
+    from api.cohort.handed_on import ERRORS, Days
     from api.cohort.select import Selection
     from api.cohort.sources.addresses import sources_of
     from api.progress_bar import progress_bar
 
-    selection, sources = Selection(select), sources_of(data, token)
-    writer = Parquet(days) if parquet is not None else Bids(days)
+    selection, sources, mapped = Selection(select), sources_of(data, token), columns or []
+    writer = bids_files if parquet is None else parquet_files
     folder = parquet or bids
     assert folder is not None
     for source in sources:
         source.check()
-    options = {"format": writer.name, "hide": days.hide, "shift_days": days.shift_days, "columns": columns}
-    state = State(folder, options)
-    try:
-        with progress_bar() as bar:
-            told = Export(sources, selection, state, writer, days, columns, lambda t: bar(0.0, _words(t))).go()
-        return {
-            "output": str(folder), "format": writer.name, "records": state.count("done"),
+    options = {"format": writer.NAME, "hide": no_dates, "shift_days": shift_days, "columns": mapped}
+    with closing(State(folder, options)) as state, progress_bar() as bar:
+        days = Days(no_dates, shift_days)
+        try:
+            told = Export(sources, selection, state, writer, days, mapped, lambda t: bar(0.0, _words(t))).go()
+        except CutOffError as error:
+            raise CommandError(f"{error}") from error
+        found = {
+            "output": str(folder), "format": writer.NAME, "records": state.count("done"),
             "errors": state.count("failed"), "written": told.written, "done_before": told.before,
             "left_out": told.left_out, "copies": told.copies, "errors_file": str(folder / ERRORS),
         }  # fmt: skip
-    finally:
-        state.close()
+    say_json(found) if as_json else say(*report(found))
 
 
 def _words(tally: Any) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+import identify
 from api.cli.errors import InputError
 from api.cli.terminal import (
     ColumnMap,
@@ -24,11 +25,6 @@ from api.cli.terminal import (
 from api.progress_bar import progress_bar
 
 METHOD = "maximum-likelihood"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("fit")(fit)
 
 
 def fit(
@@ -64,8 +60,6 @@ def fit(
     as_json: Json = False,
 ) -> None:
     """Identify a model: recruitment curve, linear dynamics, effects. Says how well it fits and whether it is usable."""
-    import identify
-
     if carry is not None and (method != METHOD or effects or fit_on):
         raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
     earlier = None if carry is None else load_model(carry)

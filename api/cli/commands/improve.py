@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+import identify
 from api.cli.commands.diagnose import VERDICTS
 from api.cli.terminal import (
     ColumnMap,
@@ -30,11 +31,6 @@ FEW = 3
 """Refused effects that are named."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("improve")(improve)
-
-
 def improve(
     data: SeveralData,
     model_json: HeldModel = None,
@@ -49,8 +45,6 @@ def improve(
 
     Takes 5 to 40 s. Without -o nothing is kept.
     """
-    import identify
-
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
         improved = identify.improve(record, progress=progress, model=model)
@@ -77,7 +71,6 @@ def report(
     """The report: what was found, what each effect is, what is left before and after."""
     import numpy as np
 
-    import identify
     from api.web.pages.report_file import improvement_html
     from api.workers.diagnosis_verbs import diagnosed
     from api.workers.verbs import runs, thinned

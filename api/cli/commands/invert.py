@@ -11,11 +11,6 @@ from api.cli.errors import InputError
 from api.cli.terminal import Json, ModelFile, load_model, number, percent, say, say_json, table, writing
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("invert")(invert)
-
-
 def invert(
     model_json: ModelFile,
     reference: Annotated[

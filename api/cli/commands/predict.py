@@ -7,13 +7,14 @@ from typing import Annotated
 
 import typer
 
+import identify
 from api.cli.terminal import (
     ColumnMap,
     Data,
     Json,
     ModelFile,
+    load_joined,
     load_model,
-    load_record,
     number,
     percent,
     say,
@@ -21,11 +22,6 @@ from api.cli.terminal import (
     write_mat,
     writing,
 )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("predict")(predict)
 
 
 def predict(
@@ -38,11 +34,10 @@ def predict(
     """Free-run simulation from the recorded pulse widths: time_s,torque_nm,predicted_torque_nm."""
     import numpy as np
 
-    import identify
     from identify.estimation.fit_statistics import best_fit_percent
 
     model = load_model(model_json)
-    record = load_record(data, columns)
+    record = load_joined([data], columns)
     predicted = np.asarray(identify.predict(model, record))
     found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
     if output.suffix.lower() == ".mat":

@@ -13,11 +13,6 @@ from api.cli.errors import InputError, LaunchError
 from api.cli.terminal import Json
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("recover")(recover)
-
-
 def recover(
     journal: Annotated[Path, typer.Argument(help="a journal of the rig; it may be damaged", metavar="JOURNAL")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="folder for the recording")] = None,

@@ -12,11 +12,6 @@ from api.cli.errors import InputError
 from api.cli.terminal import say
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("schema")(schema)
-
-
 def schema(
     name: Annotated[
         str | None, typer.Argument(help="a schema's name, or a verb; default: list all", metavar="NAME")

@@ -13,14 +13,9 @@ import typer
 from api.cli.errors import InputError
 from api.cli.launcher import Ended, Services
 from api.cli.stop_key import StopKey, at_rig
-from api.cli.terminal import say
+from api.cli.terminal import given, say, sign_in_lines
 from api.settings import Settings
 from rig.messages import Status
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("serve")(serve)
 
 
 def serve(
@@ -37,8 +32,8 @@ def serve(
     ] = None,
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
-    given = {"port": port, "host": host, "rig_file": rig, "rig_socket": rig_socket, "data_dir": data, "lsl": lsl}
-    settings = Settings(**{key: value for key, value in given.items() if value is not None})
+    named = given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data, lsl=lsl)
+    settings = Settings(**named)
     found = attachable(settings, emulate) if settings.rig_socket else None
     with contextlib.suppress(Ended), Services(settings, emulate.split(), attach=settings.rig_socket) as services:
         say(*welcome(services, settings), *rig_state(services, found))
@@ -96,15 +91,7 @@ def welcome(services: Services, settings: Settings) -> list[str]:
     if services.attached:
         devices = f"the rig at {settings.rig_socket}"
     lines = [f"stimrig serves {services.url}/ with {devices}; data and logs in {settings.data_dir.absolute()}"]
-    if services.drawn_token:
-        lines += [
-            f"first administrator's token, shown this once: {services.drawn_token}",
-            f"sign in: {services.url}/sign-in#token={services.drawn_token}",
-        ]
-    elif settings.admin_token:
-        lines.append("the administrator's token is the one in STIMRIG_ADMIN_TOKEN")
-    else:
-        lines.append("sign in with a token issued before (set STIMRIG_ADMIN_TOKEN to replace a lost one)")
+    lines += sign_in_lines(services.url, services.drawn_token, bool(settings.admin_token), "STIMRIG_ADMIN_TOKEN")
     if services.control_line:
         lines.append(f"the emulator's control line: {services.control_line}")
     return lines

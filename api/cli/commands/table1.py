@@ -10,11 +10,6 @@ from api.cli.terminal import Json, number, say, say_json, table
 from api.progress_bar import progress_bar
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("table1")(table1)
-
-
 def table1(
     trials: Annotated[int, typer.Option(min=1, max=10000, help="records for each noise level")] = 100,
     as_json: Json = False,
@@ -24,10 +19,7 @@ def table1(
 
     with progress_bar() as progress:
         found = table_one.run(trials, progress)
-    if as_json:
-        say_json(found)
-        return
-    say(*lines(found))
+    say_json(found) if as_json else say(*lines(found))
 
 
 def lines(found: dict[str, Any]) -> list[str]:

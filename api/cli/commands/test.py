@@ -17,14 +17,9 @@ from api.cli.errors import InputError
 from api.cli.launcher import Services
 from api.cli.session_report import report_lines, run_test
 from api.cli.stop_key import StopKey, at_rig, at_service
-from api.cli.terminal import Json, say, say_json
+from api.cli.terminal import Json, given, say, say_json, writing
 from api.client.rest import Client
 from api.settings import Settings
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    app.command("test")(test)
 
 
 def test(
@@ -71,7 +66,9 @@ def test(
         found = on_own_services(rig, data, emulate, participant, asked)
     recording = found.pop("recording")
     if output is not None:
-        save(output, recording)
+        with writing(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
+            output.write_bytes(recording)
     if as_json:
         say_json(found)
         return
@@ -94,8 +91,7 @@ def how(
     InputError
         An option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
     """
-    given = {"max_duration_s": max_time, "max_torque_time_nm_s": max_torque_time, "anyway": anyway or None}
-    asked: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    asked = given(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time, anyway=anyway or None)
     if not adaptive:
         if asked or target:
             raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
@@ -136,27 +132,11 @@ def say_aside(words: str) -> None:
     print(f"\r\x1b[K{words}" if sys.stderr.isatty() else words, file=sys.stderr, flush=True)
 
 
-def save(path: Path, recording: bytes) -> None:
-    """Write the recording.
-
-    Raises
-    ------
-    InputError
-        The place cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(recording)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
-
-
 def on_own_services(
     rig: Path | None, data: Path | None, emulate: str, participant: str, asked: dict[str, Any]
 ) -> dict[str, Any]:
     """Start rig and service for this one test."""
-    given = {"rig_file": rig, "data_dir": data}
-    settings = Settings(**{key: value for key, value in given.items() if value is not None})
+    settings = Settings(**given(rig_file=rig, data_dir=data))
     settings.port = 0
     token = secrets.token_urlsafe(32)
 

@@ -62,7 +62,7 @@ class Source(Protocol):
         CohortError
             It is not there, or does not let us in.
         """
-        ...
+        next(self.entries(Selection()), None)
 
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Every record, one after the other; those that cannot be meant may be left out.

@@ -12,18 +12,14 @@ from typing import Any
 
 from api.cohort.errors import CohortError
 from api.cohort.select import Selection
-from api.cohort.sources import Entry, SourceError, is_record
+from api.cohort.sources import Entry, Source, SourceError, is_record
 
 
 @dataclass(frozen=True)
-class Bucket:
+class Bucket(Source):
     """An address with a protocol of fsspec."""
 
     url: str
-
-    def check(self) -> None:
-        """Whether something is at the address."""
-        next(self.entries(Selection()), None)
 
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Objects below the address, in the order of their names, one folder in memory at a time."""

@@ -11,22 +11,18 @@ from api.client.errors import ServiceError
 from api.cohort.errors import CohortError
 from api.cohort.fields import as_day
 from api.cohort.select import Selection
-from api.cohort.sources import Entry, SourceError
+from api.cohort.sources import Entry, Source, SourceError
 
 MOST_PAGES = 1_000_000
 """A centre that answers the same page for ever is not believed."""
 
 
 @dataclass(frozen=True)
-class Centre:
+class Centre(Source):
     """A centre by its address and a token that may read."""
 
     url: str
     token: str = field(repr=False)
-
-    def check(self) -> None:
-        """Whether the centre answers, and takes the token."""
-        next(self.entries(Selection()), None)
 
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Recordings page by page; what the selection says of participant, rig and day is asked of the centre."""

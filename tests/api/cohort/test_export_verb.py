@@ -21,11 +21,12 @@ import pytest
 import identify
 from api import schemas
 from api.cli import main
+from api.cohort import parquet_files
 from api.cohort.errors import CohortError, CutOffError
 from api.cohort.export import Export
 from api.cohort.export_state import FOLDER, State
-from api.cohort.handed_on import Days
-from api.cohort.parquet_files import STATUS, Parquet
+from api.cohort.handed_on import Days, Writer
+from api.cohort.parquet_files import STATUS
 from api.cohort.select import Selection
 from api.cohort.sources.addresses import sources_of
 from rig import archive, assembly, journal
@@ -211,11 +212,13 @@ def test_what_is_no_record_is_a_line_with_its_reason(data: Path, tmp_path: Path)
     assert all("record." not in row["reason"].split(":")[0] for row in rows), "messages name the file as it is called"
 
 
-class CutOff(Parquet):
+class CutOff:
     """A disk that is full after some records."""
 
+    NAME = parquet_files.NAME
+    finish = staticmethod(parquet_files.finish)
+
     def __init__(self, after: int) -> None:
-        super().__init__(Days())
         self.left = after
 
     def write(self, record: Any, who: Any, put: Any) -> dict[str, Any]:
@@ -224,7 +227,7 @@ class CutOff(Parquet):
                 file.write(b"half of it")
                 raise OSError(28, "No space left on device")
         self.left -= 1
-        return super().write(record, who, put)
+        return parquet_files.write(record, who, put)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -233,7 +236,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def test_one_that_is_cut_off_goes_on_and_ends_as_if_it_had_not_been(data: Path, tmp_path: Path) -> None:
-    def run(folder: Path, writer: Parquet) -> Export:
+    def run(folder: Path, writer: Writer) -> Export:
         state = State(folder, {})
         export = Export(sources_of([str(data)]), Selection(), state, writer, Days())
         try:
@@ -246,12 +249,12 @@ def test_one_that_is_cut_off_goes_on_and_ends_as_if_it_had_not_been(data: Path, 
         run(tmp_path / "cut", CutOff(2))
     (tmp_path / "cut" / FOLDER / "1234.part").write_bytes(b"left by a kill")
     assert not (tmp_path / "cut" / "samples" / "half.parquet").exists()
-    again = run(tmp_path / "cut", Parquet(Days()))
+    again = run(tmp_path / "cut", parquet_files)
     assert (again.tally.before, again.tally.written) == (2, 3)
-    run(tmp_path / "whole", Parquet(Days()))
+    run(tmp_path / "whole", parquet_files)
     assert content(tmp_path / "cut") == content(tmp_path / "whole")
     assert list((tmp_path / "cut" / FOLDER).glob("*.part")) == []
-    third = run(tmp_path / "cut", Parquet(Days()))
+    third = run(tmp_path / "cut", parquet_files)
     assert (third.tally.before, third.tally.written) == (5, 0)
 
 

@@ -9,8 +9,7 @@ import pytest
 
 from api.cohort import drawn, page
 from api.cohort.errors import CohortError
-from api.cohort.gathered import gather
-from api.cohort.statistics import wilson
+from api.cohort.gathered import gather, wilson
 from tests.api.cohort.test_changed import failed, row, written
 
 

@@ -15,6 +15,7 @@ import pytest
 from distributed import Client, LocalCluster
 from distributed.scheduler import KilledWorker
 
+from api.cli.cohort_report import duration, words
 from api.cohort import flight, worker
 from api.cohort.cluster import check_versions
 from api.cohort.errors import CohortError, CutOffError
@@ -26,7 +27,6 @@ from api.cohort.select import Selection
 from api.cohort.sources import Entry, Source
 from api.cohort.sources.addresses import sources_of
 from api.cohort.tasks import Task, checked
-from api.cohort.tells import duration, words
 from api.version import software_version
 from tests.harness.cohort_records import broken, cohort
 
@@ -59,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def task(select: str = "") -> Task:
-    return checked("fit", Selection(select).text, software=software_version())
+    return checked(Task("fit", Selection(select).text, software=software_version()))
 
 
 def go(client: Client, sources: list[Source], output: Path, select: str = "", **more: Any) -> tuple[Run, Tally]:
