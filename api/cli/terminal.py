@@ -220,17 +220,16 @@ def sign_in_lines(url: str, drawn: str | None, configured: bool, setting: str) -
     return [f"sign in with a token issued before (set {setting} to replace a lost one)"]
 
 
-def number(value: float | None, digits: int = 2, unit: str = "") -> str:
+def number(value: float | None, digits: int = 2) -> str:
     """A number for people; a dash where there is none."""
-    text = "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
-    return f"{text} {unit}".rstrip()
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
-def percent(value: float | None, digits: int = 2) -> str:
+def percent(value: float | None) -> str:
     """A best-fit % for people; why there is none."""
     from api.models.summary import UNDEFINED
 
-    return UNDEFINED if value is None or not math.isfinite(value) else f"{value:.{digits}f} %"
+    return UNDEFINED if value is None or not math.isfinite(value) else f"{value:.2f} %"
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:

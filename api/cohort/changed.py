@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from api.cohort.errors import CohortError
-from api.cohort.read import options_of, rows_in, rows_of
+from api.cohort.table import options_of, rows_in, rows_of
 from api.cohort.tasks import OPTIONS, differing
 
 PROBABILITY = 0.05

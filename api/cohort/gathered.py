@@ -14,7 +14,7 @@ from typing import Any
 
 from api.cohort.answers import MODEL
 from api.cohort.errors import CohortError
-from api.cohort.read import options_of, rows_of
+from api.cohort.table import options_of, rows_of
 
 PROBABLE = 0.5
 """An effect that a diagnosis found missing counts from this probability on."""

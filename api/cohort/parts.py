@@ -19,10 +19,9 @@ from typing import IO, Any, Self
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from api.cohort import table
 from api.cohort.errors import CohortError, CutOffError
-from api.cohort.read import KEYS, groups, kept_rows, options_of, rows_of
 from api.cohort.sources import Entry
-from api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, table_of
 from api.cohort.tasks import Task, differing
 from api.cohort.worker import COPY, LEFT_OUT, digest
 
@@ -136,10 +135,8 @@ class Results:
     def _begin(self) -> None:
         """Compare the options with those of what is there, and read which records are done."""
         about = self.folder / "run.json"
-        for place, options in (
-            (self.output, options_of(self.output) if self.output.exists() else None),
-            (about, _stored(about)),
-        ):
+        before = table.options_of(self.output) if self.output.exists() else None
+        for place, options in ((self.output, before), (about, _stored(about))):
             if options is not None and (differs := differing(options, self.task.document())):
                 raise CohortError(f"{place}: made with other options ({differs}). Give another -o, or remove it.")
         _whole(about, json.dumps(self.task.document()).encode())
@@ -148,7 +145,7 @@ class Results:
         parts = self._parts()
         self._next = 1 + max((int(part.stem) for part in parts), default=-1)
         for file in (*([self.output] if self.output.exists() else []), *parts):
-            for row in rows_of(file, KEYS):
+            for row in table.rows_of(file, table.KEYS):
                 if not (self.again and row["status"] == "error" and row["error_kind"] in AGAIN):
                     self.done.read(row)
 
@@ -176,7 +173,7 @@ class Results:
         if not self.waiting:
             return
         sink = pa.BufferOutputStream()
-        pq.write_table(table_of(self.waiting), sink, compression="zstd")
+        pq.write_table(table.table_of(self.waiting), sink, compression="zstd")
         try:
             _whole(self.folder / f"{self._next:08d}.parquet", sink.getvalue().to_pybytes())
         except OSError as error:
@@ -194,12 +191,13 @@ class Results:
         """
         self.flush()
         files = [*([self.output] if self.output.exists() else []), *self._parts()]
-        kept, counts = kept_rows(files)
+        kept, counts = table.kept_rows(files)
         target = self.output.with_name(f".{self.output.name}.new")
-        about = {"format": FORMAT, "format_version": FORMAT_VERSION, "options": json.dumps(self.task.document())}
+        options = json.dumps(self.task.document())
+        about = {"format": table.FORMAT, "format_version": table.FORMAT_VERSION, "options": options}
         try:
-            with pq.ParquetWriter(target, SCHEMA.with_metadata(about), compression="zstd") as writer:
-                for group in groups(files, kept):
+            with pq.ParquetWriter(target, table.SCHEMA.with_metadata(about), compression="zstd") as writer:
+                for group in table.groups(files, kept):
                     writer.write_table(group)
             with target.open("rb") as file:
                 os.fsync(file.fileno())

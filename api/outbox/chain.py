@@ -97,13 +97,10 @@ def put(session: Session, at_utc: str, tellings: Iterable[Telling]) -> int:
     if not tellings:
         return 0
     end = head(session) or begin(session, at_utc)
-    known = newest(session, end.chain, tellings)
-    count = 0
-    for telling in tellings:
-        if not same(telling, known.get((telling.kind, telling.key))):
-            end = _append(session, end, at_utc, telling)
-            count += 1
-    return count
+    new = unlike_newest(session, tellings)
+    for telling in new:
+        end = _append(session, end, at_utc, telling)
+    return len(new)
 
 
 def unlike_newest(session: Session, tellings: Sequence[Telling]) -> list[Telling]:

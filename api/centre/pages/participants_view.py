@@ -77,17 +77,13 @@ async def participant(request: Request, context: Ctx, _who: ModelReader, code: s
     stood = await asyncio.to_thread(directory.stood, context.store, code)
     await context.count_warnings()
     told = documents(code, stood)
+    known = {name for one in told for name, figure in one["figures"].items() if figure["value"] is not None}
+    panels = [trend_charts.panel(name, told) for name in trend_charts.order(told) if name in known]
     return page(
         request, "participant.html", code=code, people=people, sessions=found, before=before,
-        more=f"{more[0]}~{more[1]}" if more else None, panels=_panels(told),
+        more=f"{more[0]}~{more[1]}" if more else None, panels=panels,
         count=sum(one["sessions"] for one in people), recordings=sum(one["recordings"] for one in people),
     )  # fmt: skip
-
-
-def _panels(documents: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The pictures of what is known in any session."""
-    known = {name for one in documents for name, figure in one["figures"].items() if figure["value"] is not None}
-    return [trend_charts.panel(name, documents) for name in trend_charts.order(documents) if name in known]
 
 
 def documents(code: str, stood: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -12,7 +12,6 @@ from api.centre import warnings
 from api.centre.check import UNSEEN_S
 from api.centre.context import Context, Ctx
 from api.centre.ingest import LEAST_DISK_BYTES, LEAST_DISK_SHARE, MOST_CLOCK_S
-from api.centre.routes.rigs import made
 from api.clock import unix_of
 from api.errors import ApiError
 from api.people.auth import LOCKED, Scope
@@ -67,8 +66,9 @@ def doubts(row: CentreRig, now_s: float) -> set[str]:
 @router.post("/rigs")
 async def add(request: Request, context: Ctx, who: Administrator, name: Annotated[str, Form()] = "") -> Response:
     """A new rig; its key is shown on the answering page only."""
-    key = await asyncio.to_thread(made, context, name.strip()[:80], who.name)
-    return await shown(request, context, key)
+    name = name.strip()[:80]
+    key = await asyncio.to_thread(context.rigs.add, name, who.name)
+    return await shown(request, context, {"name": name, "key": key})
 
 
 @router.post("/rigs/{name}/revoke")

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel, ConfigDict, StringConstraints
 
 from api.centre import warnings
-from api.centre.context import Context, Ctx
+from api.centre.context import Ctx
 from api.centre.responses import RigKeyOut, RigOut, WarningOut
 from api.store.centre_tables import CentreRig
 from api.web.dependencies import PROBLEM, Administrator, ModelReader
@@ -39,12 +39,7 @@ def list_rigs(context: Ctx, _who: ModelReader) -> list[dict[str, Any]]:
 @router.post("/rigs", status_code=201, **answers(RigKeyOut, 201, "added"))
 def add_rig(context: Ctx, who: Administrator, body: RigIn) -> dict[str, Any]:
     """A new rig, or a new key for one whose key was revoked. The key's text is shown this once."""
-    return made(context, body.name, who.name)
-
-
-def made(context: Context, name: str, by: str) -> dict[str, Any]:
-    """The rig's name and key."""
-    return {"name": name, "key": context.rigs.add(name, by)}
+    return {"name": body.name, "key": context.rigs.add(body.name, who.name)}
 
 
 @router.delete("/rigs/{name}", status_code=204)

@@ -26,22 +26,13 @@ def effect_lines(entry: dict[str, Any]) -> list[str]:
         if key == "id" or not value:
             continue
         if key == "parameters":
-            lines += [f"  {line}" for line in parameter_lines(value)]
+            for parameter in value:
+                facts = {name: fact for name, fact in parameter.items() if name != "name" and fact is not None}
+                words = ", ".join(f"{name.replace('_', ' ')} {fact}" for name, fact in facts.items())
+                lines.append(f"  {parameter['name']}: {words}")
         elif key == "forms":
             lines += [f"  {'form':14} {form['name']}: {form['equation']}" for form in value]
         else:
             shown = ", ".join(str(item) for item in value) if isinstance(value, list | tuple) else str(value)
             lines.append(f"  {key.replace('_', ' '):14} {shown}")
-    return lines
-
-
-def parameter_lines(parameters: Any) -> list[str]:
-    """Parameters with units and ranges, however the library lists them."""
-    items = parameters.items() if isinstance(parameters, dict) else [(item.get("name"), item) for item in parameters]
-    lines = []
-    for name, item in items:
-        facts = ", ".join(
-            f"{key.replace('_', ' ')} {value}" for key, value in item.items() if key != "name" and value is not None
-        )
-        lines.append(f"{name}: {facts}")
     return lines

@@ -24,9 +24,7 @@ def table1(
 
 def lines(found: dict[str, Any]) -> list[str]:
     """The table for people."""
-    rows = found.get("rows")
-    if not isinstance(rows, list) or not rows:
-        return [f"{key}: {value}" for key, value in found.items()]
+    rows = found["rows"]
     header = list(rows[0])
     body = [[str(row[key]) if isinstance(row[key], str) else number(row[key]) for key in header] for row in rows]
     rest = [f"{key}: {value}" for key, value in found.items() if key != "rows"]

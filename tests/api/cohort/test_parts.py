@@ -13,12 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from api.cohort import parts
-from api.cohort import read as read_tables
+from api.cohort import table as read_tables
 from api.cohort.errors import CohortError
 from api.cohort.parts import Results
-from api.cohort.read import options_of
 from api.cohort.sources import Entry
-from api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, table_of
+from api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, options_of, table_of
 from api.cohort.tasks import Task
 from api.cohort.worker import COPY, LEFT_OUT
 
