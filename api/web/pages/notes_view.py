@@ -21,7 +21,7 @@ from api.web.pages.checked import checked
 from api.web.pages.environment import environment
 from api.web.pages.starting import site_words
 from api.web.requests import RanByIn
-from api.web.routes import archive, muscle, notes, participants, tests
+from api.web.routes import muscle, notes, participants, tests
 
 router = APIRouter(include_in_schema=False)
 ONE = "/participants/{code}"
@@ -70,14 +70,14 @@ async def strike(context: Ctx, who: Tester, code: str, note_id: str, back: Annot
 @router.post(ONE + "/archive")
 async def put_away(context: Ctx, who: Tester, code: str) -> Response:
     """Into the archive."""
-    await archive.put(context, code, True, who.name)
+    await muscle.put(context, code, True, who.name)
     return RedirectResponse("/", 303)
 
 
 @router.post(ONE + "/unarchive")
 async def take_out(context: Ctx, who: Tester, code: str) -> Response:
     """Out of the archive."""
-    await archive.put(context, code, False, who.name)
+    await muscle.put(context, code, False, who.name)
     return RedirectResponse(f"/participants/{code}", 303)
 
 

@@ -16,7 +16,7 @@ from api.models import inverted as words
 from api.store.tables import Model
 from api.web.dependencies import Context, Ctx, ModelReader
 from api.web.pages.render import page
-from api.web.routes.inversion import inverted
+from api.web.routes.prediction import inverted
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 

@@ -1,4 +1,4 @@
-"""Models: versions, approval, what the controller gets."""
+"""Models: versions, approval, what the controller gets, and what its trials said of the muscle."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from api.store.tables import Model
 from api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader
 from api.web.headers import entity_tags
 from api.web.requests import ApprovalIn, DecisionIn
-from api.web.responses.base import published
+from api.web.responses.base import answers, published
 from api.web.responses.models import VersionOut
+from api.web.responses.tracking import TrackingOut
 from api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
@@ -74,6 +75,16 @@ def matches(if_none_match: str, etag: str) -> bool:
     """RFC 9110, section 13.1.2: weak comparison against a list, or `*`."""
     tags = entity_tags(if_none_match)
     return "*" in tags or etag in tags
+
+
+@router.get("/participants/{code}/tracking", **answers(TrackingOut))
+def tracking(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
+    """The trials since the approval that holds, oldest first; 404 where no model is approved today."""
+    found = context.tracked.document(code)
+    if found is None:
+        participants.find(context, code)
+        raise none_approved(code)
+    return found
 
 
 @router.get("/participants/{code}/models", response_model=list[VersionOut])
