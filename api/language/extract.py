@@ -37,7 +37,7 @@ SENTENCES = (
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {
     "app.py", "openapi.py", "headers.py", "dependencies.py", "server.py", "static.py", "schemas.py", "own_file.py",
-    "hdf5_chunks.py", "confinement.py", "child.py", "docs.py",
+    "hdf5_chunks.py", "confinement.py", "child.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
 NAMED = {"Effect": ("name",), "Parameter": ("about",)}

@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 
 from babel.dates import format_date
 
-from api.language.current import locale
+from api.language.words import locale
 
 _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 

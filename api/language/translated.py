@@ -16,8 +16,8 @@ from itertools import islice
 from markupsafe import Markup
 
 from api.language.catalogues import DEFAULT, catalogue, translations
-from api.language.current import code
 from api.language.numbers import localised
+from api.language.words import code
 
 _PLACE = re.compile(r"%\((\w+)\)s")
 _END = re.compile(r"(?<=[.!?;:,]) ")

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from api.language import _, lazy, plain
 from api.language import decimal as _decimal
-from api.models.followed import followed
+from api.models.summary import followed
 
 Act = Literal["approve", "add", "test", "fit"]
 

@@ -18,7 +18,7 @@ from api.clock import Clock, local_day
 from api.errors import ApiError
 from api.models import changes, headline, stored
 from api.models.changes import State
-from api.models.followed import followed
+from api.models.summary import followed
 from api.store import Store
 from api.store.tables import Analysis, Approval, Model, Note, Recording, Test
 from api.workers.pool import Pool

@@ -1,8 +1,12 @@
-"""The plan of a test that stops itself: its bounds, and the fixed plan that plays where nobody chooses in time."""
+"""The plan of a test, with what is kept beside it; of one that stops itself its bounds, and the fixed plan.
+
+The fixed plan plays where nobody chooses in time.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from api.errors import ApiError
@@ -76,3 +80,29 @@ def _pieces(default: dict[str, Any], rate_hz: float) -> Iterator[tuple[str, list
 
 def _segment(name: str, widths: list[float]) -> SegmentPlan:
     return SegmentPlan(name=name, sequence="widths", settings={"pulse_width_us": widths, "jumps": True})
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan, and what else is known of it before it is played.
+
+    Parameters
+    ----------
+    how, reach : dict or None
+        Of an adaptive test: what it shall reach, and what it probably will.
+    joint : dict or None
+        Of a guided test of a joint: doses, target, longest time.
+    """
+
+    plan: TestPlan
+    how: dict[str, Any] | None = None
+    reach: dict[str, Any] | None = None
+    joint: dict[str, Any] | None = None
+
+    def kept(self) -> dict[str, Any]:
+        """What is kept beside the plan; nothing of a test of another kind."""
+        if self.joint is not None:
+            return {"joint": self.joint}
+        if self.how is None or self.plan.adaptive is None:
+            return {}
+        return {"target": self.how["target"], "reach": self.reach, "bounds": self.plan.adaptive.model_dump()}

@@ -17,8 +17,7 @@ from api.models.places import Place, differ, place_of, site_of
 from api.models.registry import Versions
 from api.sessions import adaptive_plan
 from api.sessions.adaptive import Follower, Told
-from api.sessions.adaptive_plan import ADAPTIVE, PIECE_S
-from api.sessions.planned import Planned
+from api.sessions.adaptive_plan import ADAPTIVE, PIECE_S, Planned
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import RigClient
 from api.store.tables import Participant, Test

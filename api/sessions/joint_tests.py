@@ -12,9 +12,9 @@ from api.clock import Clock
 from api.errors import ApiError
 from api.models.registry import Versions
 from api.sessions import angles, coverage, joint_plan
+from api.sessions.adaptive_plan import Planned
 from api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Layout
 from api.sessions.joint_watch import Watcher
-from api.sessions.planned import Planned
 from api.sessions.requests import AngleIn, TestIn
 from api.sessions.rig_client import RigClient
 from api.store.tables import Test

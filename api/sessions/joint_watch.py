@@ -129,13 +129,4 @@ class Watcher:
 
     def document(self) -> dict[str, Any]:
         """As clients see it."""
-        told = self.told
-        return {
-            "state": told.state,
-            "problem": told.problem,
-            "ended": told.ended,
-            "angle_rad": told.angle_rad,
-            "velocity_rad_s": told.velocity_rad_s,
-            "torque_time_nm_s": told.torque_time_nm_s,
-            "coverage": told.coverage.document(),
-        }
+        return {**vars(self.told), "coverage": self.told.coverage.document()}

@@ -21,7 +21,7 @@ from api.models.analyses import Analyses
 from api.models.places import site_of
 from api.models.registry import Versions
 from api.sessions import document
-from api.sessions.adaptive_plan import ADAPTIVE
+from api.sessions.adaptive_plan import ADAPTIVE, Planned
 from api.sessions.adaptive_tests import AdaptiveTests
 from api.sessions.following import Follower
 from api.sessions.joint_plan import KINDS
@@ -29,7 +29,6 @@ from api.sessions.joint_tests import JointTests
 from api.sessions.lifecycle import Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
-from api.sessions.planned import Planned
 from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived, rests_of
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient

@@ -40,8 +40,8 @@ def made_up() -> Iterator[None]:
         if message:
             one = f"⟦{message}⟧" if isinstance(message, str) else tuple(f"⟦{form}⟧" for form in message)
             made.add(message, one)
-    modules = [importlib.import_module(f"api.language.{name}") for name in ("catalogues", "current", "translated")]
-    pages = [importlib.import_module(name) for name in ("api.language", "api.web.pages.choose_language")]
+    modules = [importlib.import_module(f"api.language.{name}") for name in ("catalogues", "words", "translated")]
+    pages = [importlib.import_module(name) for name in ("api.language", "api.web.pages.choices")]
     with pytest.MonkeyPatch.context() as patch:
         for module in [*modules, *pages]:
             patch.setattr(module, "CODES", ("en", MADE_UP), raising=False)

@@ -15,7 +15,7 @@ from jinja2.runtime import Context
 from api import clinical_words, effect_words, language
 from api.charts.config import PAGE_CONFIG
 from api.language import words
-from api.models.followed import followed
+from api.models.summary import followed
 
 HERE = Path(__file__).parent
 
