@@ -10,7 +10,7 @@ import pytest
 
 from api import language
 from api.models.tracking_words import OUTCOMES, sentences
-from api.web.pages import tracking_form
+from api.web.pages.decision_view import tracking_words
 from api.web.responses.tracking import TrialOut
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
@@ -79,12 +79,12 @@ def test_every_outcome_of_the_service_has_words(language_code: str) -> None:
 
 
 def test_limits_are_shown_as_they_were_typed() -> None:
-    said = tracking_form.words({"gain_percent": 12.5, "threshold_percent": 20.0, "time_scale_percent": 0.4}, 83.37)
+    said = tracking_words({"gain_percent": 12.5, "threshold_percent": 20.0, "time_scale_percent": 0.4}, 83.37)
     assert "gain ±12.5\u00a0%, threshold ±20\u00a0% (±16.7\u00a0µs), time scale ±0.4\u00a0%" in said
-    without = tracking_form.words(None, None)
+    without = tracking_words(None, None)
     assert "gain ±20\u00a0%, threshold as approved, time scale ±20\u00a0%" in without, "there is no threshold to move"
     nothing = dict.fromkeys(("gain_percent", "threshold_percent", "time_scale_percent"), "0")
-    assert "does not follow" in tracking_form.words(nothing, 80.0)
+    assert "does not follow" in tracking_words(nothing, 80.0)
 
 
 def test_the_card_tells_the_trials_without_scripts_and_in_german(

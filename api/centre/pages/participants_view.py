@@ -17,7 +17,7 @@ from api.charts import trend_charts
 from api.effect_words import effect_words
 from api.errors import ApiError, NotFoundError
 from api.models import changes
-from api.models.followed import followed
+from api.models.summary import followed
 from api.store.centre_tables import CentreEffect
 from api.web.dependencies import ModelReader
 from api.web.pages.render import page

@@ -1,23 +1,36 @@
-"""A person decides on a model: approved or rejected; before one that is not usable, a question says what is risked."""
+"""A person decides on a model: approved, and how far it may be tracked, or rejected.
+
+Before one that is not usable is approved, a question says what is risked.
+"""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
+from starlette.datastructures import FormData
 
 from api.errors import ApiError
+from api.language import _, lazy, localised
 from api.models import advice, headline, reasons, stored
+from api.models.tracking import QUANTITIES, Limits
 from api.store.tables import Model
 from api.web.dependencies import Approver, Context, Ctx
-from api.web.pages import tracking_form
+from api.web.pages import typed
+from api.web.pages.environment import environment
 from api.web.pages.render import page
 from api.web.routes import models
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 Reason = Annotated[str, Form()]
+LABELS = {
+    "gain_percent": lazy("Gain (± %%)"),
+    "threshold_percent": lazy("Threshold (± %%)"),
+    "time_scale_percent": lazy("Time scale (± %%)"),
+}
 
 
 @router.get("/approve")
@@ -34,9 +47,9 @@ async def approve(request: Request, context: Ctx, who: Approver, model_id: str, 
     """Let the controller have a version; one that is not usable wants a reason."""
     row = await asyncio.to_thread(context.versions.get, model_id)
     sent = await request.form()
-    tracking = tracking_form.read(sent)
+    tracking = read_tracking(sent)
     if _poor(context, row) and not reasons.is_reason(reason):
-        given = {name: sent[name] for name in tracking_form.LABELS if name in sent}
+        given = {name: sent[name] for name in LABELS if name in sent}
         return await _question(request, context, row, who.session_hash, reason, given)
     await models.let_have(context, model_id, who.name, reason.strip()[:500], tracking)
     return RedirectResponse(f"/models/{model_id}", 303)
@@ -63,7 +76,7 @@ def _poor(context: Context, row: Model) -> bool:
 
 
 async def _question(
-    request: Request, context: Context, row: Model, session: str | None, typed: str | None = None,
+    request: Request, context: Context, row: Model, session: str | None, written: str | None = None,
     sent: dict[str, Any] | None = None,
 ) -> Response:  # fmt: skip
     """What would be risked, and the field for the reason; with what was typed where it is no reason."""
@@ -71,12 +84,73 @@ async def _question(
     return page(
         request,
         "approve_poor.html",
-        200 if typed is None else 422,
+        200 if written is None else 422,
         model=await asyncio.to_thread(context.versions.document, row),
         risks=advice.risks(document, advice.findings(document)),
         ask_password=not await context.people.is_confirmed(session),
-        typed=typed,
+        typed=written,
         sent=sent,
         threshold_us=headline.threshold_us(row),
         what_to_write=reasons.WHAT_TO_WRITE,
     )
+
+
+def read_tracking(sent: FormData) -> Limits:
+    """The limits that were typed; the usual ones where the form has no such field.
+
+    Raises
+    ------
+    ApiError
+        422: what was typed is no percentage from 0 to 60.
+    """
+    found: dict[str, float] = {}
+    for name in Limits().to_dict():
+        text = sent.get(name)
+        if text is None:
+            continue
+        try:
+            found[name] = typed.number(str(text))
+        except ValueError as error:
+            detail = f"{name}: {error}. Nothing was decided."
+            raise ApiError(422, "invalid-input", "This value cannot be used", detail) from None
+    return Limits(**found)
+
+
+def tracking_fields(sent: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
+    """The form's fields, with what was typed in them."""
+    given = {name: typed.shown(percent) for name, percent in Limits().to_dict().items()} | dict(sent or {})
+    return [{"name": name, "label": str(label), "text": str(given[name])[:5]} for name, label in LABELS.items()]
+
+
+def tracking_words(limits: Mapping[str, Any] | None, threshold_us: float | None) -> str:
+    """What is allowed, in a sentence.
+
+    Parameters
+    ----------
+    limits : mapping or None
+        Of `LABELS`, each in percent, or as it was typed; None: the usual ones.
+    threshold_us : float or None
+        Of the model's curve, µs; without one its threshold stays as approved, whatever the limit.
+    """
+    given = {
+        name: typed.number(str(value)) if isinstance(value, str) else value for name, value in (limits or {}).items()
+    }
+    allowed = Limits(**given)
+    bounds = allowed.bounds(threshold_us)
+    if not bounds:
+        return _("The model does not follow the muscle from trial to trial: all stays as approved.")
+    said = {
+        quantity: f"±{localised(typed.shown(percent))}\u00a0%" if quantity in bounds else _("as approved")
+        for quantity, percent in zip(QUANTITIES, allowed.to_dict().values(), strict=True)
+    }
+    if shift_us := bounds.get("threshold_shift_us", (0.0, 0.0))[1]:
+        said["threshold_shift_us"] += localised(f" (±{shift_us:.3g}\u00a0µs)")
+    return _(
+        "The model follows the muscle from trial to trial, at most: gain %(gain)s, threshold %(threshold)s, "
+        "time scale %(time_scale)s.",
+        gain=said["gain"], threshold=said["threshold_shift_us"], time_scale=said["time_scale"],
+    )  # fmt: skip
+
+
+environment.globals["tracking_fields"] = tracking_fields
+environment.globals["tracking_words"] = tracking_words

@@ -17,7 +17,7 @@ from api.sessions.requests import AngleIn, TestIn
 from api.sessions.trials import SEQUENCE
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import joint_words, next_view, starting
+from api.web.pages import next_view, starting
 from api.web.pages.checked import checked
 from api.web.pages.model_view import to_job
 from api.web.pages.render import page
@@ -50,14 +50,14 @@ def _gather(context: Context, row: Participant, found: dict[str, Any]) -> dict[s
         "may_start": starting.calibrated(context, row).may_start,
         "archived": next_view.step(context, row).kind == "archived",
         "held": [{**each, "deg": _deg(each["angle_rad"])} for each in found["targets"]],
-        "allowed": None if found["next_rad"] is None else joint_words.allowed_deg({"target_rad": found["next_rad"]}),
+        "allowed": None if found["next_rad"] is None else starting.allowed_deg({"target_rad": found["next_rad"]}),
         "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],
         "kinds_lacking": [kind for kind in (PASSIVE, HELD, MOVING) if not any(test.kind == kind for test in rows)],
     }
 
 
 def _deg(angle_rad: float) -> tuple[float, float] | None:
-    return joint_words.allowed_deg({"target_rad": angle_rad})
+    return starting.allowed_deg({"target_rad": angle_rad})
 
 
 def _recorded_today(context: Context, code: str) -> list[Test]:

@@ -1,4 +1,4 @@
-"""A participant: limits for today and the way to a test in one form, models and tests below."""
+"""A participant: limits for today and the way to a test in one form, models and tests below; questions before it."""
 
 from __future__ import annotations
 
@@ -8,15 +8,18 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
+from starlette.datastructures import FormData
 
+from api.errors import ApiError
 from api.people import controller_keys
 from api.people.auth import Principal
 from api.sessions import angles, profiles
-from api.sessions.questions import Question, Row
+from api.sessions.questions import LIFE_S, Question, Row, gone
+from api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, TargetIn, TestIn
 from api.store import seen
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import angle_form, kind_form, limits_form, next_view, starting, trials_view
+from api.web.pages import angle_form, limits_form, next_view, starting, trials_view, typed
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
 from api.web.routes import participants
@@ -87,7 +90,7 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
     form = limits_form.read(sent, row.profile, status)
     if form.errors:
         return await shown(request, context, who, code, form, 422)
-    wanted = kind_form.asked(sent, code) if start else None
+    wanted = asked_test(sent, code) if start else None
 
     async def on() -> str:
         if wanted is None:
@@ -136,3 +139,46 @@ def _lost(context: Context, voids: str) -> list[str]:
     required = context.rig.status is None or context.rig.status.require_calibration is not False
     then = " Until the participant is calibrated anew, no test starts." if required else ""
     return [f"The calibration is lost with it: {voids}.{then}"]
+
+
+def asked_test(sent: FormData, code: str) -> TestIn:
+    """The test that a person asks for; one that stops itself is asked about whether or not its target is in reach.
+
+    Raises
+    ------
+    ApiError
+        422: what was typed is no target.
+    """
+    if sent.get("plan") != "adaptive":
+        return TestIn(participant=code)
+    try:
+        percent = typed.number(str(sent.get("target") or ""))
+    except ValueError as error:
+        raise no_target(str(error)) from None
+    if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
+        raise no_target(f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %")
+    target = TargetIn(curve_percent=percent, step_percent=percent)
+    return TestIn(participant=code, kind="adaptive", target=target, anyway=True)
+
+
+def no_target(why: str) -> ApiError:
+    """422, in one line."""
+    return ApiError(422, "invalid-input", "This value cannot be used", f"Target: {why}. Nothing was started.")
+
+
+@router.get("/confirm/{number}")
+async def question(request: Request, context: Ctx, who: Tester, code: str, number: str) -> Response:
+    """The question; or, where it has been answered, what came of it."""
+    asked = context.questions.find(code, number, who)
+    if asked.answer is None:
+        return page(request, "question.html", question=asked, minutes=LIFE_S / 60)
+    if asked.answer.done() and asked.answer.exception() is None:
+        return RedirectResponse(asked.answer.result(), 303)
+    raise gone("It has been answered.")
+
+
+@router.post("/confirm/{number}")
+async def answer(context: Ctx, who: Tester, code: str, number: str) -> Response:
+    """Yes."""
+    asked = context.questions.find(code, number, who)
+    return RedirectResponse(await context.questions.yes(asked), 303)

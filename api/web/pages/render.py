@@ -19,12 +19,12 @@ from api.errors import ApiError
 from api.people.auth import LOCKED, Principal, Scope
 from api.store import seen
 from api.web.dependencies import Context
-from api.web.pages import changes, colours, rig_state
+from api.web.pages import changes, choices, rig_state
 from api.web.pages.changes import Again
 from api.web.pages.environment import environment
 
 environment.filters["what_to_check"] = rig_state.what_to_check
-environment.globals["colours_media"] = colours.MEDIA
+environment.globals["colours_media"] = choices.MEDIA
 
 LOOK_S = 1.0
 
@@ -51,7 +51,7 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     bar = {**face.bar(request, looking, principal), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
     shown["signed"] = signed(principal)
-    shown["colours"] = colours.chosen(request)
+    shown["colours"] = choices.colours(request)
     html = face.environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
 

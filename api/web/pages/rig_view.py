@@ -1,4 +1,4 @@
-"""What scripts on every page ask for: the rig's state, and the notice about it."""
+"""What scripts on every page ask for: the rig's state, and the notice about it; and what a press of stop did."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from api.people.auth import LOCKED
 from api.web.browser_session import local
 from api.web.dependencies import Anyone, Ctx
 from api.web.pages import rig_state
-from api.web.pages.render import fragment
+from api.web.pages.render import fragment, look, page
 
-router = APIRouter(include_in_schema=False, prefix="/rig")
+router = APIRouter(include_in_schema=False)
 
 
-@router.get("/now")
+@router.get("/rig/now")
 async def rig_now(request: Request, context: Ctx) -> Response:
     """The state for the bar of every page, also of one whose session has ended."""
     principal, locked = None, False
@@ -29,13 +29,27 @@ async def rig_now(request: Request, context: Ctx) -> Response:
     return JSONResponse({**rig_state.now(context, principal), "signed_in": principal is not None, "locked": locked})
 
 
-@router.post("/acted")
+@router.post("/rig/acted")
 async def acted(_who: Anyone) -> Response:
     """A person has typed or moved the pointer on a page: its session is not idle."""
     return Response(status_code=204)
 
 
-@router.get("/notice")
+@router.get("/rig/notice")
 async def rig_notice(context: Ctx, who: Anyone, back: str = "/") -> Response:
     """The notice alone, for a page on which it has changed."""
     return HTMLResponse(fragment(context, "notice.html", who, local(back)))
+
+
+@router.get("/stopped/{key}")
+async def stopped(request: Request, context: Ctx, key: str) -> Response:
+    """The rig's evidence that stimulation has stopped, or why that is not sure.
+
+    Open to whoever has its address, since a session may have ended by then.
+    """
+    told = context.stops.get(key)
+    request.state.stop_right = told.right
+    await look(request)
+    if isinstance(told.answer, ApiError):
+        return page(request, "problem.html", told.answer.status, problem=told.answer, back=None)
+    return page(request, "stop.html", told=told, evidence=told.answer)

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from api.clinical_words import test_kind_words
+from api.clinical_words import degrees, test_kind_words
 from api.errors import ApiError
 from api.language import _, lazy, localised, translated, until, when
 from api.models.places import Site, site_of
 from api.people.auth import Principal
-from api.sessions import profiles
+from api.sessions import angles, profiles
+from api.sessions.joint_plan import HELD, PASSIVE
 from api.sessions.questions import Question, Row
 from api.sessions.refusals import other_than, refuse_archived
 from api.sessions.requests import TestIn
 from api.store import seen
 from api.store.tables import Participant
 from api.web.dependencies import Context
-from api.web.pages import joint_words
 from api.web.pages.environment import environment, number
 from api.web.routes import participants
 
@@ -84,7 +86,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
         stimulates=stimulates,
         back=back,
-        at_deg=joint_words.allowed_deg(joint) if joint else None,
+        at_deg=allowed_deg(joint) if joint else None,
     )
     return context.questions.ask(question, who)
 
@@ -112,7 +114,7 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
     long = number(preview["duration_s"], 0, "s")
     more = []
     if joint := preview.get("joint"):
-        long, dose, more = joint_words.of_question(joint, row.profile, long, dose)
+        long, dose, more = of_joint(joint, row.profile, long, dose)
     elif bounds := preview.get("bounds"):
         reach, most = preview["reach"], number(bounds["max_torque_time_nms"], 0, "N·m·s")
         long = _("at most %(most)s", most=number(bounds["max_duration_s"], 0, "s"))
@@ -138,6 +140,34 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
         Row(_("Run by"), ran_by),
         Row(_("Rig"), rig),
     ]
+
+
+def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Between which angles a held test starts, °; None of another one."""
+    if joint["target_rad"] is None:
+        return None
+    middle, half = math.degrees(joint["target_rad"]), math.degrees(joint.get("tolerance_rad", angles.TOLERANCE_RAD))
+    return round(middle - half, 2), round(middle + half, 2)
+
+
+def of_joint(joint: Mapping[str, Any], profile: Mapping[str, Any], long: str, dose: str) -> tuple[str, str, list[Row]]:
+    """How long a guided test of a joint takes, at what dose, and the rows about the angle."""
+    range_rad = angles.of(profile)
+    more = [Row(_("Joint angles"), _("%(range)s; beyond them the test stops", range=angles.words(range_rad or (0, 0))))]
+    if joint["kind"] == HELD:
+        more.insert(0, Row(_("Hold at"), degrees(joint["target_rad"])))
+        expected = joint["doses"]["held_each"]
+    else:
+        long = _("at most %(most)s; ends by itself once enough was seen", most=number(joint["longest_s"], 0, "s"))
+        expected = joint["doses"]["moving"]
+    if joint["kind"] == PASSIVE:
+        return long, _("none: no current flows"), more
+    if joint["known"]:
+        dose = _("about %(effort)s of torque", effort=number(expected, 1, "N·m·s"))
+    elif joint["doses"]["paper"] > 0:
+        percent = number(100 * expected / joint["doses"]["paper"], 0, "%")
+        dose = _("about %(percent)s of the pre-session test's", percent=percent)
+    return long, dose, more
 
 
 def site_words(site: Site) -> str:

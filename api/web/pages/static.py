@@ -1,4 +1,7 @@
-"""Style, scripts, plotly and Swagger UI, from this machine only; compressed once, kept by browsers for long."""
+"""Style, scripts, plotly and Swagger UI, from this machine only; compressed once, kept by browsers for long.
+
+And the API's description as a page, drawn by Swagger UI.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from fastapi import APIRouter, Request
-from fastapi.responses import Response
+from fastapi.responses import HTMLResponse, Response
 
 from api.errors import NotFoundError
 from api.web.pages.environment import HERE, environment
@@ -72,3 +75,9 @@ def static(request: Request, name: str) -> Response:
     if "gzip" in request.headers.get("accept-encoding", ""):
         body, headers["Content-Encoding"] = packed, "gzip"
     return Response(body, media_type=KINDS[path.suffix], headers=headers)
+
+
+@router.get("/docs")
+def docs() -> HTMLResponse:
+    """Every route, with what it takes and gives; it sends no request but GET: nothing is started by reading."""
+    return HTMLResponse(environment.get_template("docs.html").render())
