@@ -13,6 +13,7 @@ from api.charts.model_charts import (
     NOISE,
     TOOLBAR_PX,
     axis,
+    box,
     layout,
     line,
     segment_marks,
@@ -31,9 +32,9 @@ def residual(
     series = comparison["series"]
     time_s, band = series["time_s"], series.get("noise_band_nm") or 0.0
     shapes, labels = segment_marks(segments)
-    shapes.append(_box(time_s[0], time_s[-1], -band, band, NOISE, yref="y"))
+    shapes.append(box(time_s[0], time_s[-1], NOISE, -band, band, yref="y"))
     for place in places:
-        shapes.append(_box(place["start_s"], place["end_s"], 0, 1, MARK))
+        shapes.append(box(place["start_s"], place["end_s"], MARK))
         labels.append({
             "xref": "x", "yref": "paper", "x": (place["start_s"] + place["end_s"]) / 2, "y": 0.985, "yanchor": "top",
             "text": f"<b>{place['number']}</b>", "showarrow": False, "font": {"size": 12, "color": role("on-worst")},
@@ -52,11 +53,6 @@ def residual(
             yaxis=axis(_("Measured − model (N·m)")),
         ),
     }  # fmt: skip
-
-
-def _box(x0: float, x1: float, y0: float, y1: float, fill: str, yref: str = "paper") -> dict[str, Any]:
-    return {"type": "rect", "xref": "x", "yref": yref, "x0": x0, "x1": x1, "y0": y0, "y1": y1, "fillcolor": fill,
-            "line": {"width": 0}, "layer": "below"}  # fmt: skip
 
 
 def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.charts.model_charts import INK, MODEL, STIMULUS, axis, layout, line
+from api.charts.model_charts import INK, MODEL, STIMULUS, axis, box, layout, line
 from api.charts.palette import role
 from api.language import _
 
@@ -13,11 +13,7 @@ def inversion(found: dict[str, Any]) -> dict[str, Any]:
     """The figure of what `POST /v1/models/{id}/widths` answers; what is out of reach is shaded."""
     step_s = 1.0 / found["pulse_rate_hz"]
     time_s = [round(k * step_s, 6) for k in range(len(found["pulse_width_us"]))]
-    shades = [
-        {"type": "rect", "xref": "x", "yref": "paper", "x0": one["begin_s"], "x1": one["end_s"], "y0": 0, "y1": 1,
-         "fillcolor": role("worst-band"), "line": {"width": 0}, "layer": "below"}
-        for one in found["unreachable"]
-    ]  # fmt: skip
+    shades = [box(one["begin_s"], one["end_s"], role("worst-band")) for one in found["unreachable"]]
     data = [
         line(time_s, found["predicted_torque_nm"], _("predicted"), MODEL, 2.2),
         line(time_s, found["reference_torque_nm"], _("Reference"), INK, 1.4, line={"dash": "dash"}),

@@ -63,6 +63,12 @@ def line(
             "line": {"color": colour, "width": width, **more.pop("line", {})}, **more}  # fmt: skip
 
 
+def box(x0: float, x1: float, fill: str, y0: float = 0, y1: float = 1, yref: str = "paper") -> dict[str, Any]:
+    """A shade below the lines, over the whole height where nothing else is said."""
+    return {"type": "rect", "xref": "x", "yref": yref, "x0": x0, "x1": x1, "y0": y0, "y1": y1, "fillcolor": fill,
+            "line": {"width": 0}, "layer": "below"}  # fmt: skip
+
+
 def of_model(
     document: dict[str, Any], curves: dict[str, Any] | None, comparison: dict[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -82,10 +88,7 @@ def measurement(
     time_s = curves["time_s"]
     shapes, labels = segment_marks(curves["segments"])
     if noise_sd_nm:
-        shapes.append(
-            {"type": "rect", "xref": "x", "yref": "y2", "x0": time_s[0], "x1": time_s[-1], "y0": -2 * noise_sd_nm,
-             "y1": 2 * noise_sd_nm, "fillcolor": NOISE, "line": {"width": 0}, "layer": "below"}
-        )  # fmt: skip
+        shapes.append(box(time_s[0], time_s[-1], NOISE, -2 * noise_sd_nm, 2 * noise_sd_nm, yref="y2"))
     return {
         "data": measured_lines(curves, series),
         "layout": layout(
@@ -156,9 +159,7 @@ def segment_marks(segments: list[dict[str, Any]]) -> tuple[list[dict[str, Any]],
         name, start_s, end_s = segment["name"], segment["start_s"], segment["end_s"]
         if name == "rest":
             continue
-        shapes.append({"type": "rect", "xref": "x", "yref": "paper", "x0": start_s, "x1": end_s, "y0": 0, "y1": 1,
-                       "fillcolor": role("held-out" if name == "validate" else "segment"), "line": {"width": 0},
-                       "layer": "below"})  # fmt: skip
+        shapes.append(box(start_s, end_s, role("held-out" if name == "validate" else "segment")))
         text, middle_s = segment_name(name), (start_s + end_s) / 2
         half_s = letter_s * len(text) / 2
         if middle_s - half_s < free_s:

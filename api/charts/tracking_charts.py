@@ -73,28 +73,15 @@ def said(value: float, half: float | None, unit: str) -> str:
 class Picture(trend_charts.Plane):
     """One quantity over the numbers of the trials, with the limits that a person allowed."""
 
+    tall = TALL + FOOT
+
     def __init__(self, points: list[Point], lines: list[float], unit: str) -> None:
         super().__init__(points, breaks=False)
         self.lines_at, self.unit = lines, unit
 
-    def svg(self, label: str) -> Markup:
-        """The picture, with room for the name of its axis."""
-        parts = [
-            *self.frame(),
-            *self.limits(),
-            *self.dates(),
-            *self.bands(),
-            *self.lines(),
-            *self.marks(),
-            *self.columns(),
-        ]
-        size = f"0 0 {WIDE:g} {TALL + FOOT:g}"
-        head = f'<svg class="trend" viewBox="{size}" role="img" aria-label="{escape(label)}">'
-        return Markup(head + "".join(parts) + "</svg>")
-
     def frame(self) -> list[str]:
-        """Grid and values, and the unit above them."""
-        return [*super().frame(), f'<text class="x" x="1" y="{TOP - 2:g}">{self.unit}</text>']
+        """Grid and values, the unit above them, and the limits."""
+        return [*super().frame(), f'<text class="x" x="1" y="{TOP - 2:g}">{self.unit}</text>', *self.limits()]
 
     def limits(self) -> list[str]:
         """The limits that lie within the picture."""

@@ -96,6 +96,8 @@ def tip(session: dict[str, Any], words: str, where: str = "") -> str:
 class Plane:
     """Where a figure's values lie in its picture."""
 
+    tall = TALL
+
     def __init__(self, points: list[Point], breaks: bool) -> None:
         self.points, self.breaks = points, breaks
         self.low, self.high = span(points)
@@ -115,7 +117,7 @@ class Plane:
     def svg(self, label: str) -> Markup:
         """The picture."""
         parts = [*self.frame(), *self.dates(), *self.bands(), *self.lines(), *self.marks(), *self.columns()]
-        head = f'<svg class="trend" viewBox="0 0 {WIDE:g} {TALL:g}" role="img" aria-label="{escape(label)}">'
+        head = f'<svg class="trend" viewBox="0 0 {WIDE:g} {self.tall:g}" role="img" aria-label="{escape(label)}">'
         return Markup(head + "".join(parts) + "</svg>")
 
     def frame(self) -> list[str]:

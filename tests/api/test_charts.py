@@ -11,7 +11,6 @@ import pytest
 from api.charts import compare_charts, diagnosis_charts, hover, model_charts, palette
 from api.charts.svg import svg
 from api.language import using
-from tests.api.colours import variables
 from tests.api.test_export import measured
 
 
@@ -111,11 +110,6 @@ def test_figures_hold_roles_and_no_colours(figures: dict[str, Any]) -> None:
         assert re.findall(r'"#[0-9a-fA-F]{3,8}"|"rgba?\((?!0,0,0,0)[^"]*"', kept) == [], name
         light = json.dumps(palette.in_light(figure))
         assert "var(" not in light and palette.LIGHT["ink"] in light
-
-
-def test_the_palette_and_the_style_sheet_say_the_same() -> None:
-    light = variables("page.css")
-    assert {name: light[name] for name in palette.LIGHT} == palette.LIGHT
 
 
 def test_a_still_on_paper_has_its_colours_and_its_words(figures: dict[str, Any]) -> None:
