@@ -14,8 +14,6 @@ VOCABULARY = [
     # states of a test
     lazy("requested"), lazy("running"), lazy("sealing"), lazy("identifying"), lazy("completed"), lazy("stopped"),
     lazy("fault"), lazy("failed"), lazy("refused"), lazy("cancelled"),
-    # verdicts and decisions
-    lazy("usable"), lazy("usable with care"), lazy("not usable"), lazy("unknown"), lazy("approved"), lazy("rejected"),
     # methods
     lazy("maximum-likelihood"), lazy("two-stage"), lazy("ramp-deconvolution"), lazy("separable-least-squares"),
     lazy("narx"), lazy("plain"),

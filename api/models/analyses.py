@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from api.clock import Clock
 from api.errors import ApiError, NotFoundError
-from api.models import effect_evidence, stored
+from api.models import reasons, stored
 from api.models.carried_structure import CarriedStructure
 from api.models.places import Site, site_of_recording
 from api.models.registry import Versions
@@ -169,6 +169,13 @@ class Analyses:
         with self.store.write() as session:
             session.merge(Analysis(model_id=model_id, kind=kind, document=found, created_utc=self.clock.utc()))
 
+    async def asked(self, verb: str, on_call: OnCall | None = None, **arguments: Any) -> dict[str, Any]:
+        """What a worker answers; who asked may go away meanwhile."""
+        call = self.pool.submit(verb, **arguments)
+        if on_call is not None:
+            on_call(call)
+        return await asyncio.shield(call.result)
+
     # ---- versions -------------------------------------------------------------------------------------------
 
     async def add_effects(
@@ -202,20 +209,17 @@ class Analyses:
             detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
             raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
         if not force:
-            effect_evidence.require(await self.diagnosis(model, on_call), model.effects, added)
+            reasons.require_evidence(await self.diagnosis(model, on_call), model.effects, added)
         path = await asyncio.to_thread(self.path, model.recording_id)
         held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
         asked = [held.get(effect, effect) for effect in effects]
-        call = self.pool.submit("fit", data=path, method=model.method, effects=asked)
-        if on_call is not None:
-            on_call(call)
-        found = await asyncio.shield(call.result)
+        found = await self.asked("fit", on_call, data=path, method=model.method, effects=asked)
         return await asyncio.to_thread(self._store_added, found["json"], model, added, by, force, reason)
 
     async def check_known(self, effects: list[str]) -> None:
         """Refuse effects that are not in the library."""
         if self._ids is None:
-            found = await asyncio.shield(self.pool.submit("effects").result)
+            found = await self.asked("effects")
             self._ids = sorted(entry["id"] for entry in found["effects"])
         unknown = [effect for effect in effects if effect not in self._ids]
         if unknown:
@@ -240,10 +244,7 @@ class Analyses:
         path = await asyncio.to_thread(self.path, model.recording_id)
         plain = await asyncio.to_thread(is_plain, model)
         given: dict[str, Any] = {} if plain else {"model_json": stored.text(model)}
-        call = self.pool.submit("improve", data=path, **given)
-        if on_call is not None:
-            on_call(call)
-        found = await asyncio.shield(call.result)
+        found = await self.asked("improve", on_call, data=path, **given)
         first = await asyncio.to_thread(self._plain_eldest, model) if plain else model
         rows = await asyncio.to_thread(self._store_steps, found, first, by)
         return {key: value for key, value in found.items() if key != "models"}, rows
@@ -281,8 +282,8 @@ class Analyses:
         made = self.settings.exports_dir / f"{identity}.csv"  # all that a worker may write to
         kept = self.settings.recordings_dir / made.name
         try:
-            call = self.pool.submit("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
-            digest = (await asyncio.shield(call.result))["file_sha256"]
+            found = await self.asked("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
+            digest = found["file_sha256"]
             await asyncio.to_thread(made.replace, uploads.part_of(kept))
         except BaseException:
             made.unlink(missing_ok=True)

@@ -8,6 +8,7 @@ from typing import Any
 from api.clinical_words import segment_words
 from api.effect_words import effect_words, effects_words, parameter_words, within, without_unit
 from api.language import _, lazy, localised, ngettext, plain
+from api.models.reasons import refusal
 from api.structure import worded
 from identify.caution import caution, only_open
 
@@ -274,8 +275,6 @@ def _seconds(settings: dict[str, Any]) -> str:
 
 def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str, Any]) -> list[dict[str, Any]]:
     """Effects that were tried and are not asked for, with the reason, best first."""
-    from api.models.effect_evidence import refusal
-
     asked = {entry["effect"] for entry in diagnosis["missing"]} | set(effects)
     newest: dict[str, float] = {}
     for rows in diagnosis.get("candidates") or []:

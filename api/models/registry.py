@@ -21,6 +21,11 @@ from api.store import Store, audit, seen
 from api.store.tables import Approval, Model, Participant, Recording, Test
 
 log = logging.getLogger("stimrig.models")
+TOLD = (
+    "id", "participant", "recording_id", "parent_id", "added_effect", "carried_from_id", "carried", "method", "effects",
+    "created_utc", "created_by",
+)  # fmt: skip
+"""What clients see of a version's row as it is."""
 
 
 @dataclass(frozen=True)
@@ -315,16 +320,8 @@ class Versions:
 
     def _told(self, row: Model, decision: Approval | None, holding: Approval | None) -> dict[str, Any]:
         return {
-            "id": row.id,
             "model_id": row.id,
-            "participant": row.participant,
-            "recording_id": row.recording_id,
-            "parent_id": row.parent_id,
-            "added_effect": row.added_effect,
-            "carried_from_id": row.carried_from_id,
-            "carried": row.carried,
-            "method": row.method,
-            "effects": row.effects,
+            **{name: getattr(row, name) for name in TOLD},
             **row.fit,
             **self.quality(row),
             "decision": None if decision is None else ("approved" if decision.approved else "rejected"),
@@ -334,6 +331,4 @@ class Versions:
             "expires_utc": decision.expires_utc if decision else None,
             "tracking": decision.tracking if decision else None,
             "served": holding is not None and holding.model_id == row.id,
-            "created_utc": row.created_utc,
-            "created_by": row.created_by,
         }

@@ -41,10 +41,7 @@ async def fit(
     await analyses.check_known(ids)
     needs = [ANGLE] if {*ids} & {*_ids(JOINT_EFFECTS)} else []
     whole = rows[0] if len(rows) == 1 else await _joined(analyses, rows, participant, needs)
-    call = analyses.pool.submit("fit", data=whole.path, effects=list(effects))
-    if on_call is not None:
-        on_call(call)
-    found = await asyncio.shield(call.result)
+    found = await analyses.asked("fit", on_call, data=whole.path, effects=list(effects))
     return await asyncio.to_thread(_store, analyses, found["json"], participant, whole, by, recordings)
 
 

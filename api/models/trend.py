@@ -27,6 +27,8 @@ KEPT_AS = "headline"
 """The name under which the figures are kept of a model that was stored before its row held them."""
 CONDITIONS = ("electrodes", "side", "posture")
 """Kinds of notes that put a comparison in doubt where they differ."""
+OF_NOTE = ("at_utc", "kind", "text", "by", "test_id", "at_s")
+"""What is told of a note."""
 OTHER_UNITS = {
     "fit_percent": "%", "held_out_fit_percent": "%", "noise_sd_nm": "N·m", "charge_uc": "µC", "current_ma": "mA",
 }  # fmt: skip
@@ -76,11 +78,8 @@ class Session:
             "effects": self.model.effects,
             "verdict": fit.get("verdict", "unknown"),
             "figures": figures,
-            "notes": [
-                {"at_utc": note.at_utc, "kind": note.kind, "text": note.text, "by": note.by, "test_id": note.test_id,
-                 "at_s": note.at_s} for note in self.notes
-            ],
-        }  # fmt: skip
+            "notes": [{name: getattr(note, name) for name in OF_NOTE} for note in self.notes],
+        }
 
     def shown(self) -> dict[str, Any]:
         """As pages show it: `document`, with one fit, `follows_percent`; its `where` says on which pulses."""

@@ -110,16 +110,24 @@ class People:
         held = principal.session_hash
         if held is None:
             raise ApiError(409, "no-password", "There is no password to confirm", "Signed in with a token.")
-        row: User | None = await asyncio.to_thread(self.store.get, User, principal.name)
-        with self.passwords.room(known=True) as lane:
-            self.guesses.confirmation(held)
-            right = await self.passwords.verify(lane, row.password_hash if row else None, password)
-        if not right:
+        if not await self._right(held, principal.name, password):
             await asyncio.to_thread(self._note, principal.name, "confirmation refused")
             detail = "Nothing was decided. Go back and enter it again."
             raise unauthorized(detail, "wrong-password", "The password does not match")
-        self.guesses.confirmation_was_right(held)
         await asyncio.to_thread(self._confirm, held)
+
+    async def _right(self, session_hash: str, name: str, secret: str, token_hash: str | None = None) -> bool:
+        """Whether a person's password, or the token of this hash, is right that is given once more in a session."""
+        row: User | None = None if token_hash else await asyncio.to_thread(self.store.get, User, name)
+        with self.passwords.room(known=True) as lane:
+            self.guesses.confirmation(session_hash)
+            if token_hash:
+                right = hmac.compare_digest(digest(secret), token_hash)
+            else:
+                right = await self.passwords.verify(lane, row.password_hash if row else None, secret)
+        if right:
+            self.guesses.confirmation_was_right(session_hash)
+        return right
 
     async def unlock(self, principal: Principal, secret: str) -> None:
         """Go on in a locked session, by its person's password or by the token that it was opened with.
@@ -133,18 +141,10 @@ class People:
         if held is None or not principal.locked:
             return
         by_token = principal.session_hash is None
-        row: User | None = None if by_token else await asyncio.to_thread(self.store.get, User, principal.name)
-        with self.passwords.room(known=True) as lane:
-            self.guesses.confirmation(held.hash)
-            if by_token:
-                right = hmac.compare_digest(digest(secret), held.token_hash)
-            else:
-                right = await self.passwords.verify(lane, row.password_hash if row else None, secret)
-        if not right:
+        if not await self._right(held.hash, principal.name, secret, held.token_hash if by_token else None):
             await asyncio.to_thread(self._note, principal.name, "unlock refused")
             title = "The token does not match" if by_token else "The password does not match"
             raise unauthorized("The page stays locked. Enter it again.", "wrong-password", title)
-        self.guesses.confirmation_was_right(held.hash)
         await asyncio.to_thread(self.auth.idle.unlock, held.hash, principal.name)
 
     def _confirm(self, session_hash: str) -> None:

@@ -88,7 +88,9 @@ class AdaptiveTests:
                 if self._task is not None and not self._task.done():
                     detail = "What a test can reach is computed once the one that runs has ended."
                     raise ApiError(409, "rig-busy", "Another test is running", detail)
-                _keep(self._outlooks, name, await self.adviser.ask("adaptive_outlook", **wanted))
+                self._outlooks[name] = await self.adviser.ask("adaptive_outlook", **wanted)
+                while len(self._outlooks) > KEPT:
+                    self._outlooks.popitem(last=False)
             return self._outlooks[name]
 
     def _models_for(self, plan: TestPlan) -> list[str]:
@@ -213,9 +215,3 @@ def out_of_reach(reach: dict[str, Any]) -> ApiError:
         "to play it all the same."
     )
     return ApiError(422, "out-of-reach", "The target cannot be reached", detail, reach=reach)
-
-
-def _keep(store: OrderedDict[str, Any], name: str, value: Any) -> None:
-    store[name] = value
-    while len(store) > KEPT:
-        store.popitem(last=False)

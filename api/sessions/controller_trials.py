@@ -96,8 +96,8 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
     plan = who.plan or {}
     await asyncio.to_thread(_refuse_other_rate, runner, body)
     await asyncio.to_thread(_refuse_other_model, runner, body.participant)
-    played = await asyncio.to_thread(_played, store, who.name)
-    if played >= plan["trials"]:
+    begun = (Test.requested_by == who.name, Test.state != "refused")  # what the rig refused was no trial
+    if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
         raise beyond(f"All {plan['trials']} trials of this key are played. A person can make another key")
     participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
     limits: dict[str, Any] = {}
@@ -149,11 +149,6 @@ def _refuse_other_rate(runner: Runner, body: TestIn) -> None:
     if not abs(body.pulse_rate_hz - own_hz) <= SAME_RATE * own_hz:
         asked = f"pulse_rate_hz {body.pulse_rate_hz:g} is not the approved model's {own_hz:g}"
         raise beyond(f"{asked} (40, where none is sent). Send the model's pulse_rate_hz")
-
-
-def _played(store: Store, name: str) -> int:
-    """Trials that a key has begun; what the rig refused was not one."""
-    return len(store.all(Test, Test.requested_by == name, Test.state != "refused"))
 
 
 def unapproved(participant: str) -> ApiError:

@@ -57,7 +57,8 @@ def counts(store: Store) -> dict[str, int]:
 def listed(store: Store, versions: Versions, participants: list[Participant]) -> list[Listed]:
     """What the list says of each; no plans of tests and no models are read for it."""
     codes = [row.code for row in participants]
-    tests, models = _last_tests(store, codes), _newest_models(store, codes)
+    tests = _newest(store, Test, Test.requested_utc, codes, Test.state, Test.requested_utc)
+    models = _newest(store, Model, Model.created_utc, codes, Model.fit)
     approved = versions.all_approved(codes)
     rows = []
     for row in participants:
@@ -67,20 +68,12 @@ def listed(store: Store, versions: Versions, participants: list[Participant]) ->
     return rows
 
 
-def _last_tests(store: Store, codes: list[str]) -> dict[str, Any]:
-    newest = select(Test.participant, func.max(Test.requested_utc).label("utc")).where(Test.participant.in_(codes))
-    last = newest.group_by(Test.participant).subquery()
-    query = select(Test.id, Test.participant, Test.state, Test.requested_utc)
-    query = query.join(last, (Test.participant == last.c.participant) & (Test.requested_utc == last.c.utc))
-    with store.read() as session:
-        return {row.participant: row for row in session.execute(query)}
-
-
-def _newest_models(store: Store, codes: list[str]) -> dict[str, Any]:
-    newest = select(Model.participant, func.max(Model.created_utc).label("utc")).where(Model.participant.in_(codes))
-    last = newest.group_by(Model.participant).subquery()
-    query = select(Model.id, Model.participant, Model.fit)
-    query = query.join(last, (Model.participant == last.c.participant) & (Model.created_utc == last.c.utc))
+def _newest(store: Store, table: Any, at_utc: Any, codes: list[str], *columns: Any) -> dict[str, Any]:
+    """The newest row of each participant in a table, by its time: these columns of it."""
+    newest = select(table.participant, func.max(at_utc).label("utc")).where(table.participant.in_(codes))
+    last = newest.group_by(table.participant).subquery()
+    query = select(table.id, table.participant, *columns)
+    query = query.join(last, (table.participant == last.c.participant) & (at_utc == last.c.utc))
     with store.read() as session:
         return {row.participant: row for row in session.execute(query)}
 

@@ -10,6 +10,10 @@ from api.sessions.lifecycle import Lifecycle
 from api.sessions.live import Hub
 from api.store.tables import OPEN_STATES, Test
 
+TOLD = (
+    "id", "participant", "kind", "reason", "requested_by", "requested_utc", "finished_utc", "recording_id", "model_id"
+)  # fmt: skip
+"""What is told of its row as it is."""
 KEPT = ("adaptive", "joint")
 """What is kept with a summary, and told beside it."""
 
@@ -25,29 +29,19 @@ def of(row: Test, hub: Hub, lifecycle: Lifecycle, adaptive: AdaptiveTests, joint
     sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
     model = lifecycle.versions.get(row.model_id) if row.model_id else None
     return {
-        "id": row.id,
-        "participant": row.participant,
-        "kind": row.kind,
+        **{name: getattr(row, name) for name in TOLD},
         "state": "sealing" if sealing else row.state,
         "done": row.state not in OPEN_STATES,
-        "reason": row.reason,
         "segment": segment,
         "elapsed_s": elapsed_s,
         "duration_s": duration_s,
         "time_left_s": max(0.0, duration_s - elapsed_s),
         "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
         "identification": call.document() if call else None,
-        "requested_by": row.requested_by,
         "ran_by": row.ran_by or row.requested_by,
-        "side": row.plan.get("side"),
-        "muscle": row.plan.get("muscle"),
-        "requested_utc": row.requested_utc,
-        "finished_utc": row.finished_utc,
+        **{name: row.plan.get(name) for name in ("side", "muscle", "joins")},
         "planned": planned,
-        "recording_id": row.recording_id,
         "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
-        "joins": row.plan.get("joins"),
-        "model_id": row.model_id,
         "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
         "summary": {name: value for name, value in row.summary.items() if name not in KEPT},
         "adaptive": adaptive.document(row),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import secrets
-from typing import Any, get_args
+from typing import get_args
 
 from sqlalchemy import and_, func, select
 from sqlalchemy.orm import Session
@@ -118,8 +118,3 @@ def duration_s(test: Test) -> float:
     planned = (test.plan.get("preview") or {}).get("duration_s")
     found = float(played if played is not None else planned or 0.0)
     return found if math.isfinite(found) else 0.0
-
-
-def document(note: Note) -> dict[str, Any]:
-    """A note as clients see it."""
-    return note.as_dict()

@@ -200,13 +200,7 @@ class RigClient:
         if self.connected:
             log.warning("the rig's socket closed")
             self.connected = False
-            self._tell_link()
-
-    def _tell_link(self) -> None:
-        tell_all(self.link_listeners, self.connected)
-
-    def _tell(self, event: AnyEvent) -> None:
-        tell_all(self.listeners, event)
+            tell_all(self.link_listeners, self.connected)
 
     async def _listen(self, reader: asyncio.StreamReader) -> None:
         assert self._writer is not None
@@ -228,7 +222,7 @@ class RigClient:
             try:
                 status = await self.fresh_status()
                 if status.state != before:  # a change that no event told
-                    self._tell(StateEvent(status=status))
+                    tell_all(self.listeners, StateEvent(status=status))
                 tell_all(self.poll_listeners, status)
             except ApiError:
                 continue  # its age tells
@@ -240,13 +234,13 @@ class RigClient:
             event = _events.validate_python(message)
             if isinstance(event, StateEvent):
                 self.status = event.status
-            self._tell(event)
+            tell_all(self.listeners, event)
             return
         reply = Reply.model_validate(message)
         if reply.id == subscription_id and reply.ok:
             self.status = Status.model_validate(reply.body)
             self.connected = True
-            self._tell_link()
+            tell_all(self.link_listeners, self.connected)
         asked, future = self._waiting.get(reply.id, (None, None))
         self._take_state(asked, reply)
         if future is not None and not future.done():

@@ -18,9 +18,8 @@ from api.version import software_version
 from api.web import openapi, pages, problems, routes, strict_body
 from api.web.body_limit import BodyLimit
 from api.web.dependencies import build
-from api.web.headers import Headers
+from api.web.headers import Headers, PageLanguage
 from api.web.look_again import LookAgain
-from api.web.page_language import PageLanguage
 from api.web.scan import routers
 from api.workers.pool import WORKER
 

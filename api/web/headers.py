@@ -1,13 +1,20 @@
-"""What every answer tells a browser: load from and post to this service alone, guess nothing, keep nothing private."""
+"""What every answer tells a browser: load from and post to this service alone, guess nothing, keep nothing private.
+
+And in which language a page is written: the one that was chosen on a page, else one that the browser asks for.
+"""
 
 from __future__ import annotations
 
-from starlette.datastructures import MutableHeaders
+from http.cookies import CookieError, SimpleCookie
+
+from starlette import datastructures
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api import language
 
+COOKIE = "stimrig_language"
+"""The choice; it says nothing about who chose."""
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -56,7 +63,7 @@ class Headers:
 
         async def told(message: Message) -> None:
             if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
+                headers = datastructures.MutableHeaders(scope=message)
                 page = headers.get("content-type", "").startswith("text/html")
                 for name, value in (PAGE if page else DATA).items():
                     headers.setdefault(name, value)
@@ -67,3 +74,27 @@ class Headers:
             await send(message)
 
         await self.app(scope, receive, told)
+
+
+def chosen_language(headers: datastructures.Headers) -> str:
+    """The language for a request with these headers."""
+    try:
+        cookies = SimpleCookie(headers.get("cookie", "")[:4096])
+    except CookieError:
+        cookies = SimpleCookie()
+    kept = cookies[COOKIE].value if COOKIE in cookies else ""
+    return kept if kept in language.CODES else language.best(headers.get("accept-language", ""))
+
+
+class PageLanguage:
+    """ASGI middleware: sets the language for the request; `Headers`, around it, says it in the answer of a page."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        with language.using(chosen_language(datastructures.Headers(scope=scope))):
+            await self.app(scope, receive, send)

@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from api import language
-from api.models.tracking_words import OUTCOMES, sentences
+from api.models.tracking import OUTCOMES, sentences
 from api.web.pages.decision_view import tracking_words
 from api.web.responses.tracking import TrialOut
 from tests.api.conftest import Service

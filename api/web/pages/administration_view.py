@@ -15,7 +15,6 @@ from api.people.auth import Scope
 from api.store.tables import AuditEntry
 from api.web.dependencies import Administrator, Context, Ctx
 from api.web.pages import typed
-from api.web.pages.checked import checked
 from api.web.pages.environment import environment
 from api.web.pages.render import page
 from api.web.routes import people, tokens
@@ -75,7 +74,7 @@ async def add_user(
     password: Annotated[str, Form()] = "",
 ) -> Response:  # fmt: skip
     """A new person."""
-    body = checked(people.UserIn, name=name.strip(), password=password, scopes=ROLES.get(role, []))
+    body = typed.checked(people.UserIn, name=name.strip(), password=password, scopes=ROLES.get(role, []))
     await context.people.add(body.name, body.password, body.scopes, who.name)
     return back()
 
@@ -83,7 +82,7 @@ async def add_user(
 @router.post("/users/{name}/password")
 async def set_password(context: Ctx, who: Administrator, name: str, password: Annotated[str, Form()] = "") -> Response:
     """A new password."""
-    body = checked(people.PasswordIn, password=password)
+    body = typed.checked(people.PasswordIn, password=password)
     return await people.with_new_password(context, who, name, body.password, back())
 
 
@@ -100,7 +99,7 @@ async def make_key(
     days: Annotated[str, Form()] = "30",
 ) -> Response:  # fmt: skip
     """A key for a controller; its text is shown on the answering page only."""
-    body = checked(people.KeyIn, name=name.strip(), days=typed.whole(days))
+    body = typed.checked(people.KeyIn, name=name.strip(), days=typed.whole(days))
     made = await asyncio.to_thread(people.controller_key, context, who, body)
     return await shown(request, context, {**made, "name": body.name})
 

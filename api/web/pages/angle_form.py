@@ -71,15 +71,10 @@ def asked(
         return {}, {}
     if not any(text.strip() for text in given.values()):
         return ({} if angles.of(profile) is None else {angles.RANGE: None}), {}
-    values, errors = {}, {}
-    for name, text in given.items():
-        try:
-            values[name] = math.radians(typed.signed(text))
-        except ValueError as error:
-            errors[name] = str(error)
+    values, errors = typed.numbers(given, typed.signed)
     if errors:
         return {}, errors
-    low, high = (values[name] for name in NAMES)
+    low, high = (math.radians(values[name]) for name in NAMES)
     if not (high - low >= angles.NARROWEST_RAD - 1e-9):
         least = math.degrees(angles.NARROWEST_RAD)
         return {}, {NAMES[1]: f"the second angle must be at least {least:.0f}° above the first"}

@@ -21,7 +21,6 @@ from api.store import seen
 from api.store.tables import Participant
 from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import typed
-from api.web.pages.checked import checked
 from api.web.pages.render import page
 from api.web.routes import calibration, participants
 from rig.messages import Status
@@ -105,7 +104,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     values, errors = read(texts, row, context.rig.status)
     if errors:
         return await shown(request, context, code, texts, errors)
-    body = checked(CalibrationIn, **values, large_steps=True)
+    body = typed.checked(CalibrationIn, **values, large_steps=True)
 
     async def open_it() -> str:
         await calibration.begin(context, code, body, who.name)
@@ -135,12 +134,7 @@ def read(
     texts: dict[str, str], row: Participant, status: Status | None
 ) -> tuple[dict[str, float], dict[str, str]]:  # fmt: skip
     """The form's numbers, and what is wrong with it, a line a field."""
-    values, errors = {}, {}
-    for name, text in texts.items():
-        try:
-            values[name] = typed.number(text)
-        except ValueError as error:
-            errors[name] = str(error)
+    values, errors = typed.numbers(texts)
     low_us, high_us = fine_range(status)
     if "step_us" in values and not (low_us <= values["step_us"] <= high_us):
         errors["step_us"] = f"{texts['step_us']!r} is not {low_us:g} to {high_us:g} µs"
@@ -157,7 +151,7 @@ async def step(
     shown_us: Annotated[float | None, Form()] = None,
 ) -> Response:  # fmt: skip
     """Play one train; the trains that the page knew of and the width on the button say whether both still hold."""
-    body = checked(StepIn, direction=direction, shown_us=shown_us)
+    body = typed.checked(StepIn, direction=direction, shown_us=shown_us)
     done = calibration.step(context, code, body)
     return await attempt(request, context, code, done, address(code))
 
@@ -165,7 +159,7 @@ async def step(
 @router.post("/mark/{threshold}")
 async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str) -> Response:
     """Mark the last train's width."""
-    wanted = checked(MarkIn, threshold=threshold).threshold
+    wanted = typed.checked(MarkIn, threshold=threshold).threshold
     done = calibration.mark(context, code, wanted, who.name)
     return await attempt(request, context, code, done, address(code))
 

@@ -10,9 +10,9 @@ from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
 from api.language import CODES
-from api.web import page_language
 from api.web.browser_session import local, same_origin
 from api.web.dependencies import Ctx
+from api.web.headers import COOKIE
 
 router = APIRouter(include_in_schema=False)
 COLOURS = "stimrig_colours"
@@ -36,7 +36,7 @@ async def choose_language(
     """Write the pages in this language from now on."""
     answer = _back(request, language, CODES, back, ("no-such-language", "There is no such language"))
     secure = context.settings.secure_cookies
-    answer.set_cookie(page_language.COOKIE, language, KEPT_S, httponly=True, samesite="lax", secure=secure)
+    answer.set_cookie(COOKIE, language, KEPT_S, httponly=True, samesite="lax", secure=secure)
     return answer
 
 

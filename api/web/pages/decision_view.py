@@ -108,11 +108,7 @@ def read_tracking(sent: FormData) -> Limits:
         text = sent.get(name)
         if text is None:
             continue
-        try:
-            found[name] = typed.number(str(text))
-        except ValueError as error:
-            detail = f"{name}: {error}. Nothing was decided."
-            raise ApiError(422, "invalid-input", "This value cannot be used", detail) from None
+        found[name] = typed.wanted(str(text), lambda error, name=name: f"{name}: {error}. Nothing was decided.")
     return Limits(**found)
 
 

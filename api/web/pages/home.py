@@ -1,4 +1,4 @@
-"""Signing in and out, and the first page."""
+"""Signing in and out, a session that is locked, and the first page, where participants are made."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from api.errors import ApiError
-from api.people.auth import LOCKED, Scope
+from api.people.auth import LOCKED, Principal, Scope
 from api.sessions import directory
 from api.web.browser_session import local, same_origin, set_cookie
-from api.web.dependencies import Context, Ctx, EvenLocked
+from api.web.dependencies import Anyone, Context, Ctx, EvenLocked, Tester
 from api.web.guards import identified
+from api.web.pages import typed
 from api.web.pages.render import look, page, problem_page
+from api.web.requests import ParticipantIn
+from api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 50
@@ -49,6 +52,18 @@ def _list(context: Context, asked: Asked) -> dict[str, Any]:
     count = directory.counts(context.store)
     rows = directory.listed(context.store, context.versions, shown)
     return {"rows": rows, "more": len(found) - len(rows), "count": count}
+
+
+@router.post("/participants")
+async def create_participant(
+    context: Ctx, who: Tester, code: Annotated[str, Form()] = "", side: Annotated[str, Form()] = "",
+    muscle: Annotated[str, Form()] = "", placement: Annotated[str, Form()] = "",
+) -> Response:  # fmt: skip
+    """A new participant."""
+    said = {"side": side or None, "muscle": muscle.strip() or None, "placement": placement.strip() or None}
+    body = typed.checked(ParticipantIn, code=code.strip(), **said)
+    row = await asyncio.to_thread(participants.create, context, body, who.name)
+    return RedirectResponse(f"/participants/{row.code}", 303)
 
 
 async def sign_in_page(
@@ -97,3 +112,38 @@ async def sign_out(request: Request, context: Ctx, _who: EvenLocked) -> Response
     response = RedirectResponse("/", 303)
     response.delete_cookie(context.auth.cookie_name)
     return response
+
+
+@router.get("/locked")
+async def locked(request: Request, who: EvenLocked, next: str = "/") -> Response:
+    """The page of a locked session; straight on where nothing is locked."""
+    return locked_page(request, who, next) if who.locked else RedirectResponse(local(next), 303)
+
+
+def locked_page(request: Request, who: Principal, next: str, problem: ApiError | None = None) -> Response:
+    """The password again, and back to the page that was open; with what went wrong, if anything did."""
+    status = problem.status if problem else 200
+    answer = page(request, "locked.html", status, waiting=who, next=local(next), problem=problem)
+    answer.headers.update(problem.headers if problem else {})
+    return answer
+
+
+@router.post("/unlock")
+async def unlock(
+    request: Request, context: Ctx, who: EvenLocked, secret: Annotated[str, Form()] = "",
+    next: Annotated[str, Form()] = "/",
+) -> Response:  # fmt: skip
+    """Go on, by the password of who is signed in, or by the token that opened the session."""
+    try:
+        await context.people.unlock(who, secret[:200].strip() if who.session_hash is None else secret[:200])
+    except ApiError as error:
+        return locked_page(request, who, next, error)
+    return RedirectResponse(local(next), 303)
+
+
+@router.post("/lock")
+async def lock(context: Ctx, who: Anyone, next: Annotated[str, Form()] = "/") -> Response:
+    """Lock it now."""
+    if who.page_session is not None:
+        await asyncio.to_thread(context.auth.idle.lock, who.page_session.hash, who.name)
+    return RedirectResponse(local(next), 303)

@@ -1,4 +1,4 @@
-"""The guided tests of a joint that moves, on a page of their own: what was done, what is next, one model of all."""
+"""The guided tests of a joint that moves: what was done, what is next, one model of all; and the angle sensor."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE
 from api.sessions.joint_tests import target_of
 from api.sessions.requests import AngleIn, TestIn
 from api.sessions.trials import SEQUENCE
+from api.store.seen import ChangedError
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import next_view, starting
-from api.web.pages.checked import checked
+from api.web.pages import angle_form, next_view, starting, typed
 from api.web.pages.model_view import to_job
 from api.web.pages.render import page
 from api.web.routes import joint, participants
-from api.web.routes.joint import TogetherIn
+from api.web.routes.joint import PoseIn, TogetherIn
 
-router = APIRouter(include_in_schema=False, prefix="/participants/{code}/joint")
+router = APIRouter(include_in_schema=False)
+OF_PERSON = "/participants/{code}/joint"
 ISOMETRIC = ("pre-session", "adaptive", "next-experiment")
 """Kinds of tests in which the joint stands still at the angle of the fixture."""
 
 
-@router.get("")
+@router.get(OF_PERSON)
 async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
     """Sensor, range, the three kinds of tests with what is open, and the recordings of today."""
     row = await asyncio.to_thread(participants.find, context, code)
@@ -78,17 +79,17 @@ def _picked(rows: list[Test]) -> set[str]:
     return set(newest.values())
 
 
-@router.post("/tests")
+@router.post(OF_PERSON + "/tests")
 async def start_test(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """To the question before a guided test."""
     sent = await request.form()
     kind = str(sent.get("kind") or "")
     if kind not in KINDS:
-        raise ApiError(422, "invalid-input", "This value cannot be used", "kind: choose one of the three tests.")
+        raise typed.unusable("kind: choose one of the three tests.")
     more: dict[str, Any] = {}
     if kind == HELD and (text := str(sent.get("target_rad") or "")):
-        more["angle"] = checked(AngleIn, target_rad=_number(text))
-    body = checked(TestIn, participant=code, kind=kind, **more)
+        more["angle"] = typed.checked(AngleIn, target_rad=_number(text))
+    body = typed.checked(TestIn, participant=code, kind=kind, **more)
     return RedirectResponse(await starting.ask(context, who, body, back=f"/participants/{code}/joint"), 303)
 
 
@@ -98,10 +99,10 @@ def _number(text: str) -> float:
         return float(text[:20])
     except ValueError:
         detail = f"target_rad: {text[:20]!r} is no angle. Go back and press the button of an angle."
-        raise ApiError(422, "invalid-input", "This value cannot be used", detail) from None
+        raise typed.unusable(detail) from None
 
 
-@router.post("/model")
+@router.post(OF_PERSON + "/model")
 async def fit_together(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """One model of the recordings that are ticked."""
     await asyncio.to_thread(participants.find, context, code)
@@ -109,5 +110,46 @@ async def fit_together(request: Request, context: Ctx, who: Tester, code: str) -
     chosen = [str(each)[:80] for each in sent.getlist("recording")]
     if not chosen:
         raise ApiError(422, "invalid-input", "No recording is ticked", "Go back and tick those that belong together.")
-    body = checked(TogetherIn, recordings=chosen, effects=list(together.JOINT_EFFECTS))
+    body = typed.checked(TogetherIn, recordings=chosen, effects=list(together.JOINT_EFFECTS))
     return await to_job(joint.begin_fit(context, code, body, who.name))
+
+
+@router.get("/rig/angle")
+async def show_sensor(request: Request, context: Ctx, _who: Tester, again: str = "") -> Response:
+    """What it reads now, how it was calibrated, and the next pose; `again`: the first one once more."""
+    return await sensor_page(request, context, again=bool(again))
+
+
+async def sensor_page(
+    request: Request, context: Context, text: str = "", error: str = "", problem: ApiError | None = None,
+    again: bool = False,
+) -> Response:  # fmt: skip
+    """The page, with what was typed where something was wrong with it."""
+    if context.rig.connected:
+        await context.rig.fresh_status()
+    sensor = joint.sensor(context)
+    second = sensor.pose is not None and not again
+    status = problem.status if problem else 422 if error else 200
+    values: dict[str, Any] = {"sensor": sensor, "second": second, "text": text, "error": error, "problem": problem}
+    return page(request, "angle.html", status, **values)
+
+
+@router.post("/rig/angle/pose")
+async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
+    """Take a pose: the angle that a goniometer shows, in degrees."""
+    sent = await request.form()
+    text, first = str(sent.get("angle_deg") or "")[:60], bool(sent.get("first"))
+    try:
+        angle_rad = angle_form.of_pose(text, context.rig.status)
+    except ValueError as error:
+        return await sensor_page(request, context, text, str(error), again=first)
+    body = typed.checked(PoseIn, angle_rad=angle_rad, first=first)
+    try:
+        await joint.take_pose(context, body, who.name)
+    except ChangedError:  # it has a page of its own
+        raise
+    except ApiError as error:
+        words = error.detail.removeprefix("angle_pose: ")
+        error.detail = words[:1].upper() + words[1:]
+        return await sensor_page(request, context, text, problem=error, again=first)
+    return RedirectResponse("/rig/angle", 303)

@@ -9,14 +9,13 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 from pydantic import StringConstraints
 
-from api.errors import ApiError, NotFoundError
+from api.errors import NotFoundError
 from api.people import controller_keys
 from api.sessions.controller_trials import PlanIn, plan_within
 from api.sessions.refusals import refuse_archived
 from api.store import seen
 from api.web.dependencies import Approver, Ctx, Tester
 from api.web.pages import participant_view, typed
-from api.web.pages.checked import checked
 from api.web.routes import participants
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/keys")
@@ -41,9 +40,8 @@ async def make(
     about = (seen.participant(code), seen.decisions(code))
     await asyncio.to_thread(context.store.refuse_changed, *about)
     asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
-    body = checked(
-        KeyFor, name=name.strip(), trials=typed.whole(trials), **{k: _number(k, v) for k, v in asked.items()}
-    )
+    numbers = {field: typed.wanted(text, lambda why, field=field: f"{field}: {why}.") for field, text in asked.items()}
+    body = typed.checked(KeyFor, name=name.strip(), trials=typed.whole(trials), **numbers)
     plan = plan_within(PlanIn(**body.model_dump(exclude={"name"})), row)
     text, made = await asyncio.to_thread(
         controller_keys.make, context.auth, body.name, code, plan, who.name, who.token_hash
@@ -57,10 +55,3 @@ async def revoke(context: Ctx, who: Tester, code: str, key_id: str) -> Response:
     if not await asyncio.to_thread(controller_keys.revoke, context.auth, code, key_id, who.name):
         raise NotFoundError("key", key_id, "The participant's page lists them.")
     return RedirectResponse(f"/participants/{code}#keys", 303)
-
-
-def _number(field: str, text: str) -> float:
-    try:
-        return typed.number(text)
-    except ValueError as error:
-        raise ApiError(422, "invalid-input", "This value cannot be used", f"{field}: {error}.") from None

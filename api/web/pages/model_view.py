@@ -12,13 +12,12 @@ from api import language
 from api.charts import diagnosis_charts, joint_charts, model_charts
 from api.charts.overview import LARGE, overview
 from api.errors import ApiError
-from api.models import advice, carried_shown, explanation, headline, next_step, stored, summary
+from api.models import advice, carried_structure, explanation, headline, next_step, stored, summary
 from api.people.auth import Scope
 from api.sessions.requests import TestIn
 from api.store.tables import Model
 from api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester
-from api.web.pages import next_view, starting, trend_view
-from api.web.pages.checked import checked
+from api.web.pages import next_view, starting, trend_view, typed
 from api.web.pages.render import page
 from api.web.requests import EffectsIn
 from api.web.routes import criticism, participants
@@ -44,27 +43,34 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
         request,
         "model.html",
         model=version,
-        document=document,
         findings=found,
         advice=advice.advice(version["verdict"], found, why["likely"] if why else []),
         fit_words=advice.fit_sentence(document.get("fit") or {}),
         step=await next_step_of(context, row, version, who.may(Scope.RUN_TEST)),
         changes=await trend_view.changes_of(context, row),
         ask_password=not await context.people.is_confirmed(who.session_hash),
-        recruitment=summary.recruitment(document),
+        **await facts(context, row, document),
         threshold_us=headline.threshold_us(row),
-        dynamics=summary.dynamics(document),
-        validity=summary.validity(document),
         problem=measured["problem"],
         reasons=[] if found else version["reasons"],
-        warnings=await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
-        now_utc=context.clock.utc(),
         may_test=who.may(Scope.RUN_TEST),
         may_approve=who.may(Scope.APPROVE_MODEL),
         **{key: value for key, value in shown.items() if key != "figures"},
         figures={**drawn(document, measured), **shown["figures"]},
     )
+
+
+async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[str, Any]:
+    """What a model's page and its report show alike."""
+    return {
+        "document": document,
+        "recruitment": summary.recruitment(document),
+        "dynamics": summary.dynamics(document),
+        "validity": summary.validity(document),
+        "warnings": await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
+        "now_utc": context.clock.utc(),
+    }
 
 
 def drawn(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
@@ -136,7 +142,7 @@ def gather(
         "splits": explanation.splits(comparison),
         "tests": view["tests"] if view else [],
         "versions": rows,
-        "carried": carried_shown.shown(context.versions, row, found),
+        "carried": carried_structure.shown(context.versions, row, found),
         "figures": diagnosis_charts.of_why(comparison, segments, view, signatures, rows),
     }
 
@@ -161,7 +167,7 @@ async def add_effect(
 ) -> Response:
     """Add one effect."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    body = checked(EffectsIn, effects=[effect], reason=reason[:500], force=bool(force))
+    body = typed.checked(EffectsIn, effects=[effect], reason=reason[:500], force=bool(force))
     return await to_job(criticism.begin_adding(context, row, body, who.name))
 
 

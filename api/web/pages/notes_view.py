@@ -17,7 +17,6 @@ from api.store import seen
 from api.web.browser_session import local
 from api.web.dependencies import Ctx, Tester
 from api.web.pages import typed
-from api.web.pages.checked import checked
 from api.web.pages.environment import environment
 from api.web.pages.starting import site_words
 from api.web.requests import RanByIn
@@ -56,7 +55,7 @@ async def write(
         except ValueError as error:
             raise ApiError(422, "invalid-input", _("This time cannot be used"), str(error)) from None
     fields = {"kind": kind, "text": text, "test_id": test_id or None, "at_s": at_s, "now": bool(now and test_id)}
-    await notes.add(context, code, checked(NoteIn, **fields), who.name)
+    await notes.add(context, code, typed.checked(NoteIn, **fields), who.name)
     return RedirectResponse(local(back or f"/participants/{code}") + "#notes", 303)
 
 
@@ -87,7 +86,7 @@ async def set_muscle(
     name: Annotated[str, Form(alias="muscle")] = "", placement: Annotated[str, Form()] = "",
 ) -> Response:  # fmt: skip
     """Say the site; asked about where calibration, approved model or keys would be lost."""
-    body = checked(MuscleIn, side=side or None, muscle=name.strip() or None, placement=placement.strip() or None)
+    body = typed.checked(MuscleIn, side=side or None, muscle=name.strip() or None, placement=placement.strip() or None)
     row = await asyncio.to_thread(participants.find, context, code)
 
     async def save() -> str:
@@ -117,6 +116,6 @@ async def set_muscle(
 @router.post("/tests/{test_id}/ran-by")
 async def set_ran_by(context: Ctx, who: Tester, test_id: str, ran_by: Annotated[str, Form()] = "") -> Response:
     """Say who ran a test at the rig."""
-    body = checked(RanByIn, ran_by=ran_by.strip() or None)
+    body = typed.checked(RanByIn, ran_by=ran_by.strip() or None)
     await asyncio.to_thread(tests.change_ran_by, context, test_id, body, who.name)
     return RedirectResponse(f"/tests/{test_id}#notes", 303)

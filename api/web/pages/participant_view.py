@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 from starlette.datastructures import FormData
@@ -22,7 +22,7 @@ from api.web.dependencies import Context, Ctx, Tester
 from api.web.pages import angle_form, limits_form, next_view, starting, trials_view, typed
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
-from api.web.routes import participants
+from api.web.routes import participants, recordings
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
 
@@ -151,19 +151,17 @@ def asked_test(sent: FormData, code: str) -> TestIn:
     """
     if sent.get("plan") != "adaptive":
         return TestIn(participant=code)
-    try:
-        percent = typed.number(str(sent.get("target") or ""))
-    except ValueError as error:
-        raise no_target(str(error)) from None
+    percent = typed.wanted(str(sent.get("target") or ""), no_target)
     if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
-        raise no_target(f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %")
+        within = f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %"
+        raise typed.unusable(no_target(within))
     target = TargetIn(curve_percent=percent, step_percent=percent)
     return TestIn(participant=code, kind="adaptive", target=target, anyway=True)
 
 
-def no_target(why: str) -> ApiError:
-    """422, in one line."""
-    return ApiError(422, "invalid-input", "This value cannot be used", f"Target: {why}. Nothing was started.")
+def no_target(why: str) -> str:
+    """Why there is no target."""
+    return f"Target: {why}. Nothing was started."
 
 
 @router.get("/confirm/{number}")
@@ -182,3 +180,16 @@ async def answer(context: Ctx, who: Tester, code: str, number: str) -> Response:
     """Yes."""
     asked = context.questions.find(code, number, who)
     return RedirectResponse(await context.questions.yes(asked), 303)
+
+
+@router.post("/recordings")
+async def upload(
+    context: Ctx, who: Tester, code: str, file: Annotated[UploadFile, File()], of: Annotated[str, Form()] = ""
+) -> Response:  # fmt: skip
+    """A recording of another tool, CSV or HDF5; leads to the model made from it."""
+    await asyncio.to_thread(participants.find, context, code)
+    data = await file.read()
+    if not data:
+        raise ApiError(422, "empty", "No file came", "Go back and choose a CSV file or a sealed recording (HDF5).")
+    _row, model, _warnings = await recordings.take_in(context, code, data, who, of=of)
+    return RedirectResponse(f"/models/{model.id}", 303)

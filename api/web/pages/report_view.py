@@ -13,11 +13,11 @@ from api.charts import joint_charts, model_charts
 from api.charts.svg import svg
 from api.clock import local_day
 from api.language import _
-from api.models import advice, explanation, stored, summary
+from api.models import advice, explanation, stored
 from api.models.places import Site, site_of, site_of_recording
 from api.store.tables import Model, Note, Participant, Recording, Test
 from api.web.dependencies import Context, Ctx, ModelReader
-from api.web.pages.model_view import measurement
+from api.web.pages.model_view import facts, measurement
 from api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
@@ -62,18 +62,13 @@ async def report(request: Request, context: Ctx, _who: ModelReader, model_id: st
         request,
         "report_sheet.html",
         model=await asyncio.to_thread(context.versions.document, row),
-        document=document,
-        recruitment=summary.recruitment(document),
-        dynamics=summary.dynamics(document),
-        validity=summary.validity(document),
+        **await facts(context, row, document),
         drawn=drawn,
         problem=measured["problem"],
         why=explanation.view(found, measured["comparison"], row.effects, leaves) if found else None,
         versions=await asyncio.to_thread(_versions, context, lineage, row.id),
         recording=recording,
         session=await asyncio.to_thread(session_of, context, recording),
-        warnings=await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
-        now_utc=context.clock.utc(),
     )
 
 

@@ -1,17 +1,20 @@
-"""What scripts on every page ask for: the rig's state, and the notice about it; and what a press of stop did."""
+"""What scripts on every page ask for: the rig's state, and the notice about it; what stop did, and re-arming."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request
-from fastapi.responses import HTMLResponse, JSONResponse, Response
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Request
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from sqlalchemy.exc import SQLAlchemyError
 
 from api.errors import ApiError
 from api.people.auth import LOCKED
 from api.web.browser_session import local
-from api.web.dependencies import Anyone, Ctx
+from api.web.dependencies import Anyone, Ctx, Rearmer
 from api.web.pages import rig_state
 from api.web.pages.render import fragment, look, page
+from api.web.routes.rig import rearm_rig
 
 router = APIRouter(include_in_schema=False)
 
@@ -53,3 +56,10 @@ async def stopped(request: Request, context: Ctx, key: str) -> Response:
     if isinstance(told.answer, ApiError):
         return page(request, "problem.html", told.answer.status, problem=told.answer, back=None)
     return page(request, "stop.html", told=told, evidence=told.answer)
+
+
+@router.post("/rearm")
+async def rearm(context: Ctx, who: Rearmer, back: Annotated[str, Form()] = "/") -> Response:
+    """A person has looked, and lets the rig work again."""
+    await rearm_rig(context, who.name)
+    return RedirectResponse(local(back), 303)

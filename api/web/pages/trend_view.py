@@ -1,14 +1,20 @@
-"""A participant's sessions over time: pictures, what changed, a table; and what changed, for a model's page."""
+"""A participant's sessions over time, in pictures and a table; and two to six models or sessions side by side."""
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+from collections.abc import Sequence
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from api.charts import trend_charts
-from api.models import trend_words
+from api import language
+from api.charts import compare_charts, trend_charts
+from api.charts.compare_charts import MOST
+from api.errors import ApiError
+from api.models import changes, stored, trend_words
+from api.models.trend import Session
 from api.store.tables import Model
 from api.web.dependencies import Context, Ctx, ModelReader
 from api.web.pages.render import page
@@ -19,7 +25,108 @@ COLUMNS = (
     "threshold_us", "plateau_nm", "time_constant_s", "damping", "delay_s", "follows_percent", "noise_sd_nm",
     "charge_uc", "current_ma",
 )  # fmt: skip
-MOST_COMPARED = 6
+
+
+@router.get("/compare")
+async def compare(
+    request: Request,
+    context: Ctx,
+    _who: ModelReader,
+    model: Annotated[list[str] | None, Query()] = None,
+    reference: str = "",
+) -> Response:
+    """Models of one participant, the oldest first; differences are to `reference`, or to the oldest."""
+    rows = await chosen(context, list(dict.fromkeys(model or [])))
+    participant = rows[0].participant
+    sessions = await context.trend.of_models(participant, [row.id for row in rows])
+    at = next((number for number, row in enumerate(rows) if row.id == reference), 0)
+    sides = await asyncio.gather(*(side(context, rows, number) for number in range(len(rows))))
+    names = [language.when(row.created_utc) for row in rows]
+    documents = [stored.read(row) for row in rows]
+    return page(
+        request,
+        "compare.html",
+        participant=participant,
+        sides=sides,
+        reference=at,
+        table=comparison(sessions, at),
+        doubts=[
+            (names[number], trend_words.doubted(sessions[at].state(), one.state()))
+            for number, one in enumerate(sessions)
+            if number != at
+        ],
+        figures={
+            "recruitment": compare_charts.recruitment(documents, names),
+            "step": compare_charts.step([one["curves"] for one in sides], names),
+        },
+    )
+
+
+async def chosen(context: Context, ids: list[str]) -> list[Model]:
+    """The models, the oldest first; 422 where they are too few, too many, or of different participants."""
+    if not 2 <= len(ids) <= MOST:
+        detail = f"{len(ids)} are chosen. Go back and choose 2 to {MOST} models of the participant."
+        raise ApiError(422, "two-models", "Choose two models or more to compare", detail)
+    rows = [await asyncio.to_thread(context.versions.get, model_id) for model_id in ids]
+    other = next((row for row in rows if row.participant != rows[0].participant), None)
+    if other is not None:
+        detail = f"{rows[0].id} is of {rows[0].participant}, {other.id} of {other.participant}."
+        raise ApiError(422, "two-participants", "The models are of different participants", detail)
+    return sorted(rows, key=lambda row: row.created_utc)
+
+
+async def side(context: Context, rows: Sequence[Model], number: int) -> dict[str, Any]:
+    """One model; of two, also its error on the other one's recording."""
+    row = rows[number]
+    found: dict[str, Any] = {
+        "model": await asyncio.to_thread(context.versions.document, row),
+        "style": compare_charts.style(number),
+        "curves": None,
+        "elsewhere": None,
+        "problem": None,
+    }
+    try:
+        found["curves"] = await context.analyses.curves(row)
+        if len(rows) == 2 and rows[0].recording_id != rows[1].recording_id:
+            found["elsewhere"] = await context.analyses.comparison(row, rows[1 - number].recording_id)
+    except ApiError as error:
+        found["problem"] = error
+    return found
+
+
+def comparison(sessions: Sequence[Session], reference: int) -> list[dict[str, Any]]:
+    """The figures, a row each: the value of every model, and how far it is from the reference's."""
+    documents = [one.shown()["figures"] for one in sessions]
+    known = dict.fromkeys(name for figures in documents for name in figures)
+    order = [*(name for name in trend_words.NAMES if name in known), *(name for name in known if "." in name)]
+    return [compared(name, sessions, documents, reference) for name in order]
+
+
+def compared(
+    figure: str, sessions: Sequence[Session], documents: Sequence[dict[str, Any]], reference: int
+) -> dict[str, Any]:
+    """One figure of all models."""
+    unit = next(figures[figure]["unit"] for figures in documents if figure in figures)
+    name = trend_words.name_of(figure, unit)
+    cells = []
+    for number, figures in enumerate(documents):
+        one = figures.get(figure) or {"value": None, "uncertainty": None}
+        words = trend_words.with_uncertainty(one["value"], one["uncertainty"], name)
+        cell: dict[str, Any] = {"words": words, "where": one.get("where", ""), "difference": None, "beyond": False}
+        if number != reference:
+            cell |= apart(figure, sessions[reference], sessions[number], name)
+        cells.append(cell)
+    return {"name": name.words, "unit": "" if name.unit == "1" else name.unit, "cells": cells}
+
+
+def apart(figure: str, before: Session, now: Session, name: trend_words.Name) -> dict[str, Any]:
+    """A difference in words, and whether it is beyond twice its uncertainty."""
+    old, new = before.state(), now.state()
+    found = changes.difference(figure, old, new) if figure in changes.comparable(old, new) else None
+    if found is None:
+        return {"difference": None, "beyond": False}
+    words = trend_words.with_uncertainty(found["difference"], found["uncertainty"], name, sign=True)
+    return {"difference": words, "beyond": found["beyond"]}
 
 
 @router.get("/participants/{code}/trend")
@@ -35,7 +142,7 @@ async def trend(request: Request, context: Ctx, _who: ModelReader, code: str) ->
         panels=trend_charts.panels(documents),
         changes=rest.newest(found),
         columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(trend_words.name_of, COLUMNS)],
-        most=MOST_COMPARED,
+        most=MOST,
     )
 
 

@@ -12,8 +12,7 @@ from api.charts import tracking_charts
 from api.clock import unix_of
 from api.errors import ApiError
 from api.language import _, clock, ngettext
-from api.models.tracking import Limits
-from api.models.tracking_words import OUTCOMES, sentences
+from api.models.tracking import OUTCOMES, Limits, sentences
 from api.people.auth import Principal
 from api.store import seen
 from api.store.tables import Recording

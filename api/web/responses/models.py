@@ -210,7 +210,7 @@ class JobOut(Document):
 
 
 class SegmentSpan(Document):
-    """A stretch of a recording."""
+    """A segment's place in a recording or a test."""
 
     name: str
     start_s: float

@@ -8,8 +8,8 @@ from pydantic import Field
 
 from api.web.responses.base import Document, Holder, SegmentOut
 from api.web.responses.joint import JointOut
-from api.web.responses.models import VersionOut
-from rig.messages import AngleStatus, Bound, CalibrationStatus, RigState, StopEvidence
+from api.web.responses.models import SegmentSpan, VersionOut
+from rig.messages import AngleStatus, Bound, CalibrationStatus, ProtocolInfo, RigState, StopEvidence
 
 
 class DeviceOut(Document):
@@ -18,12 +18,18 @@ class DeviceOut(Document):
     device: str = ""
 
 
-class RigOut(Document):
-    """What is known of the rig, and how old it is."""
+class RigHealth(Document):
+    """The rig in a few words."""
 
     connected: bool = Field(description="whether the rig's process answers")
-    age_s: float | None = Field(description="time since it last said something, s")
     state: RigState
+    age_s: float | None = Field(description="time since it last said something, s")
+    torque_age_s: float | None = Field(description="age of the newest torque, s")
+
+
+class RigOut(RigHealth):
+    """What is known of the rig, and how old it is."""
+
     reason: str = Field(description="why it is latched, uncertain or disconnected")
     holder: Holder | None = Field(description="the test that holds it")
     test_id: str | None = None
@@ -71,13 +77,8 @@ class SequenceOut(Document):
     settings: SettingsOut
 
 
-class ProtocolOut(Document):
+class ProtocolOut(ProtocolInfo, Document):
     """A whole test by name."""
-
-    id: str
-    description: str
-    segments: list[str] = Field(description="names, in order")
-    duration_s: float = Field(description="at 40 pulses/s")
 
 
 class SequencesOut(Document):
@@ -88,21 +89,13 @@ class SequencesOut(Document):
     default: list[SegmentOut] = Field(description="the segments of a test that is given none")
 
 
-class SpanOut(Document):
-    """A segment's place in a test."""
-
-    name: str
-    start_s: float
-    end_s: float
-
-
 class PlannedOut(Document):
     """What a test will take."""
 
     duration_s: float = Field(0.0, description="s")
     charge_uc: float = Field(0.0, description="charge of one phase, summed over the pulses, µC")
     torque_time_nms: float | None = Field(None, description="estimated torque-time, N·m·s; null without a model")
-    segments: list[SpanOut] = Field([])
+    segments: list[SegmentSpan] = Field([])
 
 
 class ReachOut(Document):
@@ -262,15 +255,6 @@ class UploadOut(Document):
     recording_id: str
     model: VersionOut
     warnings: list[str]
-
-
-class RigHealth(Document):
-    """The rig in a few words."""
-
-    connected: bool
-    state: RigState
-    age_s: float | None
-    torque_age_s: float | None
 
 
 class HealthOut(Document):

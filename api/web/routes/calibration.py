@@ -11,13 +11,13 @@ from typing import Any
 from fastapi import APIRouter, Response
 from sqlalchemy.orm import Session
 
-from api.errors import ApiError, NotFoundError
+from api.errors import ApiError
 from api.sessions import profiles
 from api.sessions.refusals import refuse_archived
 from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from api.store import audit, seen
 from api.store.holds import LIMITS_TURN
-from api.store.tables import AuditEntry, Participant
+from api.store.tables import AuditEntry
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.responses.base import answers
 from api.web.responses.participants import CalibratedOut, CalibrationOut
@@ -232,10 +232,8 @@ def _store(
     rest between tests) stays. Storing it again changes nothing."""
     found = result.profile.model_dump() if result.profile else None
     with context.store.write() as session:
-        row = session.get(Participant, code)
-        if found is not None and row is None:
-            raise NotFoundError("participant", code)
-        if found is not None and row is not None:
+        if found is not None:
+            row = participants.within(session, code)
             changed = _changed_since(session, code, identity)
             if any(entry.detail.get("calibration") == identity for entry in changed):
                 return dict(row.profile)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 
-from api.errors import ApiError, NotFoundError
+from api.errors import ApiError
 from api.models.places import Site, in_words, site_of
 from api.sessions import profiles
 from api.sessions.requests import MuscleIn
@@ -21,6 +21,7 @@ from api.store.tables import Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.responses.base import answers
 from api.web.responses.participants import ParticipantOut
+from api.web.routes import participants
 
 router = APIRouter(prefix="/v1/participants/{code}", tags=["participants"], responses=PROBLEM)
 
@@ -54,9 +55,7 @@ def site_in(body: MuscleIn) -> Site:
 def _change(context: Context, code: str, body: MuscleIn, by: str, voids: bool) -> Participant:
     now = context.clock.utc()
     with context.store.write() as session:
-        row = session.get(Participant, code)
-        if row is None:
-            raise NotFoundError("participant", code)
+        row = participants.within(session, code)
         seen.check(session, seen.participant(code))
         lost = loses(row, body)
         if lost and not voids:
@@ -117,9 +116,7 @@ def refuse_busy(context: Context, code: str) -> None:
 def _put(context: Context, code: str, archived: bool, by: str) -> Participant:
     now = context.clock.utc()
     with context.store.write() as session:
-        row = session.get(Participant, code)
-        if row is None:
-            raise NotFoundError("participant", code)
+        row = participants.within(session, code)
         seen.check(session, seen.participant(code))
         if archived != (row.archived_utc is not None):
             row.archived_utc = now if archived else None

@@ -30,16 +30,16 @@ def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> lis
     """A participant's notes, newest first, the struck ones among them."""
     response.headers["ETag"] = context.store.etag(context.clock, f"/v1/participants/{code}/notes", notes.about(code))
     participants.find(context, code)
-    return [notes.document(note) for note in context.notes.of(code)]
+    return [note.as_dict() for note in context.notes.of(code)]
 
 
 @router.post("", status_code=201, **answers(NoteOut, 201, "written"))
 async def write_note(context: Ctx, who: Tester, code: str, body: NoteIn) -> dict[str, Any]:
     """Write a note on the participant's session, on a test (`test_id`), or at a time in it (`at_s`, or `now`)."""
-    return notes.document(await add(context, code, body, who.name))
+    return (await add(context, code, body, who.name)).as_dict()
 
 
 @router.post("/{note_id}/strike", **answers(NoteOut))
 def strike_note(context: Ctx, who: Tester, code: str, note_id: str) -> dict[str, Any]:
     """Mark a note as wrong: it stays readable, with who struck it."""
-    return notes.document(context.notes.strike(code, note_id, who.name))
+    return context.notes.strike(code, note_id, who.name).as_dict()

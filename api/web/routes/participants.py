@@ -6,6 +6,7 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
+from sqlalchemy.orm import Session
 
 from api.clock import local_day
 from api.errors import ApiError, NotFoundError
@@ -52,6 +53,14 @@ def find(context: Context, code: str) -> Participant:
     return row
 
 
+def within(session: Session, code: str) -> Participant:
+    """The same in a transaction that changes it."""
+    row = session.get(Participant, code)
+    if row is None:
+        raise NotFoundError("participant", code)
+    return row
+
+
 async def change_profile(
     context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False
 ) -> tuple[Participant, Seen]:  # fmt: skip
@@ -71,9 +80,7 @@ def _change(
     context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool
 ) -> tuple[Participant, Seen]:  # fmt: skip
     with context.store.write() as session:
-        row = session.get(Participant, code)
-        if row is None:
-            raise NotFoundError("participant", code)
+        row = within(session, code)
         poses = [] if asked.get(angles.RANGE) is None else [seen.of("rig", *seen.POSES)]
         seen.check(session, seen.participant(code), *poses)
         check_asked(context, row.profile, asked)

@@ -21,8 +21,8 @@ from api.sessions.requests import TestIn
 from api.store import audit, seen
 from api.store.holds import KEY_TURN
 from api.store.tables import Test
-from api.web import page_language
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
+from api.web.headers import chosen_language
 from api.web.key_guard import refuse_outside
 from api.web.requests import RanByIn
 from api.web.responses.base import answers
@@ -170,7 +170,7 @@ async def _pump(
     if history["test_id"] == row.id:
         await socket.send_json(history)
     document = await asyncio.to_thread(lambda: context.runner.document(find(context, row.id)))
-    words = page_language.chosen(socket.headers)
+    words = chosen_language(socket.headers)
     await socket.send_json(_told(document, words))
     while not document["done"]:
         message = await _next(queue) or {"type": "idle", "rig_connected": context.rig.connected}
