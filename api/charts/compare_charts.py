@@ -1,4 +1,4 @@
-"""Curves of several models of a participant, in one chart each."""
+"""Curves of several models of a participant, in one chart each; a reference torque beside what a model predicts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from api.charts import hover
-from api.charts.model_charts import axis, band, band_of, layout, line
+from api.charts.model_charts import INK, MODEL, STIMULUS, axis, band, band_of, box, layout, line
 from api.charts.palette import role
 from api.language import _
 
@@ -50,3 +50,26 @@ def step(curves: Sequence[dict[str, Any] | None], names: Sequence[str]) -> dict[
 
 def _drawn(x: Sequence[float], y: Sequence[float], name: str, number: int, value: str) -> dict[str, Any]:
     return line(x, y, name, COLOURS[number], 2.2, line={"dash": DASHES[number]}, **hover.says(name, value))
+
+
+def inversion(found: dict[str, Any]) -> dict[str, Any]:
+    """The figure of what `POST /v1/models/{id}/widths` answers; what is out of reach is shaded."""
+    step_s = 1.0 / found["pulse_rate_hz"]
+    time_s = [round(k * step_s, 6) for k in range(len(found["pulse_width_us"]))]
+    shades = [box(one["begin_s"], one["end_s"], role("worst-band")) for one in found["unreachable"]]
+    data = [
+        line(time_s, found["predicted_torque_nm"], _("predicted"), MODEL, 2.2),
+        line(time_s, found["reference_torque_nm"], _("Reference"), INK, 1.4, line={"dash": "dash"}),
+        line(time_s, found["pulse_width_us"], _("pulse width"), STIMULUS, 1.2, yaxis="y2", showlegend=False,
+             line={"shape": "hv"}),
+    ]  # fmt: skip
+    return {
+        "data": data,
+        "layout": layout(
+            height=460,
+            shapes=shades,
+            xaxis=axis(_("Time (s)"), range=[0.0, found["duration_s"]]),
+            yaxis=axis(_("Torque above rest (N·m)"), domain=[0.42, 1.0]),
+            yaxis2=axis(_("Pulse width (µs)"), domain=[0.0, 0.32], rangemode="tozero"),
+        ),
+    }

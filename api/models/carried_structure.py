@@ -100,11 +100,7 @@ def _not_carried(error: Exception) -> dict[str, Any]:
     told = [part for part in (error.title, error.detail) if part] if isinstance(error, ApiError) else [str(error)]
     reason = "The structure of the last session was not fitted. " + " ".join(f"{part.rstrip('.')}." for part in told)
     nothing: dict[str, Any] = {
-        "still_needed": [],
-        "no_longer_needed": [],
-        "undecided": [],
-        "effects": [],
-        "figures": [],
+        name: [] for name in ("still_needed", "no_longer_needed", "undecided", "effects", "figures")
     }
     return {"offered": "plain", "why": why, "reason": reason, **nothing}
 

@@ -23,7 +23,6 @@ from rig.messages import (
     LiveEvent,
     PreviewRequest,
     Reply,
-    Request,
     StateEvent,
     Status,
     StatusRequest,
@@ -283,6 +282,3 @@ def no_rig(detail: str) -> ApiError:
     """503: the rig cannot be reached."""
     words = re.sub(r"^\[Errno \d+\] ", "", detail).rstrip(".")
     return ApiError(503, "rig-unreachable", "The rig cannot be reached", f"{words}. Is its process running?")
-
-
-__all__ = ["AnyEvent", "Request", "RigClient", "no_rig"]

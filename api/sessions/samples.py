@@ -46,6 +46,3 @@ async def _events(reader: asyncio.StreamReader) -> AsyncIterator[dict]:
             yield message
         elif message.get("ok") is False:
             raise ApiError(503, "rig-unreachable", "The rig cannot be reached", "It tells nobody its samples.")
-
-
-__all__ = ["samples_of"]

@@ -11,7 +11,7 @@ import pytest
 from api import language
 from api.models.tracking import OUTCOMES, sentences
 from api.web.pages.decision_view import tracking_words
-from api.web.responses.tracking import TrialOut
+from api.web.responses.trend import TrialOut
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_tracked import play, say, tracked

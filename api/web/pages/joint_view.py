@@ -18,7 +18,7 @@ from api.sessions.trials import SEQUENCE
 from api.store.seen import ChangedError
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import angle_form, next_view, starting, typed
+from api.web.pages import limits_form, next_view, starting, typed
 from api.web.pages.model_view import to_job
 from api.web.pages.render import page
 from api.web.routes import joint, participants
@@ -140,7 +140,7 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
     sent = await request.form()
     text, first = str(sent.get("angle_deg") or "")[:60], bool(sent.get("first"))
     try:
-        angle_rad = angle_form.of_pose(text, context.rig.status)
+        angle_rad = limits_form.of_pose(text, context.rig.status)
     except ValueError as error:
         return await sensor_page(request, context, text, str(error), again=first)
     body = typed.checked(PoseIn, angle_rad=angle_rad, first=first)

@@ -1,7 +1,11 @@
-"""The form in which a person sets a participant's limits: what was typed, what is wrong with it, what it changes."""
+"""The form in which a person sets a participant's limits: what was typed, what is wrong with it, what it changes.
+
+The range of joint angles is typed in degrees and kept in radians.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,10 +13,15 @@ from typing import Any
 from starlette.datastructures import FormData
 
 from api.sessions import angles, profiles
-from api.web.pages import angle_form, typed
+from api.web.pages import typed
+from api.web.routes.participants import calibrated_utc
 from rig.messages import Bound, Status
 
 LONGEST_SHOWN = 60
+ANGLES = ("angle_from_deg", "angle_to_deg")
+ANGLE_LABELS = {"angle_from_deg": "Joint angle from (°)", "angle_to_deg": "Joint angle to (°)"}
+HALF_A_STEP_DEG = 0.006
+"""What is shown has two digits behind the point: nearer than half of them is the same angle."""
 
 
 @dataclass
@@ -42,7 +51,7 @@ class LimitsForm:
 
 def fresh(profile: Mapping[str, Any], status: Status | None) -> LimitsForm:
     """The form with what is saved."""
-    texts = {name: typed.shown(profile[name]) for name in profiles.LIMITS} | angle_form.texts(profile, status)
+    texts = {name: typed.shown(profile[name]) for name in profiles.LIMITS} | angle_texts(profile, status)
     return LimitsForm(texts, dict(texts))
 
 
@@ -67,13 +76,13 @@ def read(sent: FormData, profile: Mapping[str, Any], status: Status | None) -> L
 
 def _take_angles(form: LimitsForm, sent: FormData, profile: Mapping[str, Any], status: Status | None) -> None:
     """The range of angles, where the form has its fields."""
-    given = {name: text[:LONGEST_SHOWN] for name in angle_form.NAMES if (text := _one(sent, name)) is not None}
-    if len(given) < len(angle_form.NAMES) or given.items() <= form.seen.items():
+    given = {name: text[:LONGEST_SHOWN] for name in ANGLES if (text := _one(sent, name)) is not None}
+    if len(given) < len(ANGLES) or given.items() <= form.seen.items():
         return
-    asked, errors = angle_form.asked(given, profile, status)
+    asked, errors = asked_angles(given, profile, status)
     rigs = (status.angle.range_rad if status else None) or (angles.LEAST_RAD, angles.MOST_RAD)
     if beyond := angles.outside(asked, rigs):
-        errors[angle_form.NAMES[1]] = beyond[angles.RANGE]
+        errors[ANGLES[1]] = beyond[angles.RANGE]
     form.texts |= given
     form.errors |= errors
     form.asked |= {} if errors else asked
@@ -107,7 +116,75 @@ def fields(status: Status | None) -> list[dict[str, str]]:
     for name in profiles.LIMITS:
         words = profiles.takes(name, status.limits if status else {})
         found.append({"name": name, "label": LABELS[name], "help": words})
-    return found + angle_form.fields(status)
+    return found + angle_fields(status)
+
+
+def angle_texts(profile: Mapping[str, Any], status: Status | None) -> dict[str, str]:
+    """What stands in the two fields; empty where there is no range, or the sensor was calibrated anew since."""
+    range_rad = angles.of(profile)
+    if range_rad is None or (has_sensor(status) and angles.outdated(profile, calibrated_utc(status))):
+        return dict.fromkeys(ANGLES, "")
+    return {name: angle_shown(angle) for name, angle in zip(ANGLES, range_rad, strict=True)}
+
+
+def angle_shown(angle_rad: float) -> str:
+    """An angle as a person would type it."""
+    return typed.shown(round(math.degrees(angle_rad), 2) + 0.0)
+
+
+def has_sensor(status: Status | None) -> bool:
+    """Whether the rig has an angle sensor: without one there are no such fields."""
+    return status is not None and status.angle.present
+
+
+def angle_fields(status: Status | None) -> list[dict[str, str]]:
+    """What the fields are called, and what this rig takes in them."""
+    if status is None or not status.angle.present:
+        return []
+    within = "" if status.angle.range_rad is None else f"within {angles.words(status.angle.range_rad)} (rig)"
+    help_of = {ANGLES[0]: "0° is a straight arm", ANGLES[1]: within}
+    return [{"name": name, "label": ANGLE_LABELS[name], "help": help_of[name]} for name in ANGLES]
+
+
+def of_pose(text: str, status: Status | None) -> float:
+    """The angle that a goniometer shows, rad, from its text in degrees.
+
+    Raises
+    ------
+    ValueError
+        No plain number, or no angle that this rig takes; one line for people.
+    """
+    angle_rad = math.radians(typed.signed(text))
+    rigs = status.angle.range_rad if status else None
+    if rigs is not None and not (rigs[0] <= angle_rad <= rigs[1]):
+        raise ValueError(f"{angle_shown(angle_rad) + '°'} is not within {angles.words(rigs)}, as this rig asks")
+    return angle_rad
+
+
+def asked_angles(
+    given: Mapping[str, str], profile: Mapping[str, Any], status: Status | None
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """The range that is asked for as part of a profile, and what is wrong with it, by field.
+
+    Nothing is asked where the fields say what is saved. Both empty: the participant has no range any more.
+    """
+    before = angle_texts(profile, status)
+    if dict(given) == before:
+        return {}, {}
+    if not any(text.strip() for text in given.values()):
+        return ({} if angles.of(profile) is None else {angles.RANGE: None}), {}
+    values, errors = typed.numbers(given, typed.signed)
+    if errors:
+        return {}, errors
+    low, high = (math.radians(values[name]) for name in ANGLES)
+    if not (high - low >= angles.NARROWEST_RAD - 1e-9):
+        least = math.degrees(angles.NARROWEST_RAD)
+        return {}, {ANGLES[1]: f"the second angle must be at least {least:.0f}° above the first"}
+    saved = angles.of(profile) if before[ANGLES[0]] else None
+    near = math.radians(HALF_A_STEP_DEG)
+    if saved is not None and abs(saved[0] - low) < near and abs(saved[1] - high) < near:
+        return {}, {}
+    return {angles.RANGE: [low, high]}, {}
 
 
 LABELS = {

@@ -19,7 +19,7 @@ from api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, TargetIn, TestIn
 from api.store import seen
 from api.store.tables import Participant, Test
 from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import angle_form, limits_form, next_view, starting, trials_view, typed
+from api.web.pages import limits_form, next_view, starting, trials_view, typed
 from api.web.pages.limits_form import LimitsForm
 from api.web.pages.render import page
 from api.web.routes import participants, recordings
@@ -58,7 +58,7 @@ async def shown(
             "keys": controller_keys.of(context.auth, code),
             "made": made,
             "trials": trials_of(context, who, code),
-            "sensor": angle_form.present(context.rig.status),
+            "sensor": limits_form.has_sensor(context.rig.status),
         }
 
     return page(request, "participant.html", status, **await asyncio.to_thread(gather))

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import PlainTextResponse, Response
 
-from api.charts.inversion_chart import inversion
+from api.charts.compare_charts import inversion
 from api.charts.svg import svg
 from api.errors import ApiError
 from api.language import _

@@ -19,7 +19,7 @@ from api.web.headers import entity_tags
 from api.web.requests import ApprovalIn, DecisionIn
 from api.web.responses.base import answers, published
 from api.web.responses.models import VersionOut
-from api.web.responses.tracking import TrackingOut
+from api.web.responses.trend import TrackingOut
 from api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)

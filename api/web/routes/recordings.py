@@ -100,7 +100,9 @@ async def upload(
     `of`, by who may approve models; the audit trail keeps both codes.
     """
     await asyncio.to_thread(participants.find, context, code)
-    data = await bounded_body(request, context.settings.max_upload_mb)
+    data = await request.body()  # `api.web.body_limit` bounds it
+    if not data:
+        raise ApiError(422, "empty", "The upload is empty", "Send a CSV or MAT file or a sealed recording as the body.")
     row, model, warnings = await take_in(context, code, data, who, columns, of)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
@@ -185,18 +187,6 @@ def _about_the_upload(path: Path) -> Iterator[None]:
         if "place" in error.extra:
             error.extra["place"] = error.extra["place"].replace(str(path), "the upload")
         raise
-
-
-async def bounded_body(request: Request, limit_mb: float) -> bytes:
-    """The request's body; 413 as soon as it is too long."""
-    data = bytearray()
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > limit_mb * 1e6:
-            raise ApiError(413, "too-large", "The upload is too large", f"At most {limit_mb:g} MB are taken.")
-    if not data:
-        raise ApiError(422, "empty", "The upload is empty", "Send a CSV or MAT file or a sealed recording as the body.")
-    return bytes(data)
 
 
 def _suffix(data: bytes) -> str:
