@@ -86,6 +86,7 @@ def test_it_holds_for_a_test_that_the_rig_has_not_heard_of_yet(make: Make):
     for number in range(MOST_WITHDRAWN):
         assert withdraw(live, f"other-{number}")
     assert len(live.rig._withdrawn) == MOST_WITHDRAWN
+    assert list(live.rig._withdrawn)[-1] == f"other-{MOST_WITHDRAWN - 1}", "the oldest is forgotten"
     with pytest.raises(PlanError, match="letters, digits"):
         withdraw(live, "../one")
 

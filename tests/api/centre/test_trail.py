@@ -254,3 +254,16 @@ def test_another_key_signs_nothing_that_holds(trail: Trail) -> None:
     assert trail.rig.store.all(OutboxItem.chain)[0] == one.chain
     with trail.rig.store.read() as session:
         assert session.scalar(select(OutboxItem.kind).where(OutboxItem.seq == one.item)) == "audit"
+
+
+@pytest.mark.parametrize(("at_utc", "changed"), [("2026-01-01T00:00:00Z", True), ("2026-01-03T00:00:00Z", False)])
+def test_under_a_chain_that_was_begun_anew_only_what_claims_an_older_time_was_changed(
+    at_utc: str, changed: bool
+) -> None:
+    """After a restore, later entries stand in the places of those that are missing."""
+    entry = AuditEntry(seq=1, at_utc=at_utc, who="a", action="b", subject="", detail={}, previous_hash="0" * 64)
+    entry.hash = entry_hash(entry.as_dict())
+    old = receipts.Receipt(seq=1, hash="a" * 64, noted_utc="", at_utc="2026-01-02T00:00:00Z", chain="one", key="c" * 64)
+    new = old.model_copy(update={"seq": 1, "hash": entry.hash, "chain": "two"})
+    stands = receipts.standing([entry], [old, new])
+    assert (stands.differs, stands.missing) == ((old, None) if changed else (None, old))
