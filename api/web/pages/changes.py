@@ -152,7 +152,8 @@ def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[st
     if action == "muscle":
         return [site_words((texts.get("side"), texts.get("muscle"), texts.get("placement")))]
     if "model_id" in names:
-        return [model_words(names["model_id"])]
+        model, decided = model_words(names["model_id"]), DECIDED.get(action)
+        return [model if decided is None else f"{model}: {decision_words(decided)}"]
     if "ran_by" in texts:
         return [texts["ran_by"]]
     if action == "keys":
