@@ -37,7 +37,10 @@ class SendsVersions(httpx.Auth):
         for document in [] if "if-match" in request.headers else self._documents(request):
             if document not in self.seen:
                 looking = httpx.Request("GET", request.url.copy_with(path=document, query=None), headers=self._headers)
-                self._keep(document, (yield looking))
+                found = yield looking
+                self._keep(document, found)
+                if found.status_code == httpx.codes.NOT_FOUND and document not in self.seen:
+                    return  # there is nothing to decide on: that is the answer
             if tag := self.seen.get(document):
                 request.headers["if-match"] = tag
                 break

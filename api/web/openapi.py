@@ -98,7 +98,6 @@ def _tell_of_decisions(document: dict[str, Any]) -> None:
         words = f"the `ETag` of `GET {decision.document}`{model} on which this is decided"
         given = {"name": "If-Match", "in": "header", "required": decision.needed, "description": words}
         operation.setdefault("parameters", []).append(given | {"schema": {"type": "string"}})
-        if decision.needed:
-            operation["responses"]["428"] = problem("`If-Match` is missing")
+        operation["responses"]["428"] = problem("`If-Match` is missing, or cannot be read")
         shown = document["paths"][decision.document]["get"]["responses"]["200"]
         shown.setdefault("headers", {})["ETag"] = ETAG

@@ -40,7 +40,8 @@ def test_an_archived_participant_is_left_alone_until_it_is_taken_out(http: httpx
     trail = [entry["action"] for entry in http.get("/v1/audit").json()["entries"] if entry["subject"] == "A1"]
     assert trail == ["create participant", "archive", "unarchive"]
     seen = {"If-Match": http.get("/v1/participants/A1").headers["etag"]}
-    assert http.post("/v1/participants/nobody/archive", headers=seen).status_code == 404
+    refused = http.post("/v1/participants/nobody/archive", headers=seen)
+    assert refused.status_code == 409 and "no version of /v1/participants/nobody" in refused.json()["detail"]
 
 
 def test_nobody_is_archived_in_the_middle_of_a_test(service: Service, http: httpx.Client) -> None:

@@ -163,7 +163,7 @@ def test_after_garbage_frames_are_found_again(codec: Codec, garbage: bytes):
 
 @pytest.mark.parametrize("module", [emulated2, emulated4])
 def test_half_a_frame_of_a_dead_client_does_not_swallow_the_next(module: Any):
-    decoder, frame = module.Decoder(patience_s=0.1), module.encode(Packet(3, 2, bytes(32)))
+    decoder, frame = module.Decoder(), module.encode(Packet(3, 2, bytes(32)))
     assert decoder.feed(frame[:20], 0.0) == []
     assert decoder.feed(module.encode(NEXT), 0.5) == [NEXT]
     assert decoder.corrupt_frames == 1
