@@ -197,3 +197,17 @@ def test_last_times_marks_stand_beside_todays(page: Any, service: Service) -> No
     rows = page.locator(".marks tbody tr").all_inner_texts()
     assert ["10 µs" in rows[0], "20 µs" in rows[1], "30 µs" in rows[2]] == [True] * 3
     assert service.rig.asked.large_steps and service.rig.asked.last.sensory_pulse_width_us == 10
+
+
+def test_an_end_that_is_refused_says_why(page: Any, service: Service) -> None:
+    """A colleague ended it, and nothing says so but the answer."""
+    press(page, "ArrowUp", 1)
+    with service.client() as http:
+        assert http.post("/v1/participants/K1/calibration/finish", json={"discard": True}).status_code == 200
+    page.locator("#discard").click()
+    page.get_by_text("No calibration of K1 is open").wait_for()
+    assert page.locator("#calibration").get_attribute("data-at") == "/participants/K1/calibration"
+    page.get_by_role("button", name="Begin the calibration").click()
+    page.locator("#step-up").wait_for()
+    page.wait_for_load_state()
+    press(page, "ArrowUp", 1)

@@ -16,11 +16,15 @@
     const button = [...part().querySelectorAll("[data-keys]")].find((box) => box.dataset.keys.split(" ").includes(event.key));
     if (!button && event.key !== "Enter") return;
     event.preventDefault(); // Enter never presses the button that has the focus by chance
-    if (!event.repeat && button && !button.disabled) press(button);
+    if (!event.repeat && button && !button.disabled) button.click();
   });
 
   document.addEventListener("submit", (event) => {
     if (part().dataset.open === undefined || !part().contains(event.target)) return;
+    if (event.submitter && ["finish", "discard"].includes(event.submitter.id) && !asking) {
+      asking = true; // once; its answer is another page, also where it is refused
+      return;
+    }
     event.preventDefault();
     if (event.submitter && !event.submitter.disabled) press(event.submitter);
   });
@@ -39,7 +43,7 @@
   async function look() {
     if (asking || part().dataset.playing === undefined || document.hidden) return;
     asking = true;
-    await show(location.pathname, {});
+    await show(part().dataset.at, {});
     asking = false;
   }
 
@@ -50,7 +54,7 @@
       const answer = await fetch(address, { ...options, headers: { Accept: "text/html" }, cache: "no-store", signal: ending.signal });
       const fresh = new DOMParser().parseFromString(await answer.text(), "text/html").getElementById("calibration");
       if (fresh && fresh.dataset.open !== undefined) replace(fresh);
-      else location.assign(answer.redirected ? answer.url : location.pathname);
+      else location.assign(answer.redirected ? answer.url : part().dataset.at);
     } catch { unanswered(); }
     clearTimeout(timer);
   }
