@@ -152,12 +152,13 @@ def places(page: Page, size: tuple[int, int]) -> dict[str, float]:
 
 
 @contextmanager
-def served(emulate: str = "") -> Iterator[str]:
-    """A service of its own, with its emulated rig; its address."""
+def served(emulate: str = "", tree: str = "") -> Iterator[str]:
+    """A service of its own, with its emulated rig; its address. `tree`: of the checkout there."""
     with tempfile.TemporaryDirectory(prefix="stimrig-day-") as folder:
         command = [sys.executable, "-m", "api.cli", "serve", "--port", "0", "--data", folder, "--emulate", emulate]
-        environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN}
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": tree}
+        at = {"cwd": tree or None, "env": environment}
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **at) as process:
             assert process.stdout is not None
             try:
                 yield next(
