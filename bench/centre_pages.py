@@ -23,8 +23,9 @@ from typing import Any
 import psycopg
 from sqlalchemy import event, text
 
-from api.centre import directory, trend, warnings
+from api.centre import directory, warnings
 from api.centre.directory import Cohort, Search
+from api.centre.pages import participants_view
 from api.charts import trend_charts
 from api.store import Store
 from bench.stamp import RESULTS, written_by
@@ -180,7 +181,7 @@ def questions(store: Store, codes: list[str], draw: random.Random) -> dict[str, 
 
     def drawn() -> None:
         code = draw.choice(codes)
-        trend_charts.panels(trend.documents(code, directory.stood(store, code)))
+        trend_charts.panels(participants_view.documents(code, directory.stood(store, code)))
 
     def search(**asked: Any) -> Callable[[], Any]:
         return lambda: directory.participants(store, Search(**asked))

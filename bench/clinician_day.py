@@ -127,7 +127,8 @@ def calibrate(day: Day, code: str, answers: dict[str, float]) -> int:
                 break
             day.key("ArrowUp")
             trains += 1
-            page.wait_for_function("(n) => document.querySelector('[name=trains]').value == n", arg=str(trains))
+            told = "(n) => document.querySelector('[name=calibration]').value.split('.')[1] == n"
+            page.wait_for_function(told, arg=str(trains))
         day.key("m")
         page.wait_for_function("(n) => document.querySelectorAll('.marks b').length == n", arg=number)
     day.key("Enter")

@@ -34,12 +34,14 @@ class SendsVersions(httpx.Auth):
     def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
         """As httpx asks for it."""
         request.headers.update(self._headers)
-        for document in [] if "if-match" in request.headers else self._documents(request):
+        documents = [] if "if-match" in request.headers else self._documents(request)
+        model = documents[-1] if len(documents) > 1 else ""
+        for document in documents:
             if document not in self.seen:
                 looking = httpx.Request("GET", request.url.copy_with(path=document, query=None), headers=self._headers)
                 found = yield looking
                 self._keep(document, found)
-                if found.status_code == httpx.codes.NOT_FOUND and document not in self.seen:
+                if found.status_code == httpx.codes.NOT_FOUND and document not in (*self.seen, model):
                     return  # there is nothing to decide on: that is the answer
             if tag := self.seen.get(document):
                 request.headers["if-match"] = tag
@@ -50,7 +52,7 @@ class SendsVersions(httpx.Auth):
     def _documents(self, request: httpx.Request) -> list[str]:
         """Whose version may be sent with a request; none: it decides nothing.
 
-        A trial is planned with the participant's model, where that was read; a controller's key reads nothing else.
+        A test is begun on its participant. A controller's key cannot read that: its trials are planned with the model.
         """
         found = decisions.find(request.method, request.url.path)
         if found is None:
@@ -63,12 +65,13 @@ class SendsVersions(httpx.Auth):
             person = decision.document.format(code=body["participant"])
         except (ValueError, KeyError, TypeError):  # the service says what is wrong with it
             return []
-        model = f"{person}/model"
-        return [model] if model in self.seen and body.get("kind") == "sequence" else [person, model]
+        return [person, f"{person}/model"]
 
     def _keep(self, path: str, answer: httpx.Response) -> None:
         if answer.request.method == "GET":
             self.seen.pop(path, None)
+            if answer.status_code == httpx.codes.FORBIDDEN:
+                self.seen[path] = ""  # a controller's key reads no participant
             if "etag" in answer.headers:  # of a calibration that waits to be stored with a 404, too
                 self.seen[path] = answer.headers["etag"]
         elif answer.is_success and (path == "/v1/stop" or decisions.find(answer.request.method, path)):

@@ -68,15 +68,11 @@ async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: 
         403: outside the key or its plan, and by how much; 409: no model of its participant is approved; else as
         `Runner.start`.
     """
-    with_model = len(seen.sent.get()) == MODEL_TAG
-    if who.participant is None and not with_model:
+    if who.participant is None:
+        if len(seen.sent.get()) == MODEL_TAG:  # it would be played within the participant's limits: those were not seen
+            raise seen.another_document(f"/v1/participants/{body.participant}")
         return await runner.start(body, who.name, holder=who.token_hash)
     seen.shown.set(await asyncio.to_thread(store.seen, runner.clock))
-    if who.participant is None:
-        if body.kind != SEQUENCE:  # it is played within the participant's limits: those were not seen
-            raise seen.another_document(f"/v1/participants/{body.participant}")
-        await asyncio.to_thread(_refuse_other_model, runner, body.participant)
-        return await runner.start(body, who.name, holder=who.token_hash)
     async with turn:  # no two trials share the last one that is left
         try:
             _refuse_kind(who, body)

@@ -119,8 +119,9 @@ class Questions:
     async def yes(self, question: Question) -> str:
         """Do it, once; who says yes again comes to what came of it."""
         if question.answer is None:
-            if question.seen is not None and question.seen.day != local_day(self.clock.utc()):
-                raise seen.another_day(question.seen)
+            seen.today.set(lambda: local_day(self.clock.utc()))
+            if question.seen is not None:
+                seen.refuse_another_day(question.seen)
             seen.shown.set(question.seen)
             seen.sent.set(str(question.seen or ""))
             question.answer = asyncio.ensure_future(question.action())

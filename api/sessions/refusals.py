@@ -27,6 +27,8 @@ class Current:
     """Its end has been heard."""
     tokens: list[str] = field(default_factory=list)
     """Hashes of the tokens by whose right it is played."""
+    until_utc: str | None = None
+    """When that right ends by itself: a controller's key ends with its day."""
     since: seen.Seen | None = None
     """The trail's place at its intent, or at the last change that was found; None: not written yet."""
     overtaken: list[AuditEntry] = field(default_factory=list)

@@ -46,9 +46,10 @@ Muscle = Annotated[
     Field(description="the muscle that is stimulated", examples=["biceps brachii"]),
 ]
 PersonName = Annotated[str, StringConstraints(min_length=1, max_length=320), AfterValidator(names.written)]
+PARTICIPANT_CODE = r"[A-Za-z0-9_-]{1,32}"
 Code = Annotated[
     str,
-    StringConstraints(pattern=r"^[A-Za-z0-9_-]{1,32}$"),
+    StringConstraints(pattern=f"^{PARTICIPANT_CODE}$"),
     Field(description="a code, never a name: letters, digits, - and _, at most 32", examples=["P017"]),
 ]
 

@@ -189,7 +189,10 @@ class Runner:
         plan = planned.plan
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
-        current = self.current = Current(plan.test_id, plan.participant, by, plan.kind, tokens=tokens)
+        until_utc = await asyncio.to_thread(self._until_utc, tokens)
+        current = self.current = Current(
+            plan.test_id, plan.participant, by, plan.kind, tokens=tokens, until_utc=until_utc
+        )
         current_test.set(plan.test_id)
         self.pool.cancel_background()
         try:
@@ -217,6 +220,9 @@ class Runner:
             async with self.follower.holds.turn(LIMITS_TURN):
                 if changed := current.overtaken or await asyncio.to_thread(self._overtaking, current):
                     raise seen.overtaken(changed)
+                if self._is_over(current):
+                    detail = "A controller's key ends with its day. Nothing was sent."
+                    raise ApiError(409, "changed-meanwhile", "The right to this test has ended", detail)
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.adaptive.begin(planned) or self.joint.begin(planned)
                 await self.rig.ask(StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
@@ -251,6 +257,7 @@ class Runner:
         with self.store.read() as session:
             if current.since is None and current.started:  # it plays although this service was restarted
                 current.since = seen.newest(session, "", seen.of(current.test_id, "start test"))
+                current.until_utc = self._until_utc(current.tokens)
             return [] if current.since is None else seen.since(session, current.since, *current.rests_on)
 
     async def look_again(self) -> None:
@@ -263,19 +270,30 @@ class Runner:
         if current is None:
             return
         async with current.looking:
-            changed = await asyncio.to_thread(self._overtaking, current)
-            if not changed:
+            changed, over = await asyncio.to_thread(self._overtaking, current), self._is_over(current)
+            if not changed and not over:
                 return
-            current.overtaken, last = changed, changed[-1]
-            begun = current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed)
-            reason = f"{last.action}, after this test was asked for"
+            current.overtaken = changed
+            begun = over or (current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed))
+            what = changed[-1].action if changed else "the day of its key ended"
+            reason = f"{what}, after this test was asked for"
             try:
                 await self.rig.ask(WithdrawRequest(test_id=current.test_id, reason=reason, begun=begun))
             except ApiError as error:
                 log.error("%s could not be withdrawn: %s", current.test_id, error)
                 await self._stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
             else:
-                current.since = seen.at(last, "")
+                current.since = seen.at(changed[-1], "") if changed else current.since
+                current.until_utc = None if over else current.until_utc
+
+    def _is_over(self, current: Current) -> bool:
+        """Whether the right to it has ended by itself."""
+        return current.until_utc is not None and current.until_utc <= self.clock.utc()
+
+    def _until_utc(self, tokens: list[str]) -> str | None:
+        """When the first key ends by whose right a test is played; a person's session may end before the test."""
+        rows = [row for token in tokens if (row := self.store.get(Token, token)) is not None]
+        return min((row.expires_utc for row in rows if row.participant and row.expires_utc), default=None)
 
     def _tokens(self, holder: str) -> list[str]:
         """Hashes of the tokens by whose right a test is played: the asker's, and that of who made a key."""
@@ -288,8 +306,8 @@ class Runner:
             await asyncio.sleep(LOOK_AGAIN_S)
             try:
                 await self.look_again()
-            except SQLAlchemyError:
-                log.warning("whether %s may still be played could not be read", current.test_id)
+            except Exception:
+                log.exception("whether %s may still be played could not be seen", current.test_id)
 
     async def _stop_quietly(self, reason: str) -> None:
         try:
@@ -531,9 +549,10 @@ class Runner:
                 and status.state not in ("ready", "latched", "uncertain")
             ):
                 tokens = row.plan.get("tokens") or []
-                self.current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
+                current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
+                self.current = current
                 self.hub.begin(row.id)
-                self._keep(self._look_again_and_again(self.current))
+                self._keep(self._look_again_and_again(current))
             else:
                 self._follow(row.id, self._recover(row.id, "the service was restarted during the test"))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +27,7 @@ SETTINGS = ("create participant", "set profile", "set muscle", "archive", "unarc
 DECISIONS = ("approve", "reject")
 ACCOUNTS = ("add user", "change password", "revoke token")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
-RIGHTS = (*DECISIONS, "revoke token")
+RIGHTS = (*DECISIONS, "revoke token", "set muscle", "archive")
 """Entries with which a right ends that a controller plays by."""
 MOST_TOLD = 20
 """Changes that are told, the newest."""
@@ -63,16 +64,18 @@ def mark_of(document: str) -> str:
     return hashlib.sha256(document.encode()).hexdigest()[:8]
 
 
-def read(text: str, document: str) -> Seen | None:
-    """What was sent back, by a page or as a document's version; None where it is none, or of another document."""
+def read(text: str, mark: str) -> Seen | None:
+    """What was sent back, of the document with this mark, or without one by a page; None where it is none of these."""
     found = re.fullmatch(r"(\d{1,15})\.([0-9a-f]{8})\.(\d{4}-\d\d-\d\d)(?:\.([0-9a-f]{8}))?", text, re.ASCII)
-    if found is None or found[4] not in (None, mark_of(document)):
+    if found is None or (found[4] or "") != mark:
         return None
     return Seen(int(found[1]), found[2], found[3])
 
 
 shown: ContextVar[Seen | None] = ContextVar("shown", default=None)
 """What who asks was shown, as the request says; None: its action needs none (docs/safety/decisions.toml)."""
+today: ContextVar[Callable[[], str] | None] = ContextVar("today", default=None)
+"""Tells the day of now while somebody decides."""
 looked: ContextVar[Seen | None] = ContextVar("looked", default=None)
 """The place when this request began to read what it shows: a page's forms carry it, and a question is bound to it."""
 sent: ContextVar[str] = ContextVar("sent", default="")
@@ -145,6 +148,7 @@ def check(session: Session, *about: About) -> None:
     seen = shown.get()
     if seen is None:
         return
+    refuse_another_day(seen)
     known = seen.entry == 0 or session.scalar(
         select(AuditEntry.seq).where(AuditEntry.seq == seen.entry, AuditEntry.hash.startswith(seen.mark))
     )
@@ -211,10 +215,12 @@ def another_trail(seen: Seen) -> ChangedError:
     return ChangedError([], seen, detail)
 
 
-def another_day(seen: Seen) -> ChangedError:
-    """What was sent was seen before midnight."""
+def refuse_another_day(seen: Seen) -> None:
+    """Raise ChangedError if it was seen before midnight. Not where nobody asks: then the clock is another one's."""
+    if (day := today.get()) is None or day() == seen.day:
+        return
     detail = (
         f"This page is of {seen.day}. Approvals and calibrations end with their day. Nothing was done. Load the page "
         "again."
     )
-    return ChangedError([], seen, detail)
+    raise ChangedError([], seen, detail)

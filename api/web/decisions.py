@@ -12,8 +12,12 @@ from api import decisions
 from api.clock import local_day
 from api.decisions import MODEL_TAG, OF_RIG, Decision
 from api.errors import ApiError
+from api.sessions.requests import PARTICIPANT_CODE
 from api.store import seen
 from api.web.headers import entity_tags
+
+MOST_TAGS = 20
+"""Of `If-Match`: the others are not read."""
 
 
 async def take(request: Request) -> None:
@@ -29,21 +33,21 @@ async def take(request: Request) -> None:
         return
     decision, names = found
     document = decision.document.format(**{**await _names(request, decision), **names})
-    text = await _sent(request, decision, document)
+    text, mark = await _sent(request, decision, seen.mark_of(document))
     if decision.field == "latch" and not request.app.state.context.rig.latch_known:
         raise old_rig()
-    if not (text or decision.needed):
+    if not decision.needed and request.url.path == decision.path and "if-match" not in request.headers:
         return
+    seen.today.set(lambda: local_day(request.app.state.context.clock.utc()))
     if not re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII):
         raise missing(document, decision)
     seen.sent.set(text)
-    place = seen.read(text, document)
+    place = seen.read(text, mark)
     if decision.field in OF_RIG or (decision.path == "/v1/tests" and len(text) == MODEL_TAG):
         return
     if place is None:
         raise seen.another_document(document)
-    if place.day != local_day(request.app.state.context.clock.utc()):
-        raise seen.another_day(place)
+    seen.refuse_another_day(place)
     seen.shown.set(place)
 
 
@@ -51,21 +55,25 @@ async def _names(request: Request, decision: Decision) -> dict[str, str]:
     """What a request's body names of the document: a test's participant."""
     code = "{code}"
     if decision.path == "/v1/tests" and request.url.path == decision.path:
-        with suppress(ValueError, KeyError, TypeError):  # the route says what is wrong with it
-            code = str(json.loads(await request.body())["participant"])
+        with suppress(ValueError, KeyError, TypeError, RecursionError):  # the route says what is wrong with it
+            said = json.loads(await request.body())["participant"]
+            code = said if isinstance(said, str) and re.fullmatch(PARTICIPANT_CODE, said, re.ASCII) else code
     return {"code": code}
 
 
-async def _sent(request: Request, decision: Decision, document: str) -> str:
-    """The version, as `If-Match` or the form's field has it; of several the newest of this document."""
-    field = request.headers.get("if-match")
-    if field is not None:
-        tags = [tag.strip('"') for tag in entity_tags(field)]
-        places = {place.entry: tag for tag in tags if (place := seen.read(tag, document))}
-        return places[max(places)] if places else tags[0]
+async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, str]:
+    """The version, as `If-Match` or the form's field has it, and its mark, which a page's has not.
+
+    Of several the newest of this document.
+    """
+    fields = request.headers.getlist("if-match")
+    if fields:
+        tags = [tag.strip('"') for tag in entity_tags(",".join(fields))][:MOST_TAGS]
+        places = {place.entry: tag for tag in tags if (place := seen.read(tag, mark))}
+        return (places[max(places)] if places else tags[0]), mark
     if "form" not in request.headers.get("content-type", ""):
-        return ""
-    return str((await request.form()).get(decision.field) or "")
+        return "", mark
+    return str((await request.form()).get(decision.field) or ""), ""
 
 
 def old_rig() -> ApiError:
@@ -76,7 +84,7 @@ def old_rig() -> ApiError:
 
 def missing(document: str, decision: Decision) -> ApiError:
     """428: nobody says what this was decided on (RFC 6585, section 3)."""
-    trial = f" (a trial: of GET {document}/model)" if decision.path == "/v1/tests" else ""
+    trial = f" (a controller's key: of GET {document}/model)" if decision.path == "/v1/tests" else ""
     detail = (
         f"Send the ETag of GET {document}{trial} as If-Match, as you last saw it. On a page: load it again and repeat "
         "what you did. Nothing was done."

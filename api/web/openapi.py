@@ -23,8 +23,8 @@ where it is known already. `GET /v1/sequences` says what a test can be made of; 
 which plays nothing, and into `POST /v1/tests`.
 
 A decision (approve, set limits, start, re-arm, …) says on what it was made: the `ETag` of the document that its
-operation names, as it was last read, in `If-Match`. A trial names the approved model's, which a controller's key can
-read. Without: 428. Changed since: 409, with what was there, what is there now, who changed it and when.
+operation names, as it was last read, in `If-Match`. A controller's key, which reads no participant, names the approved
+model's. Without: 428. Changed since: 409, with what was there, what is there now, who changed it and when.
 
 Live signals come over a WebSocket, `/v1/tests/{id}/live`, with the same token: JSON messages with a `type`, which is
 `history` (all curves so far, once), `live` (about 20 a second), `state` (the rig), `link` (is the rig there) or `test`
@@ -94,7 +94,7 @@ def _tell_of_decisions(document: dict[str, Any]) -> None:
         operation = document["paths"].get(decision.path, {}).get(decision.method.lower())
         if operation is None:
             continue
-        model = ", or for a trial of `GET /v1/participants/{code}/model`" if decision.path == "/v1/tests" else ""
+        model = ", or for a controller's key of `GET /v1/participants/{code}/model`" if decision.path == "/v1/tests" else ""
         words = f"the `ETag` of `GET {decision.document}`{model} on which this is decided"
         given = {"name": "If-Match", "in": "header", "required": decision.needed, "description": words}
         operation.setdefault("parameters", []).append(given | {"schema": {"type": "string"}})

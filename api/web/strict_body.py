@@ -6,8 +6,10 @@ other codecs make of it is no text that can be kept.
 
 from __future__ import annotations
 
+import asyncio
 import re
 from codecs import BOM_UTF8
+from concurrent.futures import ThreadPoolExecutor
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -18,6 +20,9 @@ from identify.strict_json import BadJson, NotJson, parse
 
 DEEPEST = 16
 """Brackets within one another: a test's segment's settings take six."""
+SHORT = 16_384
+"""Bytes that are read in less than a millisecond or two."""
+_READER = ThreadPoolExecutor(1, "long-bodies")
 UTF_8 = re.compile(r';\s*charset="?utf-8"?(?=;|\s|$)')
 REFUSALS = {
     "400": "the body is not UTF-8, begins with a byte-order mark, is too deep, or has a key twice",
@@ -46,7 +51,10 @@ class StrictBody:
             message = await receive()
             body.extend(message.get("body", b""))
             if message["type"] == "http.request" and not message.get("more_body"):
-                refuse_unsound(bytes(body))
+                if len(body) <= SHORT:
+                    refuse_unsound(bytes(body))
+                else:  # one at a time: a stop, which waits for the event loop, comes between
+                    await asyncio.get_running_loop().run_in_executor(_READER, refuse_unsound, bytes(body))
             return message
 
         await self.app(scope, checked, send)

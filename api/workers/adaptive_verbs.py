@@ -85,7 +85,8 @@ def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = 
     from identify.experiments.target import Target
 
     progress(0.5, "beginning")
-    _running[:] = [Running(Target(**target), known(models), **limits)]
+    _running.clear()
+    _running.append(Running(Target(**target), known(models), **limits))
     return {}
 
 

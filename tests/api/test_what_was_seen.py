@@ -11,7 +11,10 @@ import pytest
 
 from api.client.errors import Conflict
 from api.client.rest import Client
+from api.clock import Clock
 from api.errors import ApiError
+from api.store import audit
+from api.web import decisions
 from rig import messages as m
 from rig.messages import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
@@ -21,6 +24,8 @@ from tests.api.test_forms import fields, yes
 from tests.api.test_overtaken import TRIAL, key_of
 
 HTML = {"Accept": "text/html"}
+QUIET: Any = None
+"""A client that says no version by itself."""
 HOME = "/v1/participants/P017"
 PAGE = "/participants/P017"
 
@@ -208,7 +213,10 @@ def test_a_range_that_was_said_under_another_calibration_of_the_sensor_is_asked_
     assert client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}).is_success
     asked = {"json": {"angle_range_rad": [0.5, 1.2]}, "headers": {"If-Match": old}}
     assert client.put(f"{HOME}/profile", **asked).status_code == 409
-    assert client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": old}).is_success
+    other = client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": old})
+    assert other.is_success
+    again = client.put(f"{HOME}/profile", json=asked["json"], headers={"If-Match": other.headers["etag"]})
+    assert again.status_code == 409, "limits that were set show no pose"
     assert client.put(f"{HOME}/profile", json=asked["json"]).is_success
 
 
@@ -225,17 +233,99 @@ def test_a_pose_whose_answer_was_lost_is_a_change(
     assert second.status_code == 409 and service.rig.arm.calibration is None
 
 
-def test_a_models_version_plays_a_trial_and_nothing_else(
+def test_a_models_version_is_a_controllers_only(
     service: Service, client: httpx.Client, participant: str, approved: str
 ) -> None:
+    """A program's test is played within the participant's limits, which the model does not show."""
     lab = service.client(service.token("lab", "run-test", "read-live", "read-model"))
     tag = {"If-Match": lab.get(f"{HOME}/model").headers["etag"]}
-    refused = lab.post("/v1/tests", json={"participant": participant}, headers=tag)
-    assert refused.status_code == 409 and f"no version of {HOME}" in refused.json()["detail"]
-    other = {"If-Match": f'"{"0" * 64}"'}
-    assert lab.post("/v1/tests", json={"participant": participant, **TRIAL}, headers=other).status_code == 409
-    assert lab.post("/v1/tests", json={"participant": participant, **TRIAL}, headers=tag).status_code == 202
-    assert approved
+    for body in ({}, TRIAL):
+        refused = lab.post("/v1/tests", json={"participant": participant, **body}, headers=tag)
+        assert refused.status_code == 409 and f"no version of {HOME}" in refused.json()["detail"]
+    with Client(service.url, service.token("lib", "run-test", "read-live", "read-model")) as lib:
+        lib.participant(participant)
+        lib.approved_model(participant)
+        client.put(f"{HOME}/profile", json={"current_ma": 25})
+        with pytest.raises(Conflict):
+            lib.start_test(participant, kind="sequence", segments=TRIAL["segments"])
+    assert approved and service.rig.starts == 1
+
+
+def test_a_trial_ends_with_the_day_of_its_key(
+    service: Service, client: httpx.Client, participant: str, approved: str
+) -> None:
+    playing(service, client, participant)
+    clock = service.app.state.context.clock
+    service.app.state.context.runner.clock = Tomorrow(clock)
+    soon(lambda: service.rig.withdrawn)
+    assert [request.begun for request in service.rig.withdrawn] == [True] and approved
+
+
+class Tomorrow(Clock):
+    """A day later."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.now = clock
+
+    def unix_s(self) -> float:
+        return self.now.unix_s() + 86_400.0
+
+
+def test_a_site_that_another_service_sets_ends_a_trial(
+    service: Service, client: httpx.Client, participant: str, approved: str
+) -> None:
+    playing(service, client, participant)
+    store, now = service.app.state.context.store, service.app.state.context.clock.utc()
+    with store.write() as session:
+        audit.write(session, now, "somebody elsewhere", "set muscle", participant, side="right")
+    soon(lambda: service.rig.withdrawn)
+    assert [request.begun for request in service.rig.withdrawn] == [True] and approved
+
+
+def test_what_was_seen_before_midnight_is_not_decided_after_it(
+    service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It passed the door a moment before."""
+    tag = client.get(HOME).headers["etag"]
+    asked = []
+
+    def ends(*given: Any) -> str:
+        asked.append(given)
+        return tag.split(".")[2] if len(asked) == 1 else "2999-01-01"
+
+    monkeypatch.setattr(decisions, "local_day", ends)
+    refused = client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": tag})
+    assert refused.status_code == 409 and "Approvals and calibrations end" in refused.json()["detail"]
+    assert len(asked) > 1
+
+
+def test_the_door_is_quick_and_never_fails(service: Service, client: httpx.Client, participant: str) -> None:
+    tags = ",".join(f'"1.00000000.2026-11-26.{number:08x}"' for number in range(1500))
+    long = client.post("/v1/tests", json={"participant": "x" * 900_000}, headers={"If-Match": tags})
+    assert long.status_code == 409 and "{code}" in long.json()["detail"]
+    for body in (b"[" * 200_000, b'{"participant": "\\ud800"}', b'{"participant": ["P017"]}', b"null", b"\xff"):
+        for head in ({}, {"If-Match": tags}):
+            answer = client.post("/v1/tests", content=body, headers={**head, "content-type": "text/plain"}, auth=QUIET)
+            assert answer.status_code in (409, 422, 428), answer.text
+    assert service.rig.starts == 0
+
+
+def test_a_rejection_that_brings_a_model_back_needs_what_its_page_showed(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    first, second = (run_test(client, participant)["model_id"] for _ in range(2))
+    for model in (first, second):
+        client.post(f"/v1/models/{model}/approve", json={"reason": "good enough"})
+    for head, data in (({"If-Match": '""'}, None), ({"If-Match": ""}, None), ({}, {"reason": "x", "seen": ""})):
+        path = f"/models/{second}/reject"
+        if data is None:
+            refused = client.post(f"/v1{path}", json={"reason": "x"}, headers=head)
+        else:
+            refused = client.post(path, data=data, auth=QUIET)
+        assert refused.status_code == 428, refused.text
+    page = client.get(PAGE, headers=HTML).text
+    bare = re.findall(r'name="seen" value="([^"]+)"', page)[-1]
+    assert client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": f'"{bare}"'}).status_code == 409
 
 
 def test_limits_are_answered_and_not_what_was_decided_on_models(
@@ -254,7 +344,7 @@ def test_a_key_is_made_on_what_was_seen_also_when_its_check_is_overtaken(
     service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The form's own look is before the transaction: what comes between is refused there."""
-    page = client.get(PAGE, headers=HTML).text
+    page, old = client.get(PAGE, headers=HTML).text, client.get(HOME).headers["etag"]
     version = re.findall(r'name="seen" value="([^"]+)"', page)[-1]
     assert client.put(f"{HOME}/profile", json={"max_torque_nm": 12}).is_success
     store = service.app.state.context.store
@@ -264,7 +354,7 @@ def test_a_key_is_made_on_what_was_seen_also_when_its_check_is_overtaken(
     assert refused.status_code == 409 and approved
     assert "ilc" in refused.text and "3 trials of at most 60 s, 8 mA, 200 µs" in refused.text
     assert not [token for token in client.get("/v1/tokens").json() if token["name"].startswith("ilc")]
-    begun = client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": f'"{version}"'})
+    begun = client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": old})
     assert begun.status_code == 409 and service.rig.starts == 1, "in the intent's own transaction, too"
 
 

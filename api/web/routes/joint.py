@@ -8,12 +8,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 from pydantic import AfterValidator, Field, StrictBool, StringConstraints
 
+from api.clock import local_day
 from api.errors import ApiError
 from api.models import together
 from api.sessions import angles
 from api.sessions.requests import AngleRad, Body
 from api.store import audit, seen
 from api.store.holds import LIMITS_TURN
+from api.store.seen import Seen
 from api.store.tables import Model, Participant
 from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
 from api.web.responses.base import answers
@@ -22,7 +24,7 @@ from api.web.responses.models import VersionOut
 from api.web.routes import participants
 from api.web.routes.criticism import LATER, later
 from api.workers.tracker import FIT_TOGETHER, Job
-from rig.messages import AngleCalibration, AnglePoseRequest, AngleStatus, Status
+from rig.messages import AnglePoseRequest, AngleStatus, Status
 
 router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
 
@@ -68,25 +70,27 @@ async def take_pose(context: Context, body: PoseIn, by: str) -> AngleStatus:
     """
     sensor(context)
 
-    def note(done: AngleCalibration | None) -> None:
+    def write(action: str, **detail: Any) -> Seen:
         with context.store.write() as session:
-            now, taken = context.clock.utc(), {"angle_rad": round(body.angle_rad, 4)}
-            audit.write(session, now, by, seen.POSES[0], "rig", **taken)
-            if done is not None:
-                audit.write(session, now, by, seen.POSES[1], "rig", **done.model_dump(exclude={"by"}))
+            if action == seen.POSES[0]:
+                seen.check(session, seen.of("rig", *seen.POSES))
+            now = context.clock.utc()
+            audit.write(session, now, by, action, "rig", **detail)
+            return seen.newest(session, local_day(now))
 
     async with context.holds.turn(LIMITS_TURN):  # no other pose comes between looking and taking it
         before = context.rig.status.angle.calibration if context.rig.status else None
-        await asyncio.to_thread(context.store.refuse_changed, seen.of("rig", *seen.POSES))
+        # before the rig is told: of one whose answer is lost nobody knows whether it was taken
+        place = await asyncio.to_thread(write, seen.POSES[0], angle_rad=round(body.angle_rad, 4))
         try:
             pose = AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first)
             status = await context.rig.ask_for(Status, pose)
-        except ApiError as error:
-            if error.code == "rig-unreachable":  # it may have heard us all the same
-                await asyncio.to_thread(note, None)
+        except ApiError:
+            seen.shown.set(place)  # who is told of the refusal has seen it
             raise
         context.rig.status = status
-        await asyncio.to_thread(note, status.angle.calibration if status.angle.calibration != before else None)
+        if (done := status.angle.calibration) is not None and done != before:
+            await asyncio.to_thread(write, seen.POSES[1], **done.model_dump(exclude={"by"}))
     return status.angle
 
 

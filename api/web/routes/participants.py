@@ -94,8 +94,8 @@ def _change(
             row.profile = profile
             audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
         shown = seen.shown.get()
-        if shown is not None and seen.since(session, shown, seen.decisions(code)):
-            return row, shown  # limits are answered, not what was decided on models
+        if shown is not None and seen.since(session, shown, seen.decisions(code), seen.of("rig", *seen.POSES)):
+            return row, shown  # limits are answered, not what was decided on models, nor where the angle's zero is
         return row, seen.newest(session, local_day(context.clock.utc()))
 
 
