@@ -94,7 +94,8 @@ def _tell_of_decisions(document: dict[str, Any]) -> None:
         operation = document["paths"].get(decision.path, {}).get(decision.method.lower())
         if operation is None:
             continue
-        model = ", or for a controller's key of `GET /v1/participants/{code}/model`" if decision.path == "/v1/tests" else ""
+        of_key = ", or for a controller's key of `GET /v1/participants/{code}/model`"
+        model = of_key if decision.path == "/v1/tests" else ""
         words = f"the `ETag` of `GET {decision.document}`{model} on which this is decided"
         given = {"name": "If-Match", "in": "header", "required": decision.needed, "description": words}
         operation.setdefault("parameters", []).append(given | {"schema": {"type": "string"}})
