@@ -68,7 +68,7 @@ async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, s
     """
     fields = request.headers.getlist("if-match")
     if fields:
-        tags = [tag.strip('"') for tag in entity_tags(",".join(fields))][:MOST_TAGS]
+        tags = [tag.strip('"') for field in fields for tag in entity_tags(field)][:MOST_TAGS]
         places = {place.entry: tag for tag in tags if (place := seen.read(tag, mark))}
         return (places[max(places)] if places else tags[0]), mark
     if "form" not in request.headers.get("content-type", ""):
