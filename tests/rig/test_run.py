@@ -19,6 +19,7 @@ from rig.adapters.files import Files
 from rig.control.sealing import warnings
 from rig.devices import p24, rehastim2
 from rig.errors import WireError
+from rig.limits import Steps
 from rig.messages import SegmentPlan
 from rig.signals import Ack, Pulse, PulseStatus
 from rig.tasks import Task
@@ -137,6 +138,16 @@ def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: P
     assert [f"{len(climbed)} pulses were narrower" in line for line in warnings(rig.recording())] == [True] * (
         up_s == 0.2
     )
+
+
+@pytest.mark.parametrize("late_s", [0.01, 0.03, 0.05, 0.07, 0.09])
+def test_a_pulse_that_is_too_short_for_the_device_was_not_felt(tmp_path: Path, late_s: float):
+    """After it and some that were left out the width climbs from nothing."""
+    rig = VirtualRig(tmp_path, [SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.5, "down_s": 1.0})])
+    rig.stimulator.steps = Steps(shortest_us=20.0)
+    rig.at(late_s, lambda: rig.clock.advance(0.16))
+    assert rig.execute().outcome == "completed"
+    assert max(np.diff([0, *(pulse.pulse_width_us for _, pulse in rig.stimulator.sent)])) <= 50
 
 
 def test_a_damaged_answer_of_the_stimulator_ends_a_test_like_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
