@@ -64,10 +64,10 @@ def mark_of(document: str) -> str:
     return hashlib.sha256(document.encode()).hexdigest()[:8]
 
 
-def read(text: str, mark: str) -> Seen | None:
-    """What was sent back, of the document with this mark, or without one by a page; None where it is none of these."""
+def read(text: str, *marks: str) -> Seen | None:
+    """What was sent back, with one of these documents' marks, or the empty one of a page; None where it is none."""
     found = re.fullmatch(r"(\d{1,15})\.([0-9a-f]{8})\.(\d{4}-\d\d-\d\d)(?:\.([0-9a-f]{8}))?", text, re.ASCII)
-    if found is None or (found[4] or "") != mark:
+    if found is None or (found[4] or "") not in marks:
         return None
     return Seen(int(found[1]), found[2], found[3])
 

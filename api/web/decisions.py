@@ -33,16 +33,16 @@ async def take(request: Request) -> None:
         return
     decision, names = found
     document = decision.document.format(**{**await _names(request, decision), **names})
-    text, mark = await _sent(request, decision, seen.mark_of(document))
+    text, marks = await _sent(request, decision, seen.mark_of(document))
     if decision.field == "latch" and not request.app.state.context.rig.latch_known:
         raise old_rig()
-    if not decision.needed and request.url.path == decision.path and "if-match" not in request.headers:
+    if not decision.needed and request.url.path.startswith("/v1/") and "if-match" not in request.headers:
         return
     seen.today.set(lambda: local_day(request.app.state.context.clock.utc()))
     if not re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII):
         raise missing(document, decision)
     seen.sent.set(text)
-    place = seen.read(text, mark)
+    place = seen.read(text, *marks)
     if decision.field in OF_RIG or (decision.path == "/v1/tests" and len(text) == MODEL_TAG):
         return
     if place is None:
@@ -61,8 +61,8 @@ async def _names(request: Request, decision: Decision) -> dict[str, str]:
     return {"code": code}
 
 
-async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, str]:
-    """The version, as `If-Match` or the form's field has it, and its mark, which a page's has not.
+async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, tuple[str, ...]]:
+    """The version, as `If-Match` or the form's field has it, and the marks that it may have: a page's has none.
 
     Of several the newest of this document.
     """
@@ -70,10 +70,10 @@ async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, s
     if fields:
         tags = [tag.strip('"') for field in fields for tag in entity_tags(field)][:MOST_TAGS]
         places = {place.entry: tag for tag in tags if (place := seen.read(tag, mark))}
-        return (places[max(places)] if places else tags[0]), mark
+        return (places[max(places)] if places else tags[0]), (mark,)
     if "form" not in request.headers.get("content-type", ""):
-        return "", mark
-    return str((await request.form()).get(decision.field) or ""), ""
+        return "", (mark,)
+    return str((await request.form()).get(decision.field) or ""), ("", mark)
 
 
 def old_rig() -> ApiError:

@@ -142,7 +142,7 @@ POST   /v1/models/x/reject                                 approve-model  404
 POST   /v1/models/x/undo                                   approve-model  428
 GET    /models/x/approve                                   approve-model  404
 POST   /models/x/approve                                   approve-model  428
-POST   /models/x/reject                                    approve-model  422
+POST   /models/x/reject                                    approve-model  428
 POST   /models/x/undo                                      approve-model  428
 POST   /v1/tokens                                          administer     422
 GET    /v1/tokens                                          administer     200

@@ -323,6 +323,7 @@ def test_a_rejection_that_brings_a_model_back_needs_what_its_page_showed(
         else:
             refused = client.post(path, data=data, auth=QUIET)
         assert refused.status_code == 428, refused.text
+    assert client.post(f"/v1/models/{second}/reject", json={"reason": "x"}, auth=QUIET).is_success, "of a program"
     page = client.get(PAGE, headers=HTML).text
     bare = re.findall(r'name="seen" value="([^"]+)"', page)[-1]
     assert client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": f'"{bare}"'}).status_code == 409
