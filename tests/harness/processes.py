@@ -108,8 +108,12 @@ class RigClient:
             time.sleep(0.05)
 
     def rearm(self, by: str) -> dict[str, Any]:
-        """Look at the rig, then re-arm it; the whole reply."""
-        return self.ask("rearm", by=by, latch=self.status()["latch"])
+        """Look at the rig, then re-arm it; the whole reply. Who is told of another stop or lost device looks again."""
+        for _ in range(10):
+            reply = self.ask("rearm", by=by, latch=self.status()["latch"])
+            if reply["ok"] or reply["problem"]["code"] != "latch-changed":
+                break
+        return reply
 
     def send_raw(self, line: str) -> None:
         """Send a line as it is."""
