@@ -199,7 +199,7 @@ def judge(service: Service, run: Run) -> None:
         between = [one for one in entries if int(seen) < one["seq"] < entry["seq"]]
         if entry["action"] in OF_PERSON or entry["action"] in ("begin calibration", "start test"):
             late = [one for one in between if one["subject"] == CODE and one["action"] in OF_PERSON]
-        elif entry["action"] in OF_MODELS:
+        elif entry["action"] == "approve" or (entry["action"] == "reject" and _brings_back(entries, entry)):
             late = [one for one in between if one["subject"] in models and one["action"] in OF_MODELS]
         else:
             continue
@@ -213,6 +213,23 @@ def judge(service: Service, run: Run) -> None:
         told = [at_s for at_s, withdrawn in run.withdrawn if withdrawn == test]
         if rights and not told and _answered(entries, asked) < len(ended):
             run.wrong.append(f"{test} was begun under a right that had been ended, and was not withdrawn")
+
+
+def _brings_back(entries: list[dict[str, Any]], rejection: dict[str, Any]) -> bool:
+    """Whether the model that it rejects was served, and another one is after it; else it only takes away."""
+    before = [one for one in entries if one["seq"] < rejection["seq"]]
+
+    def site(seq: int) -> Any:
+        said = [one["detail"].get("side") for one in before if one["action"] == "set muscle" and one["seq"] < seq]
+        return said[-1] if said else None
+
+    gone, served = set[str](), list[str]()
+    for one in reversed([one for one in before if one["action"] in OF_MODELS]):
+        if one["action"] == "reject":
+            gone.add(one["subject"])
+        elif one["subject"] not in gone and site(one["seq"]) == site(rejection["seq"]):
+            served.append(one["subject"])
+    return served[:1] == [rejection["subject"]] and set(served) != {rejection["subject"]}
 
 
 def _answered(entries: list[dict[str, Any]], asked: dict[str, Any] | None) -> int:
