@@ -14,7 +14,7 @@ import pytest
 from api.clock import Clock
 from api.people.idle_lock import IdleLock
 from api.people.pace import Pace
-from tests.api.browser import PASSWORD
+from tests.api.browser import PASSWORD, without_values
 from tests.api.conftest import STUB, TOKEN, Service, run_service, wait_done
 
 HTML = {"Accept": "text/html"}
@@ -161,7 +161,7 @@ def test_the_red_button_works_on_a_locked_page(service: Service, clock: SetClock
         test = http.post("/v1/tests", json={"participant": "L1"}).json()
         http.post("/v1/sessions/lock")
         page = http.get("/locked", headers=HTML).text
-        assert 'id="stop"' in page and "L1" not in page and "Ada" in page
+        assert 'id="stop"' in page and "L1" not in without_values(page) and "Ada" in page
         assert service.rig.state == "running", "the test is not touched"
         right = page.split('name="right" value="')[1].split('"')[0]
         with service.client(token=None) as nobody:
