@@ -114,6 +114,11 @@ def of(subject: str, *actions: str) -> About:
     return and_(AuditEntry.subject == subject, AuditEntry.action.in_(actions))
 
 
+def poses() -> About:
+    """Where the angle sensor's zero and scale come from."""
+    return of("rig", *POSES)
+
+
 def last(session: Session, *about: About) -> AuditEntry | None:
     """The newest entry about something; without `about`, of the whole trail."""
     entries = select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)

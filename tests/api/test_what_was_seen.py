@@ -220,6 +220,15 @@ def test_a_range_that_was_said_under_another_calibration_of_the_sensor_is_asked_
     assert client.put(f"{HOME}/profile", json=asked["json"]).is_success
 
 
+def test_a_range_is_said_by_who_read_its_participant_after_the_pose(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    """The document's version is at least as new as all that a decision on it is held against."""
+    service.rig.arm.way = still(0.2)
+    assert client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}).is_success
+    assert client.put(f"{HOME}/profile", json={"angle_range_rad": [0.5, 1.2]}).is_success
+
+
 def test_a_pose_whose_answer_was_lost_is_a_change(
     service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -122,19 +122,19 @@ def heads(
         raise InputError(f"{output}: {error.strerror}. Give a file that can be written.") from error
 
 
-def outside(settings: Settings, of_rig: bool, given: list[Path]) -> tuple[list[Receipt], list[str]]:
+def outside(settings: Settings, of_rig: bool, named: list[Path]) -> tuple[list[Receipt], list[str]]:
     """What was noted of the trail outside the database, and what is wrong with those files."""
     own = receipts.files(settings.data_dir) if of_rig else []
     if of_rig and settings.heads_file is not None and settings.heads_file.exists():
         own.append(settings.heads_file)
     noted: list[Receipt] = []
     wrong: list[str] = []
-    for path in [*own, *given]:
+    for path in [*own, *named]:
         try:
             kept, said = receipts.checked(path)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig audit heads`.") from error
-        if path in given and not kept and not said:
+        if path in named and not kept and not said:
             said = [f"{path}: no head is in it"]
         noted, wrong = noted + kept, wrong + said
     return noted, wrong
@@ -147,8 +147,8 @@ def from_centre(settings: Settings) -> tuple[list[Receipt], str]:
     noted: list[Receipt] = []
     with closing(Link(settings.centre_url, settings.centre_key.get_secret_value(), Clock())) as link:
         try:
-            while given := link.heads(noted[-1].chain if noted else "", noted[-1].item if noted else 0):
-                noted += given
+            while more := link.heads(noted[-1].chain if noted else "", noted[-1].item if noted else 0):
+                noted += more
         except PushError as error:
             return noted, str(error)
     return noted, "asked"

@@ -73,7 +73,7 @@ async def take_pose(context: Context, body: PoseIn, by: str) -> AngleStatus:
     def write(action: str, **detail: Any) -> Seen:
         with context.store.write() as session:
             if action == seen.POSES[0]:
-                seen.check(session, seen.of("rig", *seen.POSES))
+                seen.check(session, seen.poses())
             now = context.clock.utc()
             audit.write(session, now, by, action, "rig", **detail)
             return seen.newest(session, local_day(now))
@@ -125,7 +125,7 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
 @router.get("/rig/angle", **answers(AngleOut))
 async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
-    about = seen.of("rig", *seen.POSES)
+    about = seen.poses()
     response.headers["ETag"] = await asyncio.to_thread(context.store.etag, context.clock, "/v1/rig/angle", about)
     return (await context.rig.fresh_status()).angle.model_dump()
 

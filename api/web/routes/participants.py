@@ -81,7 +81,7 @@ def _change(
 ) -> tuple[Participant, Seen]:  # fmt: skip
     with context.store.write() as session:
         row = within(session, code)
-        poses = [] if asked.get(angles.RANGE) is None else [seen.of("rig", *seen.POSES)]
+        poses = [] if asked.get(angles.RANGE) is None else [seen.poses()]
         seen.check(session, seen.participant(code), *poses)
         check_asked(context, row.profile, asked)
         profile, voids = profiles.changed(row.profile, with_calibration(context, asked))
@@ -94,7 +94,7 @@ def _change(
             row.profile = profile
             audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
         shown = seen.shown.get()
-        if shown is not None and seen.since(session, shown, seen.decisions(code), seen.of("rig", *seen.POSES)):
+        if shown is not None and seen.since(session, shown, seen.decisions(code), seen.poses()):
             return row, shown  # limits are answered, not what was decided on models, nor where the angle's zero is
         return row, seen.newest(session, local_day(context.clock.utc()))
 
@@ -162,7 +162,7 @@ def list_participants(
 @router.get("/{code}", **answers(ParticipantOut))
 def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
     """One participant with its profile."""
-    about = seen.participant(code), seen.decisions(code)
+    about = seen.participant(code), seen.decisions(code), seen.poses()  # all that a decision on it may rest on
     version = context.store.etag(context.clock, f"/v1/participants/{code}", *about)
     response.headers["ETag"] = version  # read first: it is not newer than what is told
     return find(context, code).as_dict()

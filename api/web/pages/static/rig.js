@@ -84,8 +84,8 @@
     try {
       const answer = await get("/rig/notice?back=" + encodeURIComponent(notice.dataset.back));
       if (answer.ok) {
-        const before = notice.querySelector("[name=latch]"), words = await answer.text();
-        notice.innerHTML = words;
+        const before = notice.querySelector("[name=latch]");
+        notice.innerHTML = await answer.text();
         notice.dataset.key = key;
         hold(before);
       }
