@@ -34,14 +34,12 @@ class SendsVersions(httpx.Auth):
     def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
         """As httpx asks for it."""
         request.headers.update(self._headers)
-        documents = [] if "if-match" in request.headers else self._documents(request)
-        model = documents[-1] if len(documents) > 1 else ""
-        for document in documents:
+        for document in [] if "if-match" in request.headers else self._documents(request):
             if document not in self.seen:
                 looking = httpx.Request("GET", request.url.copy_with(path=document, query=None), headers=self._headers)
                 found = yield looking
                 self._keep(document, found)
-                if found.status_code == httpx.codes.NOT_FOUND and document not in (*self.seen, model):
+                if found.status_code == httpx.codes.NOT_FOUND and document not in self.seen:
                     return  # there is nothing to decide on: that is the answer
             if tag := self.seen.get(document):
                 request.headers["if-match"] = tag

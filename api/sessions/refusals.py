@@ -31,6 +31,8 @@ class Current:
     """When that right ends by itself: a controller's key ends with its day."""
     since: seen.Seen | None = None
     """The trail's place at its intent, or at the last change that was found; None: not written yet."""
+    over: bool = False
+    """That end was told to the rig."""
     overtaken: list[AuditEntry] = field(default_factory=list)
     """Changes that have withdrawn it."""
     looking: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -41,14 +43,14 @@ class Current:
 
     @property
     def rests_on(self) -> tuple[seen.About, ...]:
-        """Entries of the audit trail with which it would not have been begun."""
-        return rests_of(self.participant, self.kind, self.tokens)
+        """Entries of the audit trail, since its intent, with which it would not have been begun."""
+        return (*rests_of(self.participant, self.kind), seen.revoked(*self.tokens))
 
 
-def rests_of(participant: str, kind: str, tokens: list[str]) -> tuple[seen.About, ...]:
-    """Entries of the trail with which a test would not be begun; a controller's trial rests on the models, too."""
+def rests_of(participant: str, kind: str) -> tuple[seen.About, ...]:
+    """What must have been seen of a test: the participant, and of a controller's trial the decisions on models."""
     models = (seen.decisions(participant),) if kind == SEQUENCE else ()
-    return (seen.participant(participant), seen.revoked(*tokens), *models)
+    return (seen.participant(participant), *models)
 
 
 def other_than(asker: str, ran_by: str | None) -> str | None:
@@ -64,6 +66,12 @@ def refuse_archived(participant: Participant) -> None:
             f"POST /v1/participants/{participant.code}/unarchive. Nothing was started."
         )
         raise ApiError(409, "archived", "This participant is archived", detail)
+
+
+def right_ended() -> ApiError:
+    """409: by whose right it was asked for may do so no more."""
+    detail = "A controller's key ends with its day, and a right when it is revoked. Nothing was sent."
+    return ApiError(409, "changed-meanwhile", "The right to this test has ended", detail)
 
 
 def not_what_was_seen() -> ApiError:

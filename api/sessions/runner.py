@@ -29,7 +29,7 @@ from api.sessions.joint_tests import JointTests
 from api.sessions.lifecycle import Lifecycle
 from api.sessions.limits import limits_of
 from api.sessions.live import Hub
-from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived, rests_of
+from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived, rests_of, right_ended
 from api.sessions.requests import TestIn
 from api.sessions.rig_client import AnyEvent, RigClient
 from api.sessions.trials import SEQUENCE, Trials
@@ -183,7 +183,7 @@ class Runner:
         self, body: TestIn, participant: Participant, by: str, confirmed: dict[str, Any] | None,
         tokens: list[str],
     ) -> Test:  # fmt: skip
-        rests_on = rests_of(body.participant, body.kind, tokens)
+        rests_on = rests_of(body.participant, body.kind)
         await asyncio.to_thread(self.store.refuse_changed, *rests_on)  # then the preview may differ for no other reason
         planned = await self._planned(body, participant)
         plan = planned.plan
@@ -221,8 +221,7 @@ class Runner:
                 if changed := current.overtaken or await asyncio.to_thread(self._overtaking, current):
                     raise seen.overtaken(changed)
                 if self._is_over(current):
-                    detail = "A controller's key ends with its day. Nothing was sent."
-                    raise ApiError(409, "changed-meanwhile", "The right to this test has ended", detail)
+                    raise right_ended()
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.adaptive.begin(planned) or self.joint.begin(planned)
                 await self.rig.ask(StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
@@ -270,10 +269,11 @@ class Runner:
         if current is None:
             return
         async with current.looking:
-            changed, over = await asyncio.to_thread(self._overtaking, current), self._is_over(current)
+            changed = await asyncio.to_thread(self._overtaking, current)
+            over = self._is_over(current) and not current.over
             if not changed and not over:
                 return
-            current.overtaken = changed
+            current.overtaken = changed or current.overtaken
             begun = over or (current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed))
             what = changed[-1].action if changed else "the day of its key ended"
             reason = f"{what}, after this test was asked for"
@@ -284,16 +284,17 @@ class Runner:
                 await self._stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
             else:
                 current.since = seen.at(changed[-1], "") if changed else current.since
-                current.until_utc = None if over else current.until_utc
+                current.over = current.over or over
 
     def _is_over(self, current: Current) -> bool:
         """Whether the right to it has ended by itself."""
         return current.until_utc is not None and current.until_utc <= self.clock.utc()
 
     def _until_utc(self, tokens: list[str]) -> str | None:
-        """When the first key ends by whose right a test is played; a person's session may end before the test."""
+        """When the key ends by whose right a test is played, with its maker's; a person's may end before the test."""
         rows = [row for token in tokens if (row := self.store.get(Token, token)) is not None]
-        return min((row.expires_utc for row in rows if row.participant and row.expires_utc), default=None)
+        by_key = any(row.participant for row in rows)
+        return min((row.expires_utc for row in rows if by_key and row.expires_utc), default=None)
 
     def _tokens(self, holder: str) -> list[str]:
         """Hashes of the tokens by whose right a test is played: the asker's, and that of who made a key."""
@@ -369,7 +370,9 @@ class Runner:
         self.follower.mark(row)
         dose = {name: preview.get(name) for name in ("duration_s", "charge_uc", "torque_time_nms")}
         with self.store.write() as session:
-            seen.check(session, *current.rests_on)
+            seen.check(session, *rests_of(plan.participant, plan.kind))
+            if any((token := session.get(Token, each)) is None or token.revoked for each in current.tokens):
+                raise right_ended()
             session.add(row)
             said = {"participant": plan.participant, "kind": plan.kind, "shown": dose}
             audit.write(session, now, by, "start test", plan.test_id, **said)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from contextlib import suppress
 
@@ -15,6 +14,7 @@ from api.errors import ApiError
 from api.sessions.requests import PARTICIPANT_CODE
 from api.store import seen
 from api.web.headers import entity_tags
+from api.web.strict_body import PARSED
 
 MOST_TAGS = 20
 """Of `If-Match`: the others are not read."""
@@ -55,8 +55,9 @@ async def _names(request: Request, decision: Decision) -> dict[str, str]:
     """What a request's body names of the document: a test's participant."""
     code = "{code}"
     if decision.path == "/v1/tests" and request.url.path == decision.path:
-        with suppress(ValueError, KeyError, TypeError, RecursionError):  # the route says what is wrong with it
-            said = json.loads(await request.body())["participant"]
+        await request.body()
+        with suppress(KeyError, TypeError):  # the route says what is wrong with it
+            said = request.scope[PARSED]["participant"]
             code = said if isinstance(said, str) and re.fullmatch(PARTICIPANT_CODE, said, re.ASCII) else code
     return {"code": code}
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
+import logging
 from typing import Any
 
-from sqlalchemy.exc import SQLAlchemyError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from api.web.guards import SAFE_METHODS
 from api.web.key_guard import STOP
+
+log = logging.getLogger("stimrig.look_again")
 
 
 class LookAgain:
@@ -31,8 +32,10 @@ class LookAgain:
 
         async def told(message: Message) -> None:
             if message["type"] == "http.response.start":
-                with contextlib.suppress(SQLAlchemyError):  # it is looked at again four times a second
+                try:
                     await self.context.runner.look_again()
+                except Exception:  # what was done is answered; it is looked at again four times a second
+                    log.exception("whether a test may still be played could not be seen")
             await send(message)
 
         await self.app(scope, receive, told)

@@ -10,6 +10,7 @@ import asyncio
 import re
 from codecs import BOM_UTF8
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -20,6 +21,8 @@ from identify.strict_json import BadJson, NotJson, parse
 
 DEEPEST = 16
 """Brackets within one another: a test's segment's settings take six."""
+PARSED = "stimrig.json"
+"""Where the scope of a request has what was read."""
 SHORT = 16_384
 """Bytes that are read in less than a millisecond or two."""
 _READER = ThreadPoolExecutor(1, "long-bodies")
@@ -52,9 +55,9 @@ class StrictBody:
             body.extend(message.get("body", b""))
             if message["type"] == "http.request" and not message.get("more_body"):
                 if len(body) <= SHORT:
-                    refuse_unsound(bytes(body))
+                    scope[PARSED] = sound(bytes(body))
                 else:  # one at a time: a stop, which waits for the event loop, comes between
-                    await asyncio.get_running_loop().run_in_executor(_READER, refuse_unsound, bytes(body))
+                    scope[PARSED] = await asyncio.get_running_loop().run_in_executor(_READER, sound, bytes(body))
             return message
 
         await self.app(scope, checked, send)
@@ -65,8 +68,8 @@ async def _refused() -> Message:
     raise HTTPException(400, "The form is not in UTF-8. Send it in UTF-8, as browsers do.")
 
 
-def refuse_unsound(body: bytes) -> None:
-    """Refuse JSON that would be read in two ways, or that no route takes.
+def sound(body: bytes) -> Any:
+    """What JSON says; None where it says nothing. Refused where it would be read in two ways, or no route takes it.
 
     Raises
     ------
@@ -74,12 +77,12 @@ def refuse_unsound(body: bytes) -> None:
         400, with what is wrong in one line.
     """
     if not body.strip():
-        return
+        return None
     if body.startswith(BOM_UTF8):
         raise HTTPException(400, "The body begins with a byte-order mark. Send JSON (RFC 8259) in UTF-8 without one.")
     try:
-        parse(body, deepest=DEEPEST, finite=False)
+        return parse(body, deepest=DEEPEST, finite=False)
     except NotJson:
-        return  # the route names the field and the place
+        return None  # the route names the field and the place
     except BadJson as error:
         raise HTTPException(400, f"The body: {error}. Send JSON (RFC 8259) in UTF-8.") from error

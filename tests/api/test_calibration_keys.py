@@ -206,7 +206,7 @@ def test_an_end_that_is_refused_says_why(page: Any, service: Service) -> None:
         assert http.post("/v1/participants/K1/calibration/finish", json={"discard": True}).status_code == 200
     page.locator("#discard").click()
     page.get_by_text("No calibration of K1 is open").wait_for()
-    assert page.locator("#calibration").get_attribute("data-at") == "/participants/K1/calibration"
+    assert page.url.endswith("/participants/K1/calibration"), "loaded again it sends nothing"
     page.get_by_role("button", name="Begin the calibration").click()
     page.locator("#step-up").wait_for()
     page.wait_for_load_state()

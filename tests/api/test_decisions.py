@@ -192,7 +192,7 @@ CASES = {
         lambda world: [
             world.colleague.post(f"/v1/participants/{world.code}/calibration/finish", json={"discard": True}),
             world.colleague.post(f"/v1/participants/{world.code}/calibration", json={}),
-        ][-1], None, {}, TRAIN.ready, TRAIN.page, "Another train"),
+        ][-1], None, {}, TRAIN.ready, TRAIN.page, "colleague has begun another calibration"),
     "keys": Case(World.lower, None, KEY),
     "strike": Case(
         lambda world: world.colleague.post(f"/v1/participants/{world.code}/notes/{world.names['note_id']}/strike"),

@@ -182,13 +182,41 @@ def test_another_stop_that_comes_under_the_hand_is_read_before_it_is_re_armed(ta
     expected(button).to_be_enabled()
     tab.evaluate("""() => { window.pressable = []; new MutationObserver(() => {
         const now = document.querySelector("#rig-notice [name=latch]");
-        if (now) window.pressable.push([now.value, now.form.querySelector("button").disabled]);
+        if (now) window.pressable.push([now.value, now.form.querySelector("button").disabled, performance.now()]);
     }).observe(document.getElementById("rig-notice"), { childList: true, subtree: true, attributes: true }); }""")
+    button.focus()
+    for states in (("latched",), ("ready", "latched")):  # also where the notice was away between
+        for state in states:
+            service.rig_thread.become(state, "the same words")
+            says(tab, "Stopped" if state == "latched" else "No stimulation ready")
+        tab.wait_for_function(
+            "latch => document.querySelector('#rig-notice [name=latch]').value === latch", arg=service.rig.latch
+        )
+        expected(button).to_be_enabled()
+        held = [one[1:] for one in tab.evaluate("window.pressable") if one[0] == service.rig.latch]
+        assert held[0][0] is True and held[-1][0] is False
+        assert held[-1][1] - held[0][1] > 1900, "ms"
+        if len(states) == 1:
+            expected(button).to_be_focused()
+
+
+def test_the_page_that_refuses_a_re_arm_is_read_first(tab: Any, service: Service) -> None:
+    service.rig_thread.become("latched", "one")
+    tab.get_by_role("button", name="I have checked: re-arm").wait_for()
+    tab.route("**/rig/*", lambda route: route.abort())  # it does not hear of the second one
     service.rig_thread.become("latched", "two")
-    tab.locator("#rig-notice", has_text="two").wait_for()
-    expected(button).to_be_enabled()
-    held = [disabled for latch, disabled in tab.evaluate("window.pressable") if latch == service.rig.latch]
-    assert held[0] is True and held[-1] is False
+    soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
+    tab.get_by_role("button", name="I have checked: re-arm").click()
+    tab.get_by_text("This was changed since you saw it").wait_for()
+    buttons = tab.locator("form:has([name=latch]) button")
+    assert buttons.count() == 2
+    assert [buttons.nth(number).is_disabled() for number in (0, 1)] == [True, True] or tab.evaluate(
+        "performance.now()"
+    ) > 1900
+    expected(buttons.nth(1)).to_be_enabled()
+    buttons.nth(1).click()
+    tab.unroute("**/rig/*")
+    soon(lambda: service.rig.state == "ready")
 
 
 def test_without_scripts_the_state_carries_its_time(browser: Any, service: Service) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,9 @@ from api.client.errors import Conflict
 from api.client.rest import Client
 from api.clock import Clock
 from api.errors import ApiError
+from api.people.auth import Scope
 from api.store import audit
+from api.store.tables import Token
 from api.web import decisions
 from rig import messages as m
 from rig.messages import WithdrawRequest
@@ -191,6 +194,9 @@ def test_another_documents_version_says_nothing_and_several_count_in_any_order(
         assert client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": tag}).status_code == 409
     assert service.rig.starts == 0
     assert client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": old}).status_code == 409
+    lines = [("If-Match", old), ("If-Match", new)]
+    assert client.put(f"{HOME}/profile", json={"current_ma": 9}, headers=lines).is_success, "or in two lines"
+    new = client.get(HOME).headers["etag"]
     for number, tags in enumerate((f"{old}, {new}", f'"abc", {others}')):
         both = client.put(f"{HOME}/profile", json={"current_ma": 7 + number}, headers={"If-Match": tags})
         assert both.status_code == (409 if number else 200), both.text
@@ -238,6 +244,7 @@ def test_a_pose_whose_answer_was_lost_is_a_change(
         patch.setattr(service.app.state.context.rig, "patience_s", 0.0)
         lost = client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}, headers={"If-Match": old})
         assert lost.status_code == 503, lost.text
+    assert [one["action"] for one in client.get("/v1/audit").json()["entries"]][-1] == "pose not taken"
     second = client.post("/v1/rig/angle/pose", json={"angle_rad": 1.5}, headers={"If-Match": old})
     assert second.status_code == 409 and service.rig.arm.calibration is None
 
@@ -280,13 +287,70 @@ class Tomorrow(Clock):
         return self.now.unix_s() + 86_400.0
 
 
-def test_a_site_that_another_service_sets_ends_a_trial(
-    service: Service, client: httpx.Client, participant: str, approved: str
+def test_a_key_that_ends_between_its_intent_and_its_command_plays_nothing(
+    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is told to the rig at once; and the start that follows is refused here, whatever the rig remembers."""
+    _key, controller = key_of(service, client, participant)
+    runner = service.app.state.context.runner
+    write = runner._write_intent
+
+    def then_it_is_tomorrow(*given: Any) -> Any:
+        row = write(*given)
+        runner.clock = Tomorrow(runner.clock)
+        asyncio.run_coroutine_threadsafe(runner.look_again(), runner.rig._task.get_loop()).result(20)
+        return row
+
+    monkeypatch.setattr(runner, "_write_intent", then_it_is_tomorrow)
+    starts = service.rig.starts
+    refused = controller.post("/v1/tests", json={"participant": participant, **TRIAL})
+    assert refused.status_code == 409 and refused.json()["title"] == "The right to this test has ended"
+    assert service.rig.starts == starts and len(service.rig.withdrawn) == 1 and approved
+
+
+@pytest.mark.parametrize("by_key", [True, False])
+def test_a_trial_ends_with_its_makers_token_and_a_programs_test_does_not(
+    service: Service, client: httpx.Client, participant: str, approved: str, by_key: bool
+) -> None:
+    context, starts = service.app.state.context, service.rig.starts
+    maker = service.client(service.token("clin", "approve-model", "run-test", "read-live", "read-model"))
+    if by_key:
+        playing(service, maker_and(client, maker), participant)
+    else:
+        service.rig.speed = 0.2
+        assert maker.post("/v1/tests", json={"participant": participant, **TRIAL}).status_code == 202
+    current = context.runner.current
+    row = next(row for row in context.store.all(Token) if row.name == "clin")
+    with context.store.write() as session:
+        session.merge(row).expires_utc = "2026-01-01T00:00:00.000Z"
+    current.since, current.until_utc = None, None  # as after a restart of the service: looked up anew
+    if by_key:
+        soon(lambda: service.rig.withdrawn)
+    told = len(service.rig.withdrawn)
+    for _ in range(2):
+        asyncio.run_coroutine_threadsafe(context.runner.look_again(), context.rig._task.get_loop()).result(20)
+    assert len(service.rig.withdrawn) == told == by_key, "once, and not again"
+    assert service.rig.starts == starts + 1 and approved
+
+
+def test_a_token_that_came_back_starts_tests(service: Service, client: httpx.Client, participant: str) -> None:
+    """With the same text: its revocation stays in the trail, newer than what was read of the participant."""
+    text = service.token("lab", "run-test", "read-live")
+    auth = service.app.state.context.auth
+    (known,) = [row for row in service.app.state.context.store.all(Token) if row.name == "lab"]
+    assert auth.revoke(known.hash[:16], "somebody")
+    auth.issue("lab", [Scope.RUN_TEST, Scope.READ_LIVE], "somebody", text=text)
+    assert service.client(text).post("/v1/tests", json={"participant": participant}).status_code == 202
+
+
+@pytest.mark.parametrize("action", ["set muscle", "archive"])
+def test_what_another_service_does_to_a_participant_ends_a_trial(
+    service: Service, client: httpx.Client, participant: str, approved: str, action: str
 ) -> None:
     playing(service, client, participant)
     store, now = service.app.state.context.store, service.app.state.context.clock.utc()
     with store.write() as session:
-        audit.write(session, now, "somebody elsewhere", "set muscle", participant, side="right")
+        audit.write(session, now, "somebody elsewhere", action, participant)
     soon(lambda: service.rig.withdrawn)
     assert [request.begun for request in service.rig.withdrawn] == [True] and approved
 

@@ -140,6 +140,20 @@ def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: P
     )
 
 
+def test_after_a_rest_the_width_climbs_from_nothing(tmp_path: Path):
+    """Also where pulses came before it, and those right after it were left out."""
+    ramp = SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.5, "down_s": 0.5})
+    rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 1.0})
+    rig = VirtualRig(tmp_path, [ramp, rest, ramp.model_copy(update={"name": "again"})])
+    rig.at(2.0, lambda: rig.clock.advance(0.16))
+    assert rig.execute().outcome == "completed"
+    columns = rig.recording().columns
+    planned_us, sent_us = (columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
+    dropped = np.flatnonzero(columns["pulses/status"] == PulseStatus.DROPPED)
+    assert planned_us[dropped[0]] > 0 and planned_us[dropped[0] - 2] == 0
+    assert sent_us[dropped[-1] + 1] <= 50 + planned_us[dropped[0] - 1] < planned_us[dropped[-1] + 1]
+
+
 @pytest.mark.parametrize("late_s", [0.01, 0.03, 0.05, 0.07, 0.09])
 def test_a_pulse_that_is_too_short_for_the_device_was_not_felt(tmp_path: Path, late_s: float):
     """After it and some that were left out the width climbs from nothing."""

@@ -151,6 +151,8 @@ def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[st
     """What the form asks for: it is not looked at again on the page that it came from."""
     if action == "muscle":
         return [site_words((texts.get("side"), texts.get("muscle"), texts.get("placement")))]
+    if action in ARCHIVED:
+        return [str(ARCHIVED[action])]
     if "model_id" in names:
         model, decided = model_words(names["model_id"]), DECIDED.get(action)
         return [model if decided is None else f"{model}: {decision_words(decided)}"]

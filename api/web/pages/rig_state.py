@@ -89,8 +89,8 @@ def now(context: Context, principal: Principal | None) -> dict[str, Any]:
 
 def notice_key(context: Context, state: str) -> str:
     """A key that changes when the notice changes."""
-    reason = context.rig.status.reason if context.rig.status else ""
-    return hashlib.sha256(f"{state} {reason}".encode()).hexdigest()[:12]
+    told = f"{status.latch} {status.reason}" if (status := context.rig.status) else ""
+    return hashlib.sha256(f"{state} {told}".encode()).hexdigest()[:12]
 
 
 def what_to_check(reason: str) -> str:

@@ -113,12 +113,20 @@ def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
     sent = seen.sent.get()
     if any_train and sent.partition(".")[0] == found["calibration_id"]:
         return
+    if sent and sent.partition(".")[0] != found["calibration_id"]:
+        raise another_calibration(found["by"])
     if sent and (sent != found["version"] or found["playing"]):
         raise another_train()
 
 
+def another_calibration(by: str) -> ApiError:
+    """409: the one that was seen has ended, and somebody has begun another one."""
+    detail = f"{by} has begun another calibration since this page was shown. Nothing was done. Look at that one first."
+    return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
+
+
 def another_train() -> ApiError:
-    """409: it is another calibration, another train was sent, or another width marked."""
+    """409: another train was sent, or another width marked."""
     detail = (
         "Another train was sent after this page was shown, or another mark was set. Nothing was done now. Look at the "
         "last train and the marks first."

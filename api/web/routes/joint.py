@@ -70,22 +70,24 @@ async def take_pose(context: Context, body: PoseIn, by: str) -> AngleStatus:
     """
     sensor(context)
 
-    def write(action: str, **detail: Any) -> Seen:
+    def write(action: str, *about: seen.About, **detail: Any) -> Seen:
         with context.store.write() as session:
-            if action == seen.POSES[0]:
-                seen.check(session, seen.poses())
+            if about:
+                seen.check(session, *about)
             now = context.clock.utc()
             audit.write(session, now, by, action, "rig", **detail)
             return seen.newest(session, local_day(now))
 
+    taken = {"angle_rad": round(body.angle_rad, 4)}
     async with context.holds.turn(LIMITS_TURN):  # no other pose comes between looking and taking it
         before = context.rig.status.angle.calibration if context.rig.status else None
         # before the rig is told: of one whose answer is lost nobody knows whether it was taken
-        place = await asyncio.to_thread(write, seen.POSES[0], angle_rad=round(body.angle_rad, 4))
+        await asyncio.to_thread(write, seen.POSES[0], seen.poses(), **taken)
         try:
             pose = AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first)
             status = await context.rig.ask_for(Status, pose)
-        except ApiError:
+        except ApiError as error:
+            place = await asyncio.to_thread(write, "pose not taken", **taken, why=error.detail)
             seen.shown.set(place)  # who is told of the refusal has seen it
             raise
         context.rig.status = status

@@ -16,15 +16,11 @@
     const button = [...part().querySelectorAll("[data-keys]")].find((box) => box.dataset.keys.split(" ").includes(event.key));
     if (!button && event.key !== "Enter") return;
     event.preventDefault(); // Enter never presses the button that has the focus by chance
-    if (!event.repeat && button && !button.disabled) button.click();
+    if (!event.repeat && button && !button.disabled) press(button);
   });
 
   document.addEventListener("submit", (event) => {
     if (part().dataset.open === undefined || !part().contains(event.target)) return;
-    if (event.submitter && ["finish", "discard"].includes(event.submitter.id) && !asking) {
-      asking = true; // once; its answer is another page, also where it is refused
-      return;
-    }
     event.preventDefault();
     if (event.submitter && !event.submitter.disabled) press(event.submitter);
   });
@@ -43,7 +39,7 @@
   async function look() {
     if (asking || part().dataset.playing === undefined || document.hidden) return;
     asking = true;
-    await show(part().dataset.at, {});
+    await show(location.pathname, {});
     asking = false;
   }
 
@@ -52,9 +48,10 @@
     const timer = setTimeout(() => ending.abort(), PATIENCE_MS);
     try {
       const answer = await fetch(address, { ...options, headers: { Accept: "text/html" }, cache: "no-store", signal: ending.signal });
-      const fresh = new DOMParser().parseFromString(await answer.text(), "text/html").getElementById("calibration");
-      if (fresh && fresh.dataset.open !== undefined) replace(fresh);
-      else location.assign(answer.redirected ? answer.url : part().dataset.at);
+      const page = new DOMParser().parseFromString(await answer.text(), "text/html"), fresh = page.getElementById("calibration");
+      if (fresh && (fresh.dataset.open !== undefined || !answer.ok)) replace(fresh);
+      else if (!fresh && answer.status === 409) refused(page);
+      else location.assign(answer.redirected ? answer.url : location.pathname);
     } catch { unanswered(); }
     clearTimeout(timer);
   }
@@ -64,6 +61,11 @@
     if (told.textContent !== fresh.dataset.told) told.textContent = fresh.dataset.told;
     const box = focused && document.getElementById(focused);
     if (box && !box.disabled && (!document.activeElement || document.activeElement === document.body)) box.focus({ preventScroll: true });
+  }
+
+  function refused(page) { // what was changed has a page of its own
+    part().replaceChildren(...page.querySelectorAll("main > section"));
+    delete part().dataset.open;
   }
 
   function unanswered() { // the next look asks again; until it is answered no button works

@@ -10,6 +10,7 @@
   const boxes = (name) => document.querySelectorAll(`[data-now="${name}"]`);
   const begun = clock();
   let known = null, asked = null, last = null, busy = false, fetching = "";
+  let shown = { latch: document.querySelector("[name=latch]")?.value, since: document.querySelector(".changed [name=latch]") ? performance.now() : -READ_MS };
 
   const say = (name, text) => { for (const box of boxes(name)) if (box.textContent !== text) box.textContent = text; };
   const figure = (value, digits) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false }).replace("-", "−");
@@ -83,22 +84,21 @@
     fetching = key;
     try {
       const answer = await get("/rig/notice?back=" + encodeURIComponent(notice.dataset.back));
-      if (answer.ok) {
-        const before = notice.querySelector("[name=latch]");
-        notice.innerHTML = await answer.text();
-        notice.dataset.key = key;
-        hold(before);
-      }
+      const fresh = await answer.text(), focused = notice.contains(document.activeElement);
+      if (answer.ok) { notice.innerHTML = fresh; notice.dataset.key = key; hold(focused); }
     } catch { /* the next answer asks again */ }
     fetching = "";
   }
 
-  function hold(before) { // another stop came under the hand that was about to re-arm: it is read first
-    const latch = notice.querySelector("[name=latch]");
-    if (!before || !latch || latch.value === before.value) return;
-    const button = latch.form.querySelector("button");
-    button.disabled = true;
-    setTimeout(() => { button.disabled = false; }, READ_MS);
+  function hold(focused) { // another stop came under the hand that was about to re-arm: it is read first
+    const fields = [...document.querySelectorAll("form [name=latch]")];
+    if (fields.length && fields[0].value !== shown.latch) shown = { latch: fields[0].value, since: shown.latch ? performance.now() : shown.since };
+    const left_ms = READ_MS - (performance.now() - shown.since);
+    if (left_ms <= 0) return;
+    for (const button of fields.map((field) => field.form.querySelector("button"))) {
+      button.disabled = true;
+      setTimeout(() => { button.disabled = false; if (focused) button.focus(); }, left_ms);
+    }
   }
 
   function look() {
@@ -110,5 +110,6 @@
   addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); else now(); }); // kept by Back: all of it is old
   document.addEventListener("visibilitychange", now);
   addEventListener("online", now);
+  hold(false); // a page that tells of another stop than the one that was to be re-armed
   now();
 }
