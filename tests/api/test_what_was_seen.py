@@ -308,6 +308,25 @@ def test_a_key_that_ends_between_its_intent_and_its_command_plays_nothing(
     assert service.rig.starts == starts and len(service.rig.withdrawn) == 1 and approved
 
 
+def test_a_key_that_is_revoked_before_its_intent_plays_nothing(
+    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was good at the door; another service revokes it while the plan is looked at."""
+    key, controller = key_of(service, client, participant)
+    context, starts = service.app.state.context, service.rig.starts
+    look = context.runner._previewed
+
+    async def meanwhile(plan: Any) -> Any:
+        await asyncio.to_thread(context.auth.revoke, key, "somebody elsewhere")
+        return await look(plan)
+
+    monkeypatch.setattr(context.runner, "_previewed", meanwhile)
+    refused = controller.post("/v1/tests", json={"participant": participant, **TRIAL})
+    assert refused.status_code == 409 and refused.json()["title"] == "The right to this test has ended"
+    assert service.rig.starts == starts and approved
+    assert client.get("/v1/tests").json()[0]["kind"] != "sequence", "no intent was written"
+
+
 @pytest.mark.parametrize("by_key", [True, False])
 def test_a_trial_ends_with_its_makers_token_and_a_programs_test_does_not(
     service: Service, client: httpx.Client, participant: str, approved: str, by_key: bool
