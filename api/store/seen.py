@@ -137,9 +137,16 @@ def at(entry: AuditEntry, day: str) -> Seen:
 
 
 def since(session: Session, seen: Seen, *about: About) -> list[AuditEntry]:
-    """The entries about something that came after what was seen, the oldest first."""
-    later = select(AuditEntry).where(AuditEntry.seq > seen.entry, or_(*about))
+    """The entries about something that came after what was seen, the oldest first; all, if it is not of this trail."""
+    entry = seen.entry if known(session, seen) else 0
+    later = select(AuditEntry).where(AuditEntry.seq > entry, or_(*about))
     return list(session.scalars(later.order_by(AuditEntry.seq)))
+
+
+def known(session: Session, seen: Seen) -> bool:
+    """Whether it is a place in this trail."""
+    place = select(AuditEntry.seq).where(AuditEntry.seq == seen.entry, AuditEntry.hash.startswith(seen.mark))
+    return seen.entry == 0 or session.scalar(place) is not None
 
 
 def check(session: Session, *about: About) -> None:
@@ -154,10 +161,7 @@ def check(session: Session, *about: About) -> None:
     if seen is None:
         return
     refuse_another_day(seen)
-    known = seen.entry == 0 or session.scalar(
-        select(AuditEntry.seq).where(AuditEntry.seq == seen.entry, AuditEntry.hash.startswith(seen.mark))
-    )
-    if not known:
+    if not known(session, seen):
         raise another_trail(seen)
     if changed := since(session, seen, *about):
         raise ChangedError([change(session, seen, entry) for entry in changed[-MOST_TOLD:]], seen)

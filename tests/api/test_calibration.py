@@ -162,14 +162,17 @@ def test_what_changes_no_limit_leaves_the_calibration_open(
     assert up(client).status_code == 202
 
 
+@pytest.mark.parametrize("end", ["", "-999999", "-999999-00000000", "-1-00000000", "-1x"])
 def test_one_that_the_service_did_not_begin_is_discarded_alone(
-    client: httpx.Client, service: Service, participant: str
+    client: httpx.Client, service: Service, participant: str, end: str
 ) -> None:
     """The version is part of the id that the rig tells, so it outlives this service; no version, no train."""
     client.post(WHERE)
     known = service.rig.calibration
     assert known is not None
-    service.rig.calibration = known.model_copy(update={"calibration_id": known.calibration_id.rpartition("-")[0]})
+    service.rig.calibration = known.model_copy(
+        update={"calibration_id": "-".join(known.calibration_id.split("-")[:2]) + end}
+    )
     assert problem(up(client), 409) and problem(client.post(f"{WHERE}/finish"), 409)
     assert client.post(f"{WHERE}/finish", json={"discard": True}).status_code == 200
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import secrets
 import zlib
 from typing import Any
@@ -63,7 +64,7 @@ def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any]) ->
         seen.check(session, seen.participant(code))
         begun, now = seen.newest(session, ""), context.clock.utc()
         stamp = now[:19].replace("-", "").replace(":", "")
-        identity = f"C{stamp}-{secrets.token_hex(3)}-{begun.entry}"
+        identity = f"C{stamp}-{secrets.token_hex(3)}-{begun.entry}-{begun.mark}"
         audit.write(session, now, by, "begin calibration", code, calibration=identity, **asked)
     return identity
 
@@ -207,9 +208,9 @@ def outdated(context: Context, code: str, found: CalibrationStatus) -> str:
 
 def _changed_since(session: Session, code: str, calibration_id: str) -> list[AuditEntry]:
     """What was changed of a participant since a calibration began."""
-    begun = calibration_id.rpartition("-")[2]
-    entry = int(begun) if begun.isdecimal() else 0
-    return seen.since(session, seen.Seen(entry, "", ""), seen.participant(code))
+    place = re.fullmatch(r"C\w+-[0-9a-f]{6}-(\d{1,15})-([0-9a-f]{8})", calibration_id, re.ASCII)
+    begun = seen.Seen(int(place[1]), place[2], "") if place else seen.Seen(0, "", "")
+    return seen.since(session, begun, seen.participant(code))
 
 
 async def sound(context: Context, code: str) -> dict[str, Any]:
