@@ -350,7 +350,10 @@ def recordings_hold_every_sample(life: Life) -> Iterator[str]:
         if len(counter) and counter[0] >= 0 and not np.all(np.diff(counter) == 1):
             yield f"{path}: {np.sum(np.diff(counter) - 1)} samples are missing"
         sent_s = written_s[np.isfinite(written_s)]
-        if len(sent_s) and not (time_s[:1] - NOTICED_S <= sent_s[0] and sent_s[-1] <= time_s[-1] + BLIND_S + NOTICED_S):
+        if not len(sent_s):
+            continue
+        since_s, until_s = time_s[[0, -1]] if len(time_s) else sent_s[[0, 0]]  # a fault may come before any sample
+        if not (since_s - NOTICED_S <= sent_s[0] and sent_s[-1] <= until_s + BLIND_S + NOTICED_S):
             yield f"{path}: its pulses lie outside its samples"
 
 
@@ -442,10 +445,11 @@ def _effect_s(life: Life, rearm: Asked) -> float:
 def _forgotten(life: Life, since_s: float) -> float:
     """When a process died whose latch is not on the disk, so that the next one cannot know of it; infinite: never.
 
-    Either the disk had refused it, or was writing as the process died and nobody had been told of the stop."""
+    Either the disk had refused it, or was writing as the process died and no stop had been confirmed."""
     written = [(time_s, took) for time_s, name, took in life.disk.replaced if name == "latch.json"]
     removed = [(time_s, False) for time_s, name in life.disk.removed if name == "latch.json"]
-    told_s = min((a.replied_s for a in life.clinic.asked if a.obeyed_s == since_s and a.replied_s), default=np.inf)
+    stops = [asked for asked in life.clinic.asked if asked.kind == "stop" and asked.obeyed_s == since_s]
+    told_s = min((stop.replied_s for stop in stops if stop.replied_s), default=np.inf)
     for death_s in (death_s for death_s in life.deaths if death_s >= since_s):
         refused = [took for time_s, took in written if time_s < death_s][-1:] == [False]
         _, stays = max((found for found in written + removed if found[0] < death_s), default=(0.0, False))
