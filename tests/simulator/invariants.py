@@ -290,9 +290,11 @@ def every_pulse_has_its_intent_and_its_record(life: Life) -> Iterator[str]:
 
 def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
     """No more acknowledged pulses in the files than were felt; a pulse of which a RehaStim 2 reports that it failed is
-    acknowledged first, and ends its test or its train."""
+    acknowledged first, and ends its test or its train, if the rig does not die before it has told so."""
     acknowledged = sum(1 for test in _tests(life).values() for _, _, status in test if status == 0)
     failed = sum("stimulator:" in reason for reason in life.clinic.latched)
+    for death_s in life.deaths:
+        failed += [told.state for told in life.clinic.states if told.time_s <= death_s][-1:] == ["stopping"]
     if acknowledged > len(life.felt) + failed:
         yield f"{acknowledged} pulses acknowledged, {len(life.felt)} felt"
 
