@@ -546,8 +546,10 @@ class RigThread:
         return self
 
     def become(self, state: str, reason: str = "") -> None:
-        """Another state of the rig, from another thread."""
-        self.loop.call_soon_threadsafe(self.rig.become, state, reason)
+        """Another state of the rig, from another thread; it is that when this returns."""
+        told = threading.Event()
+        self.loop.call_soon_threadsafe(lambda: (self.rig.become(state, reason), told.set()))
+        assert told.wait(20)
 
     def __exit__(self, *_: object) -> None:
         if not self.thread.is_alive():
