@@ -137,9 +137,8 @@ def at(entry: AuditEntry, day: str) -> Seen:
 
 
 def since(session: Session, seen: Seen, *about: About) -> list[AuditEntry]:
-    """The entries about something that came after what was seen, the oldest first; all, if it is not of this trail."""
-    entry = seen.entry if known(session, seen) else 0
-    later = select(AuditEntry).where(AuditEntry.seq > entry, or_(*about))
+    """The entries about something that came after what was seen, the oldest first."""
+    later = select(AuditEntry).where(AuditEntry.seq > seen.entry, or_(*about))
     return list(session.scalars(later.order_by(AuditEntry.seq)))
 
 

@@ -65,6 +65,7 @@ class Told(NamedTuple):
     latch: str
     calibrated: str
     """The calibration whose result waits to be stored."""
+    reason: str
 
 
 @dataclass
@@ -78,8 +79,6 @@ class Clinic:
     states: list[Told] = field(default_factory=list)
     shown: dict[str, float] = field(default_factory=dict)
     """Each latch that was told, and when first."""
-    latched: list[str] = field(default_factory=list)
-    """Why it latched, each time."""
     finished: list[FinishedEvent] = field(default_factory=list)
     places: Iterator[int] = field(default_factory=count)
     loses: float = 0.0
@@ -105,12 +104,9 @@ class Clinic:
         time_s = process.computer.true_s
         if isinstance(event, StateEvent):
             state = event.status.state
-            # a new one only tells again
-            if state == "latched" and any(told.process is process for told in self.states):
-                self.latched.append(event.status.reason)
             waits = event.status.calibrated
             calibrated = "" if waits is None else waits.calibration_id
-            self.states.append(Told(time_s, process, state, event.status.latch, calibrated))
+            self.states.append(Told(time_s, process, state, event.status.latch, calibrated, event.status.reason))
             self.shown.setdefault(event.status.latch, time_s)
             self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
             if process is self.process:

@@ -290,11 +290,12 @@ def every_pulse_has_its_intent_and_its_record(life: Life) -> Iterator[str]:
 
 def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
     """No more acknowledged pulses in the files than were felt; a pulse of which a RehaStim 2 reports that it failed is
-    acknowledged first, and ends its test or its train, if the rig does not die before it has told so."""
+    acknowledged first, and ends its test or its train: it is told once, however often that is told again."""
     acknowledged = sum(1 for test in _tests(life).values() for _, _, status in test if status == 0)
-    failed = sum("stimulator:" in reason for reason in life.clinic.latched)
-    for death_s in life.deaths:
-        failed += [told.state for told in life.clinic.states if told.time_s <= death_s][-1:] == ["stopping"]
+    failed = sum(
+        told.process is before.process and "stimulator:" in told.reason and "stimulator:" not in before.reason
+        for before, told in pairwise(life.clinic.states)
+    )
     if acknowledged > len(life.felt) + failed:
         yield f"{acknowledged} pulses acknowledged, {len(life.felt)} felt"
 
@@ -424,7 +425,7 @@ def _stops(life: Life) -> Iterator[tuple[float, float]]:
         if asked.kind == "stop" and asked.obeyed_s is not None:
             yield asked.obeyed_s, asked.obeyed_s
     before: tuple[Any, str] = (None, "")
-    for time_s, process, state, latch, _ in life.clinic.states:
+    for time_s, process, state, latch, *_ in life.clinic.states:
         if state in ("latched", "uncertain") and (process, state) != before:
             yield time_s, life.clinic.shown[latch]  # perhaps while its test was being ended
         before = process, state

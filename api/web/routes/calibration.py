@@ -207,9 +207,11 @@ def outdated(context: Context, code: str, found: CalibrationStatus) -> str:
 
 
 def _changed_since(session: Session, code: str, calibration_id: str) -> list[AuditEntry]:
-    """What was changed of a participant since a calibration began."""
+    """What was changed of a participant since a calibration began; all, if it began at no place of this trail."""
     place = re.fullmatch(r"C\w+-[0-9a-f]{6}-(\d{1,15})-([0-9a-f]{8})", calibration_id, re.ASCII)
-    begun = seen.Seen(int(place[1]), place[2], "") if place else seen.Seen(0, "", "")
+    begun = seen.Seen(int(place[1]), place[2], "") if place else None
+    if begun is None or not seen.known(session, begun):
+        begun = seen.Seen(0, "", "")
     return seen.since(session, begun, seen.participant(code))
 
 
