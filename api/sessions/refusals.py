@@ -28,7 +28,7 @@ class Current:
     tokens: list[str] = field(default_factory=list)
     """Hashes of the tokens by whose right it is played."""
     until_utc: str | None = None
-    """When that right ends by itself: a controller's key ends with its day."""
+    """When that right ends by itself: a controller's key with its day, or with its maker's token."""
     since: seen.Seen | None = None
     """The trail's place at its intent, or at the last change that was found; None: not written yet."""
     over: bool = False

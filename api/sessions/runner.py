@@ -275,7 +275,7 @@ class Runner:
                 return
             current.overtaken = changed or current.overtaken
             begun = over or (current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed))
-            what = changed[-1].action if changed else "the day of its key ended"
+            what = changed[-1].action if changed else "the right to it ended"
             reason = f"{what}, after this test was asked for"
             try:
                 await self.rig.ask(WithdrawRequest(test_id=current.test_id, reason=reason, begun=begun))
@@ -284,7 +284,7 @@ class Runner:
                 await self._stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
             else:
                 current.since = seen.at(changed[-1], "") if changed else current.since
-                current.over = current.over or over
+                current.over |= over
 
     def _is_over(self, current: Current) -> bool:
         """Whether the right to it has ended by itself."""

@@ -112,11 +112,11 @@ def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
         409: it is another one, or another train was sent or is on its way.
     """
     sent = seen.sent.get()
-    if any_train and sent.partition(".")[0] == found["calibration_id"]:
+    if not sent:
         return
-    if sent and sent.partition(".")[0] != found["calibration_id"]:
+    if sent.partition(".")[0] != found["calibration_id"]:
         raise another_calibration(found["by"])
-    if sent and (sent != found["version"] or found["playing"]):
+    if not any_train and (sent != found["version"] or found["playing"]):
         raise another_train()
 
 
@@ -149,7 +149,7 @@ async def finish(context: Context, code: str, discard: bool, by: str) -> dict[st
         else:
             identity = waits.calibration_id
             if (sent := seen.sent.get()) and sent.partition(".")[0] != identity:
-                raise another_train()
+                raise another_calibration(waits.by)
         request = CalibrateFinishRequest(by=by, discard=discard, calibration_id=identity)
         result = await context.rig.ask_for(CalibrationResult, request)
         profile = await asyncio.to_thread(_store, context, code, result, by, identity)

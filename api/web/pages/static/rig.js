@@ -97,7 +97,7 @@
     if (left_ms <= 0) return;
     for (const button of fields.map((field) => field.form.querySelector("button"))) {
       button.disabled = true;
-      setTimeout(() => { button.disabled = false; if (focused) button.focus(); }, left_ms);
+      setTimeout(() => { button.disabled = false; if (focused && document.activeElement === document.body && notice.contains(button)) button.focus(); }, left_ms);
     }
   }
 
