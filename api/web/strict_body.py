@@ -80,6 +80,8 @@ def sound(body: bytes) -> Any:
         return None
     if body.startswith(BOM_UTF8):
         raise HTTPException(400, "The body begins with a byte-order mark. Send JSON (RFC 8259) in UTF-8 without one.")
+    if b"\0" in body:  # UTF-16 and UTF-32: the route's reader guesses them, so it would read more than is checked here
+        raise HTTPException(400, "The body has a zero byte. Send JSON (RFC 8259) in UTF-8.")
     try:
         return parse(body, deepest=DEEPEST, finite=False)
     except NotJson:

@@ -106,6 +106,14 @@ def test_a_byte_order_mark_is_refused(client: httpx.Client, tight: dict[str, flo
     assert limits(client) == tight
 
 
+@pytest.mark.parametrize("form", ["utf-16-le", "utf-16-be", "utf-32-le", "utf-32-be", "utf-16", "utf-32"])
+def test_what_is_not_in_utf_8_is_refused_at_the_door(client: httpx.Client, tight: dict[str, float], form: str) -> None:
+    """The route's reader would guess the form, and see a name twice that the door does not."""
+    body = '{"current_ma": 1, "current_ma": 5}'.encode(form)
+    refused = problem(client.put(f"{P}/profile", content=body, headers={"content-type": "application/json"}), 400)
+    assert "in UTF-8" in refused["detail"] and limits(client) == tight
+
+
 def test_a_typing_slip_is_seen(client: httpx.Client, tight: dict[str, float]) -> None:
     assert "current" in problem(client.put(f"{P}/profile", json={"current": 10}), 422)["detail"]
     assert limits(client) == tight
