@@ -208,6 +208,7 @@ def test_the_page_that_refuses_a_re_arm_is_read_first(tab: Any, service: Service
     soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
     tab.get_by_role("button", name="I have checked: re-arm").click()
     tab.get_by_text("This was changed since you saw it").wait_for()
+    tab.wait_for_load_state("load")  # a text may be found before the styles are here; nothing is drawn until then
     buttons = tab.locator("form:has([name=latch]) button")
     assert buttons.count() == 2
     begins = """buttons => buttons.map((button) => {  // seen as it begins: two seconds may have passed since
