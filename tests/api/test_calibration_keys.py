@@ -169,6 +169,26 @@ def test_a_service_that_does_not_answer_is_told_and_no_button_works(page: Any, s
     assert widths(service) == [10]
 
 
+def test_another_calibration_that_comes_under_the_hand_is_read_first(page: Any, service: Service) -> None:
+    press(page, "ArrowUp", 1)
+    with service.client() as http:
+        http.post("/v1/participants/K1/calibration/finish", json={"discard": True})
+        http.post("/v1/participants/K1/calibration")
+    page.evaluate("""() => { window.pressable = []; new MutationObserver(() => {
+        const box = document.getElementById("discard"), told = document.querySelector(".notice.bad, .notice.warn");
+        if (box && told) window.pressable.push([!box.disabled, performance.now()]);
+    }).observe(document.body, { childList: true, subtree: true, attributes: true }); }""")
+    page.locator("#discard").focus()
+    page.keyboard.press("Enter")
+    page.get_by_text("has begun another calibration").wait_for()
+    page.keyboard.press("Enter")
+    page.keyboard.press("ArrowUp")
+    expected(page.locator("#discard")).to_be_enabled()
+    seen = page.evaluate("window.pressable")
+    assert not seen[0][0] and seen[-1][0] and seen[-1][1] - seen[0][1] > 1900, "ms"
+    assert widths(service) == []
+
+
 def test_everything_to_press_is_on_one_screen(page: Any) -> None:
     press(page, "ArrowUp", 1)
     names = ("step-up", "step-fine", "step-repeat", "step-down", "mark-sensory", "mark-comfort", "finish", "discard")

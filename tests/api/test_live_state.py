@@ -59,7 +59,7 @@ def test_every_page_in_every_tab_follows_the_rig(tab: Any, service: Service, don
         expected(page.get_by_text("Emulated rig: no person is connected")).to_be_visible()
     row = pages[0].get_by_role("row", name="E1")
     start_button = pages[1].get_by_role("button", name="Start the pre-session test")
-    assert start_button.is_enabled()
+    expected(start_button).to_be_enabled()
     service.rig.speed = SLOW
     with service.client() as http:
         test = http.post("/v1/tests", json={"participant": "E1"}).json()["id"]
@@ -73,7 +73,7 @@ def test_every_page_in_every_tab_follows_the_rig(tab: Any, service: Service, don
     for page in pages:
         says(page, "No stimulation ready")
     row.get_by_text("ended", exact=True).wait_for()
-    assert start_button.is_enabled(), "all without loading the page again"
+    expected(start_button).to_be_enabled()  # all without loading the page again
 
 
 def test_back_to_a_page_that_was_loaded_before_the_start_shows_what_flows(tab: Any, service: Service) -> None:
@@ -206,19 +206,65 @@ def test_the_page_that_refuses_a_re_arm_is_read_first(tab: Any, service: Service
     tab.route("**/rig/*", lambda route: route.abort())  # it does not hear of the second one
     service.rig_thread.become("latched", "two")
     soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
+    tab.route("**/rig.js*", lambda route: route.abort())  # the style alone
     tab.get_by_role("button", name="I have checked: re-arm").click()
     tab.get_by_text("This was changed since you saw it").wait_for()
     tab.wait_for_load_state("load")  # a text may be found before the styles are here; nothing is drawn until then
     buttons = tab.locator("form:has([name=latch]) button")
     assert buttons.count() == 2
-    begins = """buttons => buttons.map((button) => {  // seen as it begins: two seconds may have passed since
+    begins = """buttons => buttons.map((button) => {  // begun anew, because its two seconds may be over
         button.style.animation = "none"; button.offsetWidth; button.style.animation = "";
         const style = getComputedStyle(button); return [style.visibility, style.animationDuration]; })"""
     assert buttons.evaluate_all(begins) == [["hidden", "2s"]] * 2
     expected(buttons.nth(1)).to_be_visible()
     buttons.nth(1).click()
+    tab.unroute("**/rig.js*")
     tab.unroute("**/rig/*")
     soon(lambda: service.rig.state == "ready")
+
+
+def test_a_third_stop_on_the_page_that_refuses_is_read_first_too(tab: Any, service: Service) -> None:
+    button = tab.locator("#rig-notice [name=latch] ~ button")
+    for stop in ("one", "two"):
+        if stop == "two":
+            tab.route("**/rig/*", lambda route: route.abort())
+        service.rig_thread.become("latched", stop)
+        soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
+        if stop == "one":
+            button.wait_for()
+    button.click()
+    tab.get_by_text("This was changed since you saw it").wait_for()
+    tab.wait_for_load_state("load")  # its scripts have begun
+    expected(button).to_be_enabled()
+    tab.unroute("**/rig/*")
+    for stop, moves in (("three", False), ("four", True)):
+        button.focus()
+        service.rig_thread.become("latched", stop)
+        expected(tab.locator("#rig-notice [name=latch]")).to_have_value(service.rig.latch)
+        if moves:
+            tab.locator("#stop").focus()
+        expected(button).to_be_enabled()
+        expected(tab.locator("#stop") if moves else button).to_be_focused()
+    service.rig_thread.become("ready")
+
+
+def test_the_page_that_refuses_a_re_arm_is_read_first_also_without_its_style(tab: Any, service: Service) -> None:
+    tab.add_init_script(
+        "{ const wait = setTimeout; window.setTimeout = (call, ms) => wait(call, ms > 999 ? 1e8 : ms); }"
+    )
+    tab.goto(service.url + "/participants/E1")
+    service.rig_thread.become("latched", "one")
+    tab.get_by_role("button", name="I have checked: re-arm").wait_for()
+    tab.route("**/rig/*", lambda route: route.abort())
+    tab.route("**/page.css*", lambda route: route.abort())
+    service.rig_thread.become("latched", "two")
+    soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
+    tab.get_by_role("button", name="I have checked: re-arm").click()
+    tab.get_by_text("This was changed since you saw it").wait_for()
+    tab.wait_for_load_state("load")
+    for number in (0, 1):
+        expected(tab.locator("form:has([name=latch]) button").nth(number)).to_be_disabled()
+    service.rig_thread.become("ready")
 
 
 def test_without_scripts_the_state_carries_its_time(browser: Any, service: Service) -> None:

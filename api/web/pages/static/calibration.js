@@ -1,10 +1,10 @@
 // The calibration by keys and without loading the page anew: one press, one train; nothing is kept for later.
 "use strict";
 {
-  const PATIENCE_MS = 15000, LOOK_MS = 250;
+  const PATIENCE_MS = 15000, LOOK_MS = 250, READ_MS = 2000;
   const part = () => document.getElementById("calibration");
   const told = document.getElementById("told");
-  let asking = false, focused = "";
+  let asking = false, focused = "", refused_ms = -READ_MS;
 
   document.addEventListener("focusin", (event) => { if (part().contains(event.target)) focused = event.target.id; });
 
@@ -49,6 +49,7 @@
     try {
       const answer = await fetch(address, { ...options, headers: { Accept: "text/html" }, cache: "no-store", signal: ending.signal });
       const page = new DOMParser().parseFromString(await answer.text(), "text/html"), fresh = page.getElementById("calibration");
+      if (answer.status === 409) refused_ms = performance.now();
       if (fresh && (fresh.dataset.open !== undefined || !answer.ok)) replace(fresh);
       else if (!fresh && answer.status === 409) refused(page);
       else location.assign(answer.redirected ? answer.url : location.pathname);
@@ -58,9 +59,19 @@
 
   function replace(fresh) {
     part().replaceWith(fresh);
+    hold();
     if (told.textContent !== fresh.dataset.told) told.textContent = fresh.dataset.told;
     const box = focused && document.getElementById(focused);
     if (box && !box.disabled && (!document.activeElement || document.activeElement === document.body)) box.focus({ preventScroll: true });
+  }
+
+  function hold() { // what came under the hand instead is read before it is pressed
+    const left_ms = READ_MS - (performance.now() - refused_ms);
+    if (left_ms <= 0) return;
+    for (const box of part().querySelectorAll("button:not([disabled])")) {
+      box.disabled = true;
+      setTimeout(() => { box.disabled = asking || part().dataset.playing !== undefined; }, left_ms);
+    }
   }
 
   function refused(page) { // what was changed has a page of its own

@@ -10,7 +10,8 @@
   const boxes = (name) => document.querySelectorAll(`[data-now="${name}"]`);
   const begun = clock();
   let known = null, asked = null, last = null, busy = false, fetching = "";
-  let shown = { latch: document.querySelector("[name=latch]")?.value, since: -READ_MS };
+  const unread = document.querySelector(".read-first");
+  let shown = { latch: document.querySelector("[name=latch]")?.value, since: unread ? performance.now() : -READ_MS };
 
   const say = (name, text) => { for (const box of boxes(name)) if (box.textContent !== text) box.textContent = text; };
   const figure = (value, digits) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false }).replace("-", "−");
@@ -110,5 +111,7 @@
   addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); else now(); }); // kept by Back: all of it is old
   document.addEventListener("visibilitychange", now);
   addEventListener("online", now);
+  hold(false); // another stop than the one that was to be re-armed: page.css has hidden the buttons so far
+  unread?.classList.remove("read-first");
   now();
 }
