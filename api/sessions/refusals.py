@@ -70,7 +70,9 @@ def refuse_archived(participant: Participant) -> None:
 
 def right_ended() -> ApiError:
     """409: by whose right it was asked for may do so no more."""
-    detail = "A controller's key ends with its day, and a right when it is revoked. Nothing was sent."
+    detail = (
+        "A controller's key ends with its day or its maker's token, and a right when it is revoked. Nothing was sent."
+    )
     return ApiError(409, "changed-meanwhile", "The right to this test has ended", detail)
 
 
@@ -82,8 +84,9 @@ def not_what_was_seen() -> ApiError:
 
 def busy(current: Current) -> ApiError:
     """409, naming the holder."""
+    who = current.by
     detail = (
-        f"{current.test_id} for participant {current.participant}, started by {current.by}, uses the rig. "
+        f"{current.test_id} for participant {current.participant}, started by {who}, uses the rig. "
         "Wait for its end, or stop it."
     )
     holder = {"test_id": current.test_id, "participant": current.participant, "by": current.by}

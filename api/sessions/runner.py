@@ -269,13 +269,13 @@ class Runner:
         if current is None:
             return
         async with current.looking:
-            changed = await asyncio.to_thread(self._overtaking, current)
-            over = self._is_over(current) and not current.over
+            over = self._is_over(current) and not current.over  # known here, also where the store cannot be read
+            changed = [] if over else await asyncio.to_thread(self._overtaking, current)
             if not changed and not over:
                 return
             current.overtaken = changed or current.overtaken
             begun = over or (current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed))
-            what = changed[-1].action if changed else "the right to it ended"
+            what = changed[-1].action if changed else "its right ended"
             reason = f"{what}, after this test was asked for"
             try:
                 await self.rig.ask(WithdrawRequest(test_id=current.test_id, reason=reason, begun=begun))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, FiniteFloat, StringConstraints
+from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints
 
+from api.clock import unix_of, utc_label
 from api.models.tracking import USUAL_PERCENT, Limits
 from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, MuscleIn, PersonName
 
@@ -62,4 +63,11 @@ class TokenIn(Body):
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
     scopes: Annotated[list[str], Field(min_length=1)]
-    expires_utc: Annotated[str, StringConstraints(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?Z$")] | None = None
+    expires_utc: (
+        Annotated[
+            str,
+            StringConstraints(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]+)?Z$"),
+            AfterValidator(lambda label: utc_label(unix_of(label))),  # as our clock writes them: they are compared
+        ]
+        | None
+    ) = None

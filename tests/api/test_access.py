@@ -46,6 +46,21 @@ def test_wrong_revoked_and_expired_tokens_are_refused(client: httpx.Client, serv
     assert service.client(late).post("/v1/stop").status_code == 200, "it ran out in a test: it still stops"
 
 
+@pytest.mark.parametrize(
+    ("end", "kept"),
+    [
+        ("2999-01-01T00:00:05Z", "2999-01-01T00:00:05.000Z"),
+        ("2026-99-99T00:00:00Z", None),
+        ("٢٠٢٠-٠١-٠١T00:00:00Z", None),
+    ],
+)
+def test_the_end_of_a_token_is_a_time_and_is_kept_as_the_clock_writes_it(
+    client: httpx.Client, end: str, kept: str | None
+) -> None:
+    answer = client.post("/v1/tokens", json={"name": "timed", "scopes": ["run-test"], "expires_utc": end})
+    assert answer.json().get("expires_utc") == kept and answer.status_code == (201 if kept else 422)
+
+
 def test_database_holds_no_token(service: Service) -> None:
     token = service.token("someone", "read-live")
     with signed_in(service, token):

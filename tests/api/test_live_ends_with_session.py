@@ -72,6 +72,13 @@ def goes_on(socket: ClientConnection) -> None:
         assert json.loads(socket.recv(20))["type"] in ("test", "live", "idle", "state")
 
 
+def test_it_goes_on_whatever_is_sent_to_it(service: Service, test_id: str) -> None:
+    with watching(service, test_id, {"Authorization": f"Bearer {TOKEN}"}) as socket:
+        socket.send(b"\0")
+        socket.send("stop")
+        goes_on(socket)
+
+
 def sign_out(http: httpx.Client, _service: Service) -> None:
     assert http.delete("/v1/sessions/current").status_code == 204
 

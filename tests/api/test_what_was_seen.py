@@ -353,6 +353,21 @@ def test_a_trial_ends_with_its_makers_token_and_a_programs_test_does_not(
     assert service.rig.starts == starts + 1 and approved
 
 
+def test_a_trial_ends_with_its_right_also_while_the_store_cannot_be_read(
+    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    playing(service, client, participant)
+    runner = service.app.state.context.runner
+
+    def gone(_: object) -> list[Any]:
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(runner, "_overtaking", gone)
+    runner.current.until_utc = "2026-01-01T00:00:00.000Z"
+    soon(lambda: service.rig.withdrawn)
+    assert [request.begun for request in service.rig.withdrawn] == [True] and approved
+
+
 def test_a_token_that_came_back_starts_tests(service: Service, client: httpx.Client, participant: str) -> None:
     """With the same text: its revocation stays in the trail, newer than what was read of the participant."""
     text = service.token("lab", "run-test", "read-live")
