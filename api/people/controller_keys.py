@@ -16,13 +16,12 @@ SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
 """Of these only what `api.web.key_guard` opens."""
 
 
-def refuse_without(who: Principal) -> None:
+def refuse_without(maker: Principal) -> None:
     """403 to whoever lacks a scope that a key holds: it may do nothing that its maker may not."""
-    lacking = [str(scope) for scope in SCOPES if not who.may(scope)]
+    lacking = [str(scope) for scope in SCOPES if not maker.may(scope)]
     if lacking:
-        detail = (
-            f"A key holds {', '.join(SCOPES)}. Who makes one holds them all; {who.name} lacks {', '.join(lacking)}."
-        )
+        who = maker.name
+        detail = f"A key holds {', '.join(SCOPES)}. Who makes one holds them all; {who} lacks {', '.join(lacking)}."
         raise ApiError(403, "forbidden", "Not allowed", detail)
 
 

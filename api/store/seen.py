@@ -29,6 +29,8 @@ ACCOUNTS = ("add user", "change password", "revoke token")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
 RIGHTS = (*DECISIONS, "revoke token", "set muscle", "archive")
 """Entries with which a right ends that a controller plays by."""
+ENTRY, MARK = r"(\d{1,9})", r"([0-9a-f]{8})"
+"""A place as it is written; a number that a database has."""
 MOST_TOLD = 20
 """Changes that are told, the newest."""
 
@@ -66,7 +68,7 @@ def mark_of(document: str) -> str:
 
 def read(text: str, *marks: str) -> Seen | None:
     """What was sent back, with one of these documents' marks, or the empty one of a page; None where it is none."""
-    found = re.fullmatch(r"(\d{1,15})\.([0-9a-f]{8})\.(\d{4}-\d\d-\d\d)(?:\.([0-9a-f]{8}))?", text, re.ASCII)
+    found = re.fullmatch(rf"{ENTRY}\.{MARK}\.(\d{{4}}-\d\d-\d\d)(?:\.{MARK})?", text, re.ASCII)
     if found is None or (found[4] or "") not in marks:
         return None
     return Seen(int(found[1]), found[2], found[3])

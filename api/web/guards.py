@@ -36,7 +36,8 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     async def check(request: Request, _token: Token, _session: Session) -> Principal:
         principal = await identified(request)
         if not principal.may(scope):
-            detail = f"This needs the scope {scope}; {principal.name} holds {', '.join(sorted(principal.scopes))}."
+            who = principal.name
+            detail = f"This needs the scope {scope}; {who} holds {', '.join(sorted(principal.scopes))}."
             raise ApiError(403, "forbidden", "Not allowed", detail)
         await check_csrf(request, principal)
         await decisions.take(request)

@@ -7,8 +7,8 @@ other codecs make of it is no text that can be kept.
 from __future__ import annotations
 
 import asyncio
+import json
 import re
-from codecs import BOM_UTF8
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -78,10 +78,9 @@ def sound(body: bytes) -> Any:
     """
     if not body.strip():
         return None
-    if body.startswith(BOM_UTF8):
-        raise HTTPException(400, "The body begins with a byte-order mark. Send JSON (RFC 8259) in UTF-8 without one.")
-    if b"\0" in body:  # UTF-16 and UTF-32: the route's reader guesses them, so it would read more than is checked here
-        raise HTTPException(400, "The body has a zero byte. Send JSON (RFC 8259) in UTF-8.")
+    if json.detect_encoding(body) != "utf-8":  # as the route's reader guesses it: that would decode it, unchecked
+        detail = "The body is in UTF-16 or UTF-32, or begins with a byte-order mark. Send JSON (RFC 8259) in UTF-8."
+        raise HTTPException(400, detail)
     try:
         return parse(body, deepest=DEEPEST, finite=False)
     except NotJson:

@@ -162,7 +162,7 @@ def test_what_changes_no_limit_leaves_the_calibration_open(
     assert up(client).status_code == 202
 
 
-@pytest.mark.parametrize("end", ["", "-999999", "-999999-00000000", "-1-00000000", "-1x"])
+@pytest.mark.parametrize("end", ["", "-999999", "-999999-00000000", "-{}-00000000", "-1x"])
 def test_one_that_the_service_did_not_begin_is_discarded_alone(
     client: httpx.Client, service: Service, participant: str, end: str
 ) -> None:
@@ -170,9 +170,9 @@ def test_one_that_the_service_did_not_begin_is_discarded_alone(
     client.post(WHERE)
     known = service.rig.calibration
     assert known is not None
-    service.rig.calibration = known.model_copy(
-        update={"calibration_id": "-".join(known.calibration_id.split("-")[:2]) + end}
-    )
+    stamp, drawn, entry, _ = known.calibration_id.split("-")
+    other = f"{stamp}-{drawn}{end.format(entry)}"
+    service.rig.calibration = known.model_copy(update={"calibration_id": other})
     assert problem(up(client), 409) and problem(client.post(f"{WHERE}/finish"), 409)
     assert client.post(f"{WHERE}/finish", json={"discard": True}).status_code == 200
 

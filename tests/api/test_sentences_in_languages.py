@@ -11,7 +11,7 @@ import pytest
 
 from api import language
 from api.language import catalogues, extract
-from api.language.translated import of
+from api.language.translated import PERSON, of
 
 LANGUAGES = [code for code in language.CODES if code != language.DEFAULT]
 PLACE = re.compile(r"%\((\w+)\)s")
@@ -25,7 +25,10 @@ def test_each_message_is_recognised_as_itself(code: str) -> None:
             shape = PLACE.sub("%", str(entry.id))
             if isinstance(entry.id, str) and entry.id and entry.string and shape not in seen:
                 seen.add(shape)
-                values = {name: f"Zq{k}" if k % 2 else f"{k}7" for k, name in enumerate(PLACE.findall(entry.id))}
+                values = {
+                    name: "Ben Carter" if name == PERSON else f"Zq{k}" if k % 2 else f"{k}7"
+                    for k, name in enumerate(PLACE.findall(entry.id))
+                }
                 given, expected = (text % values if values else text for text in (entry.id, str(entry.string)))
                 wrong += [(given, of(code, given))] if of(code, given) != expected else []
     assert wrong == []

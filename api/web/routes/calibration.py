@@ -18,7 +18,6 @@ from api.sessions.refusals import refuse_archived
 from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from api.store import audit, seen
 from api.store.holds import LIMITS_TURN
-from api.store.tables import AuditEntry
 from api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from api.web.responses.base import answers
 from api.web.responses.participants import CalibratedOut, CalibrationOut
@@ -120,9 +119,9 @@ def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
         raise another_train()
 
 
-def another_calibration(by: str) -> ApiError:
+def another_calibration(who: str) -> ApiError:
     """409: the one that was seen has ended, and somebody has begun another one."""
-    detail = f"{by} has begun another calibration since this page was shown. Nothing was done. Look at that one first."
+    detail = f"{who} has begun another calibration since this page was shown. Nothing was done. Look at that one first."
     return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
 
 
@@ -195,10 +194,13 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
 
 def outdated(context: Context, code: str, found: CalibrationStatus) -> str:
     """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
-    row = participants.find(context, code)
     with context.store.read() as session:
-        if not _changed_since(session, code, found.calibration_id):
+        begun = _begun(session, found.calibration_id)
+        if begun is None:
+            return "It began on other data than this service has. It sends no further train. Discard it and begin anew."
+        if not seen.since(session, begun, seen.participant(code)):
             return ""
+    row = participants.find(context, code)
     now = ", ".join(f"{row.profile[name]:g} {limit.unit}" for name, limit in profiles.LIMITS.items())
     return (
         f"{row.code} now has other limits ({now}) than when this calibration was begun with {found.current_ma:g} mA. "
@@ -206,13 +208,11 @@ def outdated(context: Context, code: str, found: CalibrationStatus) -> str:
     )
 
 
-def _changed_since(session: Session, code: str, calibration_id: str) -> list[AuditEntry]:
-    """What was changed of a participant since a calibration began; all, if it began at no place of this trail."""
-    place = re.fullmatch(r"C\w+-[0-9a-f]{6}-(\d{1,15})-([0-9a-f]{8})", calibration_id, re.ASCII)
+def _begun(session: Session, calibration_id: str) -> seen.Seen | None:
+    """Where in this trail a calibration began; None: nowhere."""
+    place = re.fullmatch(rf"C\w+-[0-9a-f]{{6}}-{seen.ENTRY}-{seen.MARK}", calibration_id, re.ASCII)
     begun = seen.Seen(int(place[1]), place[2], "") if place else None
-    if begun is None or not seen.known(session, begun):
-        begun = seen.Seen(0, "", "")
-    return seen.since(session, begun, seen.participant(code))
+    return begun if begun is not None and seen.known(session, begun) else None
 
 
 async def sound(context: Context, code: str) -> dict[str, Any]:
@@ -225,7 +225,7 @@ async def sound(context: Context, code: str) -> dict[str, Any]:
     """
     found = await standing(context, code)
     if found["outdated"]:
-        title = "The limits were changed since this calibration was begun"
+        title = "This calibration goes no further"
         raise ApiError(409, "changed-meanwhile", title, found["outdated"])
     return found
 
@@ -245,7 +245,8 @@ def _store(
     with context.store.write() as session:
         if found is not None:
             row = participants.within(session, code)
-            changed = _changed_since(session, code, identity)
+            begun = _begun(session, identity) or seen.Seen(0, "", "")
+            changed = seen.since(session, begun, seen.participant(code))
             if any(entry.detail.get("calibration") == identity for entry in changed):
                 return dict(row.profile)
             if changed:
