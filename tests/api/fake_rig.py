@@ -547,9 +547,11 @@ class RigThread:
 
     def become(self, state: str, reason: str = "") -> None:
         """Another state of the rig, from another thread; it is that when this returns."""
-        told = threading.Event()
-        self.loop.call_soon_threadsafe(lambda: (self.rig.become(state, reason), told.set()))
-        assert told.wait(20)
+
+        async def become() -> None:
+            self.rig.become(state, reason)
+
+        asyncio.run_coroutine_threadsafe(become(), self.loop).result(20)
 
     def __exit__(self, *_: object) -> None:
         if not self.thread.is_alive():

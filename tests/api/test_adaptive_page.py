@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import open_tab, participant
+from tests.api.browser import expected, open_tab, participant
 from tests.api.conftest import Service, own_service, wait_done
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_axe import examined
@@ -95,7 +95,8 @@ def test_numbers_that_are_out_of_date_look_so_and_can_be_read(browser: Any, serv
         begun(page, "0,2")
         page.locator("#known-words", has_text="known within 8.0 %").wait_for()
         numbers = ("left", "current", "dose-used", "known-words")
-        assert {page.evaluate(LOOKS, name)[0] for name in numbers} == {"normal"}
+        for name in numbers:
+            expected(page.locator(f"#{name}")).to_have_css("font-style", "normal")
         cut.append(True)
         page.locator("#live.is-stale").wait_for()
         assert [page.evaluate(LOOKS, name) for name in numbers] == [["italic", "400"]] * 4

@@ -43,7 +43,7 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     assert float(tab.locator("#progress").get_attribute("value") or 0) >= 0
     left = int(tab.locator("#left").inner_text().split()[0])
     assert 0 < left < 25
-    assert not tab.locator("#stale").is_visible()
+    expected(tab.locator("#stale")).to_be_hidden()
     service.rig.speed = 60.0
     tab.wait_for_url("**/models/M-*", timeout=60_000)
     tab.locator(".figure-box .main-svg").first.wait_for()

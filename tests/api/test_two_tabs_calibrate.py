@@ -61,7 +61,6 @@ def test_two_presses_at_once_send_exactly_one_train(service: Service, tab: Any, 
 def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(service: Service, tab: Any) -> None:
     browser, fields = tab
     service.rig_thread.become("running")
-    soon(lambda: service.rig.state == "running", 20)
     for path in ("step/repeat", "mark/sensory", "finish"):
         answer = browser.post(f"{PAGE}/{path}", data=fields)
         assert answer.status_code == 409 and "Another train was sent" in answer.text, path
