@@ -82,7 +82,7 @@ $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench
 
 words: setup ## renew the catalogues of the pages' languages; LANGUAGE=fr begins one (docs/languages.md)
-	@$(BIN)/python -m api.language.extract $(LANGUAGE)
+	@$(BIN)/python -m stimrig.api.language.extract $(LANGUAGE)
 
 lock: ## resolve the locked lists anew (needs uv; for maintainers)
 	@bash deploy/lock.sh

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from api.language import _, lazy
+from stimrig.api.language import _, lazy
 
 SEGMENTS: dict[str, Any] = {
     "rest": lazy("Rest"),

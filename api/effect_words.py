@@ -1,6 +1,6 @@
 """Titles of the library's effects and names of their parameters, in the page's language; ids are for programs.
 
-The same titles stand in `identify.effects`, which the web process does not load (a test compares them).
+The same titles stand in `stimrig.identify.effects`, which the web process does not load (a test compares them).
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from api import language
-from api.language import lazy
+from stimrig.api import language
+from stimrig.api.language import lazy
 
 EFFECTS: dict[str, Any] = {
     "activation_dependent_speed": lazy("Speed depends on activation"),

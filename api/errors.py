@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rig.messages import Problem as RigProblem
+    from stimrig.rig.messages import Problem as RigProblem
 
 RIG_STATUS = {
     "refused": 422,

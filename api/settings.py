@@ -13,7 +13,7 @@ from zoneinfo import available_timezones
 from pydantic import Field, SecretStr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from api.errors import SettingsError
+from stimrig.api.errors import SettingsError
 
 SECRET = ("_KEY", "_TOKEN")
 """How the names of settings end whose values are not shown."""

@@ -20,8 +20,8 @@ def held_by(model: Any | None, record: Any) -> list[str]:
     IdentifyError
         The model holds for another pulse rate, or effects do not stand on it.
     """
-    from identify.diagnosis import structure_of
-    from identify.simulation.predict import refuse_rate
+    from stimrig.identify.diagnosis import structure_of
+    from stimrig.identify.simulation.predict import refuse_rate
 
     if model is not None:
         refuse_rate(model, record)

@@ -23,20 +23,20 @@ from typing import Any
 
 import numpy as np
 
-import identify
 from bench.particles import HOLD, Particles
-from hardware_sim.patients.hidden.draw import draw_scenario, rng_of, still_effect_ids
-from identify.diagnosis import candidates as workers
-from identify.diagnosis import diagnose
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.estimation.prepare import prepare
-from identify.experiments.adaptive import Target
-from identify.experiments.designs import pieces
-from identify.experiments.knowledge import Knowledge, step_responses, whole_band
-from identify.model import Model
-from identify.records.record import Record
-from rig import protocols
-from rig.sequences import build
+from stimrig import identify
+from stimrig.hardware_sim.patients.hidden.draw import draw_scenario, rng_of, still_effect_ids
+from stimrig.identify.diagnosis import candidates as workers
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.estimation.prepare import prepare
+from stimrig.identify.experiments.adaptive import Target
+from stimrig.identify.experiments.designs import pieces
+from stimrig.identify.experiments.knowledge import Knowledge, step_responses, whole_band
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.rig import protocols
+from stimrig.rig.sequences import build
 from tests.harness.adaptive import Hidden, Muscle, Played, papers, play, recorded, shaped, sigmoid
 
 RATE_HZ, NOISE_NM = 400.0, 0.05

@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from api.cli.launcher import Services
-from api.client.documents import SessionTest
-from api.client.errors import NotCompleted
-from api.client.rest import Client
-from api.settings import Settings
 from bench.adaptive import unseen_percent
-from identify.model import Model
-from identify.records.recording import read_recording
+from stimrig.api.cli.launcher import Services
+from stimrig.api.client.documents import SessionTest
+from stimrig.api.client.errors import NotCompleted
+from stimrig.api.client.rest import Client
+from stimrig.api.settings import Settings
+from stimrig.identify.model import Model
+from stimrig.identify.records.recording import read_recording
 from tests.harness.adaptive import Muscle, sigmoid, sigmoid_of
 
 TOKEN = "token-of-the-adaptive-bench"

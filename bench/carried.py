@@ -20,10 +20,10 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import identify
-from hardware_sim.patients.hidden.draw import Scenario
-from identify.caution import caution
-from identify.diagnosis import candidates
+from stimrig import identify
+from stimrig.hardware_sim.patients.hidden.draw import Scenario
+from stimrig.identify.caution import caution
+from stimrig.identify.diagnosis import candidates
 from tests.harness.carried_sessions import SESSIONS, muscle, session
 
 

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from hardware_sim.hidden_records import SLOWEST_SIMULATION_HZ
-from hardware_sim.patients.hidden.draw import rng_of
+from stimrig import identify
+from stimrig.hardware_sim.hidden_records import SLOWEST_SIMULATION_HZ
+from stimrig.hardware_sim.patients.hidden.draw import rng_of
 from tests.harness.carried_sessions import SESSIONS, as_record, fine_session, muscle, session
 
 REFERENCE_EVERY = 8

@@ -30,7 +30,7 @@ import numpy as np
 from bench.centre_load_parts import PATIENCE_S, Kept, Lines, Seen, all_over, free_port, look
 from bench.stamp import RESULTS, written_by
 
-CENTRE = [sys.executable, "-m", "api.centre.server"]
+CENTRE = [sys.executable, "-m", "stimrig.api.centre.server"]
 """The centre's process; its settings are STIMRIG_CENTRE_…"""
 TOKEN = "administrator-of-the-load"
 UPLOADERS = 3
@@ -77,7 +77,7 @@ def rigs_of(count: int, folder: Path, keys: dict[str, str]) -> list[Rig]:
         }  # fmt: skip
         url = f"http://127.0.0.1:{port}"
         service = Kept([sys.executable, "-m", "bench.stub_service"], environment, place / "api.log", f"{url}/health")
-        pusher = Kept([sys.executable, "-m", "api.outbox"], environment, place / "outbox.log")
+        pusher = Kept([sys.executable, "-m", "stimrig.api.outbox"], environment, place / "outbox.log")
         made.append(Rig(name, place, url, service, pusher, line_port))
     return made
 
@@ -165,7 +165,7 @@ def play(folder: Path, options: argparse.Namespace, ends: ExitStack) -> tuple[Se
     port = free_port()
     database = f"sqlite:///{folder}/centre/centre.db"
     if options.postgres:
-        from api.centre.postgres import Cluster
+        from stimrig.api.centre.postgres import Cluster
 
         folder.chmod(0o755)  # PostgreSQL's own user has to reach its part of it
         (folder / "postgres").mkdir()

@@ -23,12 +23,12 @@ from typing import Any
 import psycopg
 from sqlalchemy import event, text
 
-from api.centre import directory, warnings
-from api.centre.directory import Cohort, Search
-from api.centre.pages import participants_view
-from api.charts import trend_charts
-from api.store import Store
 from bench.stamp import RESULTS, written_by
+from stimrig.api.centre import directory, warnings
+from stimrig.api.centre.directory import Cohort, Search
+from stimrig.api.centre.pages import participants_view
+from stimrig.api.charts import trend_charts
+from stimrig.api.store import Store
 from tests.harness.postgres import running
 
 RIGS, PARTICIPANTS, DAYS = 20, 2000, 5 * 365

@@ -22,7 +22,7 @@ from typing import Any
 import httpx
 from playwright.sync_api import Locator, Page, sync_playwright
 
-from api.client.connection import SendsVersions
+from stimrig.api.client.connection import SendsVersions
 from tests.api.browser import ARGUMENTS, CHROMIUM, PASSWORD
 
 TOKEN = "administrator-token-of-the-bench"
@@ -156,7 +156,18 @@ def places(page: Page, size: tuple[int, int]) -> dict[str, float]:
 def served(emulate: str = "", tree: str = "") -> Iterator[str]:
     """A service of its own, with its emulated rig; its address. `tree`: of the checkout there."""
     with tempfile.TemporaryDirectory(prefix="stimrig-day-") as folder:
-        command = [sys.executable, "-m", "api.cli", "serve", "--port", "0", "--data", folder, "--emulate", emulate]
+        command = [
+            sys.executable,
+            "-m",
+            "stimrig.api.cli",
+            "serve",
+            "--port",
+            "0",
+            "--data",
+            folder,
+            "--emulate",
+            emulate,
+        ]
         environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": tree}
         at = {"cwd": tree or None, "env": environment}
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **at) as process:

@@ -26,15 +26,15 @@ from typing import Any
 import psutil
 import pyarrow.parquet as pq
 
-from api.cohort import child
-from api.cohort.cluster import Workers, connected
-from api.cohort.parts import Results
-from api.cohort.run import Run
-from api.cohort.sources.addresses import sources_of
-from api.cohort.tasks import Task, checked
-from api.cohort.worker import Bounds
-from api.version import software_version
 from bench.stamp import written_by
+from stimrig.api.cohort import child
+from stimrig.api.cohort.cluster import Workers, connected
+from stimrig.api.cohort.parts import Results
+from stimrig.api.cohort.run import Run
+from stimrig.api.cohort.sources.addresses import sources_of
+from stimrig.api.cohort.tasks import Task, checked
+from stimrig.api.cohort.worker import Bounds
+from stimrig.api.version import software_version
 from tests.harness.cohort_records import Session, write
 
 MUSCLES = 100

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
-import identify
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.records.record import Record
 from tests.harness.muscle import second_order, sigmoid
 
 PULSE_RATE_HZ = 40.0

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from identify.diagnosis import candidates as workers
-from identify.diagnosis import diagnose
-from identify.diagnosis.thresholds import STRUCTURE
-from identify.effects import registry
-from identify.records.join import join
-from identify.records.record import Record
+from stimrig.identify.diagnosis import candidates as workers
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.diagnosis.thresholds import STRUCTURE
+from stimrig.identify.effects import registry
+from stimrig.identify.records.join import join
+from stimrig.identify.records.record import Record
 from tests.harness.carried_sessions import as_record
 
 SETS = ("single", "nothing", "outside", "two", "slow", "rates", "kept")
@@ -50,7 +50,7 @@ PAIRS = (
 
 def as_joined(made: dict[str, Any], kind: str, seed: int) -> tuple[Record, dict[str, Any]]:
     """Two tests of one patient, each as its own recorder gives it, as one record; and what the first recorder did."""
-    from hardware_sim.recorders import recorded
+    from stimrig.hardware_sim.recorders import recorded
 
     time_s = made["time_s"]
     cut = int(np.argmax(np.diff(time_s))) + 1
@@ -69,8 +69,8 @@ def as_joined(made: dict[str, Any], kind: str, seed: int) -> tuple[Record, dict[
 
 def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
     """One record diagnosed; None where the generator can't make it."""
-    from hardware_sim.hidden_records import generate
-    from hardware_sim.recorders import recorded
+    from stimrig.hardware_sim.hidden_records import generate
+    from stimrig.hardware_sim.recorders import recorded
 
     workers.WORKERS = 1
     effect, strength, seed, options = job
@@ -131,7 +131,7 @@ def _structure_said(result: dict[str, Any]) -> bool:
 
 def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str, Any]]]:
     """What a set is made of."""
-    from hardware_sim.patients.hidden.draw import effect_ids, outside_ids, outside_kept_ids
+    from stimrig.hardware_sim.patients.hidden.draw import effect_ids, outside_ids, outside_kept_ids
 
     seeds = list(seeds)
     if kind == "single":
@@ -283,7 +283,7 @@ def _sealed(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _recorders(text: str) -> list[str]:
-    from hardware_sim.recorders import KINDS
+    from stimrig.hardware_sim.recorders import KINDS
 
     found = [name for word in text.split(",") for name in ({"both": ["plain", "real"]}.get(word) or [word])]
     known = {*KINDS, "joined"}

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-import identify
-from identify.dynamics.linear import SecondOrder
-from identify.paper import muscle, table1
+from stimrig import identify
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.paper import muscle, table1
 
 FOLDER = Path(__file__).parent.parent / "docs" / "img"
 TRIALS = 20

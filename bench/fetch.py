@@ -20,9 +20,9 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from api.cli.child import Child
-from api.client.connection import SendsVersions
-from api.settings import Settings
+from stimrig.api.cli.child import Child
+from stimrig.api.client.connection import SendsVersions
+from stimrig.api.settings import Settings
 from tests.harness.patients import Patient, make_record
 
 TOKEN = "bench-of-the-fetch-is-not-a-secret"
@@ -91,7 +91,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-fetch-") as folder:
         settings = Settings(data_dir=Path(folder))
-        api = Child("api", [sys.executable, "-m", "api.web.server"], Path(folder) / "api.log")
+        api = Child("api", [sys.executable, "-m", "stimrig.api.web.server"], Path(folder) / "api.log")
         api.environment = {
             "STIMRIG_DATA_DIR": str(settings.data_dir),
             "STIMRIG_PORT": "0",

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-import identify
 from bench.stamp import RESULTS, written_by
-from identify.dynamics.linear import SecondOrder
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.estimation.uncertainty import prediction_band
-from identify.paper import muscle
-from identify.paper.table1 import simulate
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.estimation.uncertainty import prediction_band
+from stimrig.identify.paper import muscle
+from stimrig.identify.paper.table1 import simulate
+from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 
 TARGET = RESULTS / "identification.md"

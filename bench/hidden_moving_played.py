@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from bench.hidden_played import agrees, reveal
-from hardware_sim.hidden_records import of_patient, write_csv
-from identify.diagnosis import diagnose
-from identify.records.read import read
-from identify.records.record import Record
+from stimrig.hardware_sim.hidden_records import of_patient, write_csv
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.records.read import read
+from stimrig.identify.records.record import Record
 from tests.harness.processes import Bench, default_plan
 
 DESIGN = ("--arm", "design")

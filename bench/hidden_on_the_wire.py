@@ -19,11 +19,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from api.cli.errors import CommandError
-from api.client.errors import ServiceError
 from bench.hidden_moving_played import DESIGN
 from bench.hidden_moving_played import run as run_moving
 from bench.hidden_played import reveal, run
+from stimrig.api.cli.errors import CommandError
+from stimrig.api.client.errors import ServiceError
 
 
 def main() -> None:

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from api.cli.launcher import Services
-from api.client.rest import Client
-from api.settings import Settings
+from stimrig.api.cli.launcher import Services
+from stimrig.api.client.rest import Client
+from stimrig.api.settings import Settings
 
 TOKEN = "token-of-the-hidden-patients"
 PARTICIPANT = "HIDDEN"
@@ -20,7 +20,7 @@ NOISE_LIKE = 1.3
 def reveal(seed: int, *more: str) -> dict[str, Any]:
     """What the emulator hides, asked after the verdict; `more` are the emulator's options that change it."""
     done = subprocess.run(
-        [sys.executable, "-m", "hardware_sim", "--reveal", str(seed), *more],
+        [sys.executable, "-m", "stimrig.hardware_sim", "--reveal", str(seed), *more],
         capture_output=True,
         text=True,
         check=True,

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from api.cli.launcher import Services
-from api.client.rest import Client
-from api.settings import Settings
 from bench.stamp import written_by
 from examples import ilc_controller as ilc
+from stimrig.api.cli.launcher import Services
+from stimrig.api.client.rest import Client
+from stimrig.api.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 TOKEN = "bench-of-the-learning-controller"
@@ -104,7 +104,7 @@ def ramp_deconvolution(service: ilc.Service, test: dict[str, Any]) -> dict[str, 
         command = [
             sys.executable,
             "-m",
-            "api.cli",
+            "stimrig.api.cli",
             "fit",
             str(data),
             "--method",
@@ -186,7 +186,7 @@ def play_all(wanted: dict[str, dict[str, Any]], options: argparse.Namespace) -> 
 
 def revealed(seed: int) -> tuple[list[str], dict[str, Any]]:
     """What the seed hid, and the muscle without it (its largest width is the participant's comfort maximum)."""
-    command = [sys.executable, "-m", "hardware_sim", "--reveal", str(seed)]
+    command = [sys.executable, "-m", "stimrig.hardware_sim", "--reveal", str(seed)]
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout)
     return found["effects"], found["base"]
 

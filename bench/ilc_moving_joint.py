@@ -20,11 +20,11 @@ import numpy as np
 
 from bench.moving_joint import MOVING_JOINT, as_record, guided_tests, joined
 from bench.stamp import written_by
-from hardware_sim.arm_patient import ArmPatient, arm_patient
-from hardware_sim.arm_records import record
-from identify.fitting import fit
-from identify.model import Model
-from identify.simulation.pulses import Motion, above_rest
+from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
+from stimrig.hardware_sim.arm_records import record
+from stimrig.identify.fitting import fit
+from stimrig.identify.model import Model
+from stimrig.identify.simulation.pulses import Motion, above_rest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from ilc_controller import Reference

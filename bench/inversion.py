@@ -16,11 +16,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-import identify
 from examples.ilc_controller import Reference as Moves
-from identify.inversion import Reference, invert
-from identify.model import Model
-from identify.simulation.pulses import above_rest
+from stimrig import identify
+from stimrig.identify.inversion import Reference, invert
+from stimrig.identify.model import Model
+from stimrig.identify.simulation.pulses import above_rest
 from tests.identify import hidden_muscles
 
 HIDDEN = ("", "fatigue", "electromechanical_delay", "threshold_drift", "asymmetric_relaxation")

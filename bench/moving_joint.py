@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from api.sessions import joint_plan
 from bench.stamp import written_by
-from hardware_sim.arm_patient import ArmPatient, arm_patient
-from hardware_sim.arm_records import record
-from identify.fitting import MOVING_JOINT, fit
-from identify.model import Model
-from identify.records.join import join
-from identify.records.record import Record
-from identify.simulation.predict import predict
+from stimrig.api.sessions import joint_plan
+from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
+from stimrig.hardware_sim.arm_records import record
+from stimrig.identify.fitting import MOVING_JOINT, fit
+from stimrig.identify.model import Model
+from stimrig.identify.records.join import join
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.predict import predict
 
 PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0
 COLUMNS = ("time_s", "pulse_width_us", "torque_nm")

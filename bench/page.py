@@ -17,7 +17,7 @@ from typing import Any
 import httpx
 from playwright.sync_api import sync_playwright
 
-from api.workers.pool import WORKER
+from stimrig.api.workers.pool import WORKER
 from tests.api.browser import ARGUMENTS, CHROMIUM, participant, sign_in, start
 from tests.api.conftest import Service, run_service, run_test
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from bench.contenders import CONTENDERS, Contender, Task
 from bench.stamp import RESULTS, written_by
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.paper import muscle
-from identify.records.record import Record
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.paper import muscle
+from stimrig.identify.records.record import Record
 
 NOISE_NM = (0.0, 0.02, 0.10)
 SEEDS = {40.0: (90_001, 90_002, 90_003, 90_004, 90_005), 1600.0: (90_001, 90_002)}

@@ -17,15 +17,15 @@ import httpx
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from api.cli.launcher import Services
-from api.client.connection import SendsVersions
-from api.settings import Settings
 from bench.moving_joint import as_record, guided_tests, joined
-from hardware_sim import hidden_records
-from hardware_sim.arm_patient import arm_patient
-from hardware_sim.arm_records import record
-from identify.fitting import fit
-from identify.records import parts_csv
+from stimrig.api.cli.launcher import Services
+from stimrig.api.client.connection import SendsVersions
+from stimrig.api.settings import Settings
+from stimrig.hardware_sim import hidden_records
+from stimrig.hardware_sim.arm_patient import arm_patient
+from stimrig.hardware_sim.arm_records import record
+from stimrig.identify.fitting import fit
+from stimrig.identify.records import parts_csv
 from tests.api.browser import CHROMIUM
 
 IMAGES = Path(__file__).parents[1] / "docs" / "img"

@@ -19,15 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from hardware_sim.hidden_records import sampled
-from hardware_sim.patients.hidden.design import Design, make_design
-from hardware_sim.patients.hidden.draw import Scenario, draw_scenario, rng_of, still_effect_ids
-from identify.diagnosis import candidates as workers
-from identify.diagnosis import diagnose
-from identify.fitting import fit
-from identify.records.record import Record
-from rig import limits, plan, protocols
-from rig.messages import Profile, TestPlan
+from stimrig.hardware_sim.hidden_records import sampled
+from stimrig.hardware_sim.patients.hidden.design import Design, make_design
+from stimrig.hardware_sim.patients.hidden.draw import Scenario, draw_scenario, rng_of, still_effect_ids
+from stimrig.identify.diagnosis import candidates as workers
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.fitting import fit
+from stimrig.identify.records.record import Record
+from stimrig.rig import limits, plan, protocols
+from stimrig.rig.messages import Profile, TestPlan
 from tests.harness.carried_sessions import as_record
 
 RATE_HZ = 400.0

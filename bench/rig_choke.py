@@ -25,10 +25,10 @@ from typing import Any
 import httpx
 import numpy as np
 
-from api.cli.launcher import Services
-from api.client.connection import SendsVersions
-from api.settings import Settings
-from rig.messages import stop_socket
+from stimrig.api.cli.launcher import Services
+from stimrig.api.client.connection import SendsVersions
+from stimrig.api.settings import Settings
+from stimrig.rig.messages import stop_socket
 from tests.harness.processes import RigClient, control
 
 TOKEN = "administrator-token-of-the-bench"

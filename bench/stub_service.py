@@ -6,8 +6,8 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from api.web import server
-from api.web.app import create_app
+from stimrig.api.web import server
+from stimrig.api.web.app import create_app
 
 STUB = (sys.executable, str(Path(__file__).parents[1] / "tests" / "api" / "stub_worker.py"))
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-import identify
 from bench.stamp import RESULTS, written_by
-from identify.dynamics.linear import Discrete, SecondOrder
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.paper import muscle, table1
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.paper import muscle, table1
+from stimrig.identify.records.record import Record
 
 TARGET = RESULTS / "table1.md"
 TRIALS = 100

@@ -22,15 +22,15 @@ from typing import Any
 
 import numpy as np
 
-import identify
 from bench.adaptive import paper_test
 from bench.tracking_cases import CASES, NOTHING, PEAK_SHARE, patient
 from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
-from hardware_sim.offline import simulate
-from hardware_sim.patients import registry
-from identify.model import Model
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.hardware_sim.offline import simulate
+from stimrig.hardware_sim.patients import registry
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
 
 RATE_HZ, NOISE_NM, CURRENT_MA, LARGEST_US = 400.0, 0.05, 20.0, 300.0
 TRIALS, REST_S, APPROVAL_S = 10, 15.0, 60.0

@@ -19,17 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from api.cli.launcher import Services
-from api.client.rest import Client
-from api.settings import Settings
 from bench.ilc import Patient
 from bench.stamp import RESULTS, written_by
 from bench.tracking import APPROVAL_S, LARGEST_US, NOISE_NM, REST_S, TRIALS, moved_lines, moves, seconds_of, tables
 from bench.tracking_cases import CASES, PEAK_SHARE, patient
 from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
-from identify.model import Model
-from identify.records.recording import read_recording
+from stimrig.api.cli.launcher import Services
+from stimrig.api.client.rest import Client
+from stimrig.api.settings import Settings
+from stimrig.identify.model import Model
+from stimrig.identify.records.recording import read_recording
 
 TOKEN, PERSON = "token-of-the-tracking-bench", "TRACK"
 LIMITS = {"gain_percent": 60.0, "threshold_percent": 60.0, "time_scale_percent": 60.0}

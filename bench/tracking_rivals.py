@@ -12,14 +12,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-import identify
-from identify.dynamics.linear import SecondOrder
-from identify.errors import IdentifyError
-from identify.model import Model
-from identify.records.join import join
-from identify.records.record import Record
-from identify.recruitment.curve import Curve
-from identify.tracking import QUANTITIES, Values, follow, model_for_next, moved_model
+from stimrig import identify
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.errors import IdentifyError
+from stimrig.identify.model import Model
+from stimrig.identify.records.join import join
+from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.tracking import QUANTITIES, Values, follow, model_for_next, moved_model
 
 PULSE_RATE_HZ = 40.0
 FINE = 20
@@ -66,7 +66,7 @@ def noise_variance(error_nm: np.ndarray) -> float:
 
 
 class Ours:
-    """`identify.tracking`."""
+    """`stimrig.identify.tracking`."""
 
     def __init__(self, model: Model, test: Record) -> None:  # noqa: ARG002
         self.model, self.state = model, None

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from api.models import changes, headline
-from api.models.changes import State
 from bench.stamp import RESULTS, written_by
-from hardware_sim.hidden_records import generate
-from hardware_sim.patients.hidden.draw import still_effect_ids
-from identify.errors import IdentifyError
+from stimrig import identify
+from stimrig.api.models import changes, headline
+from stimrig.api.models.changes import State
+from stimrig.hardware_sim.hidden_records import generate
+from stimrig.hardware_sim.patients.hidden.draw import still_effect_ids
+from stimrig.identify.errors import IdentifyError
 from tests.harness.carried_sessions import as_record
 
 APART_S = 3600.0

@@ -49,7 +49,7 @@ place() { # place SOURCE TARGET MODE: copy if it differs
 
 release() { # an environment named after what is in it; the link is turned once it is complete
   local id target work
-  id=$(cd "$source_dir" && find pyproject.toml requirements/run.txt rig identify api hardware_sim deploy docs \
+  id=$(cd "$source_dir" && find pyproject.toml requirements/run.txt stimrig rig identify api hardware_sim deploy docs \
     -type f ! -path '*/__pycache__/*' ! -path '*.egg-info/*' -print0 | LC_ALL=C sort -z | xargs -0 sha256sum |
     sha256sum | cut -c1-12)
   target=$prefix/releases/$id
@@ -63,7 +63,7 @@ release() { # an environment named after what is in it; the link is turned once 
     run "$target/venv/bin/python" -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/run.txt
     if [ $dry = 0 ]; then
       work=$(mktemp -d) # setuptools writes into the folder it builds from
-      cp -r pyproject.toml README.md rig identify api hardware_sim "$work/"
+      cp -r pyproject.toml README.md stimrig rig identify api hardware_sim "$work/"
       "$target/venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation "$work"
       rm -rf "$work"
       cp -r deploy docs "$target/share/"
@@ -125,7 +125,7 @@ run systemctl --quiet enable stimrig-rig.service stimrig-api.service
 [ -z "$can" ] || run systemctl --quiet enable "stimrig-can@$can.service"
 
 if [ $dry = 0 ]; then
-  if answer=$("$prefix/current/venv/bin/python" -m rig --config /etc/stimrig/rig.toml --check 2>&1); then
+  if answer=$("$prefix/current/venv/bin/python" -m stimrig.rig --config /etc/stimrig/rig.toml --check 2>&1); then
     say "rig file: $answer"
   else
     say "rig file needs mending: $answer"

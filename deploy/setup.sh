@@ -52,7 +52,7 @@ $venv/bin/python -m pip install --quiet --disable-pip-version-check --require-ha
 $venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
 say "compiling, once (half a minute)"
-$venv/bin/python -m identify.diagnosis.warm_up
+$venv/bin/python -m stimrig.identify.diagnosis.warm_up
 
 shell=chromium-headless-shell # opens no windows: with the whole browser each tab costs three times the processor
 if [ "$what" = test ] && ! command -v $shell >/dev/null 2>&1; then

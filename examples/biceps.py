@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-import identify
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.records.record import Record
 
 WIDTH_US = 300.0
 """As a file name at the origin suggests; any constant does, since it never changes."""

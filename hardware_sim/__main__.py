@@ -1,4 +1,4 @@
-"""`python -m hardware_sim`: the process behind `stimrig emulate`."""
+"""`python -m stimrig.hardware_sim`: the process behind `stimrig emulate`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from hardware_sim import options as command_line
-from hardware_sim.emulator import Emulator
-from hardware_sim.errors import FaultError, HardwareSimError
-from hardware_sim.factory import HIDDEN, hidden_patients, make_devices
+from stimrig.hardware_sim import options as command_line
+from stimrig.hardware_sim.emulator import Emulator
+from stimrig.hardware_sim.errors import FaultError, HardwareSimError
+from stimrig.hardware_sim.factory import HIDDEN, hidden_patients, make_devices
 
 PROG = "stimrig emulate"
 FASTEST_AT_PRIORITY = 5.0

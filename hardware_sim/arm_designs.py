@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.arm import registry
-from hardware_sim.arm.law import Floats
-from hardware_sim.arm.motion import Begin, Motion, MoverProtocol
-from hardware_sim.arm_patient import ArmPatient
-from hardware_sim.patients.hidden.design import PULSES_PER_S, levels, make_design, staircase
+from stimrig.hardware_sim.arm import registry
+from stimrig.hardware_sim.arm.law import Floats
+from stimrig.hardware_sim.arm.motion import Begin, Motion, MoverProtocol
+from stimrig.hardware_sim.arm_patient import ArmPatient
+from stimrig.hardware_sim.patients.hidden.design import PULSES_PER_S, levels, make_design, staircase
 
 SIMULATION_HZ = 1600
 LARGEST_COMPLIANCE_RAD_PER_NM = 0.003
@@ -26,7 +26,7 @@ Moves = list[tuple[float, str, dict[str, Any]]]
 
 @dataclass(frozen=True)
 class Asked:
-    """A record that is wanted; `hardware_sim.arm_records.record` says what the fields mean."""
+    """A record that is wanted; `stimrig.hardware_sim.arm_records.record` says what the fields mean."""
 
     patient: ArmPatient
     rng: Generator

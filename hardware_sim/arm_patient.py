@@ -39,11 +39,11 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import cont2discrete, lfilter
 
-from hardware_sim.arm.law import Floats, Number
-from hardware_sim.arm.mechanics import Mechanics
-from hardware_sim.arm.tissue import REFERENCE_RAD, Tissue, law
-from hardware_sim.patients.hidden.base import Base, draw_base
-from hardware_sim.patients.hidden.draw import rng_of
+from stimrig.hardware_sim.arm.law import Floats, Number
+from stimrig.hardware_sim.arm.mechanics import Mechanics
+from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Tissue, law
+from stimrig.hardware_sim.patients.hidden.base import Base, draw_base
+from stimrig.hardware_sim.patients.hidden.draw import rng_of
 
 SMALLEST_G, LARGEST_G = 0.15, 2.0
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import savgol_filter
 
-from hardware_sim.arm.law import Floats
-from hardware_sim.arm_designs import KINDS, SIMULATION_HZ, ArmDesign, Asked, Parts
-from hardware_sim.arm_patient import ArmPatient, arm_patient
-from hardware_sim.patients.hidden.design import PULSES_PER_S
-from hardware_sim.patients.hidden.draw import rng_of
+from stimrig.hardware_sim.arm.law import Floats
+from stimrig.hardware_sim.arm_designs import KINDS, SIMULATION_HZ, ArmDesign, Asked, Parts
+from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
+from stimrig.hardware_sim.patients.hidden.design import PULSES_PER_S
+from stimrig.hardware_sim.patients.hidden.draw import rng_of
 
 __all__ = ["KINDS", "arm_patient", "changed", "held_angles_rad", "record"]
 

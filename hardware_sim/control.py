@@ -13,10 +13,10 @@ import socket
 from pathlib import Path
 from typing import Any, Protocol
 
-from hardware_sim.devices import Devices
-from hardware_sim.errors import ArmError, FaultError, HardwareSimError
-from hardware_sim.reactor import Reactor
-from hardware_sim.wall_clock import WallClock
+from stimrig.hardware_sim.devices import Devices
+from stimrig.hardware_sim.errors import ArmError, FaultError, HardwareSimError
+from stimrig.hardware_sim.reactor import Reactor
+from stimrig.hardware_sim.wall_clock import WallClock
 
 LONGEST_LINE = 65536
 SEND_TIMEOUT_S = 1.0

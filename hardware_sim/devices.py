@@ -11,22 +11,22 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from hardware_sim import stimulators
-from hardware_sim.angle_sensors import mounted
-from hardware_sim.arm.description import Arm
-from hardware_sim.arm.limb import Limb
-from hardware_sim.electrodes import Electrodes
-from hardware_sim.errors import SettingsError
-from hardware_sim.faults.registry import Faults
-from hardware_sim.load_cells import cells
-from hardware_sim.load_cells.frames import CellProtocol, Frame
-from hardware_sim.load_cells.sampler import LoadCell
-from hardware_sim.patients.muscle import Muscle
-from hardware_sim.sampling import Noise, take_in_order
-from hardware_sim.scan import pick
-from hardware_sim.settings import Settings
-from hardware_sim.stimulators.board import Board, FirmwareProtocol
-from hardware_sim.timeline import Timeline
+from stimrig.hardware_sim import stimulators
+from stimrig.hardware_sim.angle_sensors import mounted
+from stimrig.hardware_sim.arm.description import Arm
+from stimrig.hardware_sim.arm.limb import Limb
+from stimrig.hardware_sim.electrodes import Electrodes
+from stimrig.hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.faults.registry import Faults
+from stimrig.hardware_sim.load_cells import cells
+from stimrig.hardware_sim.load_cells.frames import CellProtocol, Frame
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.sampling import Noise, take_in_order
+from stimrig.hardware_sim.scan import pick
+from stimrig.hardware_sim.settings import Settings
+from stimrig.hardware_sim.stimulators.board import Board, FirmwareProtocol
+from stimrig.hardware_sim.timeline import Timeline
 
 
 class Devices:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.patients.muscle import Muscle
 
 Point = tuple[int, float]
 """One piece of a pulse's shape: duration in µs, current in mA."""

@@ -10,15 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hardware_sim.angle_sensors import mounted
-from hardware_sim.control import Control
-from hardware_sim.devices import Devices
-from hardware_sim.load_cells import transports
-from hardware_sim.load_cells.frames import TransportProtocol
-from hardware_sim.pseudo_terminal import PseudoTerminal
-from hardware_sim.reactor import Reactor
-from hardware_sim.scan import pick
-from hardware_sim.wall_clock import WallClock
+from stimrig.hardware_sim.angle_sensors import mounted
+from stimrig.hardware_sim.control import Control
+from stimrig.hardware_sim.devices import Devices
+from stimrig.hardware_sim.load_cells import transports
+from stimrig.hardware_sim.load_cells.frames import TransportProtocol
+from stimrig.hardware_sim.pseudo_terminal import PseudoTerminal
+from stimrig.hardware_sim.reactor import Reactor
+from stimrig.hardware_sim.scan import pick
+from stimrig.hardware_sim.wall_clock import WallClock
 
 TICK_S = 0.0025
 """How often frames are delivered, in real time: four at a time at 1600 samples/s."""

@@ -8,14 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hardware_sim.arm import description as arms
-from hardware_sim.arm.description import Arm
-from hardware_sim.arm.tissue import bare
-from hardware_sim.devices import Devices
-from hardware_sim.errors import ArmError, PatientError
-from hardware_sim.patients import registry
-from hardware_sim.patients.muscle import Muscle
-from hardware_sim.settings import Settings
+from stimrig.hardware_sim.arm import description as arms
+from stimrig.hardware_sim.arm.description import Arm
+from stimrig.hardware_sim.arm.tissue import bare
+from stimrig.hardware_sim.devices import Devices
+from stimrig.hardware_sim.errors import ArmError, PatientError
+from stimrig.hardware_sim.patients import registry
+from stimrig.hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.settings import Settings
 
 DESIGN = "design"
 HIDDEN = "hidden:"
@@ -56,7 +56,7 @@ def hidden_patients() -> Any:
     PatientError
         This installation has none.
     """
-    module = "hardware_sim.patients.hidden"
+    module = "stimrig.hardware_sim.patients.hidden"
     try:
         hidden = importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -16,12 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from hardware_sim.patients import hidden
-from hardware_sim.patients.hidden.design import UNRECORDED, Design, make_design
-from hardware_sim.patients.hidden.draw import Scenario, draw_pair, draw_scenario, effect_ids, outside_ids, rng_of
-from hardware_sim.patients.hidden.kernels import Floats
-from hardware_sim.patients.hidden.scenario import simulate
-from hardware_sim.patients.hidden.sensor_noise import NOISES, SLOW_CORRELATION_S, draw_noise
+from stimrig.hardware_sim.patients import hidden
+from stimrig.hardware_sim.patients.hidden.design import UNRECORDED, Design, make_design
+from stimrig.hardware_sim.patients.hidden.draw import (
+    Scenario,
+    draw_pair,
+    draw_scenario,
+    effect_ids,
+    outside_ids,
+    rng_of,
+)
+from stimrig.hardware_sim.patients.hidden.kernels import Floats
+from stimrig.hardware_sim.patients.hidden.scenario import simulate
+from stimrig.hardware_sim.patients.hidden.sensor_noise import NOISES, SLOW_CORRELATION_S, draw_noise
 
 SLOWEST_SIMULATION_HZ = 1600
 
@@ -201,7 +208,7 @@ def _record_of(effect: str | None, strength: str, seed: int, settings: argparse.
 
 def main(arguments: list[str] | None = None) -> int:
     """Write a set of records and `truth.json`."""
-    parser = argparse.ArgumentParser(prog="python -m hardware_sim.hidden_records", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m stimrig.hardware_sim.hidden_records", description=main.__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder, made if absent")
     parser.add_argument("--seeds", type=_seeds, default=range(1), help="first:last, last not included")
     parser.add_argument(

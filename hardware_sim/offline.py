@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.patients.muscle import Muscle
 
 
 def simulate(

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import NoReturn
 
-from hardware_sim import stimulators
-from hardware_sim.arm import registry as arms
-from hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES
-from hardware_sim.errors import SettingsError
-from hardware_sim.load_cells import cells, transports
-from hardware_sim.patients import registry
-from hardware_sim.scan import modules_with
-from hardware_sim.settings import ANGLES, Settings
+from stimrig.hardware_sim import stimulators
+from stimrig.hardware_sim.arm import registry as arms
+from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES
+from stimrig.hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.load_cells import cells, transports
+from stimrig.hardware_sim.patients import registry
+from stimrig.hardware_sim.scan import modules_with
+from stimrig.hardware_sim.settings import ANGLES, Settings
 
 DEFAULTS = Settings()
 WITH_ANGLE = "with_angle"

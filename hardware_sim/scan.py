@@ -6,7 +6,7 @@ import importlib
 import pkgutil
 from types import ModuleType
 
-from hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.errors import SettingsError
 
 
 def modules_with(package: ModuleType, attribute: str) -> dict[str, ModuleType]:

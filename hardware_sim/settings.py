@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.errors import SettingsError
 
 RANGES = {
     "noise_nm": (0.0, 10.0),

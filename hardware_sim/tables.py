@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from hardware_sim.errors import HardwareSimError
+from stimrig.hardware_sim.errors import HardwareSimError
 
 
 def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[str, Any]:

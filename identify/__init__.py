@@ -9,12 +9,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from identify.criticism import compare
-    from identify.diagnosis import diagnose
-    from identify.diagnosis.carrying import carry
-    from identify.diagnosis.experiment import Experiment, next_experiment
-    from identify.diagnosis.improvement import improve
-    from identify.errors import (
+    from stimrig.identify.criticism import compare
+    from stimrig.identify.diagnosis import diagnose
+    from stimrig.identify.diagnosis.carrying import carry
+    from stimrig.identify.diagnosis.experiment import Experiment, next_experiment
+    from stimrig.identify.diagnosis.improvement import improve
+    from stimrig.identify.errors import (
         BadModel,
         BadRecord,
         BadRequest,
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
         IdentifyError,
         NotIdentifiable,
     )
-    from identify.fitting import fit
-    from identify.model import Model
-    from identify.records.read import read
-    from identify.records.record import Record
-    from identify.results import Carried, Comparison, Diagnosis, Improvement
-    from identify.simulation.predict import predict
+    from stimrig.identify.fitting import fit
+    from stimrig.identify.model import Model
+    from stimrig.identify.records.read import read
+    from stimrig.identify.records.record import Record
+    from stimrig.identify.results import Carried, Comparison, Diagnosis, Improvement
+    from stimrig.identify.simulation.predict import predict
 
 _PLACES = {
-    name: f"identify.{module}"
+    name: f"stimrig.identify.{module}"
     for module, names in {
         "criticism": ("compare",),
         "diagnosis": ("diagnose",),
@@ -78,5 +78,5 @@ def __getattr__(name: str) -> Any:
     if name in _PLACES:
         return getattr(import_module(_PLACES[name]), name)
     if name in _MODULES:
-        return import_module(f"identify.{name}")
-    raise AttributeError(f"module 'identify' has no attribute {name!r}")
+        return import_module(f"stimrig.identify.{name}")
+    raise AttributeError(f"module 'stimrig.identify' has no attribute {name!r}")

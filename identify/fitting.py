@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from identify.diagnosis.candidates import Progress, silent
-from identify.diagnosis.improvement import helpful
-from identify.diagnosis.search import search_effects
-from identify.effects import get
-from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.effect_fit import effect_names, with_effects
-from identify.estimation.finish import finish
-from identify.estimation.prepare import prepare
-from identify.estimation.renewed_curve import renewed_curve
-from identify.estimation.rows import fitted_rows
-from identify.methods import check_options, method_of
-from identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
-from identify.model import Model
-from identify.records.record import Record
+from stimrig.identify.diagnosis.candidates import Progress, silent
+from stimrig.identify.diagnosis.improvement import helpful
+from stimrig.identify.diagnosis.search import search_effects
+from stimrig.identify.effects import get
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.effect_fit import effect_names, with_effects
+from stimrig.identify.estimation.finish import finish
+from stimrig.identify.estimation.prepare import prepare
+from stimrig.identify.estimation.renewed_curve import renewed_curve
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.methods import check_options, method_of
+from stimrig.identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
 
 AUTO = "auto"
 MOVING_JOINT = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")

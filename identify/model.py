@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from identify import model_schema
-from identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
-from identify.errors import BadModel
-from identify.json_values import json_value
-from identify.recruitment.curve import Curve, basis_from_dict, landmarks
-from identify.shown import Sheet, Shown, estimate, fit_words, held_out_label, quantity
-from identify.strict_json import BadJson, parse
+from stimrig.identify import model_schema
+from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
+from stimrig.identify.errors import BadModel
+from stimrig.identify.json_values import json_value
+from stimrig.identify.recruitment.curve import Curve, basis_from_dict, landmarks
+from stimrig.identify.shown import Sheet, Shown, estimate, fit_words, held_out_label, quantity
+from stimrig.identify.strict_json import BadJson, parse
 
 if TYPE_CHECKING:
-    from identify.records.record import Record
+    from stimrig.identify.records.record import Record
 
 SCHEMA_VERSION = "1.0"
 LARGEST_TEXT = 16 * 2**20
@@ -130,7 +130,9 @@ class Model(Shown):
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""
-        from identify.simulation.predict import predict  # imported here, so that reading a model does not import numba
+        from stimrig.identify.simulation.predict import (
+            predict,  # imported here, so that reading a model does not import numba
+        )
 
         return predict(self, record)
 
@@ -285,8 +287,8 @@ def _from_dict(data: dict[str, Any]) -> Model:
 
 def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
     """Refuse parameters that no fit gives: some would cause a division by zero. Unknown effects are not checked."""
-    from identify.effects import registry  # imported here, so that reading a model does not import numba
-    from identify.effects.base import Scene
+    from stimrig.identify.effects import registry  # imported here, so that reading a model does not import numba
+    from stimrig.identify.effects.base import Scene
 
     effect = registry().get(entry["id"])
     form = effect and next((f for f in effect.forms if entry.get("form", "") in ("", f.name)), None)

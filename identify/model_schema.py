@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any
 
-from identify.errors import BadModel
+from stimrig.identify.errors import BadModel
 
 Check = Callable[[Any, str], None]
 FIX = "Fit the record again."

@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypedDict
 
-from identify.caution import caution
-from identify.json_values import json_value
-from identify.model import Model
-from identify.shown import Sheet, Shown, both_words, estimate, fit_words, probability, quantity, torque
+from stimrig.identify.caution import caution
+from stimrig.identify.json_values import json_value
+from stimrig.identify.model import Model
+from stimrig.identify.shown import Sheet, Shown, both_words, estimate, fit_words, probability, quantity, torque
 
 Row = Mapping[str, Any]
 VERDICTS = {

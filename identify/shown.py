@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
-from identify.errors import BadRequest
+from stimrig.identify.errors import BadRequest
 
 Plotter = Callable[[Any, Any], Any]
 """`plotter(result, record) -> figure`: draws a model, comparison, diagnosis or improvement. The record may be None."""

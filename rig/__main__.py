@@ -1,4 +1,4 @@
-"""`python -m rig`: the process that owns the devices.
+"""`python -m stimrig.rig`: the process that owns the devices.
 
 It prints one JSON line on standard output when its socket is ready, and logs to standard error. If it has a terminal,
 any key in it stops stimulation. It runs until SIGTERM or SIGINT: then it stops stimulation, confirms the stop, seals
@@ -17,16 +17,16 @@ import signal
 import sys
 from pathlib import Path
 
-from rig import config as configuration
-from rig import devices
-from rig.adapters.machine import LocalMachine
-from rig.adapters.server import Ask, Server
-from rig.clock import MonotonicClock
-from rig.control.rig import Rig
-from rig.errors import RigError
-from rig.keys import StopKey
-from rig.messages import stop_socket
-from rig.notify import Notifier
+from stimrig.rig import config as configuration
+from stimrig.rig import devices
+from stimrig.rig.adapters.machine import LocalMachine
+from stimrig.rig.adapters.server import Ask, Server
+from stimrig.rig.clock import MonotonicClock
+from stimrig.rig.control.rig import Rig
+from stimrig.rig.errors import RigError
+from stimrig.rig.keys import StopKey
+from stimrig.rig.messages import stop_socket
+from stimrig.rig.notify import Notifier
 
 log = logging.getLogger("rig")
 
@@ -56,7 +56,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m rig", description="The process that owns the rig's devices.")
+    parser = argparse.ArgumentParser(
+        prog="python -m stimrig.rig", description="The process that owns the rig's devices."
+    )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--config", type=Path, metavar="FILE", help="rig file (TOML), see docs/rig-file.md")
     source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")

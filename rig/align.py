@@ -35,7 +35,7 @@ class Alignment:
     Attributes
     ----------
     method
-        Of a load cell: sync or regression; of an angle sensor: see `rig.align_angle`.
+        Of a load cell: sync or regression; of an angle sensor: see `stimrig.rig.align_angle`.
     error_ms
         Standard error of the offset, ms; NaN if there were too few samples to estimate it. Of an angle sensor it
         contains that of the torque, through which it was obtained.

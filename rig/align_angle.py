@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import align
-from rig.align import Alignment, Array, Line, Method
+from stimrig.rig import align
+from stimrig.rig.align import Alignment, Array, Line, Method
 
 ONE_CLOCK_S = 5e-4
 """Stamps that give other times than the order of the frames do are not of one clock: a device stamps itself."""
@@ -148,7 +148,7 @@ def _fitted(sensor_s: Array, time_s: Array, period_s: float) -> Line:
 
 
 def _by_arrival(host_s: Array, sensor_s: Array) -> tuple[Line, float, Method]:
-    """Below the times of arrival, as `rig.align` does without a sync line."""
+    """Below the times of arrival, as `stimrig.rig.align` does without a sync line."""
     line = align.lower_envelope(sensor_s, host_s)
     error_s = align.misfit(line, *align.earliest(sensor_s, host_s))
     return line, float(np.hypot(line.error_s, error_s)), "regression"

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import align_angle, angle_velocity
-from rig.align import counted_rate_hz
-from rig.align_angle import Reference
-from rig.journal import JournalContents, Kind
-from rig.signals import ANGLE_SAMPLE, TRUSTED
+from stimrig.rig import align_angle, angle_velocity
+from stimrig.rig.align import counted_rate_hz
+from stimrig.rig.align_angle import Reference
+from stimrig.rig.journal import JournalContents, Kind
+from stimrig.rig.signals import ANGLE_SAMPLE, TRUSTED
 
 LIKELY_RATE_HZ = 200.0
 """Assumed if the header is lost, and there are too few samples to measure it."""

@@ -18,9 +18,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.assembly import Recording
-from rig.errors import RecordingError
-from rig.machine import Disk
+from stimrig.rig.assembly import Recording
+from stimrig.rig.errors import RecordingError
+from stimrig.rig.machine import Disk
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("torque/time_s", "s", "time of each sample on the test's clock, aligned with the pulses"),

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import align, angle_columns, intended, journal
-from rig.align_angle import Reference
-from rig.clock import utc_text
-from rig.errors import RecordingError
-from rig.journal import JournalContents, Kind
-from rig.signals import SAMPLE, PulseStatus
+from stimrig.rig import align, angle_columns, intended, journal
+from stimrig.rig.align_angle import Reference
+from stimrig.rig.clock import utc_text
+from stimrig.rig.errors import RecordingError
+from stimrig.rig.journal import JournalContents, Kind
+from stimrig.rig.signals import SAMPLE, PulseStatus
 
 FORMAT = "stimrig-recording"
 FORMAT_VERSION = 1

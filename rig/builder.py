@@ -1,4 +1,4 @@
-"""`python -m rig.builder`: builds previews for the rig in a process of its own (see `rig.adapters.previews`).
+"""`python -m stimrig.rig.builder`: builds previews for the rig in a process of its own (see `rig.adapters.previews`).
 
 The first line on standard input holds the rig's limits. Each further line is the request for one preview, and gets one
 line as its reply. The process ends when its standard input ends, or with the rig. It has the lowest priority at the
@@ -22,7 +22,7 @@ PR_SET_PDEATHSIG = 1
 def main() -> int:
     """Answer requests until standard input ends."""
     _modest()
-    from rig.control.building import serve  # after the limits are set: importing numpy takes time
+    from stimrig.rig.control.building import serve  # after the limits are set: importing numpy takes time
 
     serve(sys.stdin.buffer, sys.stdout.buffer)
     return 0

@@ -1,7 +1,7 @@
 """Clocks are passed in: monotonic time for decisions, UTC as a label only.
 
 The rig runs on `MonotonicClock`. Its `speed` is 1 on hardware. With an emulator that runs n times faster than real
-time, the same rig runs with `speed=n`. Nothing here waits: that is the business of `rig.tasks`.
+time, the same rig runs with `speed=n`. Nothing here waits: that is the business of `stimrig.rig.tasks`.
 """
 
 from __future__ import annotations

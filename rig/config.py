@@ -14,12 +14,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
-from rig import devices, limits
-from rig.acquire.health import DEFAULT_WATCH, Watch
-from rig.devices import DeviceSettings, Kind
-from rig.errors import ConfigError, RefusedError
-from rig.limits import Limit
-from rig.messages import Range
+from stimrig.rig import devices, limits
+from stimrig.rig.acquire.health import DEFAULT_WATCH, Watch
+from stimrig.rig.devices import DeviceSettings, Kind
+from stimrig.rig.errors import ConfigError, RefusedError
+from stimrig.rig.limits import Limit
+from stimrig.rig.messages import Range
 
 
 class _Table(BaseModel):

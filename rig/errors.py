@@ -1,4 +1,4 @@
-"""The rig's exceptions. The socket (`rig.control`) and the command line (`rig.__main__`) turn them into messages."""
+"""The rig's exceptions. Its socket (`rig.control`) and command line (`rig.__main__`) turn them into messages."""
 
 from __future__ import annotations
 

@@ -15,13 +15,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rig import journal as jn
-from rig.clock import Clock
-from rig.devices import Stimulator
-from rig.errors import DeviceError, JournalError
-from rig.journal import Journal, Kind
-from rig.limits import Admitted, Limit, Refusal, admit, check
-from rig.signals import Ack, LateError, Pulse, PulseStatus
+from stimrig.rig import journal as jn
+from stimrig.rig.clock import Clock
+from stimrig.rig.devices import Stimulator
+from stimrig.rig.errors import DeviceError, JournalError
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.limits import Admitted, Limit, Refusal, admit, check
+from stimrig.rig.signals import Ack, LateError, Pulse, PulseStatus
 
 LATE_ACK_S = 0.015
 """Real seconds. A slower ack is noted in the recording: the pulse may have been felt that late, and at 40 pulses/s the

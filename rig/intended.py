@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import journal
-from rig.journal import JournalContents, Kind, LaidBlock, Segment
+from stimrig.rig import journal
+from stimrig.rig.journal import JournalContents, Kind, LaidBlock, Segment
 
 Floats = NDArray[np.float64]
 Intent = tuple[int, float, float, float, float]

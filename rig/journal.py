@@ -22,8 +22,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.errors import JournalError, RecordingError
-from rig.machine import Log
+from stimrig.rig.errors import JournalError, RecordingError
+from stimrig.rig.machine import Log
 
 MAGIC = b"STIMRIG\x01"
 _BLOCK = struct.Struct("<4sBxHII")

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from rig.errors import RefusedError
-from rig.messages import PASSIVE, Bound, Profile, TestPlan
-from rig.signals import Pulse
+from stimrig.rig.errors import RefusedError
+from stimrig.rig.messages import PASSIVE, Bound, Profile, TestPlan
+from stimrig.rig.signals import Pulse
 
 
 @dataclass(frozen=True, slots=True)

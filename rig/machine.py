@@ -1,6 +1,6 @@
 """What the rig needs of the machine on which it runs, as small Protocols: the only doors to anything that blocks.
 
-`rig.adapters` has the real ones. A simulator gives others, on a virtual clock. No adapter decides anything.
+`stimrig.rig.adapters` has the real ones. A simulator gives others, on a virtual clock. No adapter decides anything.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
-from rig.tasks import Tasks
+from stimrig.rig.tasks import Tasks
 
 Told = Callable[[str], None]
 """Called with a reason, in the tasks' own thread."""

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import sequences
-from rig.errors import PlanError, RefusedError
-from rig.limits import Limit, Refusal, admit, refuse
-from rig.messages import SAFE_END_S, SegmentPlan, TestPlan
-from rig.signals import Pulse
+from stimrig.rig import sequences
+from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.limits import Limit, Refusal, admit, refuse
+from stimrig.rig.messages import SAFE_END_S, SegmentPlan, TestPlan
+from stimrig.rig.signals import Pulse
 
 MAX_SEGMENTS = 200
 MAX_WIDTH_SETTING = "max_pulse_width_us"

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import pieces, protocols, sequences
-from rig.errors import PlanError
-from rig.limits import Limit, Steps, refuse
-from rig.messages import HELD, MOVING, PASSIVE, Preview, ProtocolInfo, RecruitmentTable, Sequences, TestPlan
-from rig.pieces import MAX_SEGMENTS, MAX_WIDTH_SETTING, Piece
+from stimrig.rig import pieces, protocols, sequences
+from stimrig.rig.errors import PlanError
+from stimrig.rig.limits import Limit, Steps, refuse
+from stimrig.rig.messages import HELD, MOVING, PASSIVE, Preview, ProtocolInfo, RecruitmentTable, Sequences, TestPlan
+from stimrig.rig.pieces import MAX_SEGMENTS, MAX_WIDTH_SETTING, Piece
 
 USUAL_RATE_HZ = 40.0
 

@@ -1,4 +1,4 @@
-"""`python -m rig.recover JOURNAL`: seal a journal by hand, whole, half-written or damaged.
+"""`python -m stimrig.rig.recover JOURNAL`: seal a journal by hand, whole, half-written or damaged.
 
 The journal is only read and stays where it is. The output and the recording's attribute `journal_note` say what could
 not be read and what had to be inferred. Exit 2: there is nothing to seal, or a running rig still writes the journal.
@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from rig import archive, assembly, journal
-from rig.adapters.files import Files
-from rig.errors import BusyError, RecordingError, RigError
+from stimrig.rig import archive, assembly, journal
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.errors import BusyError, RecordingError, RigError
 
 UNKNOWN_END = "recovered by hand; the journal does not say how the test ended"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Recover one journal; the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m rig.recover", description="Seal a journal by hand.")
+    parser = argparse.ArgumentParser(prog="python -m stimrig.rig.recover", description="Seal a journal by hand.")
     parser.add_argument("journal", type=Path, metavar="JOURNAL")
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="default: recordings/ of its data folder")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")

@@ -15,15 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import journal as jn
-from rig import pieces
-from rig.errors import BusyError, PlanError, RefusedError, TooLateError
-from rig.journal import Journal, Kind
-from rig.limits import Limit, refuse, tightened
-from rig.messages import AHEAD, Extended, LaidSegment, SegmentPlan
-from rig.pieces import Piece
-from rig.plan import PlannedTest
-from rig.tasks import Tasks
+from stimrig.rig import journal as jn
+from stimrig.rig import pieces
+from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.limits import Limit, refuse, tightened
+from stimrig.rig.messages import AHEAD, Extended, LaidSegment, SegmentPlan
+from stimrig.rig.pieces import Piece
+from stimrig.rig.plan import PlannedTest
+from stimrig.rig.tasks import Tasks
 
 MAX_EXTENSION_SEGMENTS = 8
 MAX_EXTENSION_S = 30.0

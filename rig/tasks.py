@@ -18,9 +18,9 @@ from collections.abc import Callable, Coroutine, Generator
 from itertools import count
 from typing import Any, Generic, TypeVar
 
-from rig.clock import Clock
+from stimrig.rig.clock import Clock
 
-log = logging.getLogger("rig.tasks")
+log = logging.getLogger("stimrig.rig.tasks")
 
 T = TypeVar("T")
 Outcome = Callable[[Any, BaseException | None], None]

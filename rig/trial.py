@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
-from rig.messages import RigState
+from stimrig.rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
+from stimrig.rig.messages import RigState
 
 BUSY: tuple[RigState, ...] = ("arming", "running", "sealing", "stopping")
 STOPPED: tuple[RigState, ...] = ("latched", "uncertain")

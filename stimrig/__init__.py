@@ -14,30 +14,30 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from identify.shown import register_plotter
 from stimrig import errors
+from stimrig.identify.shown import register_plotter
 
 if TYPE_CHECKING:
-    from api.charts.figures import plot
-    from api.client.rest import Client
-    from identify import Model, Record, compare, next_experiment, predict, read
-    from identify.effects import library as effects
+    from stimrig.api.charts.figures import plot
+    from stimrig.api.client.rest import Client
+    from stimrig.identify import Model, Record, compare, next_experiment, predict, read
+    from stimrig.identify.effects import library as effects
     from stimrig.with_progress import carry, diagnose, fit, improve
 
 _PLACES = {
-    "read": ("identify.records.read", "read"),
-    "Record": ("identify.records.record", "Record"),
-    "Model": ("identify.model", "Model"),
+    "read": ("stimrig.identify.records.read", "read"),
+    "Record": ("stimrig.identify.records.record", "Record"),
+    "Model": ("stimrig.identify.model", "Model"),
     "fit": ("stimrig.with_progress", "fit"),
     "carry": ("stimrig.with_progress", "carry"),
-    "predict": ("identify.simulation.predict", "predict"),
-    "compare": ("identify.criticism", "compare"),
+    "predict": ("stimrig.identify.simulation.predict", "predict"),
+    "compare": ("stimrig.identify.criticism", "compare"),
     "diagnose": ("stimrig.with_progress", "diagnose"),
     "improve": ("stimrig.with_progress", "improve"),
-    "next_experiment": ("identify.diagnosis.experiment", "next_experiment"),
-    "effects": ("identify.effects", "library"),
-    "plot": ("api.charts.figures", "plot"),
-    "Client": ("api.client.rest", "Client"),
+    "next_experiment": ("stimrig.identify.diagnosis.experiment", "next_experiment"),
+    "effects": ("stimrig.identify.effects", "library"),
+    "plot": ("stimrig.api.charts.figures", "plot"),
+    "Client": ("stimrig.api.client.rest", "Client"),
 }
 
 __all__ = [
@@ -71,7 +71,7 @@ def __dir__() -> list[str]:
 
 def _draw(result: Any, record: Any) -> Any:
     """What `model.plot(record)` calls; the plotting library is loaded by the first figure."""
-    return import_module("api.charts.figures").plot(result, record)
+    return import_module("stimrig.api.charts.figures").plot(result, record)
 
 
 register_plotter(_draw)

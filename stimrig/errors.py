@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from api.client.errors import (
+from stimrig.api.client.errors import (
     Conflict,
     Forbidden,
     Invalid,
@@ -15,7 +15,7 @@ from api.client.errors import (
     Unavailable,
     Unreachable,
 )
-from identify.errors import BadModel, BadRecord, BadRequest, Cancelled, IdentifyError, NotIdentifiable
+from stimrig.identify.errors import BadModel, BadRecord, BadRequest, Cancelled, IdentifyError, NotIdentifiable
 
 __all__ = [
     "BadModel",

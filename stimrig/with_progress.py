@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import identify
-from api.progress_bar import progress_bar
+from stimrig import identify
+from stimrig.api.progress_bar import progress_bar
 
 Tell = Callable[[float, str], None]
 Progress = Tell | bool

@@ -13,20 +13,20 @@ import pytest
 import typer
 from fastapi.routing import APIRoute
 
-import identify
-from api.centre.settings import CentreSettings
-from api.cli.main import build
-from api.settings import Settings
-from api.web import routes
-from api.web.scan import routers
-from identify.diagnosis import thresholds
-from identify.effects import registry
-from identify.estimation.prepare import prepare
-from identify.paper.table1 import simulate
-from rig import sequences
-from rig.acquire.health import Watch
-from rig.config import LimitSettings
-from rig.limits import HARD_LIMITS
+from stimrig import identify
+from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.cli.main import build
+from stimrig.api.settings import Settings
+from stimrig.api.web import routes
+from stimrig.api.web.scan import routers
+from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.effects import registry
+from stimrig.identify.estimation.prepare import prepare
+from stimrig.identify.paper.table1 import simulate
+from stimrig.rig import sequences
+from stimrig.rig.acquire.health import Watch
+from stimrig.rig.config import LimitSettings
+from stimrig.rig.limits import HARD_LIMITS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

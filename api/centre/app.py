@@ -6,20 +6,20 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from starlette.types import Receive, Scope, Send
 
-from api.centre import pages, routes
-from api.centre.chain import MOST_ITEM_BYTES
-from api.centre.context import build
-from api.centre.pages.face import FACE
-from api.centre.settings import CentreSettings
-from api.centre.spool import MOST_PIECE_BYTES
-from api.clock import Clock
-from api.web import openapi, problems
-from api.web import pages as web_pages
-from api.web import routes as web_routes
-from api.web.app import Service
-from api.web.body_limit import BODY_BYTES, BODY_S, BodyLimit
-from api.web.scan import routers
-from api.web.strict_body import StrictBody
+from stimrig.api.centre import pages, routes
+from stimrig.api.centre.chain import MOST_ITEM_BYTES
+from stimrig.api.centre.context import build
+from stimrig.api.centre.pages.face import FACE
+from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.centre.spool import MOST_PIECE_BYTES
+from stimrig.api.clock import Clock
+from stimrig.api.web import openapi, problems
+from stimrig.api.web import pages as web_pages
+from stimrig.api.web import routes as web_routes
+from stimrig.api.web.app import Service
+from stimrig.api.web.body_limit import BODY_BYTES, BODY_S, BodyLimit
+from stimrig.api.web.scan import routers
+from stimrig.api.web.strict_body import StrictBody
 
 DESCRIPTION = """
 Rigs push with their own keys to `/v1/rig/…`; everything else is for people and programs, who only read: programs send

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
-from api.errors import ApiError, SettingsError
+from stimrig.api.errors import ApiError, SettingsError
 
 PIECE = 2**20
 PROBE = "stimrig-centre"

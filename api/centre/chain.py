@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from api.errors import ApiError
-from api.outbox.chain import BEGIN, item_hash
-from api.store.hashes import canonical, digest
-from identify.strict_json import BadJson, parse
+from stimrig.api.errors import ApiError
+from stimrig.api.outbox.chain import BEGIN, item_hash
+from stimrig.api.store.hashes import canonical, digest
+from stimrig.identify.strict_json import BadJson, parse
 
 MOST_ITEMS = 500
 MOST_ITEM_BYTES = 4_000_000

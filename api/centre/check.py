@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, func, select
 
-from api.centre import warnings
-from api.centre.bucket import Bucket, BucketError, MissingError
-from api.centre.project import want
-from api.centre.spool import Spool
-from api.clock import Clock, utc_label
-from api.store import Store
-from api.store.centre_tables import CentreFile, CentreItem, CentreRig, CentreWarning
+from stimrig.api.centre import warnings
+from stimrig.api.centre.bucket import Bucket, BucketError, MissingError
+from stimrig.api.centre.project import want
+from stimrig.api.centre.spool import Spool
+from stimrig.api.clock import Clock, utc_label
+from stimrig.api.store import Store
+from stimrig.api.store.centre_tables import CentreFile, CentreItem, CentreRig, CentreWarning
 
 PAGE = 500
 EVERY_S = 30.0

@@ -17,23 +17,23 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 from sqlalchemy.exc import SQLAlchemyError
 
-from api import owner_only
-from api.centre import check, warnings
-from api.centre.bucket import Bucket, BucketError
-from api.centre.heads import Heads
-from api.centre.ingest import Ingest
-from api.centre.rigs import Rigs
-from api.centre.settings import CentreSettings
-from api.centre.spool import Spool
-from api.clock import Clock, set_zone
-from api.errors import ApiError, SettingsError
-from api.models.registry import Versions
-from api.people.accounts import People
-from api.people.auth import Auth
-from api.people.idle_lock import FLUSH_S, IdleLock
-from api.people.pace import Guesses
-from api.store import Store
-from api.store.secrets import shared
+from stimrig.api import owner_only
+from stimrig.api.centre import check, warnings
+from stimrig.api.centre.bucket import Bucket, BucketError
+from stimrig.api.centre.heads import Heads
+from stimrig.api.centre.ingest import Ingest
+from stimrig.api.centre.rigs import Rigs
+from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.centre.spool import Spool
+from stimrig.api.clock import Clock, set_zone
+from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.models.registry import Versions
+from stimrig.api.people.accounts import People
+from stimrig.api.people.auth import Auth
+from stimrig.api.people.idle_lock import FLUSH_S, IdleLock
+from stimrig.api.people.pace import Guesses
+from stimrig.api.store import Store
+from stimrig.api.store.secrets import shared
 
 log = logging.getLogger("stimrig.centre")
 MOST_DOWNLOADS, MOST_PUTS, MOST_PUTS_OF_A_RIG = 4, 8, 3

@@ -8,11 +8,11 @@ from typing import Any
 
 from sqlalchemy import Select, exists, select, tuple_
 
-from api.centre import clean
-from api.clock import local_day
-from api.errors import ApiError
-from api.store import Store
-from api.store.centre_tables import (
+from stimrig.api.centre import clean
+from stimrig.api.clock import local_day
+from stimrig.api.errors import ApiError
+from stimrig.api.store import Store
+from stimrig.api.store.centre_tables import (
     CentreDecision,
     CentreEffect,
     CentreModel,

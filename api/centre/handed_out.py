@@ -11,11 +11,11 @@ from typing import IO
 
 from fastapi.responses import Response, StreamingResponse
 
-from api.centre import check
-from api.centre.bucket import PIECE, BucketError, MissingError
-from api.centre.context import Context
-from api.errors import ApiError, NotFoundError
-from api.store.centre_tables import CentreFile
+from stimrig.api.centre import check
+from stimrig.api.centre.bucket import PIECE, BucketError, MissingError
+from stimrig.api.centre.context import Context
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.store.centre_tables import CentreFile
 
 IN_MEMORY = 8_000_000
 

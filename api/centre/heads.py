@@ -9,10 +9,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from sqlalchemy import func, select, tuple_
 from sqlalchemy.orm import Session, aliased
 
-from api.centre import warnings
-from api.outbox.receipts import Receipt
-from api.store import Store
-from api.store.centre_tables import CentreChain, CentreItem, CentreRig, CentreWarning
+from stimrig.api.centre import warnings
+from stimrig.api.outbox.receipts import Receipt
+from stimrig.api.store import Store
+from stimrig.api.store.centre_tables import CentreChain, CentreItem, CentreRig, CentreWarning
 
 MOST = 500
 KIND = "audit"

@@ -7,15 +7,15 @@ from typing import Any
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
-from api.centre import clean, rigs, warnings
-from api.centre.chain import BatchIn, HelloIn, Item, ItemIn, checked
-from api.centre.project import Projector
-from api.clock import Clock, unix_of
-from api.errors import ApiError
-from api.outbox.chain import NOWHERE, Position
-from api.store import Store
-from api.store.centre_tables import CentreChain, CentreItem, CentreRig
-from api.store.hashes import storable
+from stimrig.api.centre import clean, rigs, warnings
+from stimrig.api.centre.chain import BatchIn, HelloIn, Item, ItemIn, checked
+from stimrig.api.centre.project import Projector
+from stimrig.api.clock import Clock, unix_of
+from stimrig.api.errors import ApiError
+from stimrig.api.outbox.chain import NOWHERE, Position
+from stimrig.api.store import Store
+from stimrig.api.store.centre_tables import CentreChain, CentreItem, CentreRig
+from stimrig.api.store.hashes import storable
 
 MOST_CLOCK_S = 2.0
 LEAST_DISK_SHARE, LEAST_DISK_BYTES = 0.05, 5_000_000_000

@@ -13,8 +13,8 @@ import subprocess
 import time
 from pathlib import Path
 
-from api import owner_only
-from api.errors import SettingsError
+from stimrig.api import owner_only
+from stimrig.api.errors import SettingsError
 
 PROGRAMS = Path("/usr/lib/postgresql")
 UNPRIVILEGED = "postgres"

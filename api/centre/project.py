@@ -8,10 +8,10 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from api.centre import clean, heads, warnings
-from api.centre.chain import Item
-from api.clock import local_day
-from api.store.centre_tables import (
+from stimrig.api.centre import clean, heads, warnings
+from stimrig.api.centre.chain import Item
+from stimrig.api.clock import local_day
+from stimrig.api.store.centre_tables import (
     CentreDecision,
     CentreEffect,
     CentreFile,

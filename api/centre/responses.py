@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field, JsonValue
 
-from api.outbox.receipts import Receipt
-from api.web.responses.base import Document
+from stimrig.api.outbox.receipts import Receipt
+from stimrig.api.web.responses.base import Document
 
 
 class PlaceOut(Document):

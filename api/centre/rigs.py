@@ -9,13 +9,13 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.requests import HTTPConnection
 
-from api.clock import Clock
-from api.errors import ApiError, NotFoundError
-from api.people.auth import unauthorized
-from api.people.pace import Guesses, place_of
-from api.store import Store, audit
-from api.store.centre_tables import CentreRig
-from api.store.hashes import digest
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.people.auth import unauthorized
+from stimrig.api.people.pace import Guesses, place_of
+from stimrig.api.store import Store, audit
+from stimrig.api.store.centre_tables import CentreRig
+from stimrig.api.store.hashes import digest
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,59}")
 KEY_BEGINS = "stimrig_rig_"

@@ -1,4 +1,4 @@
-"""`python -m api.centre.server`: the centre's process. Prints one JSON line when it answers; ends at SIGTERM.
+"""`python -m stimrig.api.centre.server`: the centre's process. Prints one JSON line when it answers; ends at SIGTERM.
 
 Exit 2: a setting does not hold, the port is taken, the database does not open, the bucket is not there.
 """
@@ -16,12 +16,12 @@ from collections.abc import Callable
 import uvicorn
 from fastapi import FastAPI
 
-from api import logs
-from api.centre.app import create_app
-from api.centre.settings import CentreSettings
-from api.errors import ApiError, SettingsError
-from api.web.connections import raise_file_limit
-from api.web.server import address_of, bind, configuration, refuse_open_door, serve
+from stimrig.api import logs
+from stimrig.api.centre.app import create_app
+from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.web.connections import raise_file_limit
+from stimrig.api.web.server import address_of, bind, configuration, refuse_open_door, serve
 
 
 def main() -> int:

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 from pydantic_settings import SettingsConfigDict
 
-from api.settings import ServerSettings
+from stimrig.api.settings import ServerSettings
 
 
 class CentreSettings(ServerSettings):

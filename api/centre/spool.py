@@ -13,13 +13,13 @@ from typing import Any
 
 from sqlalchemy import delete, select
 
-from api import owner_only
-from api.centre import rigs, warnings
-from api.centre.bucket import Bucket, BucketError, failed, first_line
-from api.clock import Clock
-from api.errors import ApiError, NotFoundError
-from api.store import Store
-from api.store.centre_tables import CentreFile, CentreRig, CentreWanted
+from stimrig.api import owner_only
+from stimrig.api.centre import rigs, warnings
+from stimrig.api.centre.bucket import Bucket, BucketError, failed, first_line
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.store import Store
+from stimrig.api.store.centre_tables import CentreFile, CentreRig, CentreWanted
 
 MOST_PIECE_BYTES = 8_000_000
 MOST_LISTED = 1000

@@ -7,10 +7,10 @@ from typing import Any
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
-from api.clock import Clock
-from api.errors import NotFoundError
-from api.store import Store, audit
-from api.store.centre_tables import CentreRig, CentreWarning
+from stimrig.api.clock import Clock
+from stimrig.api.errors import NotFoundError
+from stimrig.api.store import Store, audit
+from stimrig.api.store.centre_tables import CentreRig, CentreWarning
 
 MOST_OPEN = 1000
 """Of a rig and a kind, as long as nobody has acknowledged them: a hostile rig fills no page."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from api.charts import hover
-from api.charts.model_charts import INK, MODEL, STIMULUS, axis, band, band_of, box, layout, line
-from api.charts.palette import role
-from api.language import _
+from stimrig.api.charts import hover
+from stimrig.api.charts.model_charts import INK, MODEL, STIMULUS, axis, band, band_of, box, layout, line
+from stimrig.api.charts.palette import role
+from stimrig.api.language import _
 
 COLOURS = tuple(role(f"series-{number}") for number in range(1, 7))
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")

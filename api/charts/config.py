@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.language import lazy
+from stimrig.api.language import lazy
 
 CHART_CONFIG: dict[str, Any] = {
     "responsive": True,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.charts import hover
-from api.charts.config import said
-from api.charts.model_charts import (
+from stimrig.api.charts import hover
+from stimrig.api.charts.config import said
+from stimrig.api.charts.model_charts import (
     INK,
     MEASURED,
     MODEL,
@@ -19,8 +19,8 @@ from api.charts.model_charts import (
     segment_marks,
     segment_name,
 )
-from api.charts.palette import role
-from api.language import _, localised
+from stimrig.api.charts.palette import role
+from stimrig.api.language import _, localised
 
 MARK, MARK_LINE, FLOOR = role("worst-band"), role("worst"), role("limit")
 
@@ -122,6 +122,6 @@ def of_why(
 
 def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """The worst places before a diagnosis is there."""
-    from api.models.explanation import place
+    from stimrig.api.models.explanation import place
 
     return [place(entry, number) for number, entry in enumerate(comparison.get("where") or [], start=1)]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.charts import diagnosis_charts, model_charts
-from api.charts.local_figure import LocalFigure
-from api.charts.palette import in_light
-from api.models import explanation
-from api.workers.verbs import curves, runs, thinned
-from identify import BadRequest, Comparison, Improvement, Model, Record, compare
+from stimrig.api.charts import diagnosis_charts, model_charts
+from stimrig.api.charts.local_figure import LocalFigure
+from stimrig.api.charts.palette import in_light
+from stimrig.api.models import explanation
+from stimrig.api.workers.verbs import curves, runs, thinned
+from stimrig.identify import BadRequest, Comparison, Improvement, Model, Record, compare
 
 BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]
 """Widths of the measurement and of the recruitment curve beside it."""

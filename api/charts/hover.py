@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from api.language import localised
+from stimrig.api.language import localised
 
 TORQUE, RESIDUAL, WIDTH, SHARE = "%{y:.2f} N·m", "%{y:+.3f} N·m", "%{y:.0f} µs", "%{y:.3f}"
 FACTOR = "%{y:.2f}"

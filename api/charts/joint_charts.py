@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from api.charts import hover
-from api.charts.model_charts import axis, filled, layout, line
-from api.charts.palette import role
-from api.language import _
+from stimrig.api.charts import hover
+from stimrig.api.charts.model_charts import axis, filled, layout, line
+from stimrig.api.charts.palette import role
+from stimrig.api.language import _
 
 STILL_RAD_S, FAST_RAD_S = 0.15, 0.7
-"""The ways to move, as the coverage of the guided tests divides them (`api.sessions.coverage`)."""
+"""The ways to move, as the coverage of the guided tests divides them (`stimrig.api.sessions.coverage`)."""
 NEAR_RAD = math.radians(3) + 1e-9
 """An angle counts as seen if the joint was this near to it: the table is finer than any movement."""
 BAND = role("series-band")

@@ -6,7 +6,7 @@ from typing import Any
 
 import plotly.graph_objects as go
 
-from api.charts.config import CHART_CONFIG
+from stimrig.api.charts.config import CHART_CONFIG
 
 
 class LocalFigure(go.Figure):

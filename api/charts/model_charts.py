@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-from api.charts import hover, ramp_directions
-from api.charts.config import said
-from api.charts.palette import role
-from api.clinical_words import segment_words
-from api.language import _, localised
+from stimrig.api.charts import hover, ramp_directions
+from stimrig.api.charts.config import said
+from stimrig.api.charts.palette import role
+from stimrig.api.clinical_words import segment_words
+from stimrig.api.language import _, localised
 
 INK, MEASURED, MODEL, STIMULUS, FAINT = (role(name) for name in ("residual", "measured", "model", "width", "plan"))
 BAND, NOISE = role("model-band"), role("noise-band")

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.charts.model_charts import TOOLBAR_PX, axis
-from api.language import _
+from stimrig.api.charts.model_charts import TOOLBAR_PX, axis
+from stimrig.api.language import _
 
 HEIGHT_PX = 260
 LARGE = "comparison"

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-from api.charts.hover import on
+from stimrig.api.charts.hover import on
 
 WINDOW_S = 0.6
 """A slope is taken over this long; a pulse width that jumps or turns within it has no direction."""
@@ -27,7 +27,7 @@ def seen(document: dict[str, Any], curves: dict[str, Any]) -> dict[str, dict[str
     document : dict
         MODEL.json.
     curves : dict
-        As `api.workers.verbs.curves` gives them.
+        As `stimrig.api.workers.verbs.curves` gives them.
 
     Returns
     -------

@@ -10,8 +10,8 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from api.charts.palette import painted_light, role
-from api.language import localised
+from stimrig.api.charts.palette import painted_light, role
+from stimrig.api.language import localised
 
 LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 40.0, 42.0
 FONT = "system-ui, 'DejaVu Sans', sans-serif"
@@ -29,7 +29,7 @@ def svg(
     Parameters
     ----------
     figure : dict
-        ``data`` and ``layout`` as `api.charts.model_charts` makes them.
+        ``data`` and ``layout`` as `stimrig.api.charts.model_charts` makes them.
     width, height : float
         px; default height: the layout's.
     label : str

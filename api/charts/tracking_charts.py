@@ -7,11 +7,11 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from api import language
-from api.charts import trend_charts
-from api.charts.trend_charts import BOTTOM, LEFT, RIGHT, TALL, TOP, WIDE, Point
-from api.language import _
-from api.models.tracking import Bounds
+from stimrig.api import language
+from stimrig.api.charts import trend_charts
+from stimrig.api.charts.trend_charts import BOTTOM, LEFT, RIGHT, TALL, TOP, WIDE, Point
+from stimrig.api.language import _
+from stimrig.api.models.tracking import Bounds
 
 FOOT = 16.0
 """For the name of the axis below its numbers."""
@@ -24,7 +24,7 @@ def panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[dict[str
     Parameters
     ----------
     trials : sequence of mapping
-        As `api.models.tracked.told` gives them, the oldest first.
+        As `stimrig.api.models.tracked.told` gives them, the oldest first.
     bounds : Bounds
         What a person allowed, drawn as lines.
     """

@@ -11,13 +11,13 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from api import language
-from api.charts.svg import plain, ticks
-from api.clock import unix_of, utc_label
-from api.language import _
-from api.models import trend_words
-from api.models.changes import BEYOND
-from api.models.trend_words import UNBROKEN, Name
+from stimrig.api import language
+from stimrig.api.charts.svg import plain, ticks
+from stimrig.api.clock import unix_of, utc_label
+from stimrig.api.language import _
+from stimrig.api.models import trend_words
+from stimrig.api.models.changes import BEYOND
+from stimrig.api.models.trend_words import UNBROKEN, Name
 
 WIDE, TALL = 400.0, 128.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 12.0, 20.0

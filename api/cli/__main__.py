@@ -1,5 +1,5 @@
-"""`python -m api.cli`: what the console script `stimrig` runs."""
+"""`python -m stimrig.api.cli`: what the console script `stimrig` runs."""
 
-from api.cli.main import main
+from stimrig.api.cli.main import main
 
 main()

@@ -9,19 +9,19 @@ import sys
 import threading
 from pathlib import Path
 
-from api import owner_only
-from api.centre.context import opened
-from api.centre.postgres import Cluster
-from api.centre.rigs import Rigs
-from api.centre.settings import CentreSettings
-from api.cli.child import Child
-from api.cli.errors import LaunchError
-from api.cli.launcher import Ended, Endings
-from api.cli.terminal import say
-from api.client.errors import ServiceError
-from api.client.rest import Client
-from api.clock import Clock
-from api.people.pace import Guesses
+from stimrig.api import owner_only
+from stimrig.api.centre.context import opened
+from stimrig.api.centre.postgres import Cluster
+from stimrig.api.centre.rigs import Rigs
+from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.cli.child import Child
+from stimrig.api.cli.errors import LaunchError
+from stimrig.api.cli.launcher import Ended, Endings
+from stimrig.api.cli.terminal import say
+from stimrig.api.client.errors import ServiceError
+from stimrig.api.client.rest import Client
+from stimrig.api.clock import Clock
+from stimrig.api.people.pace import Guesses
 
 RIGS = (("Ward 1", "paper", "P001"), ("Ward 2", "calcium", "P002"))
 """Name, emulated muscle and participant of each rig."""
@@ -35,7 +35,7 @@ class EmulatedRig:
     def __init__(self, folder: Path, name: str, patient: str, code: str, centre_url: str, key: str) -> None:
         self.name, self.code, self.token = name, code, secrets.token_urlsafe(24)
         self.port = free_port()
-        command = [sys.executable, "-m", "api.cli", "serve", "--data", str(folder), "--port", str(self.port)]
+        command = [sys.executable, "-m", "stimrig.api.cli", "serve", "--data", str(folder), "--port", str(self.port)]
         log = owner_only.folder(folder) / "service.log"
         self.child = Child(name, [*command, "--emulate", f"--patient {patient}"], log, {
             "STIMRIG_CENTRE_URL": centre_url, "STIMRIG_CENTRE_KEY": key, "STIMRIG_ADMIN_TOKEN": self.token,
@@ -112,7 +112,7 @@ def _centre(folder: Path, port: int, database: str, token: str) -> Child:
         "STIMRIG_CENTRE_FILES": str(folder / "bucket"), "STIMRIG_CENTRE_PORT": str(port),
         "STIMRIG_CENTRE_ADMIN_TOKEN": token, "STIMRIG_CENTRE_HOST": "127.0.0.1",
     }  # fmt: skip
-    return Child("centre", [sys.executable, "-m", "api.centre.server"], folder / "centre.log", environment)
+    return Child("centre", [sys.executable, "-m", "stimrig.api.centre.server"], folder / "centre.log", environment)
 
 
 def _key(folder: Path, database: str, name: str) -> str:

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from api.cli.errors import LaunchError
+from stimrig.api.cli.errors import LaunchError
 
 READY_S = 60.0
 END_S = 6.0

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from api.cli.terminal import table
-from api.progress_bar import in_notebook, progress_bar
+from stimrig.api.cli.terminal import table
+from stimrig.api.progress_bar import in_notebook, progress_bar
 
 if TYPE_CHECKING:
-    from api.cohort.run import Tally
+    from stimrig.api.cohort.run import Tally
 
 MOST_ROWS = 40
 """Changed records that are shown; --json gives all."""

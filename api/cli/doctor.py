@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from api.settings import Settings
+from stimrig.api.settings import Settings
 
 Verdict = Literal["ok", "care", "fails"]
 LEAST_FREE_GB, GOOD_FREE_GB = 0.5, 5.0
@@ -192,10 +192,10 @@ def check_database(settings: Settings) -> Iterator[Finding]:
     if settings.database_url is None and not (settings.data_dir / "stimrig.db").exists():
         yield Finding("database", "ok", "not there yet; the first start makes it")
         return
-    from api.errors import ApiError
-    from api.outbox import receipts
-    from api.store import Store
-    from api.store.tables import AuditEntry
+    from stimrig.api.errors import ApiError
+    from stimrig.api.outbox import receipts
+    from stimrig.api.store import Store
+    from stimrig.api.store.tables import AuditEntry
 
     try:
         store = Store(settings.database)
@@ -214,8 +214,8 @@ def check_database(settings: Settings) -> Iterator[Finding]:
 
 def check_centre(settings: Settings) -> Iterator[Finding]:
     """Does a centre hear of this rig? Nothing where none is configured."""
-    from api.clock import Clock
-    from api.outbox import status
+    from stimrig.api.clock import Clock
+    from stimrig.api.outbox import status
 
     told = status.read(settings, Clock().unix_s())
     if told is None:
@@ -266,7 +266,7 @@ def check_priority(_settings: Settings) -> Iterator[Finding]:
 
 def check_compiled(_settings: Settings) -> Iterator[Finding]:
     """Can what numba compiles be kept, so that the first fit is not a slow one?"""
-    import identify
+    from stimrig import identify
 
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(str(identify.__file__)).parent)
     nearest = next(folder for folder in (place, *place.parents) if folder.exists())
@@ -278,7 +278,7 @@ def check_compiled(_settings: Settings) -> Iterator[Finding]:
 
 def check_door(settings: Settings) -> Iterator[Finding]:
     """Is the service closed to the network unless TLS stands in front?"""
-    from api.web.server import refuse_open_door
+    from stimrig.api.web.server import refuse_open_door
 
     try:
         refuse_open_door(settings)
@@ -294,7 +294,7 @@ def check_door(settings: Settings) -> Iterator[Finding]:
 
 def check_workers(_settings: Settings) -> Iterator[Finding]:
     """Can the processes that read other people's files be shut in?"""
-    command = [sys.executable, "-m", "api.workers.confinement"]
+    command = [sys.executable, "-m", "stimrig.api.workers.confinement"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30)
     left_open = json.loads(done.stdout)
     if not left_open:

@@ -18,12 +18,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from api import owner_only
-from api.cli.child import ENDINGS, Child
-from api.cli.errors import LaunchError
-from api.cli.streams import Streams
-from api.settings import Settings
-from api.store.lock import HeldError, refuse_if_held
+from stimrig.api import owner_only
+from stimrig.api.cli.child import ENDINGS, Child
+from stimrig.api.cli.errors import LaunchError
+from stimrig.api.cli.streams import Streams
+from stimrig.api.settings import Settings
+from stimrig.api.store.lock import HeldError, refuse_if_held
 
 SEAL_S = 35.0
 """The rig may still have a test to seal."""
@@ -89,12 +89,12 @@ class Services:
         self.emulator: Child | None = None
         if settings.rig_file is None and not self.attached:
             arguments = ["--die-with-parent", *(emulator_arguments or [])]
-            self.emulator = self._child("emulator", ["hardware_sim", *arguments])
-        self.rig = self._child("rig", ["rig"])
-        self.api = self._child("api", ["api.web.server"])
-        self.outbox = None if settings.centre_url is None else self._child("outbox", ["api.outbox"])
+            self.emulator = self._child("emulator", ["stimrig.hardware_sim", *arguments])
+        self.rig = self._child("rig", ["stimrig.rig"])
+        self.api = self._child("api", ["stimrig.api.web.server"])
+        self.outbox = None if settings.centre_url is None else self._child("outbox", ["stimrig.api.outbox"])
         self.admin_token = admin_token
-        self.lsl = Streams(self._child("lsl", ["rig.lsl_outlets"])) if settings.lsl else None
+        self.lsl = Streams(self._child("lsl", ["stimrig.rig.lsl_outlets"])) if settings.lsl else None
 
     def _child(self, name: str, module: list[str]) -> Child:
         return Child(name, [sys.executable, "-m", *module], self.settings.logs_dir / f"{name}.log")

@@ -17,12 +17,12 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from api.cli import commands
-from api.cli.errors import CommandError
-from api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
-from api.errors import ApiError, SettingsError
-from api.version import software_version
-from identify.errors import IdentifyError
+from stimrig.api.cli import commands
+from stimrig.api.cli.errors import CommandError
+from stimrig.api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
+from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.version import software_version
+from stimrig.identify.errors import IdentifyError
 
 VERBS = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
 INPUT_AT_FAULT = (Unreachable, Unauthorized, Forbidden, NotFound, Invalid)

@@ -6,12 +6,12 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from api.cli.errors import CommandError
-from api.cli.terminal import carried_lines, model_report, number
-from api.client.documents import SessionTest
-from api.client.errors import Unreachable
-from api.client.rest import Client
-from api.clinical_words import adaptive_end_words
+from stimrig.api.cli.errors import CommandError
+from stimrig.api.cli.terminal import carried_lines, model_report, number
+from stimrig.api.client.documents import SessionTest
+from stimrig.api.client.errors import Unreachable
+from stimrig.api.client.rest import Client
+from stimrig.api.clinical_words import adaptive_end_words
 
 
 def run_test(

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 
-from rig.messages import StatusRequest, StopEvidence, StopRequest
+from stimrig.rig.messages import StatusRequest, StopEvidence, StopRequest
 
 if TYPE_CHECKING:
-    from api.sessions.rig_client import RigClient
+    from stimrig.api.sessions.rig_client import RigClient
 
 REASON, BY = "a key was pressed", "terminal"
 IDLE = ("ready", "latched", "disconnected")
@@ -122,15 +122,15 @@ def at_rig(path: Path, stray: Callable[[], bool] = lambda: True) -> Callable[[],
         Whether a key may be a stray one while the rig plays nothing. A program that has asked for a test says no: the
         key is to stop what is about to begin.
     """
-    from api.clock import Clock
-    from api.sessions.rig_client import RigClient
+    from stimrig.api.clock import Clock
+    from stimrig.api.sessions.rig_client import RigClient
 
     rig = RigClient(path, Clock())
     return lambda: asyncio.run(_stop(rig, stray()))
 
 
 async def _stop(rig: RigClient, stray: bool) -> str:
-    from api.errors import ApiError
+    from stimrig.api.errors import ApiError
 
     with contextlib.suppress(Exception):  # who does not say what it does is stopped
         if stray and (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from api.cli.child import Child
+from stimrig.api.cli.child import Child
 
 AGAIN_S = (1.0, 5.0, 30.0)
 """Real seconds until they are started again; the last one for every further time."""
@@ -12,7 +12,7 @@ LASTED_S = 300.0
 
 
 class Streams:
-    """Starts `rig.lsl_outlets`, and again when it dies; waits for nothing.
+    """Starts `stimrig.rig.lsl_outlets`, and again when it dies; waits for nothing.
 
     Parameters
     ----------

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
-import identify
-from api.cli.errors import InputError
+from stimrig import identify
+from stimrig.api.cli.errors import InputError
 
 LARGEST_MODEL_BYTES = 32 * 2**20
 
@@ -95,7 +95,7 @@ def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects:
     IdentifyError
         One cannot be read, they do not go together, or one lacks what one of the `effects` needs.
     """
-    from api.workers import several
+    from stimrig.api.workers import several
 
     twice = [path for number, path in enumerate(data) if path in data[:number]]
     if twice:
@@ -106,7 +106,7 @@ def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects:
 
 def _needed(effects: Sequence[str]) -> list[str]:
     """The columns that effects need; of an unknown one the fit says so."""
-    from identify import effects as library
+    from stimrig.identify import effects as library
 
     found: list[str] = []
     for effect in effects:
@@ -134,7 +134,7 @@ def load_held(path: Path | None, data: Sequence[Path], columns: list[str] | None
     InputError
         As `load_model`; the model is one of another pulse rate, or one that effects do not stand on.
     """
-    from api.structure import held_by
+    from stimrig.api.structure import held_by
 
     model = None if path is None else load_model(path)
     record = load_joined(data, columns)
@@ -178,7 +178,7 @@ def write_mat(path: Path, variables: dict[str, Any]) -> None:
     InputError
         It cannot be written.
     """
-    from identify import plain_mat
+    from stimrig.identify import plain_mat
 
     with writing(path):
         plain_mat.write(path, variables)
@@ -201,7 +201,7 @@ def writing(path: Path) -> Iterator[None]:
 
 def say_json(found: dict[str, Any]) -> None:
     """One JSON object, nothing else."""
-    from api.workers.json_values import clean
+    from stimrig.api.workers.json_values import clean
 
     print(json.dumps(clean(found), ensure_ascii=False, allow_nan=False))
 
@@ -227,7 +227,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 def percent(value: float | None) -> str:
     """A best-fit % for people; why there is none."""
-    from api.models.summary import UNDEFINED
+    from stimrig.api.models.summary import UNDEFINED
 
     return UNDEFINED if value is None or not math.isfinite(value) else f"{value:.2f} %"
 
@@ -256,7 +256,7 @@ def carried_lines(found: Mapping[str, Any] | None) -> list[str]:
 
 def model_report(document: dict[str, Any]) -> list[str]:
     """What a person reads off a model."""
-    from api.models import summary
+    from stimrig.api.models import summary
 
     fit, judged = summary.figures(document), summary.quality(document)
     dynamics, curve = summary.dynamics(document), summary.recruitment(document)

@@ -10,8 +10,8 @@ import httpx
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from api import decisions
-from api.client.errors import Unreachable, refused
+from stimrig.api import decisions
+from stimrig.api.client.errors import Unreachable, refused
 
 
 class SendsVersions(httpx.Auth):

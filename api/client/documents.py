@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
-    from identify import Model
+    from stimrig.identify import Model
 
 
 class Participant(TypedDict):
@@ -170,6 +170,6 @@ class ApprovedModel:
 
     def model(self) -> Model:
         """The model itself, to predict with."""
-        from identify import Model  # here: a controller that reads the document alone needs no numpy
+        from stimrig.identify import Model  # here: a controller that reads the document alone needs no numpy
 
         return Model.from_dict(self.document)

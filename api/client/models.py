@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from api.client.connection import Connection
-from api.client.documents import ApprovedModel, Job, Tracking, Trend, Version
-from api.client.errors import NotCompleted, ServiceError, refused
+from stimrig.api.client.connection import Connection
+from stimrig.api.client.documents import ApprovedModel, Job, Tracking, Trend, Version
+from stimrig.api.client.errors import NotCompleted, ServiceError, refused
 
 POLL_S = 0.1
 Progress = Callable[[float, str], None]

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from api.client.documents import Note, Participant, SessionTest
-from api.client.errors import NotCompleted, NotFound
-from api.client.models import POLL_S, Models
+from stimrig.api.client.documents import Note, Participant, SessionTest
+from stimrig.api.client.errors import NotCompleted, NotFound
+from stimrig.api.client.models import POLL_S, Models
 
 OUTLOOK_S = 300.0
 """So long a busy service may take to say what an adaptive test can reach; usually it takes a few seconds."""

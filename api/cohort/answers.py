@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import identify
-from api.cohort.tasks import Task
+from stimrig import identify
+from stimrig.api.cohort.tasks import Task
 
 FIGURES = (
     "fit_percent", "ceiling_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm", "held_out_by",
@@ -43,7 +43,7 @@ def _fit(record: Any, task: Task) -> Row:
 
 
 def _diagnose(record: Any, _task: Task) -> Row:
-    from identify.diagnosis.experiment import planned
+    from stimrig.identify.diagnosis.experiment import planned
 
     found = identify.diagnose(record).to_dict()
     missing = found["missing"]

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from api.cohort.bids_words import DESCRIPTION, EVENTS, PARTICIPANTS, PHYSIO, README, SCANS, STIM
-from api.cohort.export_state import FOLDER, State
-from api.cohort.handed_on import ERRORS, NoExport, Put, Who
-from api.cohort.opened import Opened
-from api.cohort.parquet_files import STATUS, record_row, segment_at
-from api.version import software_version
-from identify.records.cells import told
+from stimrig.api.cohort.bids_words import DESCRIPTION, EVENTS, PARTICIPANTS, PHYSIO, README, SCANS, STIM
+from stimrig.api.cohort.export_state import FOLDER, State
+from stimrig.api.cohort.handed_on import ERRORS, NoExport, Put, Who
+from stimrig.api.cohort.opened import Opened
+from stimrig.api.cohort.parquet_files import STATUS, record_row, segment_at
+from stimrig.api.version import software_version
+from stimrig.identify.records.cells import told
 
 NAME: str = "bids"
 MOST_ROWS = 20_000_000

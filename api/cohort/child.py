@@ -21,20 +21,20 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import identify
-from api.cohort.answers import answer
-from api.cohort.fields import as_day
-from api.cohort.select import Selection
-from api.cohort.tasks import Task
-from api.version import software_version
-from api.workers import confinement
-from api.workers.child import own_output, say
-from api.workers.json_values import clean
-from identify.diagnosis import candidates
-from identify.errors import BadRecord, BadRequest, IdentifyError, NotIdentifiable
-from identify.records import bounds
-from identify.records.hdf5 import StrictFile
-from identify.records.read import HDF5_MAGIC
+from stimrig import identify
+from stimrig.api.cohort.answers import answer
+from stimrig.api.cohort.fields import as_day
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.tasks import Task
+from stimrig.api.version import software_version
+from stimrig.api.workers import confinement
+from stimrig.api.workers.child import own_output, say
+from stimrig.api.workers.json_values import clean
+from stimrig.identify.diagnosis import candidates
+from stimrig.identify.errors import BadRecord, BadRequest, IdentifyError, NotIdentifiable
+from stimrig.identify.records import bounds
+from stimrig.identify.records.hdf5 import StrictFile
+from stimrig.identify.records.read import HDF5_MAGIC
 
 IDLE_S = 600.0
 """A worker that outlives the run keeps no process for longer."""
@@ -45,8 +45,8 @@ ABOUT = {
 """Attributes of a sealed recording, and the columns that repeat them."""
 SAID = ("participant", "day", "kind", "rig", "record_id", "test_id", "outcome")
 LIBRARIES = (
-    "identify.fitting", "identify.diagnosis.experiment", "identify.diagnosis.improvement", "identify.records.csv",
-    "identify.records.mat", "identify.records.recording",
+    "stimrig.identify.fitting", "stimrig.identify.diagnosis.experiment", "stimrig.identify.diagnosis.improvement",
+    "stimrig.identify.records.csv", "stimrig.identify.records.mat", "stimrig.identify.records.recording",
 )  # fmt: skip
 KINDS: tuple[tuple[type[IdentifyError], str], ...] = (
     (BadRecord, "bad record"), (NotIdentifiable, "not identifiable"), (BadRequest, "bad request"),
@@ -55,7 +55,7 @@ KINDS: tuple[tuple[type[IdentifyError], str], ...] = (
 
 def main() -> None:
     """Serve calls until the input closes."""
-    parser = argparse.ArgumentParser(prog="api.cohort.child")
+    parser = argparse.ArgumentParser(prog="stimrig.api.cohort.child")
     parser.add_argument("--folder", type=Path, required=True, help="where records are put, all that may be read")
     parser.add_argument("--memory", type=int, required=True, help="bytes beyond what the libraries take")
     options = parser.parse_args()

@@ -19,8 +19,8 @@ from distributed import Client, LocalCluster
 from distributed.comm.core import CommClosedError
 from distributed.security import Security
 
-from api.cohort.errors import SCHEDULER_GONE, CohortError, CutOffError
-from api.version import software_version
+from stimrig.api.cohort.errors import SCHEDULER_GONE, CohortError, CutOffError
+from stimrig.api.version import software_version
 
 CONNECT_S = 15.0
 LEAST_MEMORY_BYTES = 256 * 2**20

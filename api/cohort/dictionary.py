@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
-from identify.records.cells import lines
+from stimrig.identify.records.cells import lines
 
 Kind = Literal["text", "number", "integer", "true or false", "time"]
 

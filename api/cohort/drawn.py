@@ -6,10 +6,10 @@ import math
 from datetime import UTC, datetime
 from typing import Any
 
-from api.charts.config import said
-from api.charts.model_charts import axis, layout
-from api.charts.palette import role
-from api.cohort.gathered import Gathered, wilson
+from stimrig.api.charts.config import said
+from stimrig.api.charts.model_charts import axis, layout
+from stimrig.api.charts.palette import role
+from stimrig.api.cohort.gathered import Gathered, wilson
 
 LEAST_CASES = 5
 """Of fewer an interval says next to nothing; it is drawn, and said so."""

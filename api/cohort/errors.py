@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from api.errors import ApiError
+from stimrig.api.errors import ApiError
 
 GOES_ON = "What is done is kept; the same command goes on."
 SCHEDULER_GONE = f"the scheduler is gone. {GOES_ON}"

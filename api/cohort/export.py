@@ -13,15 +13,15 @@ from itertools import chain
 from pathlib import Path
 from typing import IO
 
-from api.cohort.errors import CutOffError
-from api.cohort.export_state import State
-from api.cohort.handed_on import ERRORS, Days, NoExport, Who, Writer, hidden
-from api.cohort.opened import Opened, opened, said_of
-from api.cohort.select import Selection
-from api.cohort.sources import Entry, Source, SourceError
-from identify.errors import IdentifyError
-from identify.records.bounds import LARGEST_FILE_BYTES
-from identify.records.cells import lines
+from stimrig.api.cohort.errors import CutOffError
+from stimrig.api.cohort.export_state import State
+from stimrig.api.cohort.handed_on import ERRORS, Days, NoExport, Who, Writer, hidden
+from stimrig.api.cohort.opened import Opened, opened, said_of
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.sources import Entry, Source, SourceError
+from stimrig.identify.errors import IdentifyError
+from stimrig.identify.records.bounds import LARGEST_FILE_BYTES
+from stimrig.identify.records.cells import lines
 
 UNKNOWN = "unknown"
 

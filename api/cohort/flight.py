@@ -10,9 +10,9 @@ from typing import Any
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
-from api.cohort.errors import GOES_ON, SCHEDULER_GONE, CohortError, CutOffError
-from api.cohort.tasks import Task
-from api.cohort.worker import Bounds, Done, Record, lost, run_parcel
+from stimrig.api.cohort.errors import GOES_ON, SCHEDULER_GONE, CohortError, CutOffError
+from stimrig.api.cohort.tasks import Task
+from stimrig.api.cohort.worker import Bounds, Done, Record, lost, run_parcel
 
 TRIES = 3
 """A record with which so many workers were lost is a row that says so."""

@@ -12,9 +12,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from api.cohort.answers import MODEL
-from api.cohort.errors import CohortError
-from api.cohort.table import options_of, rows_of
+from stimrig.api.cohort.answers import MODEL
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.table import options_of, rows_of
 
 PROBABLE = 0.5
 """An effect that a diagnosis found missing counts from this probability on."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from datetime import date, datetime, timedelta
 from typing import Any, Protocol
 
-from api.cohort.export_state import State
-from api.cohort.opened import Opened
+from stimrig.api.cohort.export_state import State
+from stimrig.api.cohort.opened import Opened
 
 UNDATED = "undated"
 ERRORS = "errors.csv"

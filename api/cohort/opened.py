@@ -13,11 +13,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-import identify
-from api.cohort.child import SAID, about
-from api.cohort.fields import Known
-from identify.records.hdf5 import StrictFile
-from identify.records.read import HDF5_MAGIC
+from stimrig import identify
+from stimrig.api.cohort.child import SAID, about
+from stimrig.api.cohort.fields import Known
+from stimrig.identify.records.hdf5 import StrictFile
+from stimrig.identify.records.read import HDF5_MAGIC
 
 TORQUE = ("counter", "host_time_s", "sync")
 PULSES = (
@@ -38,7 +38,7 @@ class Opened:
     Attributes
     ----------
     about : dict
-        Fields of `api.cohort.fields` and attributes of the recording.
+        Fields of `stimrig.api.cohort.fields` and attributes of the recording.
     samples : dict of ndarray, each of shape (N,)
         All torque samples, those outside of every segment, too; a column that the record lacks is not there.
     pulses : dict of ndarray, each of shape (P,)

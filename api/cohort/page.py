@@ -7,10 +7,10 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from api.charts.local_figure import LocalFigure
-from api.charts.palette import in_light
-from api.cohort import drawn
-from api.cohort.gathered import PROBABLE, Gathered, wilson
+from stimrig.api.charts.local_figure import LocalFigure
+from stimrig.api.charts.palette import in_light
+from stimrig.api.cohort import drawn
+from stimrig.api.cohort.gathered import PROBABLE, Gathered, wilson
 
 STYLE = """
 body { font: 15px/1.5 system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif; color: #1b2733;

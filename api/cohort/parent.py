@@ -19,16 +19,16 @@ from multiprocessing.util import Finalize
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
-from api.cohort.sources import SUFFIXES, Entry
-from api.cohort.tasks import Task
-from api.workers.process import environment
-from identify.strict_json import BadJson, parse
+from stimrig.api.cohort.sources import SUFFIXES, Entry
+from stimrig.api.cohort.tasks import Task
+from stimrig.api.workers.process import environment
+from stimrig.identify.strict_json import BadJson, parse
 
 RECORDS_A_PROCESS = 500
 """After so many a fresh process is started: what a library never gives back cannot add up."""
 START_S = 300.0
 """So long a start may take on a busy machine, compiling what was never compiled there."""
-CHILD = (sys.executable, "-m", "api.cohort.child")
+CHILD = (sys.executable, "-m", "stimrig.api.cohort.child")
 LONGEST_BYTES, DEEPEST = 16 * 2**20, 20
 """Of an answer: a process that a record has taken over could talk without an end."""
 NO_ANSWER = {"status": "error", "error_kind": "unexpected", "error": "its process gave an answer that cannot be read."}

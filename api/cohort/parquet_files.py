@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from api.cohort import dictionary
-from api.cohort.export_state import State
-from api.cohort.handed_on import Put, Who
-from api.cohort.opened import Opened
-from api.cohort.table import table_of
+from stimrig.api.cohort import dictionary
+from stimrig.api.cohort.export_state import State
+from stimrig.api.cohort.handed_on import Put, Who
+from stimrig.api.cohort.opened import Opened
+from stimrig.api.cohort.table import table_of
 
 NAME: str = "parquet"
 STATUS = ("acknowledged", "rest", "dropped", "refused", "unacknowledged", "device error")

@@ -19,11 +19,11 @@ from typing import IO, Any, Self
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from api.cohort import table
-from api.cohort.errors import CohortError, CutOffError
-from api.cohort.sources import Entry
-from api.cohort.tasks import Task, differing
-from api.cohort.worker import COPY, LEFT_OUT, digest
+from stimrig.api.cohort import table
+from stimrig.api.cohort.errors import CohortError, CutOffError
+from stimrig.api.cohort.sources import Entry
+from stimrig.api.cohort.tasks import Task, differing
+from stimrig.api.cohort.worker import COPY, LEFT_OUT, digest
 
 ROWS_A_PART = 500
 MOST_ALIKE = 1000

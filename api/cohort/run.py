@@ -12,14 +12,14 @@ from typing import Any
 
 from distributed import Client
 
-from api.cohort.cluster import lanes
-from api.cohort.flight import Flight
-from api.cohort.parent import close_all
-from api.cohort.parts import Results
-from api.cohort.select import Selection
-from api.cohort.sources import Source
-from api.cohort.tasks import Task
-from api.cohort.worker import COPY, LEFT_OUT, Bounds, Record, identity
+from stimrig.api.cohort.cluster import lanes
+from stimrig.api.cohort.flight import Flight
+from stimrig.api.cohort.parent import close_all
+from stimrig.api.cohort.parts import Results
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.sources import Source
+from stimrig.api.cohort.tasks import Task
+from stimrig.api.cohort.worker import COPY, LEFT_OUT, Bounds, Record, identity
 
 AHEAD = 3
 """Parcels sent for each that is computed: a worker never waits for its next, and none sees a million records."""

@@ -13,8 +13,8 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-from api.cohort.errors import CohortError
-from api.cohort.fields import FIELDS, Known, as_day
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.fields import FIELDS, Known, as_day
 
 LONGEST = 2000
 """Characters."""

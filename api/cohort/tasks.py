@@ -6,8 +6,8 @@ import json
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from api.cohort.errors import CohortError
-from identify.errors import IdentifyError
+from stimrig.api.cohort.errors import CohortError
+from stimrig.identify.errors import IdentifyError
 
 AUTO, METHOD = "auto", "maximum-likelihood"
 
@@ -65,9 +65,9 @@ def checked(task: Task) -> Task:
     CohortError
         An unknown method or effect, a column that cannot be meant.
     """
-    from identify.effects import get
-    from identify.methods import method_of
-    from identify.records.columns import parsed
+    from stimrig.identify.effects import get
+    from stimrig.identify.methods import method_of
+    from stimrig.identify.records.columns import parsed
 
     try:
         method_of(task.method)

@@ -1,6 +1,6 @@
 """What a worker of Dask does with a record: fetch it, hash it, have it computed; a row in any case.
 
-The worker itself never looks into a record: that is done by a process that is shut in (`api.cohort.child`).
+The worker itself never looks into a record: that is done by a process that is shut in (`stimrig.api.cohort.child`).
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from api.cohort.parent import computing
-from api.cohort.sources import Entry, Source, SourceError
-from api.cohort.tasks import Task
-from api.version import software_version
-from identify.records.bounds import LARGEST_FILE_BYTES
+from stimrig.api.cohort.parent import computing
+from stimrig.api.cohort.sources import Entry, Source, SourceError
+from stimrig.api.cohort.tasks import Task
+from stimrig.api.version import software_version
+from stimrig.identify.records.bounds import LARGEST_FILE_BYTES
 
 LEFT_OUT, COPY = "left out", "copy"
 """Status of rows that are kept until the end, so that a record is not read again, and not handed out."""

@@ -1,7 +1,7 @@
 """Which messages the pages show: read from the templates and the source, merged into each catalogue.
 
-``python -m api.language.extract`` renews the catalogues (``fr`` as an argument begins one); ``--check`` changes nothing
-and says what is missing.
+``python -m stimrig.api.language.extract`` renews the catalogues (``fr`` as an argument begins one); ``--check`` changes
+nothing and says what is missing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from babel.messages.catalog import Catalog
 from babel.messages.extract import extract_from_file
 from babel.messages.pofile import write_po
 
-from api.language.catalogues import CODES, DEFAULT, HERE, catalogue
+from stimrig.api.language.catalogues import CODES, DEFAULT, HERE, catalogue
 
 ROOT = HERE.parents[1]
 KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}

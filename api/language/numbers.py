@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 
 from babel.dates import format_date
 
-from api.language.words import locale
+from stimrig.api.language.words import locale
 
 _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 

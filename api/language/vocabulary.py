@@ -5,7 +5,7 @@ And what may stand at a place of a sentence that is put together elsewhere (`f"N
 
 from __future__ import annotations
 
-from api.language.words import lazy
+from stimrig.api.language.words import lazy
 
 VOCABULARY = [
     # roles of people
@@ -30,7 +30,7 @@ VOCABULARY = [
     # what is joined
     lazy("%(one)s and %(other)s"), lazy("%(one)s from %(other)s"), lazy("%(name)s (%(form)s)"), lazy(" by %(who)s"),
     lazy("with %(effects)s"),
-    # a sentence without the figure that `api.structure.worded` takes away; made by `format`
+    # a sentence without the figure that `stimrig.api.structure.worded` takes away; made by `format`
     lazy("%(test)s should separate %(those)s."),
     lazy("%(test)s is the best test to separate %(those)s, but it may not be enough."),
     lazy("pulse widths of %(range)s µs"), lazy("%(range)s pulses/s"),

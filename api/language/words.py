@@ -13,7 +13,7 @@ from typing import Any
 from babel import Locale
 from babel.support import LazyProxy
 
-from api.language.catalogues import CODES, DEFAULT, translations
+from stimrig.api.language.catalogues import CODES, DEFAULT, translations
 
 _code: ContextVar[str] = ContextVar("language", default=DEFAULT)
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from api.language import _, lazy, plain
-from api.language import decimal as _decimal
-from api.models.summary import followed
+from stimrig.api.language import _, lazy, plain
+from stimrig.api.language import decimal as _decimal
+from stimrig.api.models.summary import followed
 
 Act = Literal["approve", "add", "test", "fit"]
 
@@ -134,7 +134,7 @@ GATES: dict[str, Gate] = {
              "show it."),
     ),
 }  # fmt: skip
-"""Each check of `identify.estimation.quality`."""
+"""Each check of `stimrig.identify.estimation.quality`."""
 
 
 def findings(document: dict[str, Any]) -> list[Finding]:

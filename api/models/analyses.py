@@ -14,16 +14,16 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from api.clock import Clock
-from api.errors import ApiError, NotFoundError
-from api.models import reasons, stored
-from api.models.carried_structure import CarriedStructure
-from api.models.places import Site, site_of_recording
-from api.models.registry import Versions
-from api.settings import Settings
-from api.store import Store, audit, uploads
-from api.store.tables import Analysis, Model, Recording, Test
-from api.workers.pool import Call, Pool
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models import reasons, stored
+from stimrig.api.models.carried_structure import CarriedStructure
+from stimrig.api.models.places import Site, site_of_recording
+from stimrig.api.models.registry import Versions
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, audit, uploads
+from stimrig.api.store.tables import Analysis, Model, Recording, Test
+from stimrig.api.workers.pool import Call, Pool
 
 log = logging.getLogger("stimrig.analyses")
 OnCall = Callable[[Call], None]

@@ -11,15 +11,15 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from api.errors import ApiError
-from api.models import stored
-from api.models.explanation import name_of
-from api.models.registry import Versions
-from api.settings import Settings
-from api.store.tables import Model
-from api.structure import in_words
-from api.workers.pool import Call, Pool
-from api.workers.process import WORKER, Places
+from stimrig.api.errors import ApiError
+from stimrig.api.models import stored
+from stimrig.api.models.explanation import name_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.settings import Settings
+from stimrig.api.store.tables import Model
+from stimrig.api.structure import in_words
+from stimrig.api.workers.pool import Call, Pool
+from stimrig.api.workers.process import WORKER, Places
 
 OnCall = Callable[[Call], None]
 

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from api.models.headline import Figure
+from stimrig.api.models.headline import Figure
 
 BEYOND = 2.0
 """A change is told where it is more than so many times its uncertainty."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from api.clinical_words import segment_words
-from api.effect_words import effect_words, effects_words, parameter_words, within, without_unit
-from api.language import _, lazy, localised, ngettext, plain
-from api.models.reasons import refusal
-from api.structure import worded
-from identify.caution import caution, only_open
+from stimrig.api.clinical_words import segment_words
+from stimrig.api.effect_words import effect_words, effects_words, parameter_words, within, without_unit
+from stimrig.api.language import _, lazy, localised, ngettext, plain
+from stimrig.api.models.reasons import refusal
+from stimrig.api.structure import worded
+from stimrig.identify.caution import caution, only_open
 
 SPLITS: dict[str, Any] = {
     "segment": lazy("By part of the test"),
@@ -42,7 +42,7 @@ def view(
     Parameters
     ----------
     diagnosis : dict
-        As `api.workers.diagnosis_verbs.diagnosis` gives it, or identify's own.
+        As `stimrig.api.workers.diagnosis_verbs.diagnosis` gives it, or identify's own.
     comparison : dict or None
         `identify.compare` of the model that is looked at.
     effects : sequence of str

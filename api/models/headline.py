@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.models import stored, summary
-from api.store.tables import Model
+from stimrig.api.models import stored, summary
+from stimrig.api.store.tables import Model
 
 Figure = dict[str, Any]
 """`value`, `sd` (None where it is not known) and `unit`; of an effect's parameter, the effect's `form` besides."""

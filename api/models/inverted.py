@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from api.language import _, lazy, localised
+from stimrig.api.language import _, lazy, localised
 
 REASONS: dict[str, Any] = {
     "above-plateau": lazy("too high for the widest pulse"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from api.language import _
+from stimrig.api.language import _
 
 Kind = Literal[
     "running", "identifying", "look", "asked", "done", "archived", "rearm", "wait", "calibrating", "calibrate", "test",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from api.store.tables import Participant, Recording, Test
+from stimrig.api.store.tables import Participant, Recording, Test
 
 Site = tuple[str | None, str | None, str | None]
 """Side, muscle and where the electrodes are; None: nobody has said. Models, approvals and keys belong to one."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from api.errors import ApiError
+from stimrig.api.errors import ApiError
 
 POOR = ("not usable", "unknown")
 """The verdicts with which an approval needs a reason."""

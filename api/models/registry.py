@@ -12,13 +12,13 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
 
-from api.clock import Clock
-from api.errors import ApiError, NotFoundError
-from api.models import headline, reasons, stored, summary
-from api.models.places import Site, in_words, kept, site_of, site_of_recording
-from api.models.tracking import Limits
-from api.store import Store, audit, seen
-from api.store.tables import Approval, Model, Participant, Recording, Test
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models import headline, reasons, stored, summary
+from stimrig.api.models.places import Site, in_words, kept, site_of, site_of_recording
+from stimrig.api.models.tracking import Limits
+from stimrig.api.store import Store, audit, seen
+from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
 
 log = logging.getLogger("stimrig.models")
 TOLD = (

@@ -6,8 +6,8 @@ import hashlib
 import json
 from typing import Any
 
-from api.errors import ApiError
-from api.store.tables import Model
+from stimrig.api.errors import ApiError
+from stimrig.api.store.tables import Model
 
 
 def whole(row: Model) -> bytes:

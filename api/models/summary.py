@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from api.language import _
+from stimrig.api.language import _
 
 THRESHOLD_SHARE = 0.05
 """The threshold is where the recruitment curve has gone this share of its way to the plateau."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-from api.errors import ApiError, NotFoundError
-from api.models.analyses import Analyses, OnCall
-from api.store import audit
-from api.store.tables import Model, Recording
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models.analyses import Analyses, OnCall
+from stimrig.api.store import audit
+from stimrig.api.store.tables import Model, Recording
 
 JOINT_EFFECTS = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
 """What the torque does with angle and velocity, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):

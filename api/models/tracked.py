@@ -10,14 +10,14 @@ from typing import Any
 
 from sqlalchemy.orm import defer
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.models import headline, stored, tracking
-from api.models.places import Place, differ, place_of
-from api.models.registry import Served, Versions
-from api.models.tracking import NOT_FOLLOWED, Bounds, Limits
-from api.store import Store, audit
-from api.store.tables import Approval, Model, Test, Tracked
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.models import headline, stored, tracking
+from stimrig.api.models.places import Place, differ, place_of
+from stimrig.api.models.registry import Served, Versions
+from stimrig.api.models.tracking import NOT_FOLLOWED, Bounds, Limits
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import Approval, Model, Test, Tracked
 
 log = logging.getLogger("stimrig.tracking")
 MOST_EARLIER = 20
@@ -148,7 +148,7 @@ class TrackedVersions:
         trial : Trial
             The trial.
         found : dict
-            `step` and `model` (`api.workers.tracking_verbs`), or the `reason` why it was not followed.
+            `step` and `model` (`stimrig.api.workers.tracking_verbs`), or the `reason` why it was not followed.
         last_sample_unix_s : float, optional
             When its last sample came.
 

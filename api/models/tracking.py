@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from api.clock import local_day
-from api.errors import ApiError
-from api.language import _, clock, day, lazy, localised, when
+from stimrig.api.clock import local_day
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _, clock, day, lazy, localised, when
 
 LEAST_PERCENT, MOST_PERCENT, USUAL_PERCENT = 0.0, 60.0, 20.0
 QUANTITIES = {"gain": "gain", "threshold_shift_us": "threshold", "time_scale": "time scale"}
-"""The quantities of `identify.tracking`, named here, too, so that the service need not load it, and what people
-read; the same words stand in `api.language.vocabulary`."""
+"""The quantities of `stimrig.identify.tracking`, named here, too, so that the service need not load it, and what people
+read; the same words stand in `stimrig.api.language.vocabulary`."""
 CONTRADICTS, NO_TORQUE, NOT_FOLLOWED = "contradicts", "no-torque", "not-followed"
 NEW_TEST = "A new test is needed; the shortest is the adaptive test, which stops by itself."
 
@@ -180,7 +180,7 @@ def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
     Parameters
     ----------
     trials : sequence of mapping
-        As `api.models.tracked.told` gives them, the oldest first.
+        As `stimrig.api.models.tracked.told` gives them, the oldest first.
     since_utc : str
         When the approved model's recording was made.
     """

@@ -14,14 +14,14 @@ from typing import Any
 
 from sqlalchemy import Row, select
 
-from api.clock import Clock, local_day
-from api.errors import ApiError
-from api.models import changes, headline, stored
-from api.models.changes import State
-from api.models.summary import followed
-from api.store import Store
-from api.store.tables import Analysis, Approval, Model, Note, Recording, Test
-from api.workers.pool import Pool
+from stimrig.api.clock import Clock, local_day
+from stimrig.api.errors import ApiError
+from stimrig.api.models import changes, headline, stored
+from stimrig.api.models.changes import State
+from stimrig.api.models.summary import followed
+from stimrig.api.store import Store
+from stimrig.api.store.tables import Analysis, Approval, Model, Note, Recording, Test
+from stimrig.api.workers.pool import Pool
 
 KEPT_AS = "headline"
 """The name under which the figures are kept of a model that was stored before its row held them."""

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from api import language
-from api.effect_words import effect_words, effects_words, parameter_words
-from api.language import _, lazy
-from api.models import changes
-from api.models.changes import State
+from stimrig.api import language
+from stimrig.api.effect_words import effect_words, effects_words, parameter_words
+from stimrig.api.language import _, lazy
+from stimrig.api.models import changes
+from stimrig.api.models.changes import State
 
 
 @dataclass(frozen=True)

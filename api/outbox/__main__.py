@@ -1,4 +1,4 @@
-"""`python -m api.outbox`: tells the centre what the rig has sealed, until SIGTERM.
+"""`python -m stimrig.api.outbox`: tells the centre what the rig has sealed, until SIGTERM.
 
 Exit 2: no centre is configured, a setting does not hold, or the database does not open. Exit 1: it is not there yet.
 Exit 0: it was replaced; to be started again.
@@ -10,14 +10,14 @@ import contextlib
 import os
 import sys
 
-from api import logs
-from api.clock import Clock
-from api.errors import ApiError, SettingsError
-from api.outbox.feed import Feed
-from api.outbox.link import Link
-from api.outbox.pusher import Pusher
-from api.settings import Settings
-from api.store import Store
+from stimrig.api import logs
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.outbox.feed import Feed
+from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.pusher import Pusher
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store
 
 NICENESS = 10
 """It gives way to the rig, the service and its workers."""

@@ -7,10 +7,10 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from api.outbox.chain import Position
-from api.outbox.errors import WrongAnswerError
-from api.outbox.receipts import Receipt
-from api.store.hashes import GENESIS
+from stimrig.api.outbox.chain import Position
+from stimrig.api.outbox.errors import WrongAnswerError
+from stimrig.api.outbox.receipts import Receipt
+from stimrig.api.store.hashes import GENESIS
 
 SHA256 = re.compile(r"[0-9a-f]{64}")
 LONGEST_TEXT = 200

@@ -10,8 +10,8 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from api.store.hashes import GENESIS, canonical, digest
-from api.store.tables import OutboxItem
+from stimrig.api.store.hashes import GENESIS, canonical, digest
+from stimrig.api.store.tables import OutboxItem
 
 BEGIN = "begin"
 HASHED = ("seq", "kind", "key", "sha256", "file", "file_bytes", "at_utc", "previous")

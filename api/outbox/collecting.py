@@ -7,14 +7,14 @@ import os
 
 from sqlalchemy import select, tuple_
 
-from api.outbox import receipts
-from api.outbox.errors import RefusedError
-from api.outbox.link import Link
-from api.outbox.receipts import Receipt
-from api.settings import Settings
-from api.store import Store
-from api.store.hashes import digest
-from api.store.tables import OutboxItem
+from stimrig.api.outbox import receipts
+from stimrig.api.outbox.errors import RefusedError
+from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.receipts import Receipt
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store
+from stimrig.api.store.hashes import digest
+from stimrig.api.store.tables import OutboxItem
 
 log = logging.getLogger("stimrig.outbox")
 

@@ -13,7 +13,7 @@ class PushError(Exception):
     Attributes
     ----------
     state : str
-        What it is called in the status (`api.outbox.status`).
+        What it is called in the status (`stimrig.api.outbox.status`).
     """
 
     state = "refused"

@@ -14,11 +14,11 @@ from typing import Any
 from sqlalchemy import func, inspect, select, tuple_
 from sqlalchemy.orm import Session, SessionTransaction
 
-from api.clock import Clock
-from api.outbox import chain, items
-from api.outbox.chain import Telling
-from api.store import Store
-from api.store.tables import Approval, AuditEntry, Model, Participant, Recording, Table, Test, Tracked
+from stimrig.api.clock import Clock
+from stimrig.api.outbox import chain, items
+from stimrig.api.outbox.chain import Telling
+from stimrig.api.store import Store
+from stimrig.api.store.tables import Approval, AuditEntry, Model, Participant, Recording, Table, Test, Tracked
 
 CHANGED = "changed-for-outbox"
 UNTELLABLE = (ValueError, TypeError, AttributeError, RecursionError)

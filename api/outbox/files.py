@@ -10,11 +10,11 @@ from pathlib import Path
 
 from sqlalchemy import select
 
-from api.outbox.answers import Progress, Wanted, whole_number
-from api.outbox.errors import RefusedError, UnreachableError, WrongAnswerError
-from api.outbox.link import Link
-from api.store import Store
-from api.store.tables import Model, OutboxItem, Recording, Tracked
+from stimrig.api.outbox.answers import Progress, Wanted, whole_number
+from stimrig.api.outbox.errors import RefusedError, UnreachableError, WrongAnswerError
+from stimrig.api.outbox.link import Link
+from stimrig.api.store import Store
+from stimrig.api.store.tables import Model, OutboxItem, Recording, Tracked
 
 CHUNK = 8_000_000
 PIECE = 65536

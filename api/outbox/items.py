@@ -12,10 +12,20 @@ import re
 from pathlib import Path
 from typing import Any
 
-from api.outbox.chain import Telling
-from api.store import uploads
-from api.store.hashes import canonical
-from api.store.tables import OPEN_STATES, Approval, AuditEntry, Model, Participant, Recording, Table, Test, Tracked
+from stimrig.api.outbox.chain import Telling
+from stimrig.api.store import uploads
+from stimrig.api.store.hashes import canonical
+from stimrig.api.store.tables import (
+    OPEN_STATES,
+    Approval,
+    AuditEntry,
+    Model,
+    Participant,
+    Recording,
+    Table,
+    Test,
+    Tracked,
+)
 
 TABLES: dict[type[Table], str] = {
     Participant: "participant", Recording: "recording", Model: "model", Test: "test", Approval: "decision",

@@ -9,13 +9,13 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from api.clock import Clock
-from api.outbox import answers
-from api.outbox.answers import Progress, Wanted
-from api.outbox.chain import Position
-from api.outbox.errors import BucketError, KeyRefusedError, RefusedError, UnreachableError, WrongAnswerError
-from api.outbox.receipts import Receipt
-from api.settings import loopback
+from stimrig.api.clock import Clock
+from stimrig.api.outbox import answers
+from stimrig.api.outbox.answers import Progress, Wanted
+from stimrig.api.outbox.chain import Position
+from stimrig.api.outbox.errors import BucketError, KeyRefusedError, RefusedError, UnreachableError, WrongAnswerError
+from stimrig.api.outbox.receipts import Receipt
+from stimrig.api.settings import loopback
 
 LONGEST_ANSWER = 1_000_000
 LONGEST_S = 120.0

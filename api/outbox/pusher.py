@@ -15,17 +15,17 @@ from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from api.clock import Clock, utc_label
-from api.outbox import feed, rig_state, status
-from api.outbox.collecting import Collecting
-from api.outbox.errors import Backoff, KeyRefusedError, PushError, UnreachableError
-from api.outbox.files import Files, Sending
-from api.outbox.link import Link
-from api.outbox.status import Status
-from api.outbox.telling import Telling
-from api.settings import Settings
-from api.store import Store
-from api.version import software_version
+from stimrig.api.clock import Clock, utc_label
+from stimrig.api.outbox import feed, rig_state, status
+from stimrig.api.outbox.collecting import Collecting
+from stimrig.api.outbox.errors import Backoff, KeyRefusedError, PushError, UnreachableError
+from stimrig.api.outbox.files import Files, Sending
+from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.status import Status
+from stimrig.api.outbox.telling import Telling
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store
+from stimrig.api.version import software_version
 
 HELLO_S = 30.0
 POLL_S = 1.0

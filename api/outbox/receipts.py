@@ -16,11 +16,11 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from api import owner_only
-from api.clock import Clock
-from api.store import Store, audit
-from api.store.hashes import GENESIS, canonical
-from api.store.tables import AuditEntry
+from stimrig.api import owner_only
+from stimrig.api.clock import Clock
+from stimrig.api.store import Store, audit
+from stimrig.api.store.hashes import GENESIS, canonical
+from stimrig.api.store.tables import AuditEntry
 
 HOUR_S = 3600.0
 Hex = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]

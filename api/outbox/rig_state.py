@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from api.settings import Settings, loopback
+from stimrig.api.settings import Settings, loopback
 
 PATIENCE_S = 2.0
 LONGEST_ANSWER = 65536

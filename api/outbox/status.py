@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from api import owner_only
-from api.clock import unix_of, utc_label
-from api.language import lazy
-from api.settings import Settings
+from stimrig.api import owner_only
+from stimrig.api.clock import unix_of, utc_label
+from stimrig.api.language import lazy
+from stimrig.api.settings import Settings
 
 NAME = "outbox.json"
 WORDS: dict[str, Any] = {
@@ -34,7 +34,7 @@ FIXES = {
     "key-refused": "ask the centre's administrator for a new key, set STIMRIG_CENTRE_KEY and start again",
     "wrong-answer": "set STIMRIG_CENTRE_URL to the centre's own address",
     "bucket-failed": "tell the centre's administrator: its bucket is full or gone",
-    "not-running": "`stimrig serve` and stimrig-outbox.service run it; by hand: python -m api.outbox",
+    "not-running": "`stimrig serve` and stimrig-outbox.service run it; by hand: python -m stimrig.api.outbox",
 }
 GOOD = ("starting", "current", "sending")
 

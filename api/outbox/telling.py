@@ -9,14 +9,14 @@ from typing import Any
 
 from sqlalchemy import distinct, func, select
 
-from api.clock import Clock, unix_of, utc_label
-from api.outbox import chain
-from api.outbox.answers import whole_number
-from api.outbox.chain import NOWHERE, Head, Position
-from api.outbox.errors import RefusedError, WrongAnswerError
-from api.outbox.link import Link
-from api.store import Store, audit
-from api.store.tables import OutboxItem
+from stimrig.api.clock import Clock, unix_of, utc_label
+from stimrig.api.outbox import chain
+from stimrig.api.outbox.answers import whole_number
+from stimrig.api.outbox.chain import NOWHERE, Head, Position
+from stimrig.api.outbox.errors import RefusedError, WrongAnswerError
+from stimrig.api.outbox.link import Link
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import OutboxItem
 
 MOST_ITEMS = 500
 MOST_BYTES = 3_500_000

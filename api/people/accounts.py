@@ -10,15 +10,15 @@ from fastapi import Request
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
-from api.clock import Clock
-from api.errors import ApiError, NotFoundError
-from api.people import names
-from api.people.auth import Auth, Principal, Scope, unauthorized
-from api.people.pace import Guesses, place_of
-from api.people.passwords import Passwords
-from api.store import Store, audit, seen
-from api.store.hashes import digest
-from api.store.tables import Confirmation, KnownPlace, Token, User
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.people import names
+from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
+from stimrig.api.people.pace import Guesses, place_of
+from stimrig.api.people.passwords import Passwords
+from stimrig.api.store import Store, audit, seen
+from stimrig.api.store.hashes import digest
+from stimrig.api.store.tables import Confirmation, KnownPlace, Token, User
 
 CONFIRMED_S = 120.0
 """How long a password given once more is good for one approval."""

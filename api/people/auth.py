@@ -16,14 +16,14 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 from starlette.requests import HTTPConnection
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.people.idle_lock import IdleLock
-from api.people.pace import Guesses, place_of
-from api.store import Store, audit, seen
-from api.store.hashes import digest
-from api.store.secrets import shared
-from api.store.tables import Confirmation, PageSession, Token
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.people.idle_lock import IdleLock
+from stimrig.api.people.pace import Guesses, place_of
+from stimrig.api.store import Store, audit, seen
+from stimrig.api.store.hashes import digest
+from stimrig.api.store.secrets import shared
+from stimrig.api.store.tables import Confirmation, PageSession, Token
 
 LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
@@ -306,7 +306,7 @@ class Auth:
         """Who stands behind a request or a WebSocket.
 
         A controller's key, which is bound to a participant, is refused (403) unless whoever asks looks after that
-        (`bound`): `api.web.key_guard`, and stop.
+        (`bound`): `stimrig.api.web.key_guard`, and stop.
         """
         try:
             who = self._identify(connection, forgive_age, forgive_lock)

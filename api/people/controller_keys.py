@@ -7,13 +7,13 @@ from typing import Any
 
 from sqlalchemy import select
 
-from api.errors import ApiError
-from api.people.auth import Auth, Principal, Scope
-from api.store.hashes import digest
-from api.store.tables import Token
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import Auth, Principal, Scope
+from stimrig.api.store.hashes import digest
+from stimrig.api.store.tables import Token
 
 SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
-"""Of these only what `api.web.key_guard` opens."""
+"""Of these only what `stimrig.api.web.key_guard` opens."""
 
 
 def refuse_without(maker: Principal) -> None:

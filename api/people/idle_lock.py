@@ -10,9 +10,9 @@ import threading
 
 from sqlalchemy import select
 
-from api.clock import Clock
-from api.store import Store, audit
-from api.store.tables import PageSession
+from stimrig.api.clock import Clock
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import PageSession
 
 FLUSH_S = 15.0
 """How often the times of the last actions are written down; so much of them is lost with a process that is killed."""

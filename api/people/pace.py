@@ -11,8 +11,8 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
-from api.clock import Clock
-from api.errors import ApiError
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
 
 LONGEST_WAIT_S = 300.0
 FORGOTTEN_S = 3600.0

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from argon2 import PasswordHasher
 from argon2.exceptions import Argon2Error, InvalidHashError
 
-from api.errors import ApiError
+from stimrig.api.errors import ApiError
 
 MOST_STRANGERS, MOST_KNOWN = 8, 64
 """So many wait at most; each takes some 0.1 s and 64 MB."""

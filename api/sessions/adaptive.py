@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.sessions.rig_client import RigClient
-from api.sessions.samples import samples_of
-from api.workers.adviser import Adviser
-from rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.sessions.samples import samples_of
+from stimrig.api.workers.adviser import Adviser
+from stimrig.rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
 
 log = logging.getLogger("stimrig.adaptive")
 

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from api.errors import ApiError
-from api.sessions.requests import TestIn
-from rig.messages import SAFE_END_S, AdaptivePlan, SegmentPlan, TestPlan
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.requests import TestIn
+from stimrig.rig.messages import SAFE_END_S, AdaptivePlan, SegmentPlan, TestPlan
 
 ADAPTIVE = "adaptive"
 """Kind of test."""

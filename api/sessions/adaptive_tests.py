@@ -10,19 +10,19 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.models import stored
-from api.models.places import Place, differ, place_of, site_of
-from api.models.registry import Versions
-from api.sessions import adaptive_plan
-from api.sessions.adaptive import Follower, Told
-from api.sessions.adaptive_plan import ADAPTIVE, PIECE_S, Planned
-from api.sessions.requests import TestIn
-from api.sessions.rig_client import RigClient
-from api.store.tables import Participant, Test
-from api.workers.adviser import Adviser
-from rig.messages import SAFE_END_S, FinishedEvent, PreviewRequest, TestPlan
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.models import stored
+from stimrig.api.models.places import Place, differ, place_of, site_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.sessions import adaptive_plan
+from stimrig.api.sessions.adaptive import Follower, Told
+from stimrig.api.sessions.adaptive_plan import ADAPTIVE, PIECE_S, Planned
+from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.store.tables import Participant, Test
+from stimrig.api.workers.adviser import Adviser
+from stimrig.rig.messages import SAFE_END_S, FinishedEvent, PreviewRequest, TestPlan
 
 KEPT = 20
 """Outlooks that are remembered: the question before a test and its start need the same one."""

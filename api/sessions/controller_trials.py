@@ -8,17 +8,17 @@ from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat
 
-from api.decisions import MODEL_TAG
-from api.errors import ApiError
-from api.models.places import site_of
-from api.people.auth import Principal, outside
-from api.sessions.profiles import LIMITS
-from api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
-from api.sessions.runner import Runner
-from api.sessions.trials import SEQUENCE
-from api.store import Store, seen
-from api.store.holds import Turn
-from api.store.tables import Participant, Test
+from stimrig.api.decisions import MODEL_TAG
+from stimrig.api.errors import ApiError
+from stimrig.api.models.places import site_of
+from stimrig.api.people.auth import Principal, outside
+from stimrig.api.sessions.profiles import LIMITS
+from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
+from stimrig.api.sessions.runner import Runner
+from stimrig.api.sessions.trials import SEQUENCE
+from stimrig.api.store import Store, seen
+from stimrig.api.store.holds import Turn
+from stimrig.api.store.tables import Participant, Test
 
 LONGEST_S = 300.0
 HALTED = "The rig is stopped. A person looks at participant and rig and re-arms it."

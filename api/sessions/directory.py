@@ -7,9 +7,9 @@ from typing import Any
 
 from sqlalchemy import Row, func, select
 
-from api.models.registry import Versions
-from api.store import Store
-from api.store.tables import Approval, Model, Participant, Test
+from stimrig.api.models.registry import Versions
+from stimrig.api.store import Store
+from stimrig.api.store.tables import Approval, Model, Participant, Test
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.sessions.adaptive_tests import AdaptiveTests
-from api.sessions.joint_tests import JointTests
-from api.sessions.lifecycle import Lifecycle
-from api.sessions.live import Hub
-from api.store.tables import OPEN_STATES, Test
+from stimrig.api.sessions.adaptive_tests import AdaptiveTests
+from stimrig.api.sessions.joint_tests import JointTests
+from stimrig.api.sessions.lifecycle import Lifecycle
+from stimrig.api.sessions.live import Hub
+from stimrig.api.store.tables import OPEN_STATES, Test
 
 TOLD = (
     "id", "participant", "kind", "reason", "requested_by", "requested_utc", "finished_utc", "recording_id", "model_id"

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from sqlalchemy import ColumnElement, or_
 from sqlalchemy.exc import SQLAlchemyError
 
-from api.store import Store
-from api.store.holds import Holds, Turn
-from api.store.tables import OPEN_STATES, Test
+from stimrig.api.store import Store
+from stimrig.api.store.holds import Holds, Turn
+from stimrig.api.store.tables import OPEN_STATES, Test
 
 log = logging.getLogger("stimrig.trials")
 PLAYED_STATES = OPEN_STATES[:3]

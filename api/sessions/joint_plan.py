@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from api.sessions.angles import TOLERANCE_RAD
-from rig.messages import HELD, MOVING, PASSIVE
+from stimrig.api.sessions.angles import TOLERANCE_RAD
+from stimrig.rig.messages import HELD, MOVING, PASSIVE
 
 KINDS = (PASSIVE, HELD, MOVING)
 """Kinds of guided tests."""

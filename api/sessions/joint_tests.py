@@ -8,17 +8,25 @@ import secrets
 from collections.abc import Callable
 from typing import Any
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.models.registry import Versions
-from api.sessions import angles, coverage, joint_plan
-from api.sessions.adaptive_plan import Planned
-from api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Layout
-from api.sessions.joint_watch import Watcher
-from api.sessions.requests import AngleIn, TestIn
-from api.sessions.rig_client import RigClient
-from api.store.tables import Test
-from rig.messages import SAFE_END_S, AdaptivePlan, AnglePlan, FinishedEvent, PreviewRequest, SegmentPlan, TestPlan
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.models.registry import Versions
+from stimrig.api.sessions import angles, coverage, joint_plan
+from stimrig.api.sessions.adaptive_plan import Planned
+from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Layout
+from stimrig.api.sessions.joint_watch import Watcher
+from stimrig.api.sessions.requests import AngleIn, TestIn
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.store.tables import Test
+from stimrig.rig.messages import (
+    SAFE_END_S,
+    AdaptivePlan,
+    AnglePlan,
+    FinishedEvent,
+    PreviewRequest,
+    SegmentPlan,
+    TestPlan,
+)
 
 SAME_ANGLE_RAD = math.radians(2.5)
 """A held test was at an angle that is listed where it is as near as this: half of the steps of the list."""

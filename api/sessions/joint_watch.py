@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.sessions.coverage import Coverage
-from api.sessions.joint_plan import PASSIVE
-from api.sessions.rig_client import RigClient
-from api.sessions.samples import samples_of
-from rig.messages import EnoughRequest, LiveEvent, TestPlan
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.coverage import Coverage
+from stimrig.api.sessions.joint_plan import PASSIVE
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.sessions.samples import samples_of
+from stimrig.rig.messages import EnoughRequest, LiveEvent, TestPlan
 
 log = logging.getLogger("stimrig.joint")
 

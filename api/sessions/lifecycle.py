@@ -8,20 +8,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.models.analyses import Analyses
-from api.models.registry import Versions
-from api.sessions.adaptive_tests import AdaptiveTests
-from api.sessions.following import Follower
-from api.sessions.joint_plan import KINDS
-from api.sessions.joint_tests import JointTests
-from api.sessions.rig_client import RigClient
-from api.sessions.trials import SEQUENCE
-from api.store import Store, audit
-from api.store.tables import OPEN_STATES, Model, Recording, Test
-from api.workers.pool import Call, Pool
-from rig.messages import FinishedEvent
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.models.analyses import Analyses
+from stimrig.api.models.registry import Versions
+from stimrig.api.sessions.adaptive_tests import AdaptiveTests
+from stimrig.api.sessions.following import Follower
+from stimrig.api.sessions.joint_plan import KINDS
+from stimrig.api.sessions.joint_tests import JointTests
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.sessions.trials import SEQUENCE
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
+from stimrig.api.workers.pool import Call, Pool
+from stimrig.rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
 NOT_FITTED = (SEQUENCE, *KINDS)

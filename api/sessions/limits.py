@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.errors import ApiError
-from api.sessions import angles
-from api.sessions.profiles import LIMITS
-from api.sessions.requests import TestIn
-from rig.messages import Profile
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions import angles
+from stimrig.api.sessions.profiles import LIMITS
+from stimrig.api.sessions.requests import TestIn
+from stimrig.rig.messages import Profile
 
 
 def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from api.clock import Clock
-from rig.messages import LiveEvent
+from stimrig.api.clock import Clock
+from stimrig.rig.messages import LiveEvent
 
 QUEUE_LENGTH = 200
 SERIES = ("time_s", "torque_min_nm", "torque_max_nm", "pulse_time_s", "pulse_width_us")

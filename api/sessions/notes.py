@@ -9,11 +9,11 @@ from typing import get_args
 from sqlalchemy import and_, func, select
 from sqlalchemy.orm import Session
 
-from api.clock import Clock
-from api.errors import ApiError, NotFoundError
-from api.sessions.requests import NoteIn, NoteKind
-from api.store import Store, audit, seen
-from api.store.tables import AuditEntry, Note, Participant, Test
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.sessions.requests import NoteIn, NoteKind
+from stimrig.api.store import Store, audit, seen
+from stimrig.api.store.tables import AuditEntry, Note, Participant, Test
 
 KINDS: tuple[NoteKind, ...] = get_args(NoteKind)
 MOST = 2000

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from api.clock import unix_of
-from api.sessions import angles
-from rig.messages import Bound
+from stimrig.api.clock import unix_of
+from stimrig.api.sessions import angles
+from stimrig.rig.messages import Bound
 
 Profile = Mapping[str, Any]
 

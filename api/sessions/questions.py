@@ -11,10 +11,10 @@ import secrets
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
-from api.clock import Clock, local_day
-from api.errors import ApiError
-from api.people.auth import Principal
-from api.store import seen
+from stimrig.api.clock import Clock, local_day
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import Principal
+from stimrig.api.store import seen
 
 LIFE_S = 300.0
 """How long what was seen may be confirmed."""

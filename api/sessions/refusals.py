@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass, field
 
-from api.errors import ApiError
-from api.people import names
-from api.sessions.trials import SEQUENCE
-from api.store import seen
-from api.store.tables import AuditEntry, Participant
+from stimrig.api.errors import ApiError
+from stimrig.api.people import names
+from stimrig.api.sessions.trials import SEQUENCE
+from stimrig.api.store import seen
+from stimrig.api.store.tables import AuditEntry, Participant
 
 
 @dataclass

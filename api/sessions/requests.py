@@ -18,10 +18,10 @@ from pydantic import (
     model_validator,
 )
 
-from api.people import names
-from api.sessions import angles
-from api.sessions.profiles import LIMITS
-from rig.messages import HELD, MOVING, PASSIVE
+from stimrig.api.people import names
+from stimrig.api.sessions import angles
+from stimrig.api.sessions.profiles import LIMITS
+from stimrig.rig.messages import HELD, MOVING, PASSIVE
 
 LONGEST_NOTE = 500
 Side = Literal["left", "right"]
@@ -134,7 +134,7 @@ class SegmentIn(Body):
 
 
 LEAST_PERCENT, MOST_PERCENT = 0.2, 50.0
-"""As `identify.experiments.target` has them; named here, too, so that the service need not load it."""
+"""As `stimrig.identify.experiments.target` has them; named here, too, so that the service need not load it."""
 Percent = Annotated[FiniteFloat, Field(ge=LEAST_PERCENT, le=MOST_PERCENT)]
 
 

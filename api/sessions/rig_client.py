@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from api.clock import Clock
-from api.errors import ApiError, from_rig
-from rig.messages import (
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError, from_rig
+from stimrig.rig.messages import (
     LONGEST_LINE,
     Event,
     FinishedEvent,

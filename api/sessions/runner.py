@@ -14,31 +14,39 @@ from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from api.clock import Clock, asked_s
-from api.errors import ApiError, NotFoundError
-from api.logs import current_test
-from api.models.analyses import Analyses
-from api.models.places import site_of
-from api.models.registry import Versions
-from api.sessions import document
-from api.sessions.adaptive_plan import ADAPTIVE, Planned
-from api.sessions.adaptive_tests import AdaptiveTests
-from api.sessions.following import Follower
-from api.sessions.joint_plan import KINDS
-from api.sessions.joint_tests import JointTests
-from api.sessions.lifecycle import Lifecycle
-from api.sessions.limits import limits_of
-from api.sessions.live import Hub
-from api.sessions.refusals import Current, busy, not_what_was_seen, other_than, refuse_archived, rests_of, right_ended
-from api.sessions.requests import TestIn
-from api.sessions.rig_client import AnyEvent, RigClient
-from api.sessions.trials import SEQUENCE, Trials
-from api.store import Store, audit, seen
-from api.store.holds import LIMITS_TURN
-from api.store.tables import AuditEntry, Participant, Test, Token
-from api.workers.adviser import Adviser
-from api.workers.pool import Pool
-from rig.messages import (
+from stimrig.api.clock import Clock, asked_s
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.logs import current_test
+from stimrig.api.models.analyses import Analyses
+from stimrig.api.models.places import site_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.sessions import document
+from stimrig.api.sessions.adaptive_plan import ADAPTIVE, Planned
+from stimrig.api.sessions.adaptive_tests import AdaptiveTests
+from stimrig.api.sessions.following import Follower
+from stimrig.api.sessions.joint_plan import KINDS
+from stimrig.api.sessions.joint_tests import JointTests
+from stimrig.api.sessions.lifecycle import Lifecycle
+from stimrig.api.sessions.limits import limits_of
+from stimrig.api.sessions.live import Hub
+from stimrig.api.sessions.refusals import (
+    Current,
+    busy,
+    not_what_was_seen,
+    other_than,
+    refuse_archived,
+    rests_of,
+    right_ended,
+)
+from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.rig_client import AnyEvent, RigClient
+from stimrig.api.sessions.trials import SEQUENCE, Trials
+from stimrig.api.store import Store, audit, seen
+from stimrig.api.store.holds import LIMITS_TURN
+from stimrig.api.store.tables import AuditEntry, Participant, Test, Token
+from stimrig.api.workers.adviser import Adviser
+from stimrig.api.workers.pool import Pool
+from stimrig.rig.messages import (
     EnoughRequest,
     Extended,
     FinishedEvent,

@@ -7,9 +7,9 @@ import json
 from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
 
-from api.errors import ApiError
-from api.sessions.rig_client import LINE_LIMIT, no_rig
-from rig.messages import LiveEvent, SubscribeRequest
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.rig_client import LINE_LIMIT, no_rig
+from stimrig.rig.messages import LiveEvent, SubscribeRequest
 
 
 async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[LiveEvent, None]:

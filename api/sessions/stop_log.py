@@ -5,8 +5,8 @@ from __future__ import annotations
 import secrets
 from dataclasses import dataclass
 
-from api.errors import ApiError
-from rig.messages import StopEvidence
+from stimrig.api.errors import ApiError
+from stimrig.rig.messages import StopEvidence
 
 KEPT = 200
 

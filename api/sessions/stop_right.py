@@ -12,7 +12,7 @@ import hmac
 import json
 from collections.abc import Collection
 
-from api.clock import Clock
+from stimrig.api.clock import Clock
 
 RIGHT_S = 24 * 3600.0
 """A page's right holds this long, which no session exceeds, and beyond that while the test that it shows is running."""

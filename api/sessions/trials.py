@@ -12,14 +12,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.models.places import differ, place_of
-from api.models.tracked import TrackedVersions, Trial
-from api.sessions.requests import TestIn
-from api.store import Store
-from api.store.tables import Approval, Model, Recording, Test, Tracked
-from api.workers.adviser import Adviser
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.models.places import differ, place_of
+from stimrig.api.models.tracked import TrackedVersions, Trial
+from stimrig.api.sessions.requests import TestIn
+from stimrig.api.store import Store
+from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
+from stimrig.api.workers.adviser import Adviser
 
 log = logging.getLogger("stimrig.tracking")
 SEQUENCE = "sequence"

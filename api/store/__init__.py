@@ -1,5 +1,5 @@
 """The database: participants, tests, recordings, models, approvals, tokens and the audit trail."""
 
-from api.store.database import Store
+from stimrig.api.store.database import Store
 
 __all__ = ["Store"]

@@ -7,9 +7,9 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from api.store import seen
-from api.store.hashes import GENESIS, digest, storable
-from api.store.tables import AuditEntry
+from stimrig.api.store import seen
+from stimrig.api.store.hashes import GENESIS, digest, storable
+from stimrig.api.store.tables import AuditEntry
 
 
 def entry_hash(entry: dict[str, Any]) -> str:
@@ -21,7 +21,7 @@ def entry_hash(entry: dict[str, Any]) -> str:
 def write(session: Session, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> None:
     """Append an entry in the caller's transaction, so that action and entry stand or fall together.
 
-    What the person had seen is kept with it (`api.store.seen`).
+    What the person had seen is kept with it (`stimrig.api.store.seen`).
     """
     if tag := seen.sent.get():
         detail["seen"] = tag

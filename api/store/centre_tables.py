@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, String, Text
 from sqlalchemy.orm import Mapped, mapped_column
 
-from api.store.tables import Table
+from stimrig.api.store.tables import Table
 
 Word = String().with_variant(String(collation="C"), "postgresql")
 Number = BigInteger().with_variant(Integer, "sqlite")

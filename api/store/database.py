@@ -15,10 +15,10 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
 
-from api.clock import Clock, local_day
-from api.errors import ApiError
-from api.store import engines, migrations
-from api.store.seen import About, Seen, check, newest
+from stimrig.api.clock import Clock, local_day
+from stimrig.api.errors import ApiError
+from stimrig.api.store import engines, migrations
+from stimrig.api.store.seen import About, Seen, check, newest
 
 
 class Store:

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL
 from sqlalchemy.exc import ArgumentError
 
-from api import owner_only
+from stimrig.api import owner_only
 
 WRITES = {"stimrig_writes": True}
 """Execution option of a transaction that writes."""

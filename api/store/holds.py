@@ -17,8 +17,8 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from sqlalchemy import Connection, Engine
 from sqlalchemy.exc import OperationalError, SQLAlchemyError
 
-from api.errors import ApiError, not_answering
-from api.store.database import Store
+from stimrig.api.errors import ApiError, not_answering
+from stimrig.api.store.database import Store
 
 log = logging.getLogger("stimrig.store")
 Turn = AbstractAsyncContextManager[None]

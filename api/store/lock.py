@@ -19,10 +19,10 @@ from typing import IO
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError
 
-from api import owner_only
-from api.clock import Clock
-from api.settings import Settings
-from api.store.engines import sqlite_file
+from stimrig.api import owner_only
+from stimrig.api.clock import Clock
+from stimrig.api.settings import Settings
+from stimrig.api.store.engines import sqlite_file
 
 
 class HeldError(OSError):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from secrets import token_bytes
 
-from api.store.database import Store
-from api.store.tables import Secret
+from stimrig.api.store.database import Store
+from stimrig.api.store.tables import Secret
 
 LENGTH = 32
 

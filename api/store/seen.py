@@ -18,8 +18,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, or_, select
 from sqlalchemy.orm import Session
 
-from api.errors import ApiError
-from api.store.tables import AuditEntry, Model
+from stimrig.api.errors import ApiError
+from stimrig.api.store.tables import AuditEntry, Model
 
 About = ColumnElement[bool]
 """Which entries of the trail a decision rests on."""

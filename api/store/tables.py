@@ -52,7 +52,7 @@ class Test(Table):
     ran_by: Mapped[str | None] = mapped_column(String, default=None)
     """Who ran it at the rig, if that was somebody else than `requested_by`."""
     followed_by: Mapped[str | None] = mapped_column(String, default=None)
-    """The service that follows it to its end (`api.store.holds`)."""
+    """The service that follows it to its end (`stimrig.api.store.holds`)."""
     rig: Mapped[str | None] = mapped_column(String, default=None)
     """The rig that plays it, as its services call it (`Settings.rig_name`)."""
 
@@ -141,7 +141,7 @@ class Tracked(Table):
     number: Mapped[int] = mapped_column(Integer)
     """Of the approval's trials, from 1."""
     outcome: Mapped[str] = mapped_column(String)
-    """As `identify.tracking.Outcome`, or `not-followed`."""
+    """As `stimrig.identify.tracking.Outcome`, or `not-followed`."""
     reason: Mapped[str] = mapped_column(Text, default="")
     """Why it was not followed."""
     step: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True), default=None)

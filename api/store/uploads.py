@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from api.store import Store
+    from stimrig.api.store import Store
 
 PREFIX, JOINED = "upload-", "joined-"
 PARTS = "parts"
@@ -46,7 +46,7 @@ def settle(folder: Path, store: Store) -> None:
 
     Only files that this service itself writes are looked at, by their names.
     """
-    from api.store.tables import Recording
+    from stimrig.api.store.tables import Recording
 
     named = {Path(path).name for path in store.all(Recording.path)}
     for part in _ours(folder / PARTS):

@@ -11,17 +11,17 @@ from fastapi import APIRouter, FastAPI
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp
 
-from api.clock import Clock
-from api.settings import Settings
-from api.store.lock import ServiceLock
-from api.version import software_version
-from api.web import openapi, pages, problems, routes, strict_body
-from api.web.body_limit import BodyLimit
-from api.web.dependencies import build
-from api.web.headers import Headers, PageLanguage
-from api.web.look_again import LookAgain
-from api.web.scan import routers
-from api.workers.pool import WORKER
+from stimrig.api.clock import Clock
+from stimrig.api.settings import Settings
+from stimrig.api.store.lock import ServiceLock
+from stimrig.api.version import software_version
+from stimrig.api.web import openapi, pages, problems, routes, strict_body
+from stimrig.api.web.body_limit import BodyLimit
+from stimrig.api.web.dependencies import build
+from stimrig.api.web.headers import Headers, PageLanguage
+from stimrig.api.web.look_again import LookAgain
+from stimrig.api.web.scan import routers
+from stimrig.api.workers.pool import WORKER
 
 
 class Service(FastAPI):

@@ -11,8 +11,8 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api.clock import asked_s
-from api.errors import ApiError
+from stimrig.api.clock import asked_s
+from stimrig.api.errors import ApiError
 
 BODY_BYTES = 1_000_000
 """Enough for the longest list of pulse widths; uploads have a bound of their own."""

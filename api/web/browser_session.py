@@ -7,8 +7,8 @@ from urllib.parse import urlsplit
 from fastapi import Request
 from fastapi.responses import Response
 
-from api.errors import ApiError
-from api.web.dependencies import Context
+from stimrig.api.errors import ApiError
+from stimrig.api.web.dependencies import Context
 
 
 def same_origin(request: Request) -> None:

@@ -7,21 +7,21 @@ from contextlib import suppress
 
 from fastapi import Request
 
-from api import decisions
-from api.clock import local_day
-from api.decisions import MODEL_TAG, OF_RIG, Decision
-from api.errors import ApiError
-from api.sessions.requests import PARTICIPANT_CODE
-from api.store import seen
-from api.web.headers import entity_tags
-from api.web.strict_body import PARSED
+from stimrig.api import decisions
+from stimrig.api.clock import local_day
+from stimrig.api.decisions import MODEL_TAG, OF_RIG, Decision
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.requests import PARTICIPANT_CODE
+from stimrig.api.store import seen
+from stimrig.api.web.headers import entity_tags
+from stimrig.api.web.strict_body import PARSED
 
 MOST_TAGS = 20
 """Of `If-Match`: the others are not read."""
 
 
 async def take(request: Request) -> None:
-    """Note what the request was decided on, for `api.store.seen.check`.
+    """Note what the request was decided on, for `stimrig.api.store.seen.check`.
 
     Raises
     ------

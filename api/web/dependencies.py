@@ -15,38 +15,38 @@ from fastapi import Depends, Request, Security
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.requests import HTTPConnection
 
-from api import owner_only
-from api.clock import Clock, set_zone
-from api.models.analyses import Analyses
-from api.models.registry import Versions
-from api.models.tracked import TrackedVersions
-from api.models.trend import Trend
-from api.outbox.feed import Feed
-from api.outbox.receipts import note_hourly
-from api.people.accounts import People
-from api.people.auth import Auth, Principal, Scope
-from api.people.idle_lock import FLUSH_S, IdleLock
-from api.people.pace import Guesses
-from api.sessions.following import Follower
-from api.sessions.notes import Notes
-from api.sessions.questions import Questions
-from api.sessions.rig_client import RigClient
-from api.sessions.runner import Runner
-from api.sessions.stop_log import StopLog
-from api.sessions.stop_right import StopRights
-from api.sessions.trials import Trials
-from api.settings import Settings
-from api.store import Store, holds, secrets, uploads
-from api.store.holds import Holds
-from api.store.lock import ServiceLock
-from api.store.tables import Recording
-from api.web.guards import anyone_even_locked, anyone_signed_in, require
-from api.web.openapi import problem
-from api.web.stop_guard import Press, anyone_who_may_stop
-from api.workers.adviser import Adviser
-from api.workers.pool import WORKER, Pool
-from api.workers.process import Places
-from api.workers.tracker import Jobs
+from stimrig.api import owner_only
+from stimrig.api.clock import Clock, set_zone
+from stimrig.api.models.analyses import Analyses
+from stimrig.api.models.registry import Versions
+from stimrig.api.models.tracked import TrackedVersions
+from stimrig.api.models.trend import Trend
+from stimrig.api.outbox.feed import Feed
+from stimrig.api.outbox.receipts import note_hourly
+from stimrig.api.people.accounts import People
+from stimrig.api.people.auth import Auth, Principal, Scope
+from stimrig.api.people.idle_lock import FLUSH_S, IdleLock
+from stimrig.api.people.pace import Guesses
+from stimrig.api.sessions.following import Follower
+from stimrig.api.sessions.notes import Notes
+from stimrig.api.sessions.questions import Questions
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.sessions.runner import Runner
+from stimrig.api.sessions.stop_log import StopLog
+from stimrig.api.sessions.stop_right import StopRights
+from stimrig.api.sessions.trials import Trials
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, holds, secrets, uploads
+from stimrig.api.store.holds import Holds
+from stimrig.api.store.lock import ServiceLock
+from stimrig.api.store.tables import Recording
+from stimrig.api.web.guards import anyone_even_locked, anyone_signed_in, require
+from stimrig.api.web.openapi import problem
+from stimrig.api.web.stop_guard import Press, anyone_who_may_stop
+from stimrig.api.workers.adviser import Adviser
+from stimrig.api.workers.pool import WORKER, Pool
+from stimrig.api.workers.process import Places
+from stimrig.api.workers.tracker import Jobs
 
 log = logging.getLogger("stimrig.api")
 

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 from fastapi import Request, Security
 from fastapi.security import APIKeyCookie, HTTPBearer
 
-from api.errors import ApiError
-from api.people.auth import Principal, Scope
-from api.store import seen
-from api.web import decisions
-from api.web.headers import wants_html
-from api.web.key_guard import refuse_outside
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.store import seen
+from stimrig.api.web import decisions
+from stimrig.api.web.headers import wants_html
+from stimrig.api.web.key_guard import refuse_outside
 
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")

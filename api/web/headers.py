@@ -11,7 +11,7 @@ from starlette import datastructures
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api import language
+from stimrig.api import language
 
 COOKIE = "stimrig_language"
 """The choice; it says nothing about who chose."""

@@ -1,19 +1,19 @@
 """What a controller's key opens: these routes for its participant, and nothing else.
 
 The one place where that is decided. `Auth.identify` refuses a bound key to whoever does not ask here, so a new route is
-closed to it until it stands in `OPEN`. What a trial may be is in `api.sessions.controller_trials`.
+closed to it until it stands in `OPEN`. What a trial may be is in `stimrig.api.sessions.controller_trials`.
 """
 
 from __future__ import annotations
 
 import re
 
-from api.errors import ApiError
-from api.models.places import kept, site_of
-from api.models.registry import Versions
-from api.people.auth import Principal, outside
-from api.sessions.controller_trials import unapproved
-from api.store.tables import Model, Participant, Recording, Test
+from stimrig.api.errors import ApiError
+from stimrig.api.models.places import kept, site_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.people.auth import Principal, outside
+from stimrig.api.sessions.controller_trials import unapproved
+from stimrig.api.store.tables import Model, Participant, Recording, Test
 
 STOP = "/v1/stop"
 OPEN = [

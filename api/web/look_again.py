@@ -7,8 +7,8 @@ from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api.web.guards import SAFE_METHODS
-from api.web.key_guard import STOP
+from stimrig.api.web.guards import SAFE_METHODS
+from stimrig.api.web.key_guard import STOP
 
 log = logging.getLogger("stimrig.look_again")
 

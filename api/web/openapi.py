@@ -6,10 +6,10 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from api import schemas
-from api.decisions import DECISIONS
-from api.web.responses.base import Problem
-from api.web.strict_body import REFUSALS
+from stimrig.api import schemas
+from stimrig.api.decisions import DECISIONS
+from stimrig.api.web.responses.base import Problem
+from stimrig.api.web.strict_body import REFUSALS
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 EMBEDDED = ("model", "effects")

@@ -13,12 +13,12 @@ from sqlalchemy.exc import DataError, InterfaceError, OperationalError, SQLAlche
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
-from api.errors import ApiError, not_answering
-from api.store import seen
-from api.store.seen import ChangedError
-from api.web.headers import wants_html
-from api.web.pages import changes
-from api.web.pages.render import look, problem_page
+from stimrig.api.errors import ApiError, not_answering
+from stimrig.api.store import seen
+from stimrig.api.store.seen import ChangedError
+from stimrig.api.web.headers import wants_html
+from stimrig.api.web.pages import changes
+from stimrig.api.web.pages.render import look, problem_page
 
 log = logging.getLogger("stimrig.api")
 

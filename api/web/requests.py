@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints
 
-from api.clock import unix_of, utc_label
-from api.models.tracking import USUAL_PERCENT, Limits
-from api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, MuscleIn, PersonName
+from stimrig.api.clock import unix_of, utc_label
+from stimrig.api.models.tracking import USUAL_PERCENT, Limits
+from stimrig.api.sessions.requests import FIRST_PROFILE, Body, Code, FirstProfileIn, MuscleIn, PersonName
 
 
 class ParticipantIn(MuscleIn):

@@ -1,4 +1,4 @@
-"""`python -m api.web.server`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
+"""`python -m stimrig.api.web.server`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
 
 Exit 2: a setting does not hold, another service holds the data, the port is taken, or the database does not open.
 """
@@ -15,13 +15,13 @@ import sys
 import uvicorn
 from starlette.types import ASGIApp
 
-from api import logs
-from api.errors import ApiError, SettingsError
-from api.models import carried_structure
-from api.settings import ServerSettings, Settings, loopback
-from api.store.lock import ServiceLock
-from api.web.app import create_app
-from api.web.connections import protocol, raise_file_limit
+from stimrig.api import logs
+from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.models import carried_structure
+from stimrig.api.settings import ServerSettings, Settings, loopback
+from stimrig.api.store.lock import ServiceLock
+from stimrig.api.web.app import create_app
+from stimrig.api.web.connections import protocol, raise_file_limit
 
 
 def main() -> int:

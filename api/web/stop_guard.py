@@ -13,9 +13,9 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from api.errors import ApiError, not_answering
-from api.sessions.requests import StopIn
-from api.web.guards import Session, Token
+from stimrig.api.errors import ApiError, not_answering
+from stimrig.api.sessions.requests import StopIn
+from stimrig.api.web.guards import Session, Token
 
 FIELD, HEADER = "right", "x-stop-right"
 PATIENCE_S, LONGEST_PATIENCE_S = 0.5, 3.0

@@ -16,8 +16,8 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from api.web.body_limit import UPLOAD
-from identify.strict_json import BadJson, NotJson, parse
+from stimrig.api.web.body_limit import UPLOAD
+from stimrig.identify.strict_json import BadJson, NotJson, parse
 
 DEEPEST = 16
 """Brackets within one another: a test's segment's settings take six."""

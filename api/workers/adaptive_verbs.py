@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from api.workers.json_values import clean
-from api.workers.live_record import record_of
+from stimrig import identify
+from stimrig.api.workers.json_values import clean
+from stimrig.api.workers.live_record import record_of
 
 Progress = Callable[[float, str], None]
 NEW_PERSON_SHARE = 1 / 3
@@ -36,9 +36,9 @@ def outlook(
 
     `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
-    from identify.experiments.adaptive import decide
-    from identify.experiments.reach import reach
-    from identify.experiments.target import Target
+    from stimrig.identify.experiments.adaptive import decide
+    from stimrig.identify.experiments.reach import reach
+    from stimrig.identify.experiments.target import Target
 
     progress(0.1, "playing the test on a simulated muscle")
     left = {"target": Target(**target), "left_s": playable_s, "left_nm_s": max_torque_time_nm_s}
@@ -62,7 +62,7 @@ def known(models: Sequence[str]) -> dict[str, Any]:
     A model that cannot be read here is left out. A last model that cannot be read, or that is of another kind than the
     adaptive test fits, is no help, and none is taken in its place.
     """
-    from identify.estimation.earlier import Earlier, learn_change
+    from stimrig.identify.estimation.earlier import Earlier, learn_change
 
     read, last = [], None
     for text in models:
@@ -82,7 +82,7 @@ def known(models: Sequence[str]) -> dict[str, Any]:
 
 def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any) -> dict[str, Any]:
     """A test begins, within the limits that `Running` has: what was known of another one is forgotten."""
-    from identify.experiments.target import Target
+    from stimrig.identify.experiments.target import Target
 
     progress(0.5, "beginning")
     _running.clear()
@@ -133,7 +133,7 @@ class Running:
         torque_time_nm_s, measured_s
             Torque-time that was measured, N·m·s, and until when, s.
         """
-        from identify.experiments.adaptive import decide
+        from stimrig.identify.experiments.adaptive import decide
 
         for held, new in zip(self.samples, (host_time_s, counter, torque_nm), strict=True):
             held.extend(new)  # pyright: ignore[reportArgumentType]

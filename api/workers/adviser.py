@@ -7,8 +7,8 @@ import itertools
 import logging
 from typing import Any
 
-from api.errors import ApiError
-from api.workers.process import WORKER, Call, Places, Worker
+from stimrig.api.errors import ApiError
+from stimrig.api.workers.process import WORKER, Call, Places, Worker
 
 log = logging.getLogger("stimrig.adviser")
 

@@ -15,8 +15,8 @@ import sys
 from pathlib import Path
 from typing import Any, TextIO
 
-from api.workers import confinement
-from identify.errors import IdentifyError
+from stimrig.api.workers import confinement
+from stimrig.identify.errors import IdentifyError
 
 PROCESSOR_S = 900.0
 """Of processor time for a call that names no other bound."""
@@ -26,7 +26,9 @@ def main() -> None:
     """Serve calls until the input closes."""
     confinement.end_with_parent()
     out = own_output()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second
+    os.environ.setdefault(
+        "OPENBLAS_NUM_THREADS", "1"
+    )  # as in `stimrig.api.cli`: small matrices gain nothing from a second
     os.nice(5)  # the rig's sender goes first
     say(out, {"ready": True, "left_open": shut_in()})
     for line in sys.stdin:
@@ -44,7 +46,7 @@ def own_output() -> TextIO:
 
 def shut_in() -> dict[str, str]:
     """Leave open only what the command line names; what could not be shut."""
-    parser = argparse.ArgumentParser(prog="api.workers.child")
+    parser = argparse.ArgumentParser(prog="stimrig.api.workers.child")
     parser.add_argument("--reads", type=Path, action="append", default=[])
     parser.add_argument("--writes", type=Path, action="append", default=[])
     options = parser.parse_args()
@@ -53,7 +55,7 @@ def shut_in() -> dict[str, str]:
 
 def run(request: dict[str, Any], out: TextIO) -> dict[str, Any]:
     """Do one call; its result or its error as an object."""
-    from api.workers import verbs
+    from stimrig.api.workers import verbs
 
     def progress(fraction: float, text: str = "") -> None:
         say(out, {"call": request["call"], "progress": float(fraction), "text": str(text)})

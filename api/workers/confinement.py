@@ -21,6 +21,8 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+PACKAGE = Path(__file__).absolute().parents[2]
+"""`stimrig`; in a checkout its packages are links to the folders beside it."""
 MEMORY_BYTES = 2 * 2**30
 """Three times what the largest record takes (`bench/hostile_files.py` prints what was taken)."""
 FILE_BYTES = 512 * 2**20
@@ -152,12 +154,12 @@ def _open(rules: int, path: Path, rights: int) -> None:
 
 def code_roots() -> list[Path]:
     """Folders from which this software is imported: a data folder may lie in one, so only packages in it are open."""
-    return [Path(__file__).resolve().parents[2]]
+    return [PACKAGE.parent]
 
 
 def code_folders() -> list[Path]:
     """Where Python, its packages and ours lie."""
-    ours = [root / name for root in code_roots() for name in ("api", "identify", "rig")]
+    ours = [PACKAGE, *((PACKAGE / name).resolve() for name in ("api", "identify", "rig"))]
     theirs = {Path(entry).resolve() for entry in (sys.prefix, sys.base_prefix, *sys.path) if entry}
     return [*ours, *(theirs - {*code_roots(), Path.cwd()})]
 
@@ -166,7 +168,7 @@ def cache_folders() -> list[Path]:
     """Where numba keeps what it compiled."""
     if place := os.environ.get("NUMBA_CACHE_DIR"):
         return [Path(place)]
-    found = [module.parent / "__pycache__" for module in (code_roots()[0] / "identify").rglob("__init__.py")]
+    found = [module.parent / "__pycache__" for module in (PACKAGE / "identify").resolve().rglob("__init__.py")]
     for folder in found:
         with contextlib.suppress(OSError):
             folder.mkdir(exist_ok=True)
@@ -186,7 +188,7 @@ def _ask(function: str, *arguments: int | bytes) -> int:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """`python -m api.workers.confinement`: try it, and say what stays open as one JSON object."""
+    """`python -m stimrig.api.workers.confinement`: try it, and say what stays open as one JSON object."""
     print(json.dumps(confine(map(Path, arguments))))
 
 

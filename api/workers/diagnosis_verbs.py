@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from api.structure import held_by
-from api.workers.json_values import clean
-from identify.records import parts_csv
+from stimrig import identify
+from stimrig.api.structure import held_by
+from stimrig.api.workers.json_values import clean
+from stimrig.identify.records import parts_csv
 
 Progress = Callable[[float, str], None]
 POINTS = 900
@@ -34,7 +34,7 @@ def diagnosis(
 
 def diagnosed(record: Any, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
     """The same of a record that was read."""
-    from identify import effects
+    from stimrig.identify import effects
 
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
@@ -86,7 +86,7 @@ def smooth(record: Any, values: Any) -> Any:
 
 def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """The test that separates the first effect with rivals from them; None where no effect has any."""
-    from identify.diagnosis.experiment import planned
+    from stimrig.identify.diagnosis.experiment import planned
 
     found = planned(missing)
     return found and {**found.to_dict(), "effect": found.rivals[0]}
@@ -105,7 +105,7 @@ def joined(parts: Sequence[str], out: str, progress: Progress, needs: Sequence[s
 
     `needs` are columns that each of them must have.
     """
-    from api.workers import several
+    from stimrig.api.workers import several
 
     progress(0.1, "joining the recordings")
     whole = several.read([Path(part) for part in parts], needs=needs, name=lambda number: f"recording {number + 1}")

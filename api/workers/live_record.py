@@ -23,7 +23,7 @@ def record_of(
     rate_hz: float,
 ) -> Any:
     """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet."""
-    from identify.records.record import Pulses, Record
+    from stimrig.identify.records.record import Pulses, Record
 
     if len(host_time_s) < 2:
         return None

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from api.logs import current_test
-from api.workers.process import WORKER, Call, Places, Worker, cancelled
+from stimrig.api.logs import current_test
+from stimrig.api.workers.process import WORKER, Call, Places, Worker, cancelled
 
 log = logging.getLogger("stimrig.fitting")
 

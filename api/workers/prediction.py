@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from api.workers.json_values import clean
+from stimrig import identify
+from stimrig.api.workers.json_values import clean
 
 Progress = Callable[[float, str], None]
 
@@ -24,7 +24,7 @@ def forecast(
 
     `angle_rad`: of the joint in each pulse's period, where it moves.
     """
-    from identify.simulation.pulses import Motion, above_rest
+    from stimrig.identify.simulation.pulses import Motion, above_rest
 
     progress(0.1, "predicting")
     model = identify.Model.from_json(model_json)
@@ -49,9 +49,9 @@ def invert(
 
     The reference comes as numbers, or as the text of a CSV file (`table`).
     """
-    from identify.inversion import Reference
-    from identify.inversion import invert as widths_for
-    from identify.inversion.table import read_reference
+    from stimrig.identify.inversion import Reference
+    from stimrig.identify.inversion import invert as widths_for
+    from stimrig.identify.inversion.table import read_reference
 
     progress(0.1, "inverting")
     model = identify.Model.from_json(model_json)

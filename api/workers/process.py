@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from api.errors import ApiError
-from api.logs import current_test
+from stimrig.api.errors import ApiError
+from stimrig.api.logs import current_test
 
 log = logging.getLogger("stimrig.fitting")
 
-WORKER = (sys.executable, "-m", "api.workers.child")
+WORKER = (sys.executable, "-m", "stimrig.api.workers.child")
 BACKGROUND_NICE = "15"
 """How far a worker for what nobody waits for stands back."""
 LINE_LIMIT = 64 * 1024 * 1024
@@ -53,7 +53,7 @@ WALL_FACTOR = 3.0
 def environment() -> dict[str, str]:
     """The environment of a worker; it imports what this process imports, and nothing from the working folder."""
     kept = {name: os.environ[name] for name in PASSED_ON if name in os.environ}
-    ours = str(Path(__file__).resolve().parents[2])
+    ours = str(Path(__file__).absolute().parents[3])
     path = os.pathsep.join(dict.fromkeys([ours, *kept.get("PYTHONPATH", "").split(os.pathsep)])).rstrip(os.pathsep)
     return {**kept, "PYTHONPATH": path, "PYTHONSAFEPATH": "1", "HDF5_PLUGIN_PRELOAD": "::"}
 

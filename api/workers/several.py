@@ -10,9 +10,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import identify
-from identify.records.join import join
-from identify.records.recording import attributes
+from stimrig import identify
+from stimrig.identify.records.join import join
+from stimrig.identify.records.recording import attributes
 
 JOINT = ("angle_rad", "velocity_rad_s")
 

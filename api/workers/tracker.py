@@ -9,8 +9,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from api.errors import ApiError, NotFoundError
-from api.workers.pool import Call, Pool
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.workers.pool import Call, Pool
 
 log = logging.getLogger("stimrig.jobs")
 FIT_TOGETHER = "fit-recordings"

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from api.workers.json_values import clean
-from api.workers.several import begun
+from stimrig import identify
+from stimrig.api.workers.json_values import clean
+from stimrig.api.workers.several import begun
 
 Progress = Callable[[float, str], None]
 MOST_MISSED = 50
@@ -60,7 +60,7 @@ def track(
         `error_percent`, None without a reference; `step` and the text of the `model` for the next trial, or the
         `reason` why the trial was not followed.
     """
-    from identify.tracking import State, begin, follow, learn_rates, model_for_next
+    from stimrig.identify.tracking import State, begin, follow, learn_rates, model_for_next
 
     progress(0.1, "reading the recording")
     record = dated(Path(data))
@@ -91,7 +91,7 @@ def dated(path: Path) -> Any:
 
 def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
     """The state after what the muscle did in these recordings; of one that cannot be read nobody knows what it did."""
-    from identify.tracking import passed, slow_forms
+    from stimrig.identify.tracking import passed, slow_forms
 
     for path in between if slow_forms(model) else ():
         with contextlib.suppress(identify.IdentifyError, OSError):
@@ -107,7 +107,7 @@ def second_order(model: Any) -> Any:
     BadModel
         Its dynamics are not of second order.
     """
-    from identify.dynamics.linear import SecondOrder
+    from stimrig.identify.dynamics.linear import SecondOrder
 
     if not isinstance(model.linear, SecondOrder):
         message = "a model whose dynamics are not of second order cannot be tracked"
@@ -142,7 +142,7 @@ def warm(progress: Progress, model_json: str) -> dict[str, Any]:
     """Load all that `track` needs, and follow two seconds of the model's own torque: then a trial waits for nothing."""
     import importlib
 
-    from identify.tracking import follow, model_for_next
+    from stimrig.identify.tracking import follow, model_for_next
 
     progress(0.1, "loading")
     importlib.import_module("h5py")

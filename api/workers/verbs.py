@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from api.workers import adaptive_verbs, tracking_verbs
-from api.workers.diagnosis_verbs import diagnosis, improve, joined
-from api.workers.json_values import clean
-from api.workers.prediction import forecast, invert
-from api.workers.recorded_signals import recorded
-from identify.records import parts_csv
-from identify.records.cells import quoted
-from identify.records.recording import attributes
+from stimrig import identify
+from stimrig.api.workers import adaptive_verbs, tracking_verbs
+from stimrig.api.workers.diagnosis_verbs import diagnosis, improve, joined
+from stimrig.api.workers.json_values import clean
+from stimrig.api.workers.prediction import forecast, invert
+from stimrig.api.workers.recorded_signals import recorded
+from stimrig.identify.records import parts_csv
+from stimrig.identify.records.cells import quoted
+from stimrig.identify.records.recording import attributes
 
 Progress = Callable[[float, str], None]
 POINTS = 2400
@@ -146,7 +146,7 @@ def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, l
 
 def effects(progress: Progress) -> dict[str, Any]:
     """The library of effects."""
-    from identify import effects as library
+    from stimrig.identify import effects as library
 
     progress(0.5, "reading the library")
     return clean({"effects": library.library()})
@@ -154,7 +154,7 @@ def effects(progress: Progress) -> dict[str, Any]:
 
 def warm(progress: Progress) -> dict[str, Any]:
     """Load identify and its compiled parts, so that the fit after a test starts at once."""
-    from identify.records.csv import read_csv
+    from stimrig.identify.records.csv import read_csv
 
     progress(0.1, "loading")
     identify.fit(read_csv(_warm_csv().encode(), Path("warm.csv")))
@@ -213,7 +213,7 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
 
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
     """The sealed recording of a test, when the service did not hear of its end."""
-    from api.store.uploads import PREFIX
+    from stimrig.api.store.uploads import PREFIX
 
     progress(0.1, "looking through the recordings")
     for path in sorted(Path(folder).glob("**/*.h5")):

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hardware_sim.load_cells.frames import AngleReading
-from hardware_sim.sampling import Noise
+from stimrig.hardware_sim.load_cells.frames import AngleReading
+from stimrig.hardware_sim.sampling import Noise
 
 AngleHook = Callable[[float, float], float]
 """Takes a raw angle, degrees, and the emulated time, s; returns the raw angle that is read instead."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from hardware_sim.angle_sensors import sensor
-from hardware_sim.angle_sensors.encoder import Encoder, Mounting
-from hardware_sim.angle_sensors.sensor import AngleSensor
-from hardware_sim.load_cells.cells import with_angle
-from hardware_sim.load_cells.frames import Frame
-from hardware_sim.settings import Settings
+from stimrig.hardware_sim.angle_sensors import sensor
+from stimrig.hardware_sim.angle_sensors.encoder import Encoder, Mounting
+from stimrig.hardware_sim.angle_sensors.sensor import AngleSensor
+from stimrig.hardware_sim.load_cells.cells import with_angle
+from stimrig.hardware_sim.load_cells.frames import Frame
+from stimrig.hardware_sim.settings import Settings
 
 
 def encoder(angle_deg: Callable[[float], float], settings: Settings) -> Encoder:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable
 
-from hardware_sim.angle_sensors.encoder import Encoder
-from hardware_sim.load_cells.frames import Frame
-from hardware_sim.sampling import SampleClock
+from stimrig.hardware_sim.angle_sensors.encoder import Encoder
+from stimrig.hardware_sim.load_cells.frames import Frame
+from stimrig.hardware_sim.sampling import SampleClock
 
 CAN_ID = 0x182
 LAYOUT = struct.Struct("<fHBB")

@@ -5,7 +5,7 @@ Flash and Hogan 1985: people move their arms with the least jerk. Peak speed is 
 
 from __future__ import annotations
 
-from hardware_sim.arm.motion import Motion
+from stimrig.hardware_sim.arm.motion import Motion
 
 PEAK_OVER_MEAN = 15.0 / 8.0
 SHORTEST_S = 0.2

@@ -7,7 +7,7 @@
     from_deg = 30
     to_deg = 120
     deg_s = 20
-    [mechanics]           # what `hardware_sim.arm.mechanics` says of the forearm
+    [mechanics]           # what `stimrig.hardware_sim.arm.mechanics` says of the forearm
     weight_nm = 2.8
     [passive]             # the law of each place, and its parameters
     law = "linear_friction"
@@ -26,12 +26,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hardware_sim.arm import registry
-from hardware_sim.arm.mechanics import Mechanics
-from hardware_sim.arm.motion import LARGEST_DEG, SMALLEST_DEG, within
-from hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES, Tissue, built, law
-from hardware_sim.errors import ArmError
-from hardware_sim.tables import read_table
+from stimrig.hardware_sim.arm import registry
+from stimrig.hardware_sim.arm.mechanics import Mechanics
+from stimrig.hardware_sim.arm.motion import LARGEST_DEG, SMALLEST_DEG, within
+from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES, Tissue, built, law
+from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.tables import read_table
 
 KEYS = ("mode", "movement", "mechanics", *PLACES)
 

@@ -16,11 +16,11 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
-from hardware_sim.arm import registry
-from hardware_sim.arm.description import Arm
-from hardware_sim.arm.motion import Begin, Motion
-from hardware_sim.errors import ArmError
-from hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.arm import registry
+from stimrig.hardware_sim.arm.description import Arm
+from stimrig.hardware_sim.arm.motion import Begin, Motion
+from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.patients.muscle import Muscle
 
 LONGEST_STEP_S = 1.0 / 1600.0
 SEEDS_APART = 1 << 32

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from hardware_sim.errors import ArmError
+from stimrig.hardware_sim.errors import ArmError
 
 SMALLEST_DEG, LARGEST_DEG = -10.0, 160.0
 """What an elbow can be asked for; people reach -5 to 150 degrees."""

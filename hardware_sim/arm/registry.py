@@ -7,10 +7,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from hardware_sim.arm import movers
-from hardware_sim.arm.motion import Begin, MoverProtocol
-from hardware_sim.errors import ArmError
-from hardware_sim.scan import modules_with
+from stimrig.hardware_sim.arm import movers
+from stimrig.hardware_sim.arm.motion import Begin, MoverProtocol
+from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.scan import modules_with
 
 
 def modes() -> list[str]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from hardware_sim.arm.motion import Begin, Motion
+from stimrig.hardware_sim.arm.motion import Begin, Motion
 
 GRID_S = 0.001
 

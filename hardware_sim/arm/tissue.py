@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hardware_sim.arm import passive, torque_angle, torque_velocity
-from hardware_sim.arm.law import AngleLaw, Number, PassiveLaw, VelocityLaw
-from hardware_sim.arm.mechanics import Mechanics
-from hardware_sim.errors import ArmError
-from hardware_sim.scan import modules_with
+from stimrig.hardware_sim.arm import passive, torque_angle, torque_velocity
+from stimrig.hardware_sim.arm.law import AngleLaw, Number, PassiveLaw, VelocityLaw
+from stimrig.hardware_sim.arm.mechanics import Mechanics
+from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.scan import modules_with
 
 REFERENCE_RAD = math.pi / 2.0
 PLACES = {"passive": passive, "torque_angle": torque_angle, "torque_velocity": torque_velocity}

@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from hardware_sim.angle_sensors.encoder import AngleHook, Encoder
-from hardware_sim.angle_sensors.sensor import AngleSensor
-from hardware_sim.errors import FaultError
-from hardware_sim.faults.registry import Undo, fault, hooked, replaced
-from hardware_sim.faults.target import Target
+from stimrig.hardware_sim.angle_sensors.encoder import AngleHook, Encoder
+from stimrig.hardware_sim.angle_sensors.sensor import AngleSensor
+from stimrig.hardware_sim.errors import FaultError
+from stimrig.hardware_sim.faults.registry import Undo, fault, hooked, replaced
+from stimrig.hardware_sim.faults.target import Target
 
 
 @fault

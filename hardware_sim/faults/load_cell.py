@@ -6,10 +6,10 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from hardware_sim.errors import FaultError
-from hardware_sim.faults.registry import Undo, fault, hooked
-from hardware_sim.faults.target import Target
-from hardware_sim.load_cells.frames import Frame
+from stimrig.hardware_sim.errors import FaultError
+from stimrig.hardware_sim.faults.registry import Undo, fault, hooked
+from stimrig.hardware_sim.faults.target import Target
+from stimrig.hardware_sim.load_cells.frames import Frame
 
 BUS_OFF_CLASS, BUS_ERROR_CLASS = 0x20000040, 0x20000080
 """Ids of error frames as Linux reports them: the flag of error frames and the class."""

@@ -12,9 +12,9 @@ import pkgutil
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from hardware_sim import faults
-from hardware_sim.errors import FaultError
-from hardware_sim.faults.target import Target
+from stimrig.hardware_sim import faults
+from stimrig.hardware_sim.errors import FaultError
+from stimrig.hardware_sim.faults.target import Target
 
 Undo = Callable[[], None]
 Make = TypeVar("Make", bound=Callable[..., Undo])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hardware_sim.faults.registry import Undo, fault, hooked, replaced
-from hardware_sim.faults.target import Target
+from stimrig.hardware_sim.faults.registry import Undo, fault, hooked, replaced
+from stimrig.hardware_sim.faults.target import Target
 
 HALF_A_FRAME = bytes.fromhex("f0815581")
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 from typing import Protocol
 
-from hardware_sim.angle_sensors.encoder import Encoder
-from hardware_sim.angle_sensors.sensor import AngleSensor
-from hardware_sim.load_cells.sampler import LoadCell
-from hardware_sim.stimulators.board import Board, FirmwareProtocol
-from hardware_sim.timeline import Timeline
+from stimrig.hardware_sim.angle_sensors.encoder import Encoder
+from stimrig.hardware_sim.angle_sensors.sensor import AngleSensor
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.stimulators.board import Board, FirmwareProtocol
+from stimrig.hardware_sim.timeline import Timeline
 
 
 class Target(Protocol):

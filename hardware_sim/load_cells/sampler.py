@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import chain, repeat
 
-from hardware_sim.load_cells.frames import AngleReading, CellProtocol, Frame, Sample
-from hardware_sim.patients.muscle import Muscle
-from hardware_sim.sampling import Noise, SampleClock
+from stimrig.hardware_sim.load_cells.frames import AngleReading, CellProtocol, Frame, Sample
+from stimrig.hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.sampling import Noise, SampleClock
 
 TorqueHook = Callable[[float], float]
 FrameHook = Callable[[Frame], Iterable[Frame]]

@@ -21,8 +21,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hardware_sim.errors import PatientError
-from hardware_sim.patients.held import HeldPulses
+from stimrig.hardware_sim.errors import PatientError
+from stimrig.hardware_sim.patients.held import HeldPulses
 
 PAUSE_S = 5.0
 """A pause as long begins a new contraction."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from hardware_sim.patients.held import HeldPulses
+from stimrig.hardware_sim.patients.held import HeldPulses
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hardware_sim import patients
-from hardware_sim.errors import PatientError
-from hardware_sim.patients.muscle import Muscle
-from hardware_sim.scan import modules_with
-from hardware_sim.tables import read_table
+from stimrig.hardware_sim import patients
+from stimrig.hardware_sim.errors import PatientError
+from stimrig.hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.scan import modules_with
+from stimrig.hardware_sim.tables import read_table
 
 
 def names() -> list[str]:

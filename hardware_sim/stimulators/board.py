@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from hardware_sim.electrodes import Electrodes
-from hardware_sim.timeline import Timeline
+from stimrig.hardware_sim.electrodes import Electrodes
+from stimrig.hardware_sim.timeline import Timeline
 
 FrameHook = Callable[[bytes], bytes | None]
 """A fault on the line: takes a frame and returns what is sent instead; None sends nothing."""

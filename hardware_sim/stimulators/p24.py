@@ -9,11 +9,11 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-from hardware_sim.stimulators import sciencemode4
-from hardware_sim.stimulators.board import Board
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.p24_mid_level import MidLevel
-from hardware_sim.stimulators.p24_points import (
+from stimrig.hardware_sim.stimulators import sciencemode4
+from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.p24_mid_level import MidLevel
+from stimrig.hardware_sim.stimulators.p24_points import (
     ELECTRODE,
     ELECTRODE_DETECTION_MA,
     HIGH_VOLTAGE,
@@ -25,7 +25,7 @@ from hardware_sim.stimulators.p24_points import (
     parse_points,
     within_limits,
 )
-from hardware_sim.timeline import Event
+from stimrig.hardware_sim.timeline import Event
 
 LL_INIT, LL_CHANNEL_CONFIG, LL_STOP = 0, 2, 4
 ML_INIT, ML_UPDATE, ML_STOP, ML_GET_CURRENT_DATA = 30, 32, 34, 36

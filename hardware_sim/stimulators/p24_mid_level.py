@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from hardware_sim.electrodes import Point
-from hardware_sim.stimulators.board import Board
-from hardware_sim.stimulators.p24_points import (
+from stimrig.hardware_sim.electrodes import Point
+from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.p24_points import (
     ELECTRODE,
     ELECTRODE_DETECTION_MA,
     OK,
@@ -19,7 +19,7 @@ from hardware_sim.stimulators.p24_points import (
     parse_points,
     within_limits,
 )
-from hardware_sim.timeline import Event
+from stimrig.hardware_sim.timeline import Event
 
 CHANNELS = 8
 SILENCE_S = 2.0

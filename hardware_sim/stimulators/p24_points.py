@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hardware_sim.electrodes import Point
+from stimrig.hardware_sim.electrodes import Point
 
 OK, TRANSFER, PARAMETER, NOT_INITIALISED, HIGH_VOLTAGE = 0, 1, 2, 7, 8
 ELECTRODE, INVALID_COMMAND = 10, 11

@@ -16,10 +16,10 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from hardware_sim.stimulators import sciencemode2
-from hardware_sim.stimulators.board import Board
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.rehastim2_channels import (
+from stimrig.hardware_sim.stimulators import sciencemode2
+from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.rehastim2_channels import (
     CHANNELS,
     NO_ERROR,
     OK,
@@ -31,7 +31,7 @@ from hardware_sim.stimulators.rehastim2_channels import (
     parse_pulse,
     parse_start,
 )
-from hardware_sim.timeline import Event
+from stimrig.hardware_sim.timeline import Event
 
 INIT, INIT_ACK, UNKNOWN_COMMAND, WATCHDOG = 1, 2, 3, 4
 GET_MODE, INIT_CHANNEL_LIST, START, STOP, SINGLE_PULSE, STIMULATION_ERROR = 10, 30, 32, 34, 36, 38

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from hardware_sim.electrodes import Point
-from hardware_sim.stimulators.board import Board
-from hardware_sim.timeline import Event
+from stimrig.hardware_sim.electrodes import Point
+from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.timeline import Event
 
 OK, PARAMETER = 0, -2
 NO_ERROR, EMERGENCY_SWITCH, ELECTRODE, MODULE = 0, -1, -2, -3

@@ -6,7 +6,7 @@ over the stuffed body. The body is packet number, command, data.
 
 from __future__ import annotations
 
-from hardware_sim.stimulators.framing import FrameDecoder, Packet, frame, stuff, unstuff
+from stimrig.hardware_sim.stimulators.framing import FrameDecoder, Packet, frame, stuff, unstuff
 
 SHORTEST_BODY_BYTES = 2
 LONGEST_BODY_BYTES = 2 * (2 + 8 * 4)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import binascii
 
-from hardware_sim.stimulators.framing import FrameDecoder, Packet, frame, stuff, unstuff
+from stimrig.hardware_sim.stimulators.framing import FrameDecoder, Packet, frame, stuff, unstuff
 
 AROUND_BODY_BYTES = 10
 """Start, escaped header and stop."""

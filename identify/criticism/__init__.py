@@ -6,19 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from identify.criticism.correlation import correlation_tests
-from identify.criticism.shares import error_shares
-from identify.criticism.where import worst_places
-from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRecord
-from identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
-from identify.estimation.quality import range_warnings
-from identify.estimation.samples import inspect
-from identify.estimation.uncertainty import POINTWISE, prediction_band
-from identify.model import Model
-from identify.records.record import Record
-from identify.results import Comparison, FitStatistics
+from stimrig.identify.criticism.correlation import correlation_tests
+from stimrig.identify.criticism.shares import error_shares
+from stimrig.identify.criticism.where import worst_places
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
+from stimrig.identify.estimation.quality import range_warnings
+from stimrig.identify.estimation.samples import inspect
+from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.results import Comparison, FitStatistics
 
 POINTS = 4000
 """Largest number of points of a plotted series."""

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from identify.criticism.where import direction_of
-from identify.dynamics.pulse_grid import runs
-from identify.records.record import Record
+from stimrig.identify.criticism.where import direction_of
+from stimrig.identify.dynamics.pulse_grid import runs
+from stimrig.identify.records.record import Record
 
 LEVELS = 6
 SPANS = 10

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.records.record import Record
+from stimrig.identify.records.record import Record
 
 STRETCH_S = 0.5
 MOST = 5

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from identify.diagnosis.candidates import Progress
-from identify.diagnosis.result import diagnosis_of
-from identify.diagnosis.search import search_effects
-from identify.diagnosis.verdict import judge
-from identify.dynamics.linear import SecondOrder
-from identify.errors import BadRequest
-from identify.model import Model
-from identify.records.record import Record
-from identify.results import Diagnosis
+from stimrig.identify.diagnosis.candidates import Progress
+from stimrig.identify.diagnosis.result import diagnosis_of
+from stimrig.identify.diagnosis.search import search_effects
+from stimrig.identify.diagnosis.verdict import judge
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.results import Diagnosis
 
 
 def diagnose(record: Record, model: Model | None = None, progress: Progress | None = None) -> Diagnosis:

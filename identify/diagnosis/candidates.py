@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from identify.diagnosis.side_by_side import side_by_side
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.estimation.effect_fit import Candidate, effect_names, try_effect
-from identify.estimation.joint import Fitted
-from identify.simulation.problem import Problem
-from identify.simulation.setup import Setup
+from stimrig.identify.diagnosis.side_by_side import side_by_side
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.estimation.effect_fit import Candidate, effect_names, try_effect
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
 
 WORKERS = min(2, os.cpu_count() or 1)
 """Processes that try effects in parallel."""

@@ -6,17 +6,17 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from identify.diagnosis.held_out_error import held_out_rise
-from identify.diagnosis.residual_structure import quiet_rows, residual_structure
-from identify.diagnosis.search import without_effect
-from identify.diagnosis.thresholds import FIRST_MARGIN
-from identify.effects import get
-from identify.effects.base import Effect
-from identify.errors import NotIdentifiable
-from identify.estimation.effect_fit import BAND_COST, add_effect, detected_effects, effect_names, try_effect
-from identify.estimation.joint import Fitted
-from identify.estimation.samples import Raw
-from identify.model import Model
+from stimrig.identify.diagnosis.held_out_error import held_out_rise
+from stimrig.identify.diagnosis.residual_structure import quiet_rows, residual_structure
+from stimrig.identify.diagnosis.search import without_effect
+from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
+from stimrig.identify.effects import get
+from stimrig.identify.effects.base import Effect
+from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.estimation.effect_fit import BAND_COST, add_effect, detected_effects, effect_names, try_effect
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.model import Model
 
 LAST = "fitting last session's structure"
 

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from identify.diagnosis.candidates import Progress, silent
-from identify.diagnosis.carried_effects import LAST, Judged, Reason, prior, rise, still_needed
-from identify.diagnosis.thresholds import FIRST_MARGIN
-from identify.effects import get, registry
-from identify.estimation.effect_fit import detected_effects, effect_names
-from identify.estimation.finish import finish
-from identify.estimation.joint import Fitted
-from identify.estimation.prepare import fit_plain, prepare
-from identify.estimation.renewed_curve import renewed_curve
-from identify.estimation.rows import fitted_rows
-from identify.estimation.samples import Raw
-from identify.model import Model
-from identify.records.record import Record
-from identify.results import Carried
+from stimrig.identify.diagnosis.candidates import Progress, silent
+from stimrig.identify.diagnosis.carried_effects import LAST, Judged, Reason, prior, rise, still_needed
+from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
+from stimrig.identify.effects import get, registry
+from stimrig.identify.estimation.effect_fit import detected_effects, effect_names
+from stimrig.identify.estimation.finish import finish
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.estimation.renewed_curve import renewed_curve
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.results import Carried
 
 METHOD = "maximum-likelihood"
 FIGURES = ("fit_percent", "ceiling_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "held_out_by")

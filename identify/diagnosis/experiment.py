@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from identify import experiments
-from identify.diagnosis import diagnose
-from identify.records.record import Record
-from identify.results import Diagnosis, Result
-from identify.shown import Sheet
+from stimrig.identify import experiments
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.records.record import Record
+from stimrig.identify.results import Diagnosis, Result
+from stimrig.identify.shown import Sheet
 
 
 @dataclass(frozen=True, repr=False, eq=False)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import FORM_ERROR, HELD_OUT_RISE, LEAST_HELD_OUT_ROWS, NEAR
-from identify.dynamics.pulse_grid import Grid
-from identify.effects import get
-from identify.estimation.joint import Fitted
-from identify.records.record import FORGOTTEN_S
+from stimrig.identify.diagnosis.thresholds import FORM_ERROR, HELD_OUT_RISE, LEAST_HELD_OUT_ROWS, NEAR
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.records.record import FORGOTTEN_S
 
 MEDIAN = 0.6745
 """Median of the size of normal errors over their standard deviation."""

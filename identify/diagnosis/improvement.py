@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from identify.diagnosis import structure_of
-from identify.diagnosis.candidates import Progress
-from identify.diagnosis.held_out_error import held_out_rise
-from identify.diagnosis.result import Step, steps
-from identify.diagnosis.search import MOST, EffectSearch, search_effects
-from identify.diagnosis.verdict import judge
-from identify.effects import get
-from identify.estimation.effect_fit import add_effect, effect_names
-from identify.estimation.evaluation import evaluate
-from identify.estimation.finish import finish
-from identify.estimation.samples import Raw
-from identify.model import Model
-from identify.records.record import Record
-from identify.results import Improvement
+from stimrig.identify.diagnosis import structure_of
+from stimrig.identify.diagnosis.candidates import Progress
+from stimrig.identify.diagnosis.held_out_error import held_out_rise
+from stimrig.identify.diagnosis.result import Step, steps
+from stimrig.identify.diagnosis.search import MOST, EffectSearch, search_effects
+from stimrig.identify.diagnosis.verdict import judge
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.effect_fit import add_effect, effect_names
+from stimrig.identify.estimation.evaluation import evaluate
+from stimrig.identify.estimation.finish import finish
+from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.results import Improvement
 
 COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent")
 

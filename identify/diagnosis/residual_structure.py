@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.diagnosis.thresholds import COUNTS, QUIET, STRUCTURE, STRUCTURE_SHARE
-from identify.dynamics.pulse_grid import ends_of, runs
-from identify.estimation.joint import Fitted
-from identify.noise.level import band_part
-from identify.noise.slow_and_white import profile_noise
-from identify.records.record import Record
+from stimrig.identify.diagnosis.thresholds import COUNTS, QUIET, STRUCTURE, STRUCTURE_SHARE
+from stimrig.identify.dynamics.pulse_grid import ends_of, runs
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.noise.level import band_part
+from stimrig.identify.noise.slow_and_white import profile_noise
+from stimrig.identify.records.record import Record
 
 
 @dataclass(frozen=True)

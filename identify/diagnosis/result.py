@@ -7,21 +7,21 @@ from typing import Any
 
 import numpy as np
 
-from identify.caution import OPEN
-from identify.criticism.where import worst_places
-from identify.diagnosis.search import EffectSearch
-from identify.diagnosis.thresholds import CLOSE, RIVAL
-from identify.diagnosis.verdict import Verdict
-from identify.effects import get
-from identify.estimation.band_effect import band_as_effect, predict_fitted
-from identify.estimation.effect_fit import effect_names
-from identify.estimation.evaluation import evaluate
-from identify.estimation.finish import describe_parameters
-from identify.estimation.joint import Fitted
-from identify.estimation.renewed_curve import knows_joint, renewed_curve
-from identify.experiments import plan
-from identify.results import Diagnosis
-from identify.shown import probability, sure
+from stimrig.identify.caution import OPEN
+from stimrig.identify.criticism.where import worst_places
+from stimrig.identify.diagnosis.search import EffectSearch
+from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
+from stimrig.identify.diagnosis.verdict import Verdict
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.band_effect import band_as_effect, predict_fitted
+from stimrig.identify.estimation.effect_fit import effect_names
+from stimrig.identify.estimation.evaluation import evaluate
+from stimrig.identify.estimation.finish import describe_parameters
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.renewed_curve import knows_joint, renewed_curve
+from stimrig.identify.experiments import plan
+from stimrig.identify.results import Diagnosis
+from stimrig.identify.shown import probability, sure
 
 MOST_PARAMETERS = 24
 """The wave of a tremor has hundreds."""
@@ -42,7 +42,7 @@ class Step:
     fitted : Fitted
         The model.
     statistics : dict
-        See `identify.estimation.evaluation`.
+        See `stimrig.identify.estimation.evaluation`.
     """
 
     added: str | None

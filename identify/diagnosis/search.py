@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from identify.diagnosis import thresholds
-from identify.diagnosis.candidates import FREE_GAIN, Progress, scan
-from identify.diagnosis.residual_structure import ResidualStructure, quiet_rows, residual_structure
-from identify.effects import get, registry
-from identify.effects.base import Effect
-from identify.estimation.effect_fit import (
+from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.diagnosis.candidates import FREE_GAIN, Progress, scan
+from stimrig.identify.diagnosis.residual_structure import ResidualStructure, quiet_rows, residual_structure
+from stimrig.identify.effects import get, registry
+from stimrig.identify.effects.base import Effect
+from stimrig.identify.estimation.effect_fit import (
     BAND_COST,
     Candidate,
     detected_effects,
@@ -22,14 +22,14 @@ from identify.estimation.effect_fit import (
     try_effect,
     with_effects,
 )
-from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import fit_plain, prepare
-from identify.estimation.renewed_curve import renewed_curve
-from identify.estimation.rows import fitted_rows
-from identify.estimation.samples import Raw
-from identify.noise.level import NoiseLevel
-from identify.records.record import Record
-from identify.simulation.problem import Problem
+from stimrig.identify.estimation.joint import Fitted, solve, start_from
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.estimation.renewed_curve import renewed_curve
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.noise.level import NoiseLevel
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
 
 MOST = 3
 """Effects at most."""

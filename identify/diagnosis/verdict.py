@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from identify.diagnosis import thresholds
-from identify.diagnosis.held_out_error import HeldOutError, held_out_error, held_out_rise
-from identify.diagnosis.residual_structure import held_readings
-from identify.diagnosis.search import EffectSearch, seen_at_rest
-from identify.effects import get
-from identify.estimation.effect_fit import Candidate
+from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.diagnosis.held_out_error import HeldOutError, held_out_error, held_out_rise
+from stimrig.identify.diagnosis.residual_structure import held_readings
+from stimrig.identify.diagnosis.search import EffectSearch, seen_at_rest
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.effect_fit import Candidate
 
 
 @dataclass(frozen=True)

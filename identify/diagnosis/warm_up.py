@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.effects import registry
-from identify.estimation.joint import start_from
-from identify.estimation.prepare import fit_plain, prepare
-from identify.estimation.rows import fitted_rows
-from identify.noise.level import find_band
-from identify.records.record import Record
-from identify.simulation.problem import Problem
+from stimrig.identify.effects import registry
+from stimrig.identify.estimation.joint import start_from
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.noise.level import find_band
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
 
 
 def warm() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from identify.dynamics import second_order
+from stimrig.identify.dynamics import second_order
 
 step_matrix = njit(cache=True, nogil=True, inline="always")(second_order.step_matrix)
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from identify.dynamics.second_order import Core, transition
+from stimrig.identify.dynamics.second_order import Core, transition
 
 if TYPE_CHECKING:
-    from identify.dynamics.pulse_grid import Grid
+    from stimrig.identify.dynamics.pulse_grid import Grid
 
 
 TIME_CONSTANT_BOUNDS_S = (0.003, 4.0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid, runs
-from identify.errors import BadRecord
-from identify.records import bounds
-from identify.records.pulse_phase import pulse_phase_s
-from identify.records.record import FORGOTTEN_S, Record
+from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds
+from stimrig.identify.records.pulse_phase import pulse_phase_s
+from stimrig.identify.records.record import FORGOTTEN_S, Record
 
 
 def make_grid(record: Record) -> Grid:

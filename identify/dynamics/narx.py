@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete
-from identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.linear import Discrete
+from stimrig.identify.dynamics.pulse_grid import Grid
 
 LIMIT = 20.0
 """Scaled torque at which a diverging free run is stopped."""

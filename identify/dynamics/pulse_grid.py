@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.boundary import CUBIC, boundary_states, curve_weights, read_at
-from identify.dynamics.mean_weights import mean_weights, read_means
-from identify.dynamics.second_order import Core
-from identify.records.record import Record
+from stimrig.identify.dynamics.boundary import CUBIC, boundary_states, curve_weights, read_at
+from stimrig.identify.dynamics.mean_weights import mean_weights, read_means
+from stimrig.identify.dynamics.second_order import Core
+from stimrig.identify.records.record import Record
 
 FUSED = 0.2
 """Share of an interval. A pulse that is late by less prolongs the drive before it (an early one shortens it). The

@@ -15,10 +15,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from identify.effects import own_file
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.own_file import BadEffect
-from identify.errors import BadRequest
+from stimrig.identify.effects import own_file
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.own_file import BadEffect
+from stimrig.identify.errors import BadRequest
 
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"

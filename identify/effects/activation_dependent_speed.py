@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from identify.dynamics.variable_speed import SpeedLaw as Law
-from identify.effects.base import Effect, Form, Parameter
+from stimrig.identify.dynamics.variable_speed import SpeedLaw as Law
+from stimrig.identify.effects.base import Effect, Form, Parameter
 
 
 def _form(name: str, equation: str, law: Law, lower: float = -0.85, upper: float = 5.0) -> Form:

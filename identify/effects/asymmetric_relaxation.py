@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.variable_speed import SpeedLaw
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import activate, activate_by_level
+from stimrig.identify.dynamics.variable_speed import SpeedLaw
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import activate, activate_by_level
 
 _LAGS = (
     Parameter("rise_s", "s", 0.0, 0.35, 0.0, (0.02, 0.1), about="activation"),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
-from identify.dynamics.variable_speed import SpeedLaw
+from stimrig.identify.dynamics.variable_speed import SpeedLaw
 
 STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
@@ -307,7 +307,7 @@ class Effect:
         other effects are compared.
     detect : callable or None
         `detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. `raw`
-        is the result of `inspect` in `identify.estimation`. A detected effect is added before any fit.
+        is the result of `inspect` in `stimrig.identify.estimation`. A detected effect is added before any fit.
     prior : float
         Logarithm of its prior odds, relative to other effects.
     """

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 
 def _linear(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:

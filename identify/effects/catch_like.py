@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import adapt, since_onset, train, used_up
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import adapt, since_onset, train, used_up
 
 BURST_S, GAP_S = 0.06, 0.1
 ENGAGED = 0.03

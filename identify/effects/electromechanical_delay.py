@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import activate
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import activate
 
 _DELAY = Parameter(
     "delay_s", "s", 0.0, 0.15, 0.0, (0.02, 0.06), about="delay in addition to that of the linear dynamics"

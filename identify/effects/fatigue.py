@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import adapt
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import adapt
 
 _DEPTH = Parameter("depth", "1", 0.0, 0.95, 0.0, (0.3, 0.6), about="largest share of torque that is lost")
 _ONSET = Parameter("onset_s", "s", 3.0, 250.0, 30.0, (15.0, 50.0), "log", about="time constant under full stimulation")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 HARMONICS = 4
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 _SHARE = Parameter("slow_share", "1", 0.0, 0.9, 0.0, (0.3, 0.15), about="share of torque from the slow fibres")
 _RATIO = Parameter("ratio", "1", 1.4, 12.0, 2.0, (2.0, 4.0), "log", about="slow time constant divided by fast")

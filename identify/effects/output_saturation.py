@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 _CEILING = Parameter("ceiling_nm", "N·m", 0.4, 4.0, np.inf, (1.2, 2.0), "log", "torque", "largest possible torque")
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import STAGES, Effect, Form, Parameter, Scene
-from identify.errors import IdentifyError
+from stimrig.identify.effects.base import STAGES, Effect, Form, Parameter, Scene
+from stimrig.identify.errors import IdentifyError
 
 FIX = "See docs/add-an-effect.md."
 SCALES = ("linear", "log")

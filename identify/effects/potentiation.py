@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import adapt
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import adapt
 
 _GAIN = Parameter("gain", "1", 0.0, 2.0, 0.0, (0.2, 0.5), about="largest share of torque that is gained")
 _ONSET = Parameter("onset_s", "s", 1.2, 80.0, 5.0, (4.0, 15.0), "log", about="time constant under full stimulation")

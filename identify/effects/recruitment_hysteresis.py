@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import dahl, play
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import dahl, play
 
 
 def _play(width: np.ndarray, p: dict[str, Any], _scene: Scene) -> np.ndarray:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import exponential, follow, follow_curved
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import exponential, follow, follow_curved
 
 _RESTARTS = tuple(
     {"resonance_hz": hz, "damping": 0.15, "share": 0.4, "base.time_constant_s": t, "base.damping": 1.0}

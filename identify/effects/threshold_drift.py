@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 
 def _moved(width: np.ndarray, shift: np.ndarray) -> np.ndarray:

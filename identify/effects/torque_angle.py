@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 _PARABOLA = (
     Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 _SIDE = Parameter("slope_s_per_rad", "s/rad", -2.0, 2.0, 0.0, (0.1, -0.1), about="share of torque lost per rad/s")
 

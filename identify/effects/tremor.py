@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
 
 LOWEST_HZ, HIGHEST_HZ = 2.6, 14.0
 KNOTS = (1, 8, 20, 45, 90, 180)

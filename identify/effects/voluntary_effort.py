@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from identify.effects.base import Effect, Form, Parameter, Scene
-from identify.effects.kernels import bumps
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.kernels import bumps
 
 MOST = 6
 """Largest number of bumps: more of them could imitate any error."""

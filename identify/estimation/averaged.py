@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.estimation.gram import gram
-from identify.estimation.joint import Fitted
-from identify.estimation.rows import joint_of
-from identify.estimation.short_result import Short
-from identify.noise.level import profile, whitened
-from identify.simulation.problem import Problem
-from identify.simulation.setup import Setup
+from stimrig.identify.estimation.gram import gram
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.rows import joint_of
+from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.noise.level import profile, whitened
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
 
 LEAST_SD = 1e-5
 """Standard deviation, as a share of the plateau, that is added to the curve's coefficients: below its threshold a curve

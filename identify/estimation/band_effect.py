@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from identify.effects import get, registry
-from identify.estimation.joint import Fitted
-from identify.noise.level import band_part
-from identify.simulation.problem import Problem
+from stimrig.identify.effects import get, registry
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.noise.level import band_part
+from stimrig.identify.simulation.problem import Problem
 
 
 def band_as_effect(fitted: Fitted) -> Fitted:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack, solve_triangular
 
-from identify.recruitment.near_shape import NearShape
+from stimrig.identify.recruitment.near_shape import NearShape
 
 STEPS = 40
 """Newton steps at most."""

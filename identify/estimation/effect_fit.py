@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.effects import get, registry
-from identify.effects.base import STAGES, Effect, Form, Scene
-from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.joint import Fitted, solve, start_from
-from identify.estimation.prepare import fit_plain, prepare
-from identify.estimation.rows import fitted_rows
-from identify.estimation.samples import Raw
-from identify.noise.level import find_band
-from identify.records.record import Record
-from identify.simulation.problem import Problem
+from stimrig.identify.effects import get, registry
+from stimrig.identify.effects.base import STAGES, Effect, Form, Scene
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.joint import Fitted, solve, start_from
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.noise.level import find_band
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
 
 PATIENCE = 2
 """A chain of forms (one bump, two bumps, …) ends after this many steps without a gain."""

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import ends_of
-from identify.estimation.band_effect import predict_fitted
-from identify.estimation.fit_statistics import fit_statistics, white_sd
-from identify.estimation.joint import Fitted
-from identify.noise.level import whitened
+from stimrig.identify.dynamics.pulse_grid import ends_of
+from stimrig.identify.estimation.band_effect import predict_fitted
+from stimrig.identify.estimation.fit_statistics import fit_statistics, white_sd
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.noise.level import whitened
 
 BLOCK_S = 2.0
 FOLDS = 5

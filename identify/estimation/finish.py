@@ -10,22 +10,22 @@ from uuid import uuid4
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete, SecondOrder
-from identify.dynamics.narx import run
-from identify.dynamics.pulse_grid import Grid, runs
-from identify.estimation.band_effect import band_as_effect
-from identify.estimation.evaluation import evaluate
-from identify.estimation.fit_statistics import fit_statistics, white_sd
-from identify.estimation.joint import Fitted
-from identify.estimation.quality import quality, valid_for
-from identify.estimation.residual_tests import residual_tests
-from identify.estimation.uncertainty import bands
-from identify.model import Covariance, Model, Noise
-from identify.noise.ar1 import ar1_or_white
-from identify.noise.level import whitened
-from identify.recruitment.curve import Curve
-from identify.simulation.joint_surface import Surfaces, joint_tables
-from identify.simulation.predict import fingerprint, predict_on
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder
+from stimrig.identify.dynamics.narx import run
+from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.estimation.band_effect import band_as_effect
+from stimrig.identify.estimation.evaluation import evaluate
+from stimrig.identify.estimation.fit_statistics import fit_statistics, white_sd
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.quality import quality, valid_for
+from stimrig.identify.estimation.residual_tests import residual_tests
+from stimrig.identify.estimation.uncertainty import bands
+from stimrig.identify.model import Covariance, Model, Noise
+from stimrig.identify.noise.ar1 import ar1_or_white
+from stimrig.identify.noise.level import whitened
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.simulation.joint_surface import Surfaces, joint_tables
+from stimrig.identify.simulation.predict import fingerprint, predict_on
 
 AT_WORK = 0.05
 EASED = 0.98

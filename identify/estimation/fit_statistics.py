@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.pulse_grid import Grid
 
 CONSTANT = 1e-9
 """Torque whose standard deviation is below this (N·m, or share of its size) is constant, but for rounding."""

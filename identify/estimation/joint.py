@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from identify.effects.base import Form
-from identify.estimation.gram import gram
-from identify.noise.level import NoiseLevel, profile, whitened
-from identify.simulation.problem import Problem
+from stimrig.identify.effects.base import Form
+from stimrig.identify.estimation.gram import gram
+from stimrig.identify.noise.level import NoiseLevel, profile, whitened
+from stimrig.identify.simulation.problem import Problem
 
 OPTIMISM = 3.0
 """A run is stopped only if it stays below the floor even with this many times the gain that a parabola predicts."""

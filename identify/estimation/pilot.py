@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import NotIdentifiable
-from identify.estimation.projected_search import State, bounded, descend, search
-from identify.estimation.projection import Projection, Solution
-from identify.noise.ar1 import ar1_or_white, whiten
-from identify.recruitment.knots import (
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.estimation.projected_search import State, bounded, descend, search
+from stimrig.identify.estimation.projection import Projection, Solution
+from stimrig.identify.noise.ar1 import ar1_or_white, whiten
+from stimrig.identify.recruitment.knots import (
     KNOTS,
     PILOT_KNOTS,
     QUIET_KNOTS,
@@ -19,7 +19,7 @@ from identify.recruitment.knots import (
     knots_for,
     spline_roughness,
 )
-from identify.recruitment.spline import SplineBasis
+from stimrig.identify.recruitment.spline import SplineBasis
 
 STARTS_S = (0.12, 0.4)
 ROUNDING = 2e-5

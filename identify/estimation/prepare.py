@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import NotIdentifiable
-from identify.estimation.joint import Fitted, solve
-from identify.estimation.pilot import estimate
-from identify.estimation.projection import Solution
-from identify.estimation.rows import joint_of, refuse_few, still_rows
-from identify.estimation.samples import Raw, inspect, white_noise
-from identify.noise.level import NoiseLevel
-from identify.records.record import Record
-from identify.simulation.problem import Problem
-from identify.simulation.setup import Setup
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.estimation.joint import Fitted, solve
+from stimrig.identify.estimation.pilot import estimate
+from stimrig.identify.estimation.projection import Solution
+from stimrig.identify.estimation.rows import joint_of, refuse_few, still_rows
+from stimrig.identify.estimation.samples import Raw, inspect, white_noise
+from stimrig.identify.noise.level import NoiseLevel
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
 
 LEAST_SPREAD = 0.2
 """The noise of a part is taken as at least this share of the largest one."""

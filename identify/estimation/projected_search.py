@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.estimation.projection import Projection, Solution
-from identify.noise.ar1 import whiten
-from identify.recruitment.smoothing import choose_weight
+from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
+from stimrig.identify.estimation.projection import Projection, Solution
+from stimrig.identify.noise.ar1 import whiten
+from stimrig.identify.recruitment.smoothing import choose_weight
 
 REWEIGHTED = 2
 """After this many steps the weight of the penalty is kept, since a cost that changes has no minimum."""

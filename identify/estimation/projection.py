@@ -7,14 +7,14 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.boundary import held_states
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.mean_weights import read_means
-from identify.dynamics.pulse_grid import Grid
-from identify.dynamics.second_order import Core, step_matrix
-from identify.errors import NotIdentifiable
-from identify.recruitment.curve import Basis
-from identify.recruitment.smoothing import straight_lines
+from stimrig.identify.dynamics.boundary import held_states
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.mean_weights import read_means
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.second_order import Core, step_matrix
+from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.recruitment.curve import Basis
+from stimrig.identify.recruitment.smoothing import straight_lines
 
 INITIAL_RIDGE = 1e-8
 """Penalty on the initial torque: it keeps a state that no row shows at zero, and is negligible for all others."""

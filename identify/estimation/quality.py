@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete
-from identify.dynamics.pulse_grid import Grid
-from identify.model import Model
-from identify.records.record import Record
-from identify.simulation.predict import moves_with_joint, refuse_rate
+from stimrig.identify.dynamics.linear import Discrete
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.predict import moves_with_joint, refuse_rate
 
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05

@@ -6,15 +6,15 @@ from contextlib import suppress
 
 import numpy as np
 
-from identify.effects import get
-from identify.estimation.gram import gram
-from identify.estimation.joint import Fitted, solve
-from identify.estimation.rows import still_rows
-from identify.noise.level import whitened
-from identify.recruitment.knots import QUIET_KNOTS, adapted_knots, bending_order, spline_roughness
-from identify.recruitment.smoothing import choose_weight
-from identify.recruitment.spline import SplineBasis
-from identify.simulation.problem import Problem
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.gram import gram
+from stimrig.identify.estimation.joint import Fitted, solve
+from stimrig.identify.estimation.rows import still_rows
+from stimrig.identify.noise.level import whitened
+from stimrig.identify.recruitment.knots import QUIET_KNOTS, adapted_knots, bending_order, spline_roughness
+from stimrig.identify.recruitment.smoothing import choose_weight
+from stimrig.identify.recruitment.spline import SplineBasis
+from stimrig.identify.simulation.problem import Problem
 
 TIMES = 2
 """The first curve shows roughly where the knots belong, the second one better."""

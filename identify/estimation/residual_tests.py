@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from identify.estimation.joint import Fitted
-from identify.noise.level import correlation_slopes, whitened
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.noise.level import correlation_slopes, whitened
 
 LAGS = 20
 ALARM = 0.01

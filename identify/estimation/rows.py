@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRequest, NotIdentifiable
-from identify.records.record import HELD_OUT
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.records.record import HELD_OUT
 
 LEAST_ROWS = 8
 STILL_RAD_S = 0.05

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import runs
-from identify.effects.mains_hum import HARMONICS, line
-from identify.records.record import Record
+from stimrig.identify.dynamics.pulse_grid import runs
+from stimrig.identify.effects.mains_hum import HARMONICS, line
+from stimrig.identify.records.record import Record
 
 LEAST_EQUAL = 20
 """Number of samples at exactly the largest (or smallest) value from which they count as clipping."""

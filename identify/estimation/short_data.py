@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import Grid, ends_of
-from identify.estimation.curve_posterior import Quadratic
-from identify.estimation.earlier import Earlier
-from identify.estimation.projection import Projection
-from identify.noise.level import NoiseLevel, profile, whitened
-from identify.recruitment.spline import SplineBasis
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.pulse_grid import Grid, ends_of
+from stimrig.identify.estimation.curve_posterior import Quadratic
+from stimrig.identify.estimation.earlier import Earlier
+from stimrig.identify.estimation.projection import Projection
+from stimrig.identify.noise.level import NoiseLevel, profile, whitened
+from stimrig.identify.recruitment.spline import SplineBasis
 
 CORRELATED = 6.0
 """Log likelihood by which correlated noise must explain the residual better before it is believed."""

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.dynamics.pulse_grid import Grid
-from identify.estimation.curve_posterior import CurvePosterior, Mode
-from identify.estimation.earlier import Earlier
-from identify.estimation.short_data import ShortData, direction
-from identify.estimation.short_result import Short
-from identify.noise.level import NoiseLevel
-from identify.recruitment.near_shape import (
+from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.estimation.curve_posterior import CurvePosterior, Mode
+from stimrig.identify.estimation.earlier import Earlier
+from stimrig.identify.estimation.short_data import ShortData, direction
+from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.noise.level import NoiseLevel
+from stimrig.identify.recruitment.near_shape import (
     FINE_KNOTS,
     KNOTS,
     LOGISTIC_RISE,
@@ -27,7 +27,7 @@ from identify.recruitment.near_shape import (
     logistic,
     new_person,
 )
-from identify.recruitment.spline import SplineBasis
+from stimrig.identify.recruitment.spline import SplineBasis
 
 DRAWS = 400
 OUTER = 10

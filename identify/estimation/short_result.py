@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.pulse_grid import Grid
-from identify.estimation.curve_posterior import Mode
-from identify.noise.level import NoiseLevel
-from identify.recruitment.spline import SplineBasis
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.estimation.curve_posterior import Mode
+from stimrig.identify.noise.level import NoiseLevel
+from stimrig.identify.recruitment.spline import SplineBasis
 
 
 @dataclass(frozen=True)

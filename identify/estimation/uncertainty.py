@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.make_grid import make_grid
-from identify.model import Covariance, Model
-from identify.records.record import Record
-from identify.recruitment.curve import Basis
-from identify.simulation.predict import slopes
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.model import Covariance, Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment.curve import Basis
+from stimrig.identify.simulation.predict import slopes
 
 POINTWISE = 1.959964
 BENT = 2.0

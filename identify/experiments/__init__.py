@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.make_grid import make_grid
-from identify.effects import get
-from identify.errors import BadRequest
-from identify.estimation.effect_fit import fitted_with
-from identify.estimation.joint import Fitted
-from identify.experiments.designs import Design, designs
-from identify.noise.level import whitened
-from identify.records.record import Record
-from identify.simulation.problem import Problem
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.effects import get
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.effect_fit import fitted_with
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.experiments.designs import Design, designs
+from stimrig.identify.noise.level import whitened
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
 
 ENOUGH = 7.0
 """Expected log evidence that is enough to decide: odds of about 1000 to 1."""

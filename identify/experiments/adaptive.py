@@ -13,21 +13,21 @@ from typing import Literal
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRequest, IdentifyError
-from identify.estimation.averaged import averaged
-from identify.estimation.earlier import Change, Earlier
-from identify.estimation.prepare import prepare
-from identify.estimation.residual_tests import residual_tests
-from identify.estimation.short_record import fit_short
-from identify.estimation.short_result import Short
-from identify.experiments.designs import Piece, Segment, pieces
-from identify.experiments.foresight import Foresight
-from identify.experiments.knowledge import Knowledge, knowledge
-from identify.experiments.target import Target
-from identify.model import Model
-from identify.records.record import Record
-from identify.recruitment.near_shape import KNOTS
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import BadRequest, IdentifyError
+from stimrig.identify.estimation.averaged import averaged
+from stimrig.identify.estimation.earlier import Change, Earlier
+from stimrig.identify.estimation.prepare import prepare
+from stimrig.identify.estimation.residual_tests import residual_tests
+from stimrig.identify.estimation.short_record import fit_short
+from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.experiments.designs import Piece, Segment, pieces
+from stimrig.identify.experiments.foresight import Foresight
+from stimrig.identify.experiments.knowledge import Knowledge, knowledge
+from stimrig.identify.experiments.target import Target
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment.near_shape import KNOTS
 
 Kind = Literal["next", "enough", "misfit", "spent"]
 REST_S, RISE_S, TOP_S, FALL_S = 0.5, 1.0, 0.3, 0.5

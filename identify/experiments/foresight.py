@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from identify.dynamics.boundary import FROM_START, held_states, step_matrix
-from identify.estimation.short_result import Short
-from identify.experiments.designs import Piece
-from identify.experiments.knowledge import POINTS, knowledge, step_responses
-from identify.experiments.target import Target
+from stimrig.identify.dynamics.boundary import FROM_START, held_states, step_matrix
+from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.experiments.designs import Piece
+from stimrig.identify.experiments.knowledge import POINTS, knowledge, step_responses
+from stimrig.identify.experiments.target import Target
 
 DIRECTIONS = 24
 NORM = 6

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.dynamics.boundary import boundary_states
-from identify.dynamics.linear import SecondOrder
-from identify.errors import BadRequest
-from identify.estimation.earlier import Change, Earlier
-from identify.experiments.adaptive import Decision, decide
-from identify.experiments.target import Target
-from identify.model import Model
-from identify.records.record import Record
+from stimrig.identify.dynamics.boundary import boundary_states
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.earlier import Change, Earlier
+from stimrig.identify.experiments.adaptive import Decision, decide
+from stimrig.identify.experiments.target import Target
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
 
 SAMPLES = 10
 """Simulated samples per pulse."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from identify.errors import BadRequest
+from stimrig.identify.errors import BadRequest
 
 LEAST_PERCENT, MOST_PERCENT = 0.2, 50.0
 

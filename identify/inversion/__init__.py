@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.inversion.demand import Bounds, best_demand
-from identify.inversion.plant import Plant
-from identify.inversion.reached import Inversion, judged
-from identify.inversion.reference import Reference
-from identify.model import Model
-from identify.simulation.joint_surface import Surfaces
-from identify.simulation.pulses import Motion, above_rest
+from stimrig.identify.inversion.demand import Bounds, best_demand
+from stimrig.identify.inversion.plant import Plant
+from stimrig.identify.inversion.reached import Inversion, judged
+from stimrig.identify.inversion.reference import Reference
+from stimrig.identify.model import Model
+from stimrig.identify.simulation.joint_surface import Surfaces
+from stimrig.identify.simulation.pulses import Motion, above_rest
 
 __all__ = ["Inversion", "Reference", "invert"]
 

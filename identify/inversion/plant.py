@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.second_order import recursion, transition
-from identify.errors import BadModel, BadRequest
-from identify.inversion.reference import Reference
-from identify.model import Model
-from identify.recruitment.curve import THRESHOLD_SHARE
-from identify.simulation.joint_surface import Surfaces
-from identify.simulation.predict import LARGEST_RATE_CHANGE
-from identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.second_order import recursion, transition
+from stimrig.identify.errors import BadModel, BadRequest
+from stimrig.identify.inversion.reference import Reference
+from stimrig.identify.model import Model
+from stimrig.identify.recruitment.curve import THRESHOLD_SHARE
+from stimrig.identify.simulation.joint_surface import Surfaces
+from stimrig.identify.simulation.predict import LARGEST_RATE_CHANGE
+from stimrig.identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest
 
 OWED = 0.05
 """Most that one pulse leaves to those after it, as a share of the largest torque."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.errors import BadRequest
-from identify.simulation.pulses import Motion
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.simulation.pulses import Motion
 
 LONGEST_S = 300.0
 MOST_SAMPLES = 60_000

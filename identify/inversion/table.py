@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.inversion.reference import MOST_SAMPLES, Reference
-from identify.records import text
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.inversion.reference import MOST_SAMPLES, Reference
+from stimrig.identify.records import text
 
 FIX = "Give a header time_s,torque_nm (or torque_nm alone) and one row of numbers a line."
 NAMES = {

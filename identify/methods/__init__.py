@@ -11,9 +11,9 @@ from functools import cache
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRequest
-from identify.model import Model
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.model import Model
 
 
 @runtime_checkable

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRequest
-from identify.estimation.finish import finish
-from identify.estimation.joint import Fitted
-from identify.estimation.pilot import estimate
-from identify.estimation.prepare import to_fitted
-from identify.estimation.rows import fitted_rows, still_rows
-from identify.methods.support.alternatives import monotone, near_sigmoid, power_series, sigmoid
-from identify.methods.support.common import flag, order_option
-from identify.methods.two_stage import general
-from identify.model import Model
-from identify.recruitment.knots import KNOTS
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.finish import finish
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.pilot import estimate
+from stimrig.identify.estimation.prepare import to_fitted
+from stimrig.identify.estimation.rows import fitted_rows, still_rows
+from stimrig.identify.methods.support.alternatives import monotone, near_sigmoid, power_series, sigmoid
+from stimrig.identify.methods.support.common import flag, order_option
+from stimrig.identify.methods.two_stage import general
+from stimrig.identify.model import Model
+from stimrig.identify.recruitment.knots import KNOTS
 
 
 class MaximumLikelihood:

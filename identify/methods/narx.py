@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete
-from identify.dynamics.narx import run
-from identify.dynamics.pulse_grid import Grid
-from identify.estimation.finish import finish_discrete
-from identify.estimation.rows import fitted_rows
-from identify.methods.support.common import quiet_level
-from identify.model import Model
-from identify.recruitment.curve import Curve
-from identify.recruitment.spline import SplineBasis
+from stimrig.identify.dynamics.linear import Discrete
+from stimrig.identify.dynamics.narx import run
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.estimation.finish import finish_discrete
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.methods.support.common import quiet_level
+from stimrig.identify.model import Model
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment.spline import SplineBasis
 
 MOST_TERMS = 14
 

@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.finish import finish_discrete
-from identify.estimation.rows import fitted_rows
-from identify.methods.support.output_error import shifted
-from identify.model import Model
-from identify.recruitment.curve import Curve
-from identify.recruitment.sigmoid import SigmoidBasis
-from identify.recruitment.sigmoid_fit import fit_shape
+from stimrig.identify.dynamics.linear import Discrete
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.finish import finish_discrete
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.methods.support.output_error import shifted
+from stimrig.identify.model import Model
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment.sigmoid import SigmoidBasis
+from stimrig.identify.recruitment.sigmoid_fit import fit_shape
 
 TAPS = 41
 

@@ -19,23 +19,29 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete, SecondOrder
-from identify.dynamics.pulse_grid import Grid
-from identify.dynamics.second_order import recursion
-from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.finish import finish, finish_discrete
-from identify.estimation.pilot import pilot_curve, pilot_solution
-from identify.estimation.prepare import to_fitted
-from identify.estimation.projected_search import project, search
-from identify.estimation.projection import Projection, Solution
-from identify.methods.support.common import flag, near_rest, order_option, quiet_level, segment_rows
-from identify.methods.support.output_error import OutputError, choose_order, equation_error, output_error, stable
-from identify.model import Model
-from identify.recruitment.curve import Curve, FixedShape
-from identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, spline_roughness
-from identify.recruitment.power import PowerBasis
-from identify.recruitment.smoothing import choose_weight
-from identify.recruitment.spline import SplineBasis
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.second_order import recursion
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.finish import finish, finish_discrete
+from stimrig.identify.estimation.pilot import pilot_curve, pilot_solution
+from stimrig.identify.estimation.prepare import to_fitted
+from stimrig.identify.estimation.projected_search import project, search
+from stimrig.identify.estimation.projection import Projection, Solution
+from stimrig.identify.methods.support.common import flag, near_rest, order_option, quiet_level, segment_rows
+from stimrig.identify.methods.support.output_error import (
+    OutputError,
+    choose_order,
+    equation_error,
+    output_error,
+    stable,
+)
+from stimrig.identify.model import Model
+from stimrig.identify.recruitment.curve import Curve, FixedShape
+from stimrig.identify.recruitment.knots import KNOTS, PILOT_KNOTS, adapted_knots, spline_roughness
+from stimrig.identify.recruitment.power import PowerBasis
+from stimrig.identify.recruitment.smoothing import choose_weight
+from stimrig.identify.recruitment.spline import SplineBasis
 
 STARTS_S = (0.06, 0.15, 0.35, 0.8)
 

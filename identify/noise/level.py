@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from identify.noise.narrow_band import profile_band, smooth_band, whiten_band
-from identify.noise.slow_and_white import MEAN_OF_SLOW, SHORTEST, profile_noise, whiten_rows
+from stimrig.identify.noise.narrow_band import profile_band, smooth_band, whiten_band
+from stimrig.identify.noise.slow_and_white import MEAN_OF_SLOW, SHORTEST, profile_noise, whiten_rows
 
 Stretches = tuple[np.ndarray, np.ndarray]
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.fitting import fit
-from identify.paper import muscle
-from identify.records.record import Record
-from identify.simulation.predict import predict
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.fitting import fit
+from stimrig.identify.paper import muscle
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.predict import predict
 
 NOISE_NM = (0.0, 0.02, 0.04, 0.06, 0.08, 0.10)
 PAPER: dict[str, tuple[tuple[float, float], ...]] = {

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds, clock, segments
-from identify.records.columns import MAY_LACK
-from identify.records.record import OPTIONAL, Record, Source
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds, clock, segments
+from stimrig.identify.records.columns import MAY_LACK
+from stimrig.identify.records.record import OPTIONAL, Record, Source
 
 LEAST_LARGEST_US = 1.0
 """A record whose largest pulse width is less has it in another unit."""

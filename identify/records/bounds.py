@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from identify.errors import BadRecord
+from stimrig.identify.errors import BadRecord
 
 LARGEST_FILE_BYTES = 256 * 2**20
 PIECE_BYTES = 2**20

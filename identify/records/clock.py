@@ -12,9 +12,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds
-from identify.records.pulse_slots import width_in_slots
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds
+from stimrig.identify.records.pulse_slots import width_in_slots
 
 PAUSE_S = 1.0
 """A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""

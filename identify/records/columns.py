@@ -9,9 +9,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from identify.errors import BadRecord
-from identify.records import units
-from identify.records.record import OPTIONAL
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import units
+from stimrig.identify.records.record import OPTIONAL
 
 NEEDED = ("time_s", "pulse_width_us", "torque_nm")
 MAY_LACK = (*NEEDED, "angle_rad", "velocity_rad_s")

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds, columns, parts_csv, text
-from identify.records.assemble import PULSE_RATE_HZ, Found, check_widths, optional, record_of
-from identify.records.columns import Column, Given
-from identify.records.record import Record, Source, joined_source
-from identify.records.table import Table
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds, columns, parts_csv, text
+from stimrig.identify.records.assemble import PULSE_RATE_HZ, Found, check_widths, optional, record_of
+from stimrig.identify.records.columns import Column, Given
+from stimrig.identify.records.record import Record, Source, joined_source
+from stimrig.identify.records.table import Table
 
 
 def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, given: Given | None = None) -> Record:

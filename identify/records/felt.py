@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds
-from identify.records.hdf5 import FIX, StrictFile
-from identify.records.record import FORGOTTEN_S, Pulses
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds
+from stimrig.identify.records.hdf5 import FIX, StrictFile
+from stimrig.identify.records.record import FORGOTTEN_S, Pulses
 
 SENT_AND_ACKNOWLEDGED, DROPPED, REFUSED = 0, 2, 3
 PROMPT = 0.05

@@ -15,9 +15,9 @@ import h5py
 import numpy as np
 from h5py import h5a, h5d, h5f, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
-from identify.errors import BadRecord
-from identify.records import hdf5_chunks
-from identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import hdf5_chunks
+from stimrig.identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS
 
 FIX = "Give a sealed recording, as written by the rig at the end of a test."
 LONGEST_TEXT = 10_000

@@ -13,10 +13,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds
-from identify.records.pulse_phase import pulse_phase_s
-from identify.records.record import OPTIONAL, Part, Pulses, Record, Source, joined_source
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds
+from stimrig.identify.records.pulse_phase import pulse_phase_s
+from stimrig.identify.records.record import OPTIONAL, Part, Pulses, Record, Source, joined_source
 
 PAUSE_S = 30.0
 """What of a pause is kept in the time at most: every pulse interval of it is a row of the grid."""

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds, columns
-from identify.records.assemble import PULSE_RATE_HZ, Found, record_of
-from identify.records.columns import Column, Given
-from identify.records.mat_file import CELL, CHAR, FIX, BadMat, Variable, variables
-from identify.records.record import Record, Source
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds, columns
+from stimrig.identify.records.assemble import PULSE_RATE_HZ, Found, record_of
+from stimrig.identify.records.columns import Column, Given
+from stimrig.identify.records.mat_file import CELL, CHAR, FIX, BadMat, Variable, variables
+from stimrig.identify.records.record import Record, Source
 
 RATE = "pulse_rate_hz"
 """A variable of one number that says the pulse rate."""

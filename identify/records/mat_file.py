@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS
 
 HEADER_BYTES = 128
 HEAD_BYTES = 4096

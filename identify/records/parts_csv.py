@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds
-from identify.records.cells import quoted
-from identify.records.record import Part, Record, Source
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds
+from stimrig.identify.records.cells import quoted
+from stimrig.identify.records.record import Part, Record, Source
 
 CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "recording_id", "sha256")
 """Columns of which only a part's first row is filled; all but `pause_s` may be missing or empty."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.records.record import Record
+from stimrig.identify.records.record import Record
 
 NEARLY = 0.9
 """Share of the pulse interval from which a sample is nearly as long."""

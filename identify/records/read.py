@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from identify.errors import BadRecord
-from identify.records import bounds, columns
-from identify.records.mat_file import is_mat
-from identify.records.record import Record
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds, columns
+from stimrig.identify.records.mat_file import is_mat
+from stimrig.identify.records.record import Record
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
@@ -41,15 +41,15 @@ def read(
     given = columns.parsed(map)
     content = bounds.content_of(path)
     if content.startswith(HDF5_MAGIC):
-        from identify.records.recording import read_recording
+        from stimrig.identify.records.recording import read_recording
 
         if given:
             raise BadRecord("a sealed recording has its own columns", place=str(path), fix="Leave --map out.")
         return read_recording(content, path, pulse_rate_hz)
     if is_mat(content) or path.suffix.lower() == ".mat":
-        from identify.records.mat import read_mat
+        from stimrig.identify.records.mat import read_mat
 
         return read_mat(content, path, pulse_rate_hz, given)
-    from identify.records.csv import read_csv
+    from stimrig.identify.records.csv import read_csv
 
     return read_csv(content, path, pulse_rate_hz, given)

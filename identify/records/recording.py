@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds
-from identify.records.felt import read_pulses
-from identify.records.hdf5 import FIX, StrictFile
-from identify.records.record import Pulses, Record, Source
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds
+from stimrig.identify.records.felt import read_pulses
+from stimrig.identify.records.hdf5 import FIX, StrictFile
+from stimrig.identify.records.record import Pulses, Record, Source
 
 FORMAT = "stimrig-recording"
 LONGEST_GAP_S = 0.05

@@ -8,11 +8,11 @@ from itertools import islice
 
 import numpy as np
 
-from identify.errors import BadRecord
-from identify.records import bounds
-from identify.records.cells import as_written
-from identify.records.columns import MAY_LACK, Column
-from identify.records.text import Row, is_number
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds
+from stimrig.identify.records.cells import as_written
+from stimrig.identify.records.columns import MAY_LACK, Column
+from stimrig.identify.records.text import Row, is_number
 
 BLOCK = 4096
 CUT = "Every row needs every column; was the file cut off?"

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
 
-from identify.errors import BadRecord
-from identify.records import bounds, columns, units
-from identify.records.columns import Given
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds, columns, units
+from stimrig.identify.records.columns import Given
 
 LONGEST_LINE = 10_000
 """Characters; no row of numbers has as many."""

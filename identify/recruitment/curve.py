@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from identify.errors import BadModel
+from stimrig.identify.errors import BadModel
 
 
 class Basis(Protocol):
@@ -118,9 +118,9 @@ def basis_from_dict(data: dict[str, Any]) -> Basis:
     BadModel
         Its kind is unknown.
     """
-    from identify.recruitment.power import PowerBasis
-    from identify.recruitment.sigmoid import SigmoidBasis
-    from identify.recruitment.spline import SplineBasis
+    from stimrig.identify.recruitment.power import PowerBasis
+    from stimrig.identify.recruitment.sigmoid import SigmoidBasis
+    from stimrig.identify.recruitment.spline import SplineBasis
 
     kinds = {"cubic-spline": SplineBasis, "power-series": PowerBasis, "sigmoid": SigmoidBasis}
     if data.get("kind") not in kinds:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.recruitment.spline import SplineBasis
+from stimrig.identify.recruitment.spline import SplineBasis
 
 KNOTS = 31
 SMOOTH_KNOTS = 19

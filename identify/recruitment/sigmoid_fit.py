@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from identify.recruitment.curve import Curve
-from identify.recruitment.sigmoid import SigmoidBasis
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment.sigmoid import SigmoidBasis
 
 
 def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:

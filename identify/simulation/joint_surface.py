@@ -13,10 +13,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from identify.effects import get
-from identify.effects.base import Effect, Form, Scene
-from identify.errors import BadModel
-from identify.model_schema import parameter_value
+from stimrig.identify.effects import get
+from stimrig.identify.effects.base import Effect, Form, Scene
+from stimrig.identify.errors import BadModel
+from stimrig.identify.model_schema import parameter_value
 
 ANGLES = 61
 SPEEDS = (0.0, 0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75, 1.0)

@@ -9,19 +9,19 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from identify import model_schema
-from identify.dynamics import narx
-from identify.dynamics.linear import Discrete, Linear, SecondOrder
-from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import Grid
-from identify.effects import get
-from identify.effects.base import Form
-from identify.errors import BadModel
-from identify.records.record import Record
-from identify.recruitment.curve import Curve
-from identify.simulation.joint_surface import Acting, angle_range
-from identify.simulation.problem import Problem
-from identify.simulation.setup import Setup
+from stimrig.identify import model_schema
+from stimrig.identify.dynamics import narx
+from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.effects import get
+from stimrig.identify.effects.base import Form
+from stimrig.identify.errors import BadModel
+from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.simulation.joint_surface import Acting, angle_range
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
 
 LARGEST_RATE_CHANGE = 0.25
 

@@ -12,13 +12,13 @@ from functools import cached_property
 
 import numpy as np
 
-from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
-from identify.dynamics.mean_weights import read_means
-from identify.dynamics.second_order import Core
-from identify.dynamics.variable_speed import SpeedLaw, run_core
-from identify.effects.base import Form, Parameter
-from identify.recruitment.curve import Basis
-from identify.simulation.setup import WITHIN, Setup
+from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
+from stimrig.identify.dynamics.mean_weights import read_means
+from stimrig.identify.dynamics.second_order import Core
+from stimrig.identify.dynamics.variable_speed import SpeedLaw, run_core
+from stimrig.identify.effects.base import Form, Parameter
+from stimrig.identify.recruitment.curve import Basis
+from stimrig.identify.simulation.setup import WITHIN, Setup
 
 _NONE = np.zeros((0, 1))
 

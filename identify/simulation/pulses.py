@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from identify.errors import BadModel
-from identify.records.record import Record
-from identify.simulation.joint_surface import Surfaces
-from identify.simulation.predict import Muscle, predict
+from stimrig.identify.errors import BadModel
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.joint_surface import Surfaces
+from stimrig.identify.simulation.predict import Muscle, predict
 
 REST_S = 1.0
 SAMPLES_A_PULSE = 8

@@ -1,9 +1,9 @@
 """Following an approved model from trial to trial: gain, threshold and time scale, with bands."""
 
-from identify.tracking.carried import moved_model, passed, slow_forms
-from identify.tracking.follow import Outcome, Step, begin, follow, levels_of, model_for_next
-from identify.tracking.rates import learn_rates
-from identify.tracking.state import QUANTITIES, USUAL, State, Values
+from stimrig.identify.tracking.carried import moved_model, passed, slow_forms
+from stimrig.identify.tracking.follow import Outcome, Step, begin, follow, levels_of, model_for_next
+from stimrig.identify.tracking.rates import learn_rates
+from stimrig.identify.tracking.state import QUANTITIES, USUAL, State, Values
 
 __all__ = [
     "QUANTITIES",

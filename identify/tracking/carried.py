@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.make_grid import make_grid
-from identify.effects import registry
-from identify.effects.base import Form, Scene
-from identify.errors import BadModel
-from identify.model import Model
-from identify.model_schema import parameter_value
-from identify.records.record import Record
-from identify.recruitment.curve import Curve
-from identify.recruitment.spline import SplineBasis
-from identify.tracking.forms import placed
-from identify.tracking.state import State, Values
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.effects import registry
+from stimrig.identify.effects.base import Form, Scene
+from stimrig.identify.errors import BadModel
+from stimrig.identify.model import Model
+from stimrig.identify.model_schema import parameter_value
+from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment.spline import SplineBasis
+from stimrig.identify.tracking.forms import placed
+from stimrig.identify.tracking.state import State, Values
 
 CLOCK_S = 0.1
 """By so much a record may seem to begin before the end of the one before it: clocks are set."""
@@ -85,7 +85,7 @@ def passed(model: Model, state: State, record: Record, rest_s: float | None = No
     Raises
     ------
     BadModel, BadRecord
-        As `identify.tracking.trial.look`, of any pulse rate.
+        As `stimrig.identify.tracking.trial.look`, of any pulse rate.
     """
     if not slow_forms(model):
         return state

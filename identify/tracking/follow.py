@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from identify.model import Model
-from identify.records.record import Record
-from identify.simulation.predict import refuse_rate
-from identify.tracking.carried import largest_change, moved_model, passed, rest_before, rested, with_states
-from identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, Values, updated
-from identify.tracking.trial import Seen, curve_covariance, look
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.predict import refuse_rate
+from stimrig.identify.tracking.carried import largest_change, moved_model, passed, rest_before, rested, with_states
+from stimrig.identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, Values, updated
+from stimrig.identify.tracking.trial import Seen, curve_covariance, look
 
 UNEXPLAINED = 4.0
 """An error so many times what the approved model left is not one of gain, threshold or speed."""
@@ -146,7 +146,7 @@ def follow(
     ------
     BadModel
         The model's dynamics are not of second order, the record's pulse rate is another one, or see
-        `identify.simulation.predict.problem_of`.
+        `stimrig.identify.simulation.predict.problem_of`.
     BadRecord
         The record is too short, or sampled more slowly than the pulses.
     """

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid
-from identify.effects.base import Form, Parameter, Scene
-from identify.model import Model
-from identify.simulation.predict import problem_of
-from identify.simulation.problem import Problem
-from identify.tracking.state import LEVELS
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.effects.base import Form, Parameter, Scene
+from stimrig.identify.model import Model
+from stimrig.identify.simulation.predict import problem_of
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.tracking.state import LEVELS
 
 
 def _along(scene: Scene) -> np.ndarray:
@@ -76,7 +76,7 @@ def placed(model: Model, levels: np.ndarray, grid: Grid) -> tuple[Problem, np.nd
     Raises
     ------
     BadModel
-        As `identify.simulation.predict.problem_of`.
+        As `stimrig.identify.simulation.predict.problem_of`.
     """
     log_gain, shift_us, log_time = levels[:LEVELS].tolist()
     forms = ((GAIN, (log_gain, 0.0)), (SHIFT, (shift_us, 0.0)), (DRIFT, (0.0,)))

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.tracking.state import QUANTITIES, USUAL, Rates, Values
+from stimrig.identify.tracking.state import QUANTITIES, USUAL, Rates, Values
 
 BELIEVED_SESSIONS = 2.0
 """The usual start and the usual first trend count like this many sessions of the person's own."""

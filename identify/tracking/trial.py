@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import Grid, runs
-from identify.errors import BadRecord
-from identify.model import Model
-from identify.records.record import Record
-from identify.simulation.problem import Problem
-from identify.tracking.forms import placed
-from identify.tracking.state import LEVELS, State
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.tracking.forms import placed
+from stimrig.identify.tracking.state import LEVELS, State
 
 SHORTEST_S = 1.0
 ROUNDS = 7
@@ -128,7 +128,7 @@ def look(model: Model, expected: State, record: Record) -> Seen:
     Raises
     ------
     BadModel, BadRecord
-        As `identify.simulation.predict.predict`; and a trial shorter than a second.
+        As `stimrig.identify.simulation.predict.predict`; and a trial shorter than a second.
     """
     grid = make_grid(record)
     if not np.sum(grid.fitted) * grid.step_s >= SHORTEST_S:

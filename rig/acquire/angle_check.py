@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.rate import RateCheck
-from rig.acquire.stream import steps_from
-from rig.limits import Limit
-from rig.messages import HELD, TestPlan
-from rig.signals import TRUSTED
+from stimrig.rig.acquire.rate import RateCheck
+from stimrig.rig.acquire.stream import steps_from
+from stimrig.rig.limits import Limit
+from stimrig.rig.messages import HELD, TestPlan
+from stimrig.rig.signals import TRUSTED
 
 FASTEST_RAD_S = 20.0
 """The fastest voluntary flexion of an elbow: while samples are missing it may turn so far."""

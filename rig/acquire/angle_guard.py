@@ -7,16 +7,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rig.acquire.angle_check import AngleCheck, degrees, outside
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.acquire.health import Watch
-from rig.clock import Clock
-from rig.errors import DeviceError, JournalError, RefusedError
-from rig.journal import Journal, Kind
-from rig.limits import Limit, check
-from rig.messages import TestPlan
-from rig.signals import Recorded
-from rig.tasks import Tasks
+from stimrig.rig.acquire.angle_check import AngleCheck, degrees, outside
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.acquire.health import Watch
+from stimrig.rig.clock import Clock
+from stimrig.rig.errors import DeviceError, JournalError, RefusedError
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.limits import Limit, check
+from stimrig.rig.messages import TestPlan
+from stimrig.rig.signals import Recorded
+from stimrig.rig.tasks import Tasks
 
 AROUND_S = 0.1
 """Real seconds over which the median tells where the joint is before a test."""

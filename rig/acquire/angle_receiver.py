@@ -1,7 +1,7 @@
 """The angle receiver: a stream that is always open, and records while a test runs.
 
 A sensor that is gone harms no test that does not ask for the angle. So it is opened again by itself, and whether a test
-must stop is decided by what the test asks (`rig.acquire.angle_guard`).
+must stop is decided by what the test asks (`stimrig.rig.acquire.angle_guard`).
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.angle_check import AngleCheck
-from rig.acquire.stream import Stream
-from rig.align import RATE_TOLERANCE
-from rig.angle_velocity import LiveSlope
-from rig.devices import AngleSensor
-from rig.errors import DeviceError
-from rig.journal import Journal, Kind
-from rig.signals import ANGLE_SAMPLE, AngleScale
-from rig.tasks import Tasks
+from stimrig.rig.acquire.angle_check import AngleCheck
+from stimrig.rig.acquire.stream import Stream
+from stimrig.rig.align import RATE_TOLERANCE
+from stimrig.rig.angle_velocity import LiveSlope
+from stimrig.rig.devices import AngleSensor
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.signals import ANGLE_SAMPLE, AngleScale
+from stimrig.rig.tasks import Tasks
 
 NAME = "angle sensor"
 REOPEN_S = 0.5

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from rig.acquire.receiver import Receiver
-from rig.errors import DeviceError
-from rig.gate import Gate
-from rig.tasks import Tasks
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.gate import Gate
+from stimrig.rig.tasks import Tasks
 
 DECAY_S = 3.0
 """Rig seconds within which the torque must fall to half; the slowest muscle of the paper takes about 1 s."""

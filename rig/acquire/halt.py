@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from rig.clock import Clock
-from rig.tasks import Signal
+from stimrig.rig.clock import Clock
+from stimrig.rig.tasks import Signal
 
 Cause = Literal["stopped", "fault", "withdrawn"]
 """`withdrawn`: nothing is wrong, so nothing latches. A stop or a fault that comes later outranks it."""

@@ -10,13 +10,13 @@ from collections.abc import Callable
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rig.acquire.receiver import Receiver
-from rig.clock import Clock
-from rig.errors import JournalError
-from rig.gate import Gate
-from rig.journal import Journal
-from rig.machine import Machine
-from rig.tasks import Signal
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.clock import Clock
+from stimrig.rig.errors import JournalError
+from stimrig.rig.gate import Gate
+from stimrig.rig.journal import Journal
+from stimrig.rig.machine import Machine
+from stimrig.rig.tasks import Signal
 
 SYNC_PERIOD_S = 0.5
 STALL_S = 0.25

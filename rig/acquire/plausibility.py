@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.rate import RateCheck
-from rig.acquire.stream import steps_from
+from stimrig.rig.acquire.rate import RateCheck
+from stimrig.rig.acquire.stream import steps_from
 
 FASTEST_NM_S = 1000.0
 RAIL_VISITS = 2

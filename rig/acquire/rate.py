@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from bisect import bisect_left, bisect_right
 
-from rig.align import RATE_TOLERANCE
+from stimrig.rig.align import RATE_TOLERANCE
 
 RATE_WINDOW_S = 3.0
 """Real seconds over which the rate is measured, between the least delayed blocks of the first and last third."""

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.stream import Stream
-from rig.acquire.torque_time import TorqueTime
-from rig.devices import LoadCell
-from rig.journal import Journal, Kind
-from rig.signals import Recorded
-from rig.tasks import Tasks
+from stimrig.rig.acquire.stream import Stream
+from stimrig.rig.acquire.torque_time import TorqueTime
+from stimrig.rig.devices import LoadCell
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.signals import Recorded
+from stimrig.rig.tasks import Tasks
 
 LIVE_BLOCKS = 4000
 RANGE_MEAN_S = 0.01

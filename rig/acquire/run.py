@@ -14,23 +14,23 @@ from typing import Any
 
 import numpy as np
 
-from rig.acquire.angle_guard import AngleGuard
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.acquire.evidence import AROUND_S, stop_device, watch_decay
-from rig.acquire.halt import Cause, Halt
-from rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
-from rig.acquire.plausibility import PlausibilityCheck
-from rig.acquire.receiver import Receiver
-from rig.errors import DeviceError, JournalError
-from rig.gate import Gate
-from rig.journal import Journal, Kind
-from rig.limits import Limit
-from rig.machine import Machine
-from rig.messages import StopEvidence, TestOutcome
-from rig.plan import PlannedTest
-from rig.score import Score
-from rig.signals import Pulse, PulseStatus, Recorded
-from rig.tasks import Signal
+from stimrig.rig.acquire.angle_guard import AngleGuard
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.acquire.evidence import AROUND_S, stop_device, watch_decay
+from stimrig.rig.acquire.halt import Cause, Halt
+from stimrig.rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
+from stimrig.rig.acquire.plausibility import PlausibilityCheck
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.errors import DeviceError, JournalError
+from stimrig.rig.gate import Gate
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.limits import Limit
+from stimrig.rig.machine import Machine
+from stimrig.rig.messages import StopEvidence, TestOutcome
+from stimrig.rig.plan import PlannedTest
+from stimrig.rig.score import Score
+from stimrig.rig.signals import Pulse, PulseStatus, Recorded
+from stimrig.rig.tasks import Signal
 
 log = logging.getLogger("rig.run")
 

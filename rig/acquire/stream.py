@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.align import RATE_TOLERANCE
-from rig.devices import Sensor
-from rig.errors import JournalError
-from rig.journal import Journal, Kind
-from rig.signals import Block, Recorded
-from rig.tasks import Signal, Task, Tasks
+from stimrig.rig.align import RATE_TOLERANCE
+from stimrig.rig.devices import Sensor
+from stimrig.rig.errors import JournalError
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.signals import Block, Recorded
+from stimrig.rig.tasks import Signal, Task, Tasks
 
 log = logging.getLogger("rig.receiver")
 

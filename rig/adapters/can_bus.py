@@ -18,10 +18,10 @@ import can
 import serial
 from can.interfaces.slcan import slcanBus
 
-from rig.adapters.read_ahead import ReadAhead
-from rig.clock import Clock
-from rig.errors import DeviceError
-from rig.machine import Frame, Listener
+from stimrig.rig.adapters.read_ahead import ReadAhead
+from stimrig.rig.clock import Clock
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.machine import Frame, Listener
 
 ATTEMPTS = 5
 STAMPING = ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")
@@ -34,7 +34,7 @@ _registering = threading.Lock()
 
 
 class CanBus:
-    """See `rig.machine.Bus`.
+    """See `stimrig.rig.machine.Bus`.
 
     Parameters
     ----------

@@ -14,8 +14,8 @@ from concurrent.futures import Future
 from functools import partial
 from typing import Any, TypeVar
 
-from rig.clock import Clock
-from rig.tasks import Outcome, Task, Tasks
+from stimrig.rig.clock import Clock
+from stimrig.rig.tasks import Outcome, Task, Tasks
 
 log = logging.getLogger("rig.driver")
 

@@ -9,11 +9,11 @@ import tempfile
 from pathlib import Path
 from typing import IO
 
-from rig.errors import BusyError
+from stimrig.rig.errors import BusyError
 
 
 class Files:
-    """See `rig.machine.Disk`."""
+    """See `stimrig.rig.machine.Disk`."""
 
     def make_folder(self, path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The machine that this process runs on; see `rig.machine.Machine`."""
+"""The machine that this process runs on; see `stimrig.rig.machine.Machine`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from rig.adapters.can_bus import CanBus
-from rig.adapters.driver import Driver, undisturbed
-from rig.adapters.files import Files
-from rig.adapters.serial_port import SerialPort
-from rig.clock import Clock
-from rig.machine import Disk
+from stimrig.rig.adapters.can_bus import CanBus
+from stimrig.rig.adapters.driver import Driver, undisturbed
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.adapters.serial_port import SerialPort
+from stimrig.rig.clock import Clock
+from stimrig.rig.machine import Disk
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 

@@ -1,4 +1,4 @@
-"""Previews are built by another process, `rig.builder`, one at a time, with limits on memory and time.
+"""Previews are built by another process, `stimrig.rig.builder`, one at a time, with limits on memory and time.
 
 So no plan can take memory or processor time from the rig's sender. Requests that would have to wait too long are
 refused at once.
@@ -14,8 +14,8 @@ import os
 import sys
 from dataclasses import asdict
 
-from rig.errors import BusyError, PlanError
-from rig.limits import Limit
+from stimrig.rig.errors import BusyError, PlanError
+from stimrig.rig.limits import Limit
 
 log = logging.getLogger("rig.previews")
 
@@ -84,7 +84,7 @@ class Previews:
     async def _begin(self) -> asyncio.subprocess.Process:
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "rig.builder",
+                sys.executable, "-m", "stimrig.rig.builder",
                 stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_REPLY_BYTES,
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )  # fmt: skip

@@ -13,8 +13,8 @@ from typing import Any
 
 import serial
 
-from rig.clock import Clock
-from rig.errors import DeviceError
+from stimrig.rig.clock import Clock
+from stimrig.rig.errors import DeviceError
 
 READ_TIMEOUT_S = 0.05
 PSEUDO_TERMINALS = "/dev/pts/"
@@ -23,7 +23,7 @@ Post = Callable[[Callable[[], None]], None]
 
 
 class SerialPort:
-    """See `rig.machine.Port`."""
+    """See `stimrig.rig.machine.Port`."""
 
     def __init__(self, path: str, clock: Clock, post: Post, **arguments: Any) -> None:
         self.port, self._clock, self._post, self._arguments = path, clock, post, arguments

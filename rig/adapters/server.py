@@ -16,14 +16,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from rig.adapters.connections import Connections
-from rig.adapters.previews import Previews
-from rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
-from rig.control import desk
-from rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
-from rig.control.rig import Rig
-from rig.errors import BusyError, ConfigError, PlanError, RigError
-from rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, StopRequest, stop_socket
+from stimrig.rig.adapters.connections import Connections
+from stimrig.rig.adapters.previews import Previews
+from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
+from stimrig.rig.control import desk
+from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
+from stimrig.rig.control.rig import Rig
+from stimrig.rig.errors import BusyError, ConfigError, PlanError, RigError
+from stimrig.rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, StopRequest, stop_socket
 
 log = logging.getLogger("rig.socket")
 

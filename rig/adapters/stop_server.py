@@ -16,10 +16,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from rig.adapters.connections import Connections
-from rig.control.replies import id_of, internal_error, refusal, to_line
-from rig.errors import ConfigError, RigError
-from rig.messages import Reply, StopEvidence, StopRequest
+from stimrig.rig.adapters.connections import Connections
+from stimrig.rig.control.replies import id_of, internal_error, refusal, to_line
+from stimrig.rig.errors import ConfigError, RigError
+from stimrig.rig.messages import Reply, StopEvidence, StopRequest
 
 log = logging.getLogger("rig.stop")
 

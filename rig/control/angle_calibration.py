@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.angle_check import degrees
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.clock import utc_text
-from rig.control.small_file import SmallFile
-from rig.devices import DeviceSettings
-from rig.errors import DeviceError, RefusedError
-from rig.limits import Limit, refuse
-from rig.machine import Machine
-from rig.messages import AngleCalibration, AnglePose
-from rig.signals import TRUSTED, AngleScale
+from stimrig.rig.acquire.angle_check import degrees
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.clock import utc_text
+from stimrig.rig.control.small_file import SmallFile
+from stimrig.rig.devices import DeviceSettings
+from stimrig.rig.errors import DeviceError, RefusedError
+from stimrig.rig.limits import Limit, refuse
+from stimrig.rig.machine import Machine
+from stimrig.rig.messages import AngleCalibration, AnglePose
+from stimrig.rig.signals import TRUSTED, AngleScale
 
 log = logging.getLogger("rig")
 

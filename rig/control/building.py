@@ -1,4 +1,4 @@
-"""Work of the preview builder, in its own process (see `rig.builder`)."""
+"""Work of the preview builder, in its own process (see `stimrig.rig.builder`)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import BinaryIO
 
 from pydantic import ValidationError
 
-from rig import limits, plan
-from rig.control.calibration import check_profile, check_range
-from rig.control.replies import id_of, internal_error, invalid_request, refusal, to_line
-from rig.errors import RigError
-from rig.limits import Limit
-from rig.messages import Preview, PreviewRequest, Reply
+from stimrig.rig import limits, plan
+from stimrig.rig.control.calibration import check_profile, check_range
+from stimrig.rig.control.replies import id_of, internal_error, invalid_request, refusal, to_line
+from stimrig.rig.errors import RigError
+from stimrig.rig.limits import Limit
+from stimrig.rig.messages import Preview, PreviewRequest, Reply
 
 
 def previewed(

@@ -1,14 +1,14 @@
-"""Requests of a guided calibration; `rig.control.calibration` decides what is allowed, `Playing` plays it."""
+"""Requests of a guided calibration; `stimrig.rig.control.calibration` decides what is allowed, `Playing` plays it."""
 
 from __future__ import annotations
 
 import logging
 
-from rig import plan
-from rig.control.calibration import Calibration
-from rig.control.playing import Playing, check_names
-from rig.errors import BusyError, PlanError
-from rig.messages import (
+from stimrig.rig import plan
+from stimrig.rig.control.calibration import Calibration
+from stimrig.rig.control.playing import Playing, check_names
+from stimrig.rig.errors import BusyError, PlanError
+from stimrig.rig.messages import (
     Calibrated,
     CalibrateFinishRequest,
     CalibrateStartRequest,

@@ -13,12 +13,12 @@ from __future__ import annotations
 import itertools
 from datetime import UTC, datetime, timedelta
 
-from rig import limits
-from rig.clock import utc_text
-from rig.control.calibration_steps import rule_of
-from rig.errors import PlanError, RefusedError
-from rig.limits import FINEST, Limit, Steps
-from rig.messages import (
+from stimrig.rig import limits
+from stimrig.rig.clock import utc_text
+from stimrig.rig.control.calibration_steps import rule_of
+from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.limits import FINEST, Limit, Steps
+from stimrig.rig.messages import (
     CalibrateStartRequest,
     CalibrationStatus,
     CalibrationTrain,

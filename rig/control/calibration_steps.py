@@ -14,9 +14,9 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rig.errors import RefusedError
-from rig.limits import Limit
-from rig.messages import CalibrateStartRequest, Profile, Threshold
+from stimrig.rig.errors import RefusedError
+from stimrig.rig.limits import Limit
+from stimrig.rig.messages import CalibrateStartRequest, Profile, Threshold
 
 FIRST_SHARE = 0.6
 """The first train's width, as a share of the last sensory threshold: too narrow to be felt, unless much has changed."""

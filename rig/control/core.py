@@ -7,24 +7,24 @@ import logging
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
-from rig import limits
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.acquire.halt import Cause, Halt
-from rig.acquire.run import TestRun
-from rig.config import RigConfig
-from rig.control.angle_calibration import AngleCalibrating
-from rig.control.calibration import Calibration
-from rig.control.latch import Latch
-from rig.control.live import finite, live_event
-from rig.control.pair import Pair
-from rig.control.rest import Rest
-from rig.control.result import Result
-from rig.control.sealing import RecordingStore
-from rig.errors import BusyError, DeviceError, LatchChangedError, RigError
-from rig.machine import Machine
-from rig.messages import AngleStatus, Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
-from rig.tasks import Signal, Task, Turn
-from rig.trial import STOPPED, Trial
+from stimrig.rig import limits
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.acquire.halt import Cause, Halt
+from stimrig.rig.acquire.run import TestRun
+from stimrig.rig.config import RigConfig
+from stimrig.rig.control.angle_calibration import AngleCalibrating
+from stimrig.rig.control.calibration import Calibration
+from stimrig.rig.control.latch import Latch
+from stimrig.rig.control.live import finite, live_event
+from stimrig.rig.control.pair import Pair
+from stimrig.rig.control.rest import Rest
+from stimrig.rig.control.result import Result
+from stimrig.rig.control.sealing import RecordingStore
+from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, RigError
+from stimrig.rig.machine import Machine
+from stimrig.rig.messages import AngleStatus, Event, FinishedEvent, LiveEvent, StateEvent, Status, StopEvidence
+from stimrig.rig.tasks import Signal, Task, Turn
+from stimrig.rig.trial import STOPPED, Trial
 
 log = logging.getLogger("rig")
 
@@ -35,7 +35,7 @@ RETRY_S = 1.0
 
 
 class Core:
-    """State and devices of a rig. Others use its subclass `rig.control.rig.Rig`.
+    """State and devices of a rig. Others use its subclass `stimrig.rig.control.rig.Rig`.
 
     Requests that begin something take their turn, one after the other. A stop never waits for it: it changes the state
     at once, and what was begun finds that out before it goes on.

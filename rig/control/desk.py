@@ -8,10 +8,10 @@ from typing import Any
 
 from pydantic import BaseModel, TypeAdapter
 
-from rig.control.replies import internal_error, refusal
-from rig.control.rig import Rig
-from rig.errors import RigError
-from rig.messages import Reply, Request
+from stimrig.rig.control.replies import internal_error, refusal
+from stimrig.rig.control.rig import Rig
+from stimrig.rig.errors import RigError
+from stimrig.rig.messages import Reply, Request
 
 log = logging.getLogger("rig.desk")
 

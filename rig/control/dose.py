@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import intended
-from rig.acquire.torque_time import TorqueTime
-from rig.assembly import Recording
-from rig.journal import JournalContents, Kind
-from rig.limits import HARD_LIMITS
-from rig.signals import PulseStatus
+from stimrig.rig import intended
+from stimrig.rig.acquire.torque_time import TorqueTime
+from stimrig.rig.assembly import Recording
+from stimrig.rig.journal import JournalContents, Kind
+from stimrig.rig.limits import HARD_LIMITS
+from stimrig.rig.signals import PulseStatus
 
 MAY_BE_FELT = PulseStatus.ACKNOWLEDGED, PulseStatus.UNACKNOWLEDGED, PulseStatus.DEVICE_ERROR
 REST_S = 0.1

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from rig.control.small_file import SmallFile
-from rig.machine import Machine
+from stimrig.rig.control.small_file import SmallFile
+from stimrig.rig.machine import Machine
 
 Remembered = Literal["running", "latched"]
 

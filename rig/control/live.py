@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.acquire.receiver import Receiver
-from rig.acquire.run import TestRun
-from rig.messages import LatePulse, LiveEvent, TorqueSamples
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.acquire.run import TestRun
+from stimrig.rig.messages import LatePulse, LiveEvent, TorqueSamples
 
 BIN_S = 0.01
 

@@ -6,15 +6,15 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from rig import devices, limits
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.acquire.receiver import Receiver
-from rig.acquire.run import FRESH_S, SETTLE_S
-from rig.config import RigConfig
-from rig.errors import DeviceError
-from rig.gate import Gate
-from rig.machine import Machine
-from rig.signals import AngleScale
+from stimrig.rig import devices, limits
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.acquire.run import FRESH_S, SETTLE_S
+from stimrig.rig.config import RigConfig
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.gate import Gate
+from stimrig.rig.machine import Machine
+from stimrig.rig.signals import AngleScale
 
 log = logging.getLogger("rig.pair")
 

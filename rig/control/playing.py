@@ -1,6 +1,6 @@
 """Plays one test, or one train of a calibration: from the first block of its journal to its sealed recording.
 
-An adaptive test is extended meanwhile, and ended well; `rig.score` decides what is laid.
+An adaptive test is extended meanwhile, and ended well; `stimrig.rig.score` decides what is laid.
 """
 
 from __future__ import annotations
@@ -11,13 +11,21 @@ import logging
 import math
 import re
 
-from rig import limits, plan
-from rig.acquire.halt import Halt
-from rig.acquire.run import RunResult, TestRun
-from rig.control.core import Core
-from rig.errors import DeviceError, PlanError, RigError, TooLateError
-from rig.messages import EnoughRequest, Extended, ExtendRequest, FinishedEvent, StopEvidence, Withdrawn, WithdrawRequest
-from rig.trial import Trial
+from stimrig.rig import limits, plan
+from stimrig.rig.acquire.halt import Halt
+from stimrig.rig.acquire.run import RunResult, TestRun
+from stimrig.rig.control.core import Core
+from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError
+from stimrig.rig.messages import (
+    EnoughRequest,
+    Extended,
+    ExtendRequest,
+    FinishedEvent,
+    StopEvidence,
+    Withdrawn,
+    WithdrawRequest,
+)
+from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
 

@@ -9,14 +9,14 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from rig.errors import RigError
-from rig.messages import Problem, Reply
+from stimrig.rig.errors import RigError
+from stimrig.rig.messages import Problem, Reply
 
 _HEAD = re.compile(rb'\s*\{\s*"kind"\s*:\s*"([a-z_-]{1,40})"\s*,\s*"id"\s*:\s*(\d{1,15})\s*[,}]')
 
 
 def head_of(line: bytes) -> tuple[str, int] | None:
-    """Kind and id of a request that begins with them, as `rig.messages` writes it, without parsing the rest."""
+    """Kind and id of a request that begins with them, as `stimrig.rig.messages` writes it, without parsing the rest."""
     found = _HEAD.match(line[:200])
     return (found[1].decode(), int(found[2])) if found else None
 

@@ -12,13 +12,13 @@ import contextlib
 import logging
 from pathlib import Path
 
-from rig import limits
-from rig.acquire.run import LEAD_S
-from rig.clock import utc_text
-from rig.control.small_file import SmallFile
-from rig.errors import RestError, RigError
-from rig.machine import Machine
-from rig.plan import PlannedTest
+from stimrig.rig import limits
+from stimrig.rig.acquire.run import LEAD_S
+from stimrig.rig.clock import utc_text
+from stimrig.rig.control.small_file import SmallFile
+from stimrig.rig.errors import RestError, RigError
+from stimrig.rig.machine import Machine
+from stimrig.rig.plan import PlannedTest
 
 log = logging.getLogger("rig.rest")
 

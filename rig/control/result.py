@@ -6,10 +6,10 @@ import logging
 from datetime import datetime
 from pathlib import Path
 
-from rig.control.small_file import SmallFile
-from rig.errors import BusyError
-from rig.machine import Machine
-from rig.messages import Calibrated
+from stimrig.rig.control.small_file import SmallFile
+from stimrig.rig.errors import BusyError
+from stimrig.rig.machine import Machine
+from stimrig.rig.messages import Calibrated
 
 log = logging.getLogger("rig")
 

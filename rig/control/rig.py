@@ -6,14 +6,14 @@ import logging
 import math
 from dataclasses import replace
 
-from rig import limits, plan
-from rig.acquire.angle_check import degrees
-from rig.acquire.angle_guard import await_angle, check_start
-from rig.control.angle_calibration import APART_RAD
-from rig.control.calibrating import Calibrating
-from rig.control.calibration import check_profile, check_range
-from rig.control.playing import LONGEST_WORDS, check_names
-from rig.errors import (
+from stimrig.rig import limits, plan
+from stimrig.rig.acquire.angle_check import degrees
+from stimrig.rig.acquire.angle_guard import await_angle, check_start
+from stimrig.rig.control.angle_calibration import APART_RAD
+from stimrig.rig.control.calibrating import Calibrating
+from stimrig.rig.control.calibration import check_profile, check_range
+from stimrig.rig.control.playing import LONGEST_WORDS, check_names
+from stimrig.rig.errors import (
     BusyError,
     ConfigError,
     DeviceError,
@@ -22,9 +22,9 @@ from rig.errors import (
     RefusedError,
     WithdrawnError,
 )
-from rig.limits import Limit
-from rig.messages import PASSIVE, AnglePoseRequest, Sequences, StateEvent, Status, StopEvidence, TestPlan
-from rig.trial import Trial
+from stimrig.rig.limits import Limit
+from stimrig.rig.messages import PASSIVE, AnglePoseRequest, Sequences, StateEvent, Status, StopEvidence, TestPlan
+from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
 

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from rig import archive, assembly, journal
-from rig.acquire.health import SYNC_PERIOD_S
-from rig.acquire.run import RunResult
-from rig.config import RigConfig
-from rig.control import dose
-from rig.control.live import finite
-from rig.errors import JournalError, PlanError, RecordingError
-from rig.journal import Journal
-from rig.machine import Log, Machine
-from rig.messages import FinishedEvent
-from rig.plan import PlannedTest
+from stimrig.rig import archive, assembly, journal
+from stimrig.rig.acquire.health import SYNC_PERIOD_S
+from stimrig.rig.acquire.run import RunResult
+from stimrig.rig.config import RigConfig
+from stimrig.rig.control import dose
+from stimrig.rig.control.live import finite
+from stimrig.rig.errors import JournalError, PlanError, RecordingError
+from stimrig.rig.journal import Journal
+from stimrig.rig.machine import Log, Machine
+from stimrig.rig.messages import FinishedEvent
+from stimrig.rig.plan import PlannedTest
 
 log = logging.getLogger("rig.sealing")
 

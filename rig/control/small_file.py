@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rig.errors import RigError
-from rig.machine import Machine
-from rig.tasks import Turn
+from stimrig.rig.errors import RigError
+from stimrig.rig.machine import Machine
+from stimrig.rig.tasks import Turn
 
 
 class SmallFile:

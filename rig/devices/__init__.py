@@ -16,9 +16,9 @@ from typing import Any, Literal, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict
 
-from rig.errors import ConfigError
-from rig.limits import Admitted, Steps
-from rig.signals import Ack, AngleScale, Block
+from stimrig.rig.errors import ConfigError
+from stimrig.rig.limits import Admitted, Steps
+from stimrig.rig.signals import Ack, AngleScale, Block
 
 Kind = Literal["stimulator", "load_cell", "angle_sensor"]
 
@@ -36,7 +36,7 @@ class DeviceSettings(BaseModel):
 
 
 class Stimulator(Protocol):
-    """Delivers single pulses. Only `rig.gate` may hold one."""
+    """Delivers single pulses. Only `stimrig.rig.gate` may hold one."""
 
     steps: Steps
     """Its resolution; the gate rounds to it."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from rig.errors import DeviceError, WireError
-from rig.machine import Machine, Port
-from rig.signals import Ack, LateError
-from rig.tasks import Signal
-from rig.wire.framing import FrameReader, Packet
+from stimrig.rig.errors import DeviceError, WireError
+from stimrig.rig.machine import Machine, Port
+from stimrig.rig.signals import Ack, LateError
+from stimrig.rig.tasks import Signal
+from stimrig.rig.wire.framing import FrameReader, Packet
 
 log = logging.getLogger("rig.line")
 

@@ -12,11 +12,11 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from rig.devices import DeviceSettings
-from rig.errors import DeviceError
-from rig.machine import Bus, Frame, Listener, Machine
-from rig.signals import ANGLE_SAMPLE, AngleScale, Block
-from rig.wire import dbc
+from stimrig.rig.devices import DeviceSettings
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.machine import Bus, Frame, Listener, Machine
+from stimrig.rig.signals import ANGLE_SAMPLE, AngleScale, Block
+from stimrig.rig.wire import dbc
 
 KIND = "angle_sensor"
 
@@ -55,7 +55,7 @@ class Settings(DeviceSettings):
 
 
 class CanAngleSensor:
-    """Driver of one sensor; see `rig.devices.AngleSensor` for what the methods promise."""
+    """Driver of one sensor; see `stimrig.rig.devices.AngleSensor` for what the methods promise."""
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings, self._machine = settings, machine

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
-from rig.devices import DeviceSettings
-from rig.errors import DeviceError
-from rig.machine import Bus, Frame, Listener, Machine
-from rig.signals import SAMPLE, Block
-from rig.wire import dbc
-from rig.wire.dbc import CELL_FAULT
+from stimrig.rig.devices import DeviceSettings
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.machine import Bus, Frame, Listener, Machine
+from stimrig.rig.signals import SAMPLE, Block
+from stimrig.rig.wire import dbc
+from stimrig.rig.wire.dbc import CELL_FAULT
 
 KIND = "load_cell"
 
@@ -68,7 +68,7 @@ def message_of(frame: str) -> tuple[int, bytes, bool]:
 
 
 class CanLoadCell:
-    """Driver of one cell; see `rig.devices.LoadCell` for what the methods promise."""
+    """Driver of one cell; see `stimrig.rig.devices.LoadCell` for what the methods promise."""
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings

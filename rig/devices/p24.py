@@ -9,15 +9,15 @@ from typing import Any
 
 from pydantic import Field
 
-from rig.devices import DeviceSettings
-from rig.devices._line import PacketLine
-from rig.errors import DeviceError
-from rig.limits import Admitted, Steps
-from rig.machine import Machine
-from rig.signals import Ack
-from rig.wire import sciencemode4 as wire
-from rig.wire.framing import Packet
-from rig.wire.sciencemode4 import Command
+from stimrig.rig.devices import DeviceSettings
+from stimrig.rig.devices._line import PacketLine
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.limits import Admitted, Steps
+from stimrig.rig.machine import Machine
+from stimrig.rig.signals import Ack
+from stimrig.rig.wire import sciencemode4 as wire
+from stimrig.rig.wire.framing import Packet
+from stimrig.rig.wire.sciencemode4 import Command
 
 KIND = "stimulator"
 
@@ -33,7 +33,7 @@ class Settings(DeviceSettings):
 
 
 class P24:
-    """Driver of one P24 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
+    """Driver of one P24 on one serial port; see `stimrig.rig.devices.Stimulator` for what the methods promise."""
 
     steps = Steps(pulse_width_us=1.0, current_ma=0.5, shortest_us=1.0)
 

@@ -11,16 +11,16 @@ from typing import Any
 
 from pydantic import Field
 
-from rig.devices import DeviceSettings
-from rig.devices._line import PacketLine
-from rig.errors import DeviceError
-from rig.limits import Admitted, Steps
-from rig.machine import Machine
-from rig.signals import Ack
-from rig.tasks import Signal
-from rig.wire import sciencemode2 as wire
-from rig.wire.framing import Packet
-from rig.wire.sciencemode2 import Command
+from stimrig.rig.devices import DeviceSettings
+from stimrig.rig.devices._line import PacketLine
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.limits import Admitted, Steps
+from stimrig.rig.machine import Machine
+from stimrig.rig.signals import Ack
+from stimrig.rig.tasks import Signal
+from stimrig.rig.wire import sciencemode2 as wire
+from stimrig.rig.wire.framing import Packet
+from stimrig.rig.wire.sciencemode2 import Command
 
 KIND = "stimulator"
 

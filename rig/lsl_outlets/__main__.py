@@ -1,4 +1,4 @@
-"""`python -m rig.lsl_outlets --data DIR`: sends torque and pulses of the running test to Lab Streaming Layer.
+"""`python -m stimrig.rig.lsl_outlets --data DIR`: sends torque and pulses of the running test to Lab Streaming Layer.
 
 It prints one JSON line on standard output when the outlets are open, and logs to standard error. It runs until SIGTERM
 or SIGINT. Exit 2: LSL is not installed, or the data folder is not suitable.
@@ -18,7 +18,7 @@ MAX_MEMORY_BYTES = 2 << 30
 def main() -> int:
     """Stream until asked to end; the exit code."""
     _modest()
-    from rig.lsl_outlets.streaming import main as stream  # after that: importing numpy takes time
+    from stimrig.rig.lsl_outlets.streaming import main as stream  # after that: importing numpy takes time
 
     return stream()
 

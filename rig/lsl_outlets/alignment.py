@@ -1,4 +1,4 @@
-"""The alignment of `rig.align` while the samples still come: of all samples so far, kept as few points.
+"""The alignment of `stimrig.rig.align` while the samples still come: of all samples so far, kept as few points.
 
 The sealed recording's alignment uses the whole test. A line through its first second errs most far away from it, so the
 first samples are held back until the line is known well enough (`error_s`).
@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import align
-from rig.align import Array, Line
+from stimrig.rig import align
+from stimrig.rig.align import Array, Line
 
 WINDOW_S = 0.5
-"""The earliest sample of each such stretch is kept for the envelope, as `rig.align.earliest` does."""
+"""The earliest sample of each such stretch is kept for the envelope, as `stimrig.rig.align.earliest` does."""
 IN_TRANSIT_S = 0.1
 """Real seconds: edges and pulses newer than this are not compared, one of a pair may still be on its way."""
 NO_SYNC = 255
@@ -46,7 +46,7 @@ class LiveAlignment:
         self._span_s = 0.0
 
     def samples(self, samples: NDArray[Any]) -> Array:
-        """Take the next samples (`rig.signals.SAMPLE`); their times on the cell's clock, s."""
+        """Take the next samples (`stimrig.rig.signals.SAMPLE`); their times on the cell's clock, s."""
         cell_s, host_s = self._cell_s(samples), samples["host_time_s"]
         self._newest_s = max(self._newest_s, float(host_s[-1]))
         windows = np.floor(cell_s / WINDOW_S).astype(np.int64)
@@ -107,7 +107,7 @@ class LiveAlignment:
             self._earliest[-1] = cell_s, host_s
 
     def _cell_s(self, samples: NDArray[Any]) -> Array:
-        """`rig.align.cell_time`, block by block: what the first block has tells what is counted by."""
+        """`stimrig.rig.align.cell_time`, block by block: what the first block has tells what is counted by."""
         counter, stamp_s = samples["counter"], samples["stamp_s"]
         if not self._kind:
             self._kind = "counter" if np.all(counter >= 0) else "stamp" if np.all(np.isfinite(stamp_s)) else "count"

@@ -7,9 +7,9 @@ import ctypes
 import os
 from pathlib import Path
 
-from rig import journal
-from rig.errors import RecordingError
-from rig.journal import MAGIC, MARK, Kind
+from stimrig.rig import journal
+from stimrig.rig.errors import RecordingError
+from stimrig.rig.journal import MAGIC, MARK, Kind
 
 AT_ONCE_BYTES = 1 << 18
 FREE_TO_READ = {0xEF53: "ext2 to ext4", 0x9123683E: "btrfs", 0x01021994: "tmpfs", 0x794C7630: "overlay"}

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rig import journal
-from rig.journal import Kind
-from rig.lsl_outlets.alignment import LiveAlignment
-from rig.signals import SAMPLE
+from stimrig.rig import journal
+from stimrig.rig.journal import Kind
+from stimrig.rig.lsl_outlets.alignment import LiveAlignment
+from stimrig.rig.signals import SAMPLE
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from rig.clock import MonotonicClock
-from rig.errors import RigError
-from rig.lsl_outlets.live_test import Batch
+from stimrig.rig.clock import MonotonicClock
+from stimrig.rig.errors import RigError
+from stimrig.rig.lsl_outlets.live_test import Batch
 
 PULSE_CHANNELS = (("pulse_width", "µs"), ("current", "mA"), ("index", "1"))
 

@@ -1,4 +1,4 @@
-"""Follows one test after another and sends what its journal holds; the command line of `python -m rig.lsl_outlets`."""
+"""Follows one test after another and sends what its journal holds, as `python -m stimrig.rig.lsl_outlets`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import threading
 import time
 from pathlib import Path
 
-from rig import config as configuration
-from rig.errors import ConfigError, RigError
-from rig.journal import Kind
-from rig.lsl_outlets import outlets
-from rig.lsl_outlets.follow import Journals, Tail, refuse_locking
-from rig.lsl_outlets.live_test import LiveTest
+from stimrig.rig import config as configuration
+from stimrig.rig.errors import ConfigError, RigError
+from stimrig.rig.journal import Kind
+from stimrig.rig.lsl_outlets import outlets
+from stimrig.rig.lsl_outlets.follow import Journals, Tail, refuse_locking
+from stimrig.rig.lsl_outlets.live_test import LiveTest
 
 log = logging.getLogger("rig.lsl")
 
@@ -193,7 +193,7 @@ def _configuration(options: argparse.Namespace) -> configuration.RigConfig | Non
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m rig.lsl_outlets", description="Torque and pulses for LSL.")
+    parser = argparse.ArgumentParser(prog="python -m stimrig.rig.lsl_outlets", description="Torque and pulses for LSL.")
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--config", type=Path, metavar="FILE", help="rig file: says rate and devices")
     source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")

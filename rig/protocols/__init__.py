@@ -13,8 +13,8 @@ import pkgutil
 from functools import cache
 from typing import Protocol, cast
 
-from rig.errors import PlanError
-from rig.messages import SegmentPlan
+from stimrig.rig.errors import PlanError
+from stimrig.rig.messages import SegmentPlan
 
 DEFAULT = "paper"
 

@@ -7,7 +7,7 @@ the torque of the slowest muscle falls to a few percent before the ramp (10 s) b
 
 from __future__ import annotations
 
-from rig.messages import SegmentPlan
+from stimrig.rig.messages import SegmentPlan
 
 
 def segments(max_pulse_width_us: float) -> list[SegmentPlan]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from rig.messages import SegmentPlan
+from stimrig.rig.messages import SegmentPlan
 
 LOWER = 0.75
 

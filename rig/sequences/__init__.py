@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from rig.errors import PlanError
-from rig.messages import SequenceInfo
+from stimrig.rig.errors import PlanError
+from stimrig.rig.messages import SequenceInfo
 
 Floats = NDArray[np.float64] | list[float]
 

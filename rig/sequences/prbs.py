@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rig.sequences import SequenceSettings
+from stimrig.rig.sequences import SequenceSettings
 
 JUMPS = True
 

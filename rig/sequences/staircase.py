@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rig.sequences import SequenceSettings, pulses_in
+from stimrig.rig.sequences import SequenceSettings, pulses_in
 
 JUMPS = True
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from rig.sequences import SequenceSettings
+from stimrig.rig.sequences import SequenceSettings
 
 MAX_PULSES = 18_000
-"""Pulses of the longest test (300 s) at the highest rate (60 Hz): `rig.limits` allows no more."""
+"""Pulses of the longest test (300 s) at the highest rate (60 Hz): `stimrig.rig.limits` allows no more."""
 
 
 class Settings(SequenceSettings):

@@ -16,8 +16,8 @@ from cantools.database import Database
 from cantools.database.can import Message
 from cantools.database.namedsignalvalue import NamedSignalValue
 
-from rig.errors import ConfigError, WireError
-from rig.machine import Frame
+from stimrig.rig.errors import ConfigError, WireError
+from stimrig.rig.machine import Frame
 
 CELL_FAULT = "Cell_Fault"
 """A cell's own fault, in the descriptions that have it."""
@@ -35,7 +35,7 @@ def load(dbc: str) -> Database:
     """
     try:
         if "/" not in dbc and not dbc.endswith(".dbc"):
-            text = resources.files("rig.wire").joinpath(f"{dbc}.dbc").read_text("utf-8")
+            text = resources.files("stimrig.rig.wire").joinpath(f"{dbc}.dbc").read_text("utf-8")
         else:
             text = Path(dbc).read_text("cp1252")
         database = cantools.database.load_string(text, "dbc")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from rig.errors import WireError
+from stimrig.rig.errors import WireError
 
 START, STOP, ESCAPE, KEY = 0xF0, 0x0F, 0x81, 0x55
 SHORTEST_BODY_BYTES = 2

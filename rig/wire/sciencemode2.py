@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rig.errors import WireError
-from rig.wire.framing import Framing, Packet
+from stimrig.rig.errors import WireError
+from stimrig.rig.wire.framing import Framing, Packet
 
 OVERHEAD_BYTES = 6
 MAX_BODY_BYTES = 0xFF

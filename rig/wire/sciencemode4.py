@@ -10,8 +10,8 @@ import binascii
 import struct
 from enum import IntEnum
 
-from rig.errors import WireError
-from rig.wire.framing import Framing, Packet
+from stimrig.rig.errors import WireError
+from stimrig.rig.wire.framing import Framing, Packet
 
 OVERHEAD_BYTES = 10
 MAX_FRAME_BYTES = 128

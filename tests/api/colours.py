@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from math import atan2, cos, degrees, exp, hypot, radians, sin, sqrt
 
-from api.web.pages.environment import HERE
+from stimrig.api.web.pages.environment import HERE
 
 STATIC = HERE / "static"
 Rgb = tuple[float, float, float]

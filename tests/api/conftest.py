@@ -21,12 +21,12 @@ import uvicorn
 from argon2 import PasswordHasher
 from sqlalchemy import text
 
-from api.clock import Clock
-from api.people import passwords
-from api.settings import Settings
-from api.store import Store, engines
-from api.web import connections
-from api.web.app import create_app
+from stimrig.api.clock import Clock
+from stimrig.api.people import passwords
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, engines
+from stimrig.api.web import connections
+from stimrig.api.web.app import create_app
 from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness import postgres

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rig import messages as m
+from stimrig.rig import messages as m
 
 RATE_HZ = 200.0
 Way = Callable[[float], tuple[float, float]]

@@ -1,7 +1,7 @@
 # ruff: noqa: ARG002, N801
-"""A rig that speaks `rig.messages` on a Unix socket and plays a made-up test in a second or two.
+"""A rig that speaks `stimrig.rig.messages` on a Unix socket and plays a made-up test in a second or two.
 
-Run as a process it prints the one ready line of `python -m rig`.
+Run as a process it prints the one ready line of `python -m stimrig.rig`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import h5py  # here, not at a test's end: seconds, and other threads of the test
 import numpy as np
 from pydantic import TypeAdapter
 
-from rig import messages as m
+from stimrig.rig import messages as m
 from tests.api.fake_arm import FakeArm
 from tests.api.fake_score import PULSE_RATE_HZ, FakeScore
 from tests.harness.muscle import Patient

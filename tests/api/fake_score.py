@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rig import messages as m
+from stimrig.rig import messages as m
 
 PULSE_RATE_HZ = 40.0
 AHEAD_S = 0.05

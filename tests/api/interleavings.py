@@ -2,7 +2,7 @@
 
 ``python -m tests.api.interleavings --runs 300 --seed 1 [--postgresql]`` plays so many runs, each on a service of its
 own; its last line is one JSON object. Exit 1 if a decision was obeyed on what its maker had not seen. What may be
-decided on what is written here a second time, apart from `api.store.seen`.
+decided on what is written here a second time, apart from `stimrig.api.store.seen`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api.store.tables import AuditEntry, Model
+from stimrig.api.store.tables import AuditEntry, Model
 from tests.api import conftest
 from tests.api.conftest import Service, run_service, run_test
 from tests.api.fake_rig import FakeRig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from functools import partial
 
-from api.web import server
+from stimrig.api.web import server
 from tests.api.stub_worker import COMMAND
 
 if __name__ == "__main__":

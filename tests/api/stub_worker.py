@@ -1,4 +1,4 @@
-"""A worker that speaks the protocol of `api.workers.child` but fits nothing: quick, and slow when asked to be.
+"""A worker that speaks the protocol of `stimrig.api.workers.child` but fits nothing: quick, and slow when asked to be.
 
 Run as a process by tests of processes; for all others `tests/api/thread_process.py` has it in the test's own process.
 """
@@ -299,19 +299,19 @@ class Stub:
             Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
             return {"result": {"rows": 1}}
         if verb == "plain_csv":
-            from api.workers.verbs import plain_csv
-            from identify.errors import IdentifyError
+            from stimrig.api.workers.verbs import plain_csv
+            from stimrig.identify.errors import IdentifyError
 
             try:
                 return {"result": plain_csv(progress=lambda *_: None, **arguments)}
             except IdentifyError as error:
                 return {"error": {"expected": True, "detail": str(error), "place": error.place}}
         if verb == "find_recording":
-            from api.workers.verbs import find_recording
+            from stimrig.api.workers.verbs import find_recording
 
             return {"result": find_recording(lambda *_: None, **arguments)}
         if verb == "recorded":
-            from api.workers.recorded_signals import recorded
+            from stimrig.api.workers.recorded_signals import recorded
 
             return {"result": recorded(progress=lambda *_: None, **arguments)}
         return {"result": {}}

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 import httpx
 import pytest
 
-from api.clock import utc_label
-from api.people.auth import Scope
-from api.settings import Settings
+from stimrig.api.clock import utc_label
+from stimrig.api.people.auth import Scope
+from stimrig.api.settings import Settings
 from tests.api.conftest import TOKEN, Service, run_test, wait_done
 
 HTML = {"Accept": "text/html,application/xhtml+xml"}
@@ -71,7 +71,7 @@ def test_database_holds_no_token(service: Service) -> None:
 
 
 def test_first_start_draws_a_token_once(tmp_path) -> None:
-    from api.web.dependencies import build
+    from stimrig.api.web.dependencies import build
 
     settings = Settings(data_dir=tmp_path)
     first = build(settings)
@@ -83,8 +83,8 @@ def test_first_start_draws_a_token_once(tmp_path) -> None:
 
 
 def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
-    from api.errors import ApiError
-    from api.web.dependencies import build
+    from stimrig.api.errors import ApiError
+    from stimrig.api.web.dependencies import build
 
     build(Settings(data_dir=tmp_path, admin_token="first-one")).lock.release()  # pyright: ignore[reportArgumentType]
     later = build(Settings(data_dir=tmp_path, admin_token="second-one"))  # pyright: ignore[reportArgumentType]

@@ -9,13 +9,13 @@ from typing import Any
 import httpx
 import pytest
 
-from api.sessions import runner
-from api.sessions.adaptive_tests import KEPT, AdaptiveTests
-from api.sessions.requests import TargetIn, TestIn
-from api.sessions.rig_client import no_rig
-from api.store.tables import Test
-from identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
-from rig.messages import FinishedEvent
+from stimrig.api.sessions import runner
+from stimrig.api.sessions.adaptive_tests import KEPT, AdaptiveTests
+from stimrig.api.sessions.requests import TargetIn, TestIn
+from stimrig.api.sessions.rig_client import no_rig
+from stimrig.api.store.tables import Test
+from stimrig.identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
+from stimrig.rig.messages import FinishedEvent
 from tests.api.conftest import Service, own_service, soon, wait_done
 
 service = own_service(speed=1.0)
@@ -43,7 +43,7 @@ def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service:
     assert [row["kind"] for row in laid][-1] == "enough" and laid[0]["kind"] == "next"
     assert document["summary"]["duration_s"] < 38.7
     with service.app.state.context.store.read() as session:
-        from api.store.tables import Test
+        from stimrig.api.store.tables import Test
 
         plan = session.get(Test, document["id"]).plan
     assert plan["adaptive"] == {"max_duration_s": 50.0, "max_torque_time_nms": 360.0}

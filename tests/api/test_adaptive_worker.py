@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import identify
-from api.errors import ApiError
-from api.workers import adaptive_verbs as verbs
-from api.workers import live_record
-from api.workers.adviser import Adviser
-from identify.experiments import adaptive
-from identify.experiments.adaptive import Decision
+from stimrig import identify
+from stimrig.api.errors import ApiError
+from stimrig.api.workers import adaptive_verbs as verbs
+from stimrig.api.workers import live_record
+from stimrig.api.workers.adviser import Adviser
+from stimrig.identify.experiments import adaptive
+from stimrig.identify.experiments.adaptive import Decision
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
 
 HOW: dict[str, Any] = {

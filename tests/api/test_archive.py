@@ -9,7 +9,7 @@ import httpx
 import pytest
 from sqlalchemy import event
 
-from api.store.tables import Participant
+from stimrig.api.store.tables import Participant
 from tests.api.conftest import Service, run_test, shared_service, wait_done
 from tests.api.test_access import csrf, signed_in
 

@@ -10,14 +10,14 @@ from typing import Any
 import httpx
 import pytest
 
-from api.cli import stop_key
-from api.clock import Clock
-from api.errors import ApiError
-from api.people.auth import Auth, Scope
-from api.people.idle_lock import IdleLock
-from api.people.pace import Guesses
-from api.store import Store
-from api.store.hashes import digest
+from stimrig.api.cli import stop_key
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import Auth, Scope
+from stimrig.api.people.idle_lock import IdleLock
+from stimrig.api.people.pace import Guesses
+from stimrig.api.store import Store
+from stimrig.api.store.hashes import digest
 from tests.api.conftest import Service, let_go, wait_done
 from tests.api.test_problems import problem
 

@@ -11,9 +11,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api.people.auth import Principal
-from api.sessions.questions import LIFE_S, MOST, Question, Questions
-from rig import messages as m
+from stimrig.api.people.auth import Principal
+from stimrig.api.sessions.questions import LIFE_S, MOST, Question, Questions
+from stimrig.rig import messages as m
 from tests.api.conftest import Service, SetClock, run_test, wait_done
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_forms import fields
@@ -164,7 +164,7 @@ def test_a_rig_that_asks_for_a_calibration_offers_that_first(
 def test_a_calibration_of_yesterday_starts_nothing(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
     calibrate(client)
     with service.app.state.context.store.write() as session:
-        from api.store.tables import Participant
+        from stimrig.api.store.tables import Participant
 
         row = session.get(Participant, "P017")
         row.profile = {**row.profile, "expires_at_utc": "2026-01-02T00:00:00Z"}

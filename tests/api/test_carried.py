@@ -10,9 +10,9 @@ from typing import Any, cast
 import httpx
 import pytest
 
-from api.cli.terminal import carried_lines
-from api.models.carried_structure import CarriedStructure
-from api.store.tables import Approval
+from stimrig.api.cli.terminal import carried_lines
+from stimrig.api.models.carried_structure import CarriedStructure
+from stimrig.api.store.tables import Approval
 from tests.api.conftest import Service, run_test, soon, wait_done
 from tests.api.test_access import csrf, signed_in
 

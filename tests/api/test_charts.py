@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from api.charts import compare_charts, diagnosis_charts, hover, model_charts, palette
-from api.charts.svg import svg
-from api.language import using
+from stimrig.api.charts import compare_charts, diagnosis_charts, hover, model_charts, palette
+from stimrig.api.charts.svg import svg
+from stimrig.api.language import using
 from tests.api.test_export import measured
 
 

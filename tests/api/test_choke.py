@@ -16,10 +16,10 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from api.errors import ApiError
-from api.sessions.rig_client import LONGEST_LINE, line_of
-from api.web import body_limit, connections
-from rig.messages import PreviewRequest, Profile, SegmentPlan, TestPlan
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.rig_client import LONGEST_LINE, line_of
+from stimrig.api.web import body_limit, connections
+from stimrig.rig.messages import PreviewRequest, Profile, SegmentPlan, TestPlan
 from tests.api.conftest import Server, Service, soon
 from tests.api.test_stop_right import stops_noted
 

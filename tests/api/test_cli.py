@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from api.cli import main
-from api.progress_bar import progress_bar
+from stimrig.api.cli import main
+from stimrig.api.progress_bar import progress_bar
 from tests.api.test_worker import made_up_csv
 from tests.harness import few_effects
 
@@ -155,7 +155,7 @@ def test_models_and_predictions_as_mat_files(
 
 
 def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    from rig.messages import Profile, TestPlan
+    from stimrig.rig.messages import Profile, TestPlan
     from tests.api.fake_rig import write_recording
 
     plan = TestPlan(test_id="T1", participant="P1", profile=Profile(), segments=None)  # pyright: ignore[reportCallIssue]
@@ -213,7 +213,7 @@ def test_a_model_that_cannot_be_criticised_on_this_record_is_refused(
 
 
 def test_progress_tells_share_and_text_to_who_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("api.progress_bar.PATIENCE_S", 0.0)
+    monkeypatch.setattr("stimrig.api.progress_bar.PATIENCE_S", 0.0)
     for looks in (True, False):
         shown = io.StringIO()
         shown.isatty = lambda looks=looks: looks
@@ -238,7 +238,7 @@ def test_work_that_is_done_within_a_second_shows_no_bar(monkeypatch: pytest.Monk
 def test_unforeseen_error_is_one_line_and_a_log(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, record: Path
 ) -> None:
-    import identify
+    from stimrig import identify
 
     def broken(*_: Any, **__: Any) -> None:
         raise ZeroDivisionError("odd")
@@ -252,23 +252,27 @@ def test_unforeseen_error_is_one_line_and_a_log(
 
 
 def test_every_verb_of_the_contract_is_there_and_helps() -> None:
-    done = subprocess.run([sys.executable, "-m", "api.cli", "--help"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "stimrig.api.cli", "--help"], capture_output=True, text=True, check=True
+    )
     for verb in ("serve", "emulate", "test", "fit", "predict", "compare", "diagnose", "improve", "effects", "table1"):
         assert f"\n  {verb}" in done.stdout
 
 
 def test_bad_input_as_a_process() -> None:
-    done = subprocess.run([sys.executable, "-m", "api.cli", "fit", "nowhere.csv"], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "stimrig.api.cli", "fit", "nowhere.csv"], capture_output=True, text=True
+    )
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
 
 
 def test_emulate_hands_everything_on() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "api.cli", "emulate", "--patient", "nobody"], capture_output=True, text=True
+        [sys.executable, "-m", "stimrig.api.cli", "emulate", "--patient", "nobody"], capture_output=True, text=True
     )
     assert done.returncode == 2 and "nobody" in done.stderr and done.stderr.count("\n") == 1
     helped = subprocess.run(
-        [sys.executable, "-m", "api.cli", "emulate", "--help"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "stimrig.api.cli", "emulate", "--help"], capture_output=True, text=True, check=True
     )
     assert "--hidden SEED" in helped.stdout
 

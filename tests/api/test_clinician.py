@@ -157,7 +157,7 @@ def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, ser
     expected(blank.get_by_text("The chain of hashes is complete")).to_be_visible()
     with blank.expect_download() as caught:
         blank.get_by_role("link", name="Export all").click()
-    from api.cli import main
+    from stimrig.api.cli import main
 
     assert main.run(["audit", "verify", "--file", str(caught.value.path())]) == 0
     blank.get_by_role("button", name=re.compile("Revoke the token of ilc")).first.click()

@@ -15,9 +15,9 @@ from sqlalchemy import select
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from api.store.hashes import digest
-from api.store.tables import AuditEntry, Test, Token
-from api.web.key_guard import OPEN
+from stimrig.api.store.hashes import digest
+from stimrig.api.store.tables import AuditEntry, Test, Token
+from stimrig.api.web.key_guard import OPEN
 from tests.api.browser import without_values
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done
 from tests.api.test_scopes import ROWS

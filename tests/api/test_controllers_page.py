@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from api.people import controller_keys
-from api.web import routes
-from api.web.scan import routers
+from stimrig.api.people import controller_keys
+from stimrig.api.web import routes
+from stimrig.api.web.scan import routers
 from tests.api.browser import bring_to_rest
 from tests.api.conftest import REAL, Service, run_service
 from tests.api.test_worker import made_up_csv

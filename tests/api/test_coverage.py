@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from api.sessions.coverage import ENOUGH, Coverage, covered, grid
+from stimrig.api.sessions.coverage import ENOUGH, Coverage, covered, grid
 
 RATE_HZ = 200.0
 RANGE_RAD = (math.radians(20), math.radians(110))

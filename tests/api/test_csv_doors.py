@@ -16,14 +16,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import identify
-from api.cli import main
-from api.cohort import bids, dictionary
-from api.models import inverted
-from api.web.routes import trend
-from api.workers import verbs
-from identify.records import cells, parts_csv
-from identify.records.record import Record, Source
+from stimrig import identify
+from stimrig.api.cli import main
+from stimrig.api.cohort import bids, dictionary
+from stimrig.api.models import inverted
+from stimrig.api.web.routes import trend
+from stimrig.api.workers import verbs
+from stimrig.identify.records import cells, parts_csv
+from stimrig.identify.records.record import Record, Source
 from tests.harness.cohort_records import Session, write
 
 ROOT = Path(__file__).parents[2]
@@ -151,7 +151,7 @@ def named() -> Record:
         width_us = np.where(np.arange(count) % 50 < 25, 100.0 + number, 0.0)
         return Record.from_arrays(time_s, width_us, -time_s - number, segment, source=source)
 
-    from identify.records.join import join
+    from stimrig.identify.records.join import join
 
     joined = [join([one(a), one(b)], [0.0, 100.0]) for a, b in ((0, 1), (2, 3), (4, 5))]
     return join([*joined, one(6)], [0.0, 500.0, 1000.0, 1500.0])

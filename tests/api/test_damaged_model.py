@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api.store.tables import Model
+from stimrig.api.store.tables import Model
 from tests.api.conftest import QUICK_SPEED, Service, let_go, run_test, wait_done
 from tests.api.test_access import signed_in
 from tests.api.test_problems import problem

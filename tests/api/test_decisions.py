@@ -14,11 +14,11 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from api.centre import pages as centre_pages
-from api.centre import routes as centre_routes
-from api.decisions import DECISIONS
-from api.web import pages, routes
-from api.web.scan import routers
+from stimrig.api.centre import pages as centre_pages
+from stimrig.api.centre import routes as centre_routes
+from stimrig.api.decisions import DECISIONS
+from stimrig.api.web import pages, routes
+from stimrig.api.web.scan import routers
 from tests.api.conftest import Service, run_test, shared_service, soon
 from tests.api.fake_arm import still
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import identify
-from api.cli.commands.diagnose import effect_lines
-from api.models import explanation, summary
-from api.web.pages.environment import environment
+from stimrig import identify
+from stimrig.api.cli.commands.diagnose import effect_lines
+from stimrig.api.models import explanation, summary
+from stimrig.api.web.pages.environment import environment
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.cli import doctor, main
-from api.cli.doctor import Finding, examine
-from api.logs import JsonLines
-from api.settings import Settings
+from stimrig.api.cli import doctor, main
+from stimrig.api.cli.doctor import Finding, examine
+from stimrig.api.logs import JsonLines
+from stimrig.api.settings import Settings
 from tests.api.conftest import Service, run_test
 
 RIG = """data_dir = "{folder}"

@@ -8,11 +8,11 @@ import time
 
 from websockets.sync.client import connect
 
-from api import language
-from api.effect_words import EFFECTS, PARAMETERS, effects_words, without_unit
-from api.language import translated
-from api.models import explanation, headline, trend_words
-from identify import effects
+from stimrig.api import language
+from stimrig.api.effect_words import EFFECTS, PARAMETERS, effects_words, without_unit
+from stimrig.api.language import translated
+from stimrig.api.models import explanation, headline, trend_words
+from stimrig.identify import effects
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 from tests.api.test_access import signed_in
 

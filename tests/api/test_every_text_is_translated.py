@@ -12,8 +12,8 @@ import httpx
 import pytest
 from babel.messages.catalog import Catalog
 
-from api import language
-from api.language import extract
+from stimrig.api import language
+from stimrig.api.language import extract
 from tests.api.conftest import STUB, Service, run_service, run_test
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_languages import forget
@@ -40,8 +40,9 @@ def made_up() -> Iterator[None]:
         if message:
             one = f"⟦{message}⟧" if isinstance(message, str) else tuple(f"⟦{form}⟧" for form in message)
             made.add(message, one)
-    modules = [importlib.import_module(f"api.language.{name}") for name in ("catalogues", "words", "translated")]
-    pages = [importlib.import_module(name) for name in ("api.language", "api.web.pages.choices")]
+    names = ("catalogues", "words", "translated")
+    modules = [importlib.import_module(f"stimrig.api.language.{name}") for name in names]
+    pages = [importlib.import_module(name) for name in ("stimrig.api.language", "stimrig.api.web.pages.choices")]
     with pytest.MonkeyPatch.context() as patch:
         for module in [*modules, *pages]:
             patch.setattr(module, "CODES", ("en", MADE_UP), raising=False)

@@ -12,12 +12,12 @@ import httpx
 import numpy as np
 import pytest
 
-import identify
-from api.charts import model_charts, ramp_directions
-from api.charts.hover import on
-from api.charts.svg import svg, ticks
-from api.workers.pool import WORKER
-from api.workers.verbs import curves
+from stimrig import identify
+from stimrig.api.charts import model_charts, ramp_directions
+from stimrig.api.charts.hover import on
+from stimrig.api.charts.svg import svg, ticks
+from stimrig.api.workers.pool import WORKER
+from stimrig.api.workers.verbs import curves
 from tests.api.conftest import run_service, run_test
 from tests.api.fake_rig import default_widths, muscle
 

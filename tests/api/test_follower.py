@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from api.sessions import adaptive
-from api.sessions.adaptive import Follower
-from rig.messages import (
+from stimrig.api.sessions import adaptive
+from stimrig.api.sessions.adaptive import Follower
+from stimrig.rig.messages import (
     AHEAD,
     AdaptivePlan,
     ExtendRequest,

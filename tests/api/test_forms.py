@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from api.web.pages import typed
+from stimrig.api.web.pages import typed
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_profiles import calibrate, limits

@@ -11,9 +11,9 @@ from urllib.parse import parse_qs, urlsplit
 import httpx
 import pytest
 
-from api.clock import Clock
-from api.people.idle_lock import IdleLock
-from api.people.pace import Pace
+from stimrig.api.clock import Clock
+from stimrig.api.people.idle_lock import IdleLock
+from stimrig.api.people.pace import Pace
 from tests.api.browser import PASSWORD, without_values
 from tests.api.conftest import STUB, TOKEN, Service, run_service, wait_done
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from api.charts import joint_charts
-from api.charts.svg import svg
-from api.language import using
-from api.sessions import coverage
+from stimrig.api.charts import joint_charts
+from stimrig.api.charts.svg import svg
+from stimrig.api.language import using
+from stimrig.api.sessions import coverage
 from tests.api import made_up_joint
 from tests.api.browser import open_tab
 from tests.api.conftest import Service, run_test, shared_service

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from api.models.together import JOINT_EFFECTS
-from api.sessions import joint_plan
-from api.sessions.joint_plan import Curve, curve_of, layout, targets, torque_time, widths_of
-from api.web.routes.joint import EffectId
-from identify.effects import get
-from identify.fitting import MOVING_JOINT
-from rig.limits import HARD_LIMITS, for_profile
-from rig.messages import Profile, TestPlan
-from rig.plan import build
+from stimrig.api.models.together import JOINT_EFFECTS
+from stimrig.api.sessions import joint_plan
+from stimrig.api.sessions.joint_plan import Curve, curve_of, layout, targets, torque_time, widths_of
+from stimrig.api.web.routes.joint import EffectId
+from stimrig.identify.effects import get
+from stimrig.identify.fitting import MOVING_JOINT
+from stimrig.rig.limits import HARD_LIMITS, for_profile
+from stimrig.rig.messages import Profile, TestPlan
+from stimrig.rig.plan import build
 
 RATE_HZ = 40.0
 TEST = TestPlan(

@@ -15,7 +15,7 @@ from typing import Any
 
 import httpx
 
-from api.cli.child import Child
+from stimrig.api.cli.child import Child
 from tests.api.conftest import TOKEN, soon, wait_done
 from tests.harness.looks_first import LooksFirst
 

@@ -13,9 +13,9 @@ from babel.messages.catalog import Catalog
 from hypothesis import given
 from hypothesis import strategies as st
 
-from api import language
-from api.language import catalogues, extract, translated
-from api.language.catalogues import best
+from stimrig.api import language
+from stimrig.api.language import catalogues, extract, translated
+from stimrig.api.language.catalogues import best
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
 
@@ -79,7 +79,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def translated_module() -> Any:
     import importlib
 
-    return importlib.import_module("api.language.translated")
+    return importlib.import_module("stimrig.api.language.translated")
 
 
 def forget() -> None:
@@ -142,7 +142,7 @@ def forms_of(text: Any) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("code", [code for code in language.CODES if code != language.DEFAULT])
 def test_every_message_has_its_translation(code: str) -> None:
-    """`python -m api.language.extract --check` says the same; `make words` renews the catalogues."""
+    """`python -m stimrig.api.language.extract --check` says the same; `make words` renews the catalogues."""
     assert extract.missing(code) == []
 
 

@@ -15,9 +15,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from api.store.hashes import digest
-from api.store.tables import PageSession, Token
-from api.web.routes.tests import _next
+from stimrig.api.store.hashes import digest
+from stimrig.api.store.tables import PageSession, Token
+from stimrig.api.web.routes.tests import _next
 from tests.api.browser import PASSWORD
 from tests.api.conftest import STUB, TOKEN, Service, run_service
 from tests.api.test_idle_lock import signed_in

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from api.store.tables import Test
-from api.web.pages.views import limits_of
-from rig.messages import Bound, Status
+from stimrig.api.store.tables import Test
+from stimrig.api.web.pages.views import limits_of
+from stimrig.rig.messages import Bound, Status
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service, soon
 

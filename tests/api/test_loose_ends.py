@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from api import language
-from api.models.summary import followed
+from stimrig.api import language
+from stimrig.api.models.summary import followed
 from tests.api.conftest import Service, run_test, shared_service
 from tests.api.test_access import csrf, signed_in
 

@@ -17,9 +17,9 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 
-from api.errors import ApiError
-from api.store import Store, audit, migrations
-from api.store.tables import Approval, AuditEntry, Participant, Recording, Table, User
+from stimrig.api.errors import ApiError
+from stimrig.api.store import Store, audit, migrations
+from stimrig.api.store.tables import Approval, AuditEntry, Participant, Recording, Table, User
 from tests.api.conftest import STUB, run_service, run_test
 
 pytestmark = pytest.mark.sqlite
@@ -165,7 +165,7 @@ def test_the_service_says_so_in_one_line_and_ends(tmp_path: Path) -> None:
     Store(f"sqlite:///{path}").close()
     change(path, NEWER)
     environment = {**os.environ, "STIMRIG_DATA_DIR": str(tmp_path), "STIMRIG_PORT": "0"}
-    command = [sys.executable, "-m", "api.web.server"]
+    command = [sys.executable, "-m", "stimrig.api.web.server"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=60)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("{")]
     assert done.returncode == 2 and len(lines) == 1 and "version 0900" in lines[0], done.stderr

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from api.clock import Clock
-from api.people import names
-from api.people.pace import Guesses
-from api.sessions.stop_right import StopRights
+from stimrig.api.clock import Clock
+from stimrig.api.people import names
+from stimrig.api.people.pace import Guesses
+from stimrig.api.sessions.stop_right import StopRights
 from tests.api.browser import PASSWORD
 from tests.api.conftest import STUB, Service, run_service
 

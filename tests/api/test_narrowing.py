@@ -8,9 +8,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api.errors import ApiError
-from api.sessions.limits import limits_of
-from api.sessions.requests import ProfileIn, TestIn
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.limits import limits_of
+from stimrig.api.sessions.requests import ProfileIn, TestIn
 from tests.api.conftest import Service, wait_done
 from tests.api.test_problems import problem
 

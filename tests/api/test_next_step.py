@@ -9,8 +9,8 @@ from typing import Any
 import httpx
 import pytest
 
-from api.models import next_step
-from api.models.next_step import Situation, Today
+from stimrig.api.models import next_step
+from stimrig.api.models.next_step import Situation, Today
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import csrf, signed_in
 
@@ -68,7 +68,7 @@ def test_each_state_has_one_step(so: dict[str, Any], kind: str, words: str, lead
 
 
 def test_the_table_names_every_kind_and_every_state_of_the_rig() -> None:
-    from api.web.pages.rig_state import WORDS
+    from stimrig.api.web.pages.rig_state import WORDS
 
     assert {kind for _, kind, _, _ in TABLE} == set(next_step.Kind.__args__)
     for state in WORDS:
@@ -112,7 +112,7 @@ def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service,
 
 
 def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Service, participant: str) -> None:
-    from api.store.tables import Model, Test
+    from stimrig.api.store.tables import Model, Test
 
     document = run_test(client, participant)
     with service.app.state.context.store.write() as session:
@@ -124,7 +124,7 @@ def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Ser
 def test_of_two_versions_of_a_test_the_offered_one_is_next(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    from api.store.tables import Model
+    from stimrig.api.store.tables import Model
 
     plain = run_test(client, participant)["model_id"]
     carried = client.post(f"/v1/models/{plain}/effects", json={"effects": ["fatigue"]}).json()["id"]

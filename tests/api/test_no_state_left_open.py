@@ -14,15 +14,15 @@ from typing import Any
 import httpx
 import pytest
 
-from api.clock import Clock
-from api.sessions import runner
-from api.sessions.following import Follower
-from api.sessions.lifecycle import Lifecycle
-from api.sessions.rig_client import RigClient
-from api.store import Store
-from api.store.holds import Holds
-from api.store.tables import Model, Participant, Recording, Test
-from rig.messages import Reply, StartRequest, StateEvent, Status
+from stimrig.api.clock import Clock
+from stimrig.api.sessions import runner
+from stimrig.api.sessions.following import Follower
+from stimrig.api.sessions.lifecycle import Lifecycle
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.store import Store
+from stimrig.api.store.holds import Holds
+from stimrig.api.store.tables import Model, Participant, Recording, Test
+from stimrig.rig.messages import Reply, StartRequest, StateEvent, Status
 from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
 

@@ -17,12 +17,12 @@ from typing import Any
 import httpx
 import pytest
 
-from api.cli import main
-from api.cli.errors import LaunchError
-from api.cli.launcher import Services
-from api.settings import Settings
-from api.store import Store, lock
-from api.store.lock import HeldError, ServiceLock
+from stimrig.api.cli import main
+from stimrig.api.cli.errors import LaunchError
+from stimrig.api.cli.launcher import Services
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, lock
+from stimrig.api.store.lock import HeldError, ServiceLock
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 from tests.harness.looks_first import LooksFirst
 
@@ -120,8 +120,8 @@ def test_serve_says_so_before_it_starts_a_rig(tmp_path: Path) -> None:
 
 
 def test_a_service_that_does_not_come_up_lets_go(tmp_path: Path) -> None:
-    from api.errors import ApiError
-    from api.web.dependencies import build
+    from stimrig.api.errors import ApiError
+    from stimrig.api.web.dependencies import build
 
     (tmp_path / "stimrig.db").write_bytes(b"not a database at all" * 100)
     with pytest.raises(ApiError, match="cannot be opened"):

@@ -10,8 +10,8 @@ import httpx
 import jsonschema_rs
 import pytest
 
-from api.web.responses.rig import SequencesOut
-from rig import plan
+from stimrig.api.web.responses.rig import SequencesOut
+from stimrig.rig import plan
 from tests.api.browser import open_tab
 from tests.api.conftest import Service, run_test, shared_service
 

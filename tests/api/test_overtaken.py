@@ -14,8 +14,8 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from api.sessions import runner
-from api.web.routes import calibration
+from stimrig.api.sessions import runner
+from stimrig.api.web.routes import calibration
 from tests.api.conftest import Service, run_test, soon
 
 

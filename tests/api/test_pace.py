@@ -11,10 +11,10 @@ from typing import Any
 import httpx
 import pytest
 
-from api.clock import Clock
-from api.errors import ApiError
-from api.people.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
-from api.people.passwords import MOST_STRANGERS, Passwords
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.people.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
+from stimrig.api.people.passwords import MOST_STRANGERS, Passwords
 from tests.api.conftest import TOKEN, Service, SetClock, run_test
 from tests.api.test_people import PASSWORD, standing_still
 

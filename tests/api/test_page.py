@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from api.web import pages
+from stimrig.api.web import pages
 from tests.api.browser import (
     NARROW,
     PASSWORD,

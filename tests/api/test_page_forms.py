@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from fastapi.routing import APIRoute
 
-from api.web import pages
-from api.web.scan import routers
+from stimrig.api.web import pages
+from stimrig.api.web.scan import routers
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 
 HTML = {"Accept": "text/html"}

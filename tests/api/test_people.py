@@ -12,11 +12,11 @@ import httpx
 import pytest
 from sqlalchemy import inspect
 
-from api.cli import main
-from api.people import passwords
-from api.people.pace import Pace
-from api.settings import Settings
-from api.web.server import configuration, loopback, refuse_open_door
+from stimrig.api.cli import main
+from stimrig.api.people import passwords
+from stimrig.api.people.pace import Pace
+from stimrig.api.settings import Settings
+from stimrig.api.web.server import configuration, loopback, refuse_open_door
 from tests.api.conftest import PATIENCE_S, Service, SetClock, run_test
 
 PASSWORD = "correct horse battery"

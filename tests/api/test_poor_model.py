@@ -12,8 +12,8 @@ from typing import Any
 import httpx
 import pytest
 
-from api.models import advice, reasons
-from identify.estimation import quality
+from stimrig.api.models import advice, reasons
+from stimrig.identify.estimation import quality
 from tests.api.conftest import Service, run_test
 from tests.api.test_access import csrf, signed_in
 
@@ -167,8 +167,8 @@ def test_fit_and_ceiling_in_one_sentence(fit: dict[str, Any], words: str) -> Non
 
 
 def test_segments_in_a_clinicians_words() -> None:
-    from api.charts.model_charts import segment_marks
-    from api.clinical_words import segment_words
+    from stimrig.api.charts.model_charts import segment_marks
+    from stimrig.api.clinical_words import segment_words
 
     names = ["rest", "prbs", "ramp", "validate", "my <own>"]
     assert [segment_words(name) for name in names] == [
@@ -182,7 +182,7 @@ def test_segments_in_a_clinicians_words() -> None:
 
 
 def test_names_of_short_segments_are_not_written_over_one_another() -> None:
-    from api.charts.model_charts import LETTER, segment_marks
+    from stimrig.api.charts.model_charts import LETTER, segment_marks
 
     ends = [2.7, 3.7, 4.7, 6.7, 8.7, 40.0]
     names = ["opening", "ramp 2", "ramp 3", "step 4", "prbs", "ramp"]

@@ -8,9 +8,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api import errors
-from api.sessions import runner
-from rig.messages import Problem as RigProblem
+from stimrig.api import errors
+from stimrig.api.sessions import runner
+from stimrig.rig.messages import Problem as RigProblem
 from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
 GOOD_HEADER = "time_s,pulse_width_us,torque_nm,segment\n"

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api.sessions import profiles
+from stimrig.api.sessions import profiles
 from tests.api.conftest import Service
 from tests.api.test_problems import problem
 
@@ -93,7 +93,7 @@ def test_a_limit_begins_where_a_stimulator_does(
 
 
 def test_the_least_limits_are_the_stimulators_finest_steps() -> None:
-    from rig.limits import FINEST
+    from stimrig.rig.limits import FINEST
 
     least = {name: limit.least for name, limit in profiles.LIMITS.items()}
     assert (least["current_ma"], least["max_pulse_width_us"]) == (FINEST.current_ma, FINEST.shortest_us)
@@ -182,7 +182,7 @@ def test_a_calibration_takes_the_participants_own_limits(
     """Not 20 mA and 30 N·m because nothing was said; and what it doesn't look for is kept."""
     context = service.app.state.context
     with context.store.write() as session:
-        from api.store.tables import Participant
+        from stimrig.api.store.tables import Participant
 
         row = session.get(Participant, "P017")
         row.profile = {**row.profile, "rest_between_tests_s": 60.0}

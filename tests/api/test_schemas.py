@@ -15,14 +15,14 @@ import jsonschema_rs
 import numpy as np
 import pytest
 
-from api import schemas
-from api.cli import main
-from api.cli.commands.test import through
-from api.store import Store
-from identify.json_values import json_value
-from identify.model import SCHEMA_VERSION, Covariance
-from identify.paper import table1
-from identify.simulation.joint_surface import joint_tables
+from stimrig.api import schemas
+from stimrig.api.cli import main
+from stimrig.api.cli.commands.test import through
+from stimrig.api.store import Store
+from stimrig.identify.json_values import json_value
+from stimrig.identify.model import SCHEMA_VERSION, Covariance
+from stimrig.identify.paper import table1
+from stimrig.identify.simulation.joint_surface import joint_tables
 from tests.api.conftest import REAL, TOKEN, run_service
 from tests.api.test_worker import made_up_csv
 from tests.harness import few_effects
@@ -92,7 +92,9 @@ def test_table1_holds_to_its_schema() -> None:
 
 
 def test_the_emulators_line_holds_to_its_schema() -> None:
-    with subprocess.Popen([sys.executable, "-m", "hardware_sim"], stdout=subprocess.PIPE, text=True) as emulator:
+    with subprocess.Popen(
+        [sys.executable, "-m", "stimrig.hardware_sim"], stdout=subprocess.PIPE, text=True
+    ) as emulator:
         assert emulator.stdout is not None
         try:
             assert unmet("emulate", json.loads(emulator.stdout.readline())) == []

@@ -9,9 +9,9 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from api.people.auth import Scope
-from api.web import pages, routes
-from api.web.scan import routers
+from stimrig.api.people.auth import Scope
+from stimrig.api.web import pages, routes
+from stimrig.api.web.scan import routers
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 
 SCOPES = ("read-live", "run-test", "rearm", "approve-model", "read-model", "administer")

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from api import language
-from api.language import catalogues, extract
-from api.language.translated import PERSON, of
+from stimrig.api import language
+from stimrig.api.language import catalogues, extract
+from stimrig.api.language.translated import PERSON, of
 
 LANGUAGES = [code for code in language.CODES if code != language.DEFAULT]
 PLACE = re.compile(r"%\((\w+)\)s")

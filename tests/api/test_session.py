@@ -10,8 +10,8 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
-from api.errors import ApiError
-from api.store import Store, engines
+from stimrig.api.errors import ApiError
+from stimrig.api.store import Store, engines
 from tests.api.conftest import DURABLE, TOKEN, Service, run_test, soon, wait_done
 
 

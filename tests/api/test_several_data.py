@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-import identify
-from api.cli import main
-from identify.records import parts_csv
+from stimrig import identify
+from stimrig.api.cli import main
+from stimrig.identify.records import parts_csv
 from tests.api.test_cli import run
 from tests.api.test_worker import made_up_csv
 from tests.identify import hidden_muscles

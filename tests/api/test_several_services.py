@@ -18,12 +18,12 @@ import httpx
 import pytest
 from sqlalchemy import inspect
 
-from api.errors import ApiError
-from api.settings import Settings
-from api.store import Store, audit, holds
-from api.store.holds import Among
-from api.store.tables import AuditEntry, Model, Test
-from api.web.app import create_app
+from stimrig.api.errors import ApiError
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, audit, holds
+from stimrig.api.store.holds import Among
+from stimrig.api.store.tables import AuditEntry, Model, Test
+from stimrig.api.web.app import create_app
 from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Server, Service, run_test, soon, wait_done
 from tests.api.fake_rig import RigThread
 from tests.api.test_one_service import served
@@ -190,7 +190,7 @@ def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, addre
 
 WRITER = """
 import sys
-from api.store import Store, audit
+from stimrig.api.store import Store, audit
 store = Store(sys.argv[1])
 print("ready", flush=True)
 sys.stdin.readline()

@@ -18,11 +18,11 @@ from typing import Any
 import httpx
 import pytest
 
-from api.errors import ApiError
-from api.workers import confinement
-from api.workers.pool import WORKER, Pool
-from api.workers.process import Places
-from api.workers.verbs import find_recording
+from stimrig.api.errors import ApiError
+from stimrig.api.workers import confinement
+from stimrig.api.workers.pool import WORKER, Pool
+from stimrig.api.workers.process import Places
+from stimrig.api.workers.verbs import find_recording
 from tests.api.conftest import STUB, Service, run_service, soon
 from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool
@@ -251,7 +251,7 @@ def test_a_row_that_is_not_written_leaves_no_file(
             def full(*_: object, **__: object) -> None:
                 raise OSError("disk full")
 
-            monkeypatch.setattr("api.web.routes.recordings.audit.write", full)
+            monkeypatch.setattr("stimrig.api.web.routes.recordings.audit.write", full)
             assert client.post("/v1/participants/P017/recordings", content=b"a,b\n").status_code == 500
             monkeypatch.undo()
         assert not list((tmp_path / "recordings").rglob("upload-*"))

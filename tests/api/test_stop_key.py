@@ -18,9 +18,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api.cli import main, stop_key
-from api.cli.commands import test as test_verb
-from api.cli.stop_key import StopKey, at_rig, at_service
+from stimrig.api.cli import main, stop_key
+from stimrig.api.cli.commands import test as test_verb
+from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
 from tests.api.conftest import TOKEN, Service, soon, wait_done
 from tests.api.fake_rig import RigThread
 from tests.harness.looks_first import LooksFirst
@@ -225,7 +225,7 @@ def test_no_rig_at_the_socket_is_one_line(tmp_path: Path, capsys: pytest.Capture
     path = tmp_path / "none.sock"
     assert main.run(["serve", "--rig-socket", str(path), "--data", str(tmp_path / "data")]) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and str(path) in said and "python -m rig" in said
+    assert said.count("\n") == 1 and str(path) in said and "python -m stimrig.rig" in said
 
 
 @pytest.mark.slow
@@ -234,7 +234,18 @@ def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
 ) -> None:
     keyboard, program = terminal
     socket = short_dir / f"attached-{time.time_ns()}.sock"
-    command = [sys.executable, "-m", "api.cli", "serve", "--rig-socket", str(socket), "--port", "0", "--data", "data"]
+    command = [
+        sys.executable,
+        "-m",
+        "stimrig.api.cli",
+        "serve",
+        "--rig-socket",
+        str(socket),
+        "--port",
+        "0",
+        "--data",
+        "data",
+    ]
     environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": str(ROOT)}
     with RigThread(socket, tmp_path / "data" / "recordings", speed=1.0) as thread:
         served = subprocess.Popen(

@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from api.charts import model_charts
-from api.workers.recorded_signals import recorded
+from stimrig.api.charts import model_charts
+from stimrig.api.workers.recorded_signals import recorded
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service
 from tests.api.test_access import signed_in

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from api.cli import streams as streams_module
-from api.cli.child import LAST_BYTES, Child
-from api.cli.launcher import Services
-from api.cli.streams import Streams
-from api.settings import Settings
+from stimrig.api.cli import streams as streams_module
+from stimrig.api.cli.child import LAST_BYTES, Child
+from stimrig.api.cli.launcher import Services
+from stimrig.api.cli.streams import Streams
+from stimrig.api.settings import Settings
 from tests.harness.lsl_recorder import on_this_machine
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from api.cli import main
-from api.settings import Settings
+from stimrig.api.cli import main
+from stimrig.api.settings import Settings
 from tests.api.conftest import STUB, Service, run_service, run_test
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_one_service import command

@@ -10,9 +10,9 @@ from typing import Any
 import httpx
 import pytest
 
-from api.models.tracking import NEW_TEST
-from api.store.tables import Model, Test, Tracked
-from rig.messages import FinishedEvent
+from stimrig.api.models.tracking import NEW_TEST
+from stimrig.api.store.tables import Model, Test, Tracked
+from stimrig.rig.messages import FinishedEvent
 from tests.api.conftest import STUB, Service, run_service, run_test, soon, wait_done
 
 WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 40}}]

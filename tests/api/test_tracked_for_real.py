@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from api.workers.pool import WORKER
+from stimrig.api.workers.pool import WORKER
 from tests.api.conftest import run_service, run_test, wait_done
 
 PERSON = "/v1/participants/P1"

@@ -11,9 +11,9 @@ import h5py
 import httpx
 import pytest
 
-import identify
-from api.store.tables import Recording
-from api.workers import tracking_verbs
+from stimrig import identify
+from stimrig.api.store.tables import Recording
+from stimrig.api.workers import tracking_verbs
 from tests.api.conftest import Service, run_test, soon
 from tests.api.fake_rig import PATIENT
 from tests.api.test_tracked import play, say

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from api import language
-from api.errors import ApiError
-from api.models import tracking
-from api.models.tracking import Limits
+from stimrig.api import language
+from stimrig.api.errors import ApiError
+from stimrig.api.models import tracking
+from stimrig.api.models.tracking import Limits
 
 
 def step(outcome: str = "followed", **coming: float) -> dict[str, Any]:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import identify
-from api.models.tracking import Limits
-from api.workers import tracking_verbs
-from rig import messages as m
+from stimrig import identify
+from stimrig.api.models.tracking import Limits
+from stimrig.api.workers import tracking_verbs
+from stimrig.rig import messages as m
 from tests.api.fake_rig import PATIENT, write_recording
 from tests.harness.sessions import Planned, record
 

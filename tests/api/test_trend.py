@@ -13,11 +13,11 @@ from typing import Any
 import httpx
 import pytest
 
-import identify
-from api.models import changes, summary, trend_words
-from api.models.changes import State
-from api.store.tables import Analysis, Model
-from api.workers.pool import WORKER
+from stimrig import identify
+from stimrig.api.models import changes, summary, trend_words
+from stimrig.api.models.changes import State
+from stimrig.api.store.tables import Analysis, Model
+from stimrig.api.workers.pool import WORKER
 from tests.api.conftest import Service, run_service
 from tests.harness import sessions
 from tests.harness.muscle import Patient

@@ -8,10 +8,10 @@ from typing import Any, get_args
 import httpx
 import pytest
 
-from api import language
-from api.models.tracking import OUTCOMES, sentences
-from api.web.pages.decision_view import tracking_words
-from api.web.responses.trend import TrialOut
+from stimrig.api import language
+from stimrig.api.models.tracking import OUTCOMES, sentences
+from stimrig.api.web.pages.decision_view import tracking_words
+from stimrig.api.web.responses.trend import TrialOut
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_tracked import play, say, tracked

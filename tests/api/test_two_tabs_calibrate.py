@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from api.store.holds import LIMITS_TURN
+from stimrig.api.store.holds import LIMITS_TURN
 from tests.api.conftest import Service, soon
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_calibration import WHERE, up

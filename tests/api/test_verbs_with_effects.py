@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from api.cli import main
-from api.workers import diagnosis_verbs
-from hardware_sim import hidden_records
+from stimrig.api.cli import main
+from stimrig.api.workers import diagnosis_verbs
+from stimrig.hardware_sim import hidden_records
 from tests.harness import few_effects
 
 pytestmark = pytest.mark.slow

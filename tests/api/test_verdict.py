@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from api.cli import main
-from api.models import summary
-from api.models.registry import Versions
+from stimrig.api.cli import main
+from stimrig.api.models import summary
+from stimrig.api.models.registry import Versions
 from tests.api.conftest import REAL, run_service
 from tests.harness.patients import Patient, make_record
 

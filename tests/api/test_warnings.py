@@ -6,8 +6,8 @@ import json
 
 import httpx
 
-from api.cli.session_report import report_lines
-from api.web.pages.report_file import comparison_html
+from stimrig.api.cli.session_report import report_lines
+from stimrig.api.web.pages.report_file import comparison_html
 from tests.api.conftest import Service, run_test
 
 WORDS = [

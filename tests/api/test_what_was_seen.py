@@ -10,16 +10,16 @@ from typing import Any
 import httpx
 import pytest
 
-from api.client.errors import Conflict
-from api.client.rest import Client
-from api.clock import Clock
-from api.errors import ApiError
-from api.people.auth import Scope
-from api.store import audit
-from api.store.tables import Token
-from api.web import decisions
-from rig import messages as m
-from rig.messages import WithdrawRequest
+from stimrig.api.client.errors import Conflict
+from stimrig.api.client.rest import Client
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import Scope
+from stimrig.api.store import audit
+from stimrig.api.store.tables import Token
+from stimrig.api.web import decisions
+from stimrig.rig import messages as m
+from stimrig.rig.messages import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
 from tests.api.fake_arm import still
 from tests.api.test_access import csrf, signed_in

@@ -12,8 +12,8 @@ import h5py
 import httpx
 import pytest
 
-from api.models import explanation, reasons
-from hardware_sim import hidden_records
+from stimrig.api.models import explanation, reasons
+from stimrig.hardware_sim import hidden_records
 from tests.api.conftest import Service, run_test, soon, wait_done
 from tests.api.test_access import csrf, signed_in
 from tests.harness import few_effects
@@ -212,8 +212,8 @@ def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, 
 
 
 def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) -> None:
-    import identify
-    from api.workers import diagnosis_verbs, verbs
+    from stimrig import identify
+    from stimrig.api.workers import diagnosis_verbs, verbs
     from tests.api.fake_rig import write_recording
 
     widths = [200.0 if index >= 40 and index // 20 % 2 else 0.0 for index in range(240)]
@@ -351,9 +351,9 @@ def test_two_models_side_by_side(client: httpx.Client, service: Service, model: 
 
 def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
-    from api.web.responses.models import ComparisonOut, DiagnosisOut
-    from api.workers import diagnosis_verbs
-    from api.workers.verbs import comparison, fit
+    from stimrig.api.web.responses.models import ComparisonOut, DiagnosisOut
+    from stimrig.api.workers import diagnosis_verbs
+    from stimrig.api.workers.verbs import comparison, fit
 
     path = str(tmp_path / "record.csv")
     hidden_records.write_csv(hidden_records.generate("asymmetric_relaxation", "middle", 8, rate_hz=200), path)

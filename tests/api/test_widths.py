@@ -14,9 +14,9 @@ import httpx
 import numpy as np
 import pytest
 
-from api.cli import main
-from rig.messages import Bound
 from stimrig import Client
+from stimrig.api.cli import main
+from stimrig.rig.messages import Bound
 from tests.api.conftest import PATIENCE_S, REAL, TOKEN, Service, run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_worker import made_up_csv

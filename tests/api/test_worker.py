@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from api.errors import ApiError
-from api.workers.pool import Pool
+from stimrig.api.errors import ApiError
+from stimrig.api.workers.pool import Pool
 from tests.api.fake_rig import default_widths, muscle
 from tests.api.stub_worker import COMMAND
 
@@ -108,7 +108,7 @@ def made_up_csv(path: Path) -> Path:
 
 
 def test_real_worker_fits_draws_and_tells_bad_data(tmp_path: Path) -> None:
-    from api.workers.pool import WORKER
+    from stimrig.api.workers.pool import WORKER
 
     good, bad = made_up_csv(tmp_path / "good.csv"), tmp_path / "bad.csv"
     bad.write_text("time_s,pulse_width_us,segment\n0,0,prbs\n")

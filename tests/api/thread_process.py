@@ -1,4 +1,4 @@
-"""Workers without a process: what `api.workers.process` starts for the stub, or for a real one, is a thread.
+"""Workers without a process: what `stimrig.api.workers.process` starts for the stub, or for a real one, is a thread.
 
 Tests of what a process does (shut in, killed, out of memory) start processes.
 """
@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from api.workers import child
+from stimrig.api.workers import child
 from tests.api.stub_worker import Stub
 
 STUB = ("the stub worker, as a thread",)

@@ -128,8 +128,9 @@ def test_an_outdated_list_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 LOADED = """
 import importlib, json, pkgutil, sys
-import rig.__main__, rig.devices, rig.sequences
-for package in (rig.devices, rig.sequences):
+import stimrig.rig.__main__
+from stimrig.rig import devices, sequences
+for package in (devices, sequences):
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"{package.__name__}.{module.name}")
 for interface in ("socketcan", "socketcand", "slcan"):

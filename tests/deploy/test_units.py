@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from api.cli.launcher import SEAL_S
-from rig.__main__ import BEAT_PERIOD_S, PROCESS_PRIORITY
-from rig.adapters.driver import PRIORITY
+from stimrig.api.cli.launcher import SEAL_S
+from stimrig.rig.__main__ import BEAT_PERIOD_S, PROCESS_PRIORITY
+from stimrig.rig.adapters.driver import PRIORITY
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"

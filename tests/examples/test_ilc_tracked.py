@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from examples import ilc_controller as ilc
-from identify.fitting import fit
-from identify.model import Model
-from identify.tracking import QUANTITIES, State, follow, model_for_next
+from stimrig.identify.fitting import fit
+from stimrig.identify.model import Model
+from stimrig.identify.tracking import QUANTITIES, State, follow, model_for_next
 from tests.harness.changing import Changing
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record

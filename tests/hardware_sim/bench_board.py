@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from hardware_sim.electrodes import Electrodes, Point
-from hardware_sim.stimulators import p24, sciencemode4
-from hardware_sim.stimulators.board import Board
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.timeline import Timeline
+from stimrig.hardware_sim.electrodes import Electrodes, Point
+from stimrig.hardware_sim.stimulators import p24, sciencemode4
+from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.timeline import Timeline
 
 LL_INIT, LL_CONFIG, LL_STOP = 0, 2, 4
 ML_INIT, ML_UPDATE, ML_STOP, ML_DATA = 30, 32, 34, 36

@@ -20,7 +20,7 @@ class Emulated:
 
     def __init__(self, *arguments: str) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hardware_sim", *arguments],
+            [sys.executable, "-m", "stimrig.hardware_sim", *arguments],
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

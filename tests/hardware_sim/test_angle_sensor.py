@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import serial
 
-from hardware_sim.__main__ import main
-from hardware_sim.angle_sensors.encoder import Encoder, Mounting
-from hardware_sim.angle_sensors.sensor import AngleSensor
-from hardware_sim.load_cells.cells import plain, with_angle
-from hardware_sim.load_cells.frames import AngleReading, Frame, Sample
-from hardware_sim.load_cells.sampler import LoadCell
-from hardware_sim.sampling import Noise, take_in_order
+from stimrig.hardware_sim.__main__ import main
+from stimrig.hardware_sim.angle_sensors.encoder import Encoder, Mounting
+from stimrig.hardware_sim.angle_sensors.sensor import AngleSensor
+from stimrig.hardware_sim.load_cells.cells import plain, with_angle
+from stimrig.hardware_sim.load_cells.frames import AngleReading, Frame, Sample
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.sampling import Noise, take_in_order
 from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 from tests.hardware_sim.test_load_cells import Ramp, listen
 from tests.hardware_sim.test_pairs import p24

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hardware_sim.arm import description, registry
-from hardware_sim.arm.description import Arm
-from hardware_sim.arm.limb import Limb
-from hardware_sim.arm.mechanics import Mechanics
-from hardware_sim.arm.motion import Begin, Motion
-from hardware_sim.arm.passive.standard_linear_solid import Law as Solid
-from hardware_sim.arm.tissue import PLACES, REFERENCE_RAD, Tissue, bare, law
-from hardware_sim.errors import ArmError
-from hardware_sim.patients import registry as patients
-from hardware_sim.scan import modules_with
+from stimrig.hardware_sim.arm import description, registry
+from stimrig.hardware_sim.arm.description import Arm
+from stimrig.hardware_sim.arm.limb import Limb
+from stimrig.hardware_sim.arm.mechanics import Mechanics
+from stimrig.hardware_sim.arm.motion import Begin, Motion
+from stimrig.hardware_sim.arm.passive.standard_linear_solid import Law as Solid
+from stimrig.hardware_sim.arm.tissue import PLACES, REFERENCE_RAD, Tissue, bare, law
+from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.patients import registry as patients
+from stimrig.hardware_sim.scan import modules_with
 
 STEP_S = 1.0 / 1600.0
 RANGE = np.radians(np.linspace(0.0, 140.0, 71))

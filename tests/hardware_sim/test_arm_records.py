@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hardware_sim.arm_records import KINDS, arm_patient, changed, held_angles_rad, record
+from stimrig.hardware_sim.arm_records import KINDS, arm_patient, changed, held_angles_rad, record
 
 KIND_NAMES = tuple(KINDS)
 COLUMNS = {"time_s", "pulse_width_us", "torque_nm", "angle_rad", "velocity_rad_s", "segment"}

@@ -7,10 +7,10 @@ import pytest
 from scipy.signal import lsim
 from scipy.stats import weibull_min
 
-from hardware_sim.errors import PatientError
-from hardware_sim.offline import simulate
-from hardware_sim.patients import registry
-from hardware_sim.patients.changing import ChangingMuscle, Parameters
+from stimrig.hardware_sim.errors import PatientError
+from stimrig.hardware_sim.offline import simulate
+from stimrig.hardware_sim.patients import registry
+from stimrig.hardware_sim.patients.changing import ChangingMuscle, Parameters
 
 PULSES_PER_S = 40
 DEFAULT = Parameters()

@@ -8,12 +8,12 @@ import struct
 import numpy as np
 import pytest
 
-from hardware_sim.errors import FaultError, SettingsError
-from hardware_sim.load_cells.cells import canopen, counts, plain
-from hardware_sim.load_cells.frames import Sample
-from hardware_sim.load_cells.sampler import LoadCell
-from hardware_sim.sampling import Noise
-from hardware_sim.settings import Settings
+from stimrig.hardware_sim.errors import FaultError, SettingsError
+from stimrig.hardware_sim.load_cells.cells import canopen, counts, plain
+from stimrig.hardware_sim.load_cells.frames import Sample
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.sampling import Noise
+from stimrig.hardware_sim.settings import Settings
 from tests.hardware_sim.test_load_cells import Ramp
 from tests.hardware_sim.virtual_host import LAYOUT, VirtualHost
 

@@ -9,10 +9,10 @@ import sys
 
 import pytest
 
-from hardware_sim.factory import make_devices
-from hardware_sim.settings import Settings
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.sciencemode4 import encode
+from stimrig.hardware_sim.factory import make_devices
+from stimrig.hardware_sim.settings import Settings
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.sciencemode4 import encode
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import ROOT
 from tests.hardware_sim.virtual_host import VirtualHost

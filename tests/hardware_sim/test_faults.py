@@ -13,9 +13,9 @@ import can
 import pytest
 import serial
 
-from hardware_sim.faults.registry import library
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.sciencemode4 import encode
+from stimrig.hardware_sim.faults.registry import library
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.sciencemode4 import encode
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 from tests.hardware_sim.virtual_host import VirtualHost

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hardware_sim.patients.hidden.base import Base, draw_base
-from hardware_sim.patients.hidden.chain import Chain
-from hardware_sim.patients.hidden.design import make_design
-from hardware_sim.patients.hidden.draw import (
+from stimrig.hardware_sim.patients.hidden.base import Base, draw_base
+from stimrig.hardware_sim.patients.hidden.chain import Chain
+from stimrig.hardware_sim.patients.hidden.design import make_design
+from stimrig.hardware_sim.patients.hidden.draw import (
     Writer,
     draw_scenario,
     effect_ids,
@@ -19,9 +19,9 @@ from hardware_sim.patients.hidden.draw import (
     outside_kept_ids,
     rng_of,
 )
-from hardware_sim.patients.hidden.effect_free_fit import EffectFreeFit
-from hardware_sim.patients.hidden.kernels import Formulation, NotSuited
-from hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, simulate
+from stimrig.hardware_sim.patients.hidden.effect_free_fit import EffectFreeFit
+from stimrig.hardware_sim.patients.hidden.kernels import Formulation, NotSuited
+from stimrig.hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, simulate
 
 pytestmark = pytest.mark.slow
 

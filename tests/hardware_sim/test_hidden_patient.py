@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hardware_sim.load_cells.cells.plain import Cell
-from hardware_sim.load_cells.sampler import LoadCell
-from hardware_sim.patients import hidden
-from hardware_sim.patients.hidden.draw import Scenario, draw_scenario
-from hardware_sim.patients.hidden.live import HiddenMuscle
-from hardware_sim.patients.hidden.scenario import simulate
-from hardware_sim.sampling import Noise
+from stimrig.hardware_sim.load_cells.cells.plain import Cell
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.patients import hidden
+from stimrig.hardware_sim.patients.hidden.draw import Scenario, draw_scenario
+from stimrig.hardware_sim.patients.hidden.live import HiddenMuscle
+from stimrig.hardware_sim.patients.hidden.scenario import simulate
+from stimrig.hardware_sim.sampling import Noise
 
 pytestmark = pytest.mark.slow
 

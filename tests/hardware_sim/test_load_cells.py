@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import serial
 
-from hardware_sim.load_cells.cells import canopen, counts, plain
-from hardware_sim.load_cells.frames import Frame, Sample
-from hardware_sim.load_cells.sampler import LoadCell
-from hardware_sim.load_cells.transports import slcan, socketcand
-from hardware_sim.pseudo_terminal import PseudoTerminal
-from hardware_sim.reactor import Reactor
-from hardware_sim.sampling import Noise
+from stimrig.hardware_sim.load_cells.cells import canopen, counts, plain
+from stimrig.hardware_sim.load_cells.frames import Frame, Sample
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.load_cells.transports import slcan, socketcand
+from stimrig.hardware_sim.pseudo_terminal import PseudoTerminal
+from stimrig.hardware_sim.reactor import Reactor
+from stimrig.hardware_sim.sampling import Noise
 from tests.hardware_sim.emulated import emulated
 
 LAYOUT = struct.Struct("<fHBB")

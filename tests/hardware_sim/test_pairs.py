@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import serial
 
-from hardware_sim.offline import simulate
-from hardware_sim.patients import registry
-from hardware_sim.stimulators import sciencemode2, sciencemode4
+from stimrig.hardware_sim.offline import simulate
+from stimrig.hardware_sim.patients import registry
+from stimrig.hardware_sim.stimulators import sciencemode2, sciencemode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import emulated
 
@@ -80,9 +80,9 @@ CELLS: dict[str, tuple[list[str], int, int, Decode]] = {
 
 
 def test_every_kind_there_is_is_paired() -> None:
-    from hardware_sim import stimulators
-    from hardware_sim.load_cells import cells, transports
-    from hardware_sim.scan import modules_with
+    from stimrig.hardware_sim import stimulators
+    from stimrig.hardware_sim.load_cells import cells, transports
+    from stimrig.hardware_sim.scan import modules_with
 
     assert all(set(names) <= {*sum(PAIRS, ())} for names in (PLAYERS, CELLS))
     assert set(PLAYERS) == set(modules_with(stimulators, "Firmware"))

@@ -11,12 +11,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
-from hardware_sim.errors import PatientError
-from hardware_sim.offline import simulate
-from hardware_sim.patients import registry
-from hardware_sim.patients.calcium import CalciumMuscle
-from hardware_sim.patients.paper import PaperMuscle
-from hardware_sim.patients.paper import Parameters as PaperParameters
+from stimrig.hardware_sim.errors import PatientError
+from stimrig.hardware_sim.offline import simulate
+from stimrig.hardware_sim.patients import registry
+from stimrig.hardware_sim.patients.calcium import CalciumMuscle
+from stimrig.hardware_sim.patients.paper import PaperMuscle
+from stimrig.hardware_sim.patients.paper import Parameters as PaperParameters
 from tests.harness.muscle import Patient
 
 PERIOD_S = 0.025

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from hardware_sim.__main__ import main
+from stimrig.hardware_sim.__main__ import main
 from tests.hardware_sim.emulated import ROOT, Emulated, emulated, wait_for
 
 pytestmark = pytest.mark.wire
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.wire
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "hardware_sim", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=30
+        [sys.executable, "-m", "stimrig.hardware_sim", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=30
     )
 
 
@@ -57,7 +57,7 @@ def test_it_ends_with_its_parent() -> None:
             sys.executable,
             "-c",
             "import subprocess, sys, time\n"
-            "subprocess.Popen([sys.executable, '-m', 'hardware_sim', '--die-with-parent'])\n"
+            "subprocess.Popen([sys.executable, '-m', 'stimrig.hardware_sim', '--die-with-parent'])\n"
             "time.sleep(60)",
         ],
         cwd=ROOT,
@@ -87,7 +87,7 @@ def test_patient_file_faults_and_readable_lines(tmp_path: Path) -> None:
         assert rig.ready["patient"] == str(path)
         assert rig.ask(cmd="state")["faults"] == ["no_ack", "torque_saturated"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "hardware_sim", "--no-json"], cwd=ROOT, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "stimrig.hardware_sim", "--no-json"], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
     assert process.stdout.readline().startswith("stimulator: /dev/pts/")

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import pytest
 
-from hardware_sim.stimulators import rehastim2, sciencemode2
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.sciencemode2 import encode
+from stimrig.hardware_sim.stimulators import rehastim2, sciencemode2
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.sciencemode2 import encode
 from tests.hardware_sim.bench_board import Bench
 
 INIT, INIT_ACK, UNKNOWN, WATCHDOG, GET_MODE, INIT_LIST, START, STOP, SINGLE, ERROR = 1, 2, 3, 4, 10, 30, 32, 34, 36, 38

@@ -11,8 +11,8 @@ import time
 import pytest
 import serial
 
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.sciencemode2 import Decoder, encode
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.sciencemode2 import Decoder, encode
 from tests.hardware_sim.emulated import emulated, wait_for
 
 pytestmark = pytest.mark.wire

@@ -6,11 +6,11 @@ import struct
 from itertools import pairwise
 from typing import Any
 
-from hardware_sim.factory import make_devices
-from hardware_sim.load_cells.frames import Frame
-from hardware_sim.settings import Settings
-from hardware_sim.stimulators.framing import Packet
-from hardware_sim.stimulators.sciencemode4 import Decoder, encode
+from stimrig.hardware_sim.factory import make_devices
+from stimrig.hardware_sim.load_cells.frames import Frame
+from stimrig.hardware_sim.settings import Settings
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.sciencemode4 import Decoder, encode
 
 LAYOUT = struct.Struct("<fHBB")
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from hardware_sim.patients.hidden import recruitment
-from hardware_sim.patients.hidden.chain import Chain
-from hardware_sim.patients.hidden.draw import Scenario
-from hardware_sim.patients.hidden.scenario import split
-from identify.experiments.adaptive import Decision, Target, decide
-from identify.records.record import Record
+from stimrig.hardware_sim.patients.hidden import recruitment
+from stimrig.hardware_sim.patients.hidden.chain import Chain
+from stimrig.hardware_sim.patients.hidden.draw import Scenario
+from stimrig.hardware_sim.patients.hidden.scenario import split
+from stimrig.identify.experiments.adaptive import Decision, Target, decide
+from stimrig.identify.records.record import Record
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 
 PULSE_RATE_HZ = 40.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from identify.records.record import Record
+from stimrig.identify.records.record import Record
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 
 PULSE_RATE_HZ = 40.0

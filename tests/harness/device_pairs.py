@@ -9,10 +9,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hardware_sim import stimulators
-from hardware_sim.load_cells import cells, transports
-from hardware_sim.scan import modules_with
-from rig import archive
+from stimrig.hardware_sim import stimulators
+from stimrig.hardware_sim.load_cells import cells, transports
+from stimrig.hardware_sim.scan import modules_with
+from stimrig.rig import archive
 from tests.harness.processes import Bench, RigClient, control, kill_hard, short_plan
 
 SAME_CLOCK_S = 2e-4

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from unittest import mock
 
-from identify import effects
+from stimrig.identify import effects
 
 
 @contextlib.contextmanager

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from api.errors import ApiError
-from api.workers.pool import Pool
-from api.workers.process import Places
+from stimrig.api.errors import ApiError
+from stimrig.api.workers.pool import Pool
+from stimrig.api.workers.process import Places
 from tests.harness.hostile_shapes import SECRET, Hostile, good
 
 LONGEST_LINE = 400

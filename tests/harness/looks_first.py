@@ -7,7 +7,7 @@ from typing import Any
 
 import httpx
 
-from api.client.connection import SendsVersions
+from stimrig.api.client.connection import SendsVersions
 
 
 class LooksFirst(SendsVersions):

@@ -1,4 +1,4 @@
-"""Records the streams of `rig.lsl_outlets` as LabRecorder does, and compares them with a sealed recording.
+"""Records the streams of `stimrig.rig.lsl_outlets` as LabRecorder does, and compares them with a sealed recording.
 
     python -m tests.harness.lsl_recorder NAME FILE.npz [modest]
 
@@ -82,7 +82,7 @@ class Streams:
         """Start outlets, once more where they were killed."""
         log = self._bench.folder / f"{self._name}-{len(self.started)}.log"
         source = ("--emulator-json", json.dumps(self._bench.emulator.ready), "--data", str(self._bench.data))
-        self.started.append(Process("rig.lsl_outlets", *source, "--name", self._name, log=log))
+        self.started.append(Process("stimrig.rig.lsl_outlets", *source, "--name", self._name, log=log))
         return self.started[-1]
 
     def wait_sent(self, test_id: str, timeout_s: float = 60.0) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from identify.records.record import Record
+from stimrig.identify.records.record import Record
 from tests.harness.muscle import Patient
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psycopg
 
-from api.store import Store
+from stimrig.api.store import Store
 
 STARTS_S = 60.0
 TEMPLATE = "stimrig_template"

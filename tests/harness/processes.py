@@ -155,7 +155,7 @@ class Bench:
     folder
         Where data, logs and the socket go; a socket's path must be short, so it lies in a temporary folder.
     emulator_options
-        Passed to `python -m hardware_sim`.
+        Passed to `python -m stimrig.hardware_sim`.
     """
 
     def __init__(self, folder: Path, *emulator_options: str, speed: float = 1.0) -> None:
@@ -165,13 +165,14 @@ class Bench:
         self._socket_folder = tempfile.TemporaryDirectory(prefix="rig-")
         self.socket = Path(self._socket_folder.name) / "rig.sock"
         self.data = folder / "data"
-        self.emulator = Process("hardware_sim", "--speed", f"{speed:g}", *emulator_options, log=folder / "emulator.log")
+        log = folder / "emulator.log"
+        self.emulator = Process("stimrig.hardware_sim", "--speed", f"{speed:g}", *emulator_options, log=log)
         with contextlib.suppress(OSError):  # hardware does not wait for a processor, so neither should its stand-in
             os.sched_setscheduler(self.emulator.popen.pid, os.SCHED_RR, os.sched_param(10))
         self.rig: Process | None = None
         self._clients: list[RigClient] = []
 
-    def start_rig(self, *options: str, module: str = "rig", watch: dict[str, float] | None = None) -> RigClient:
+    def start_rig(self, *options: str, module: str = "stimrig.rig", watch: dict[str, float] | None = None) -> RigClient:
         """Start the rig and connect to it.
 
         `module` is what runs it, for benches that break its host; `watch` takes the place of an emulated rig's, which

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-import identify
-from api.clock import Clock
-from api.models.registry import Versions
-from api.store import Store
-from api.store.tables import Note, Participant, Recording, Test
+from stimrig import identify
+from stimrig.api.clock import Clock
+from stimrig.api.models.registry import Versions
+from stimrig.api.store import Store
+from stimrig.api.store.tables import Note, Participant, Recording, Test
 from tests.harness.muscle import Patient
 
 FIRST = datetime(2026, 8, 3, 11, 0, tzinfo=UTC)

@@ -24,8 +24,8 @@ from tests.harness.processes import CLINIC_WATCH, ROOT, Bench, RigClient, contro
 FITTER = """
 import sys, time
 from pathlib import Path
-from identify.fitting import fit
-from identify import read
+from stimrig.identify.fitting import fit
+from stimrig.identify import read
 fits = 0
 while True:
     newest = sorted(Path(sys.argv[1]).glob('*.h5'))[-1:]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import identify
-from identify.records.record import Record
-from identify.results import Diagnosis, Improvement
+from stimrig import identify
+from stimrig.identify.records.record import Record
+from stimrig.identify.results import Diagnosis, Improvement
 from tests.harness import few_effects
 from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles

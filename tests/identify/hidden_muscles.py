@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.records.record import Record
+from stimrig.identify.records.record import Record
 
 FINE_HZ = 1000
 TOP_US = 300.0

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-import identify
-from identify.errors import BadRequest
-from identify.estimation.earlier import USUAL, learn_change
-from identify.experiments.adaptive import SETTLED_S, Target, decide
-from identify.experiments.designs import pieces
-from identify.experiments.reach import Reach, reach, worse
-from identify.records.record import Record
-from rig.sequences import build
+from stimrig import identify
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.earlier import USUAL, learn_change
+from stimrig.identify.experiments.adaptive import SETTLED_S, Target, decide
+from stimrig.identify.experiments.designs import pieces
+from stimrig.identify.experiments.reach import Reach, reach, worse
+from stimrig.identify.records.record import Record
+from stimrig.rig.sequences import build
 from tests.harness.adaptive import Muscle, Played, play, recorded, shaped, sigmoid
 from tests.identify import hidden_muscles
 

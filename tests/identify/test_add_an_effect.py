@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from api.cli import main
-from hardware_sim import hidden_records
+from stimrig.api.cli import main
+from stimrig.hardware_sim import hidden_records
 from tests.harness import few_effects
 
 PAGE = Path(__file__).parents[2] / "docs" / "add-an-effect.md"

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import identify
-from identify.methods import methods
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.methods import methods
+from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 
 METHODS = tuple(methods())

@@ -8,9 +8,9 @@ from functools import cache
 
 import pytest
 
-import identify
-from api.models.explanation import headline
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.api.models.explanation import headline
+from stimrig.identify.records.record import Record
 from tests.harness.carried_sessions import SESSIONS, as_record, fine_session, muscle, session
 from tests.identify import hidden_muscles
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import identify
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.records.record import Record
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 

@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-import identify
-from identify.criticism import compare
-from identify.criticism.correlation import _auto, _bands, _cross, _filtered
-from identify.dynamics.make_grid import make_grid
+from stimrig import identify
+from stimrig.identify.criticism import compare
+from stimrig.identify.criticism.correlation import _auto, _bands, _cross, _filtered
+from stimrig.identify.dynamics.make_grid import make_grid
 from tests.identify import hidden_muscles
 
 

@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from hardware_sim.hidden_records import generate
-from identify.diagnosis import diagnose
-from identify.errors import Cancelled
-from identify.records.record import Record
+from stimrig.hardware_sim.hidden_records import generate
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.errors import Cancelled
+from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
 from tests.identify import hidden_muscles
 from tests.identify.dear import diagnosed

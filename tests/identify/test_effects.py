@@ -7,14 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from identify import fit
-from identify.effects import get, library, registry
-from identify.effects.base import STAGES
-from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.prepare import fit_plain, prepare
-from identify.model import Model
-from identify.records.record import Record
-from identify.simulation.problem import Problem
+from stimrig.identify import fit
+from stimrig.identify.effects import get, library, registry
+from stimrig.identify.effects.base import STAGES
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
 from tests.identify import hidden_muscles
 
 CONTRACT = {

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identify.experiments import designs, next_experiment
-from identify.experiments.designs import SHAPES
-from rig.sequences import build
+from stimrig.identify.experiments import designs, next_experiment
+from stimrig.identify.experiments.designs import SHAPES
+from stimrig.rig.sequences import build
 from tests.identify import hidden_muscles
 
 

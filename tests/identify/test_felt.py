@@ -8,16 +8,16 @@ import h5py
 import numpy as np
 import pytest
 
-import identify
-from identify.criticism import compare
-from identify.criticism.correlation import correlation_tests
-from identify.dynamics import pulse_grid
-from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import Grid
-from identify.methods import methods
-from identify.records.read import read
-from identify.records.record import OPTIONAL, Record
-from identify.simulation.predict import predict
+from stimrig import identify
+from stimrig.identify.criticism import compare
+from stimrig.identify.criticism.correlation import correlation_tests
+from stimrig.identify.dynamics import pulse_grid
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.methods import methods
+from stimrig.identify.records.read import read
+from stimrig.identify.records.record import OPTIONAL, Record
+from stimrig.identify.simulation.predict import predict
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 from tests.harness.patients import make_record, protocol
 
@@ -301,7 +301,7 @@ def test_bad_csv_columns_are_one_line(tmp_path, cells, says):
 
 
 def test_exported_records_keep_both(tmp_path):
-    from api.workers.verbs import export_csv
+    from stimrig.api.workers.verbs import export_csv
 
     seal(tmp_path / "r.h5", sync=True)
     sealed = read(tmp_path / "r.h5")

@@ -8,8 +8,8 @@ import h5py
 import numpy as np
 import pytest
 
-import identify
-from identify.records.read import read
+from stimrig import identify
+from stimrig.identify.records.read import read
 from tests.harness.patients import Patient, make_record
 
 HEADER = "time_s,pulse_width_us,torque_nm,segment"

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import identify
-from identify.dynamics.linear import SecondOrder
-from identify.estimation.evaluation import BLOCK_S, FOLDS, held_out_change
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.estimation.joint import solve
-from identify.estimation.prepare import fit_plain, prepare
-from identify.paper import muscle
-from identify.records.record import Record
-from identify.simulation.problem import Problem
+from stimrig import identify
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.estimation.evaluation import BLOCK_S, FOLDS, held_out_change
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.estimation.joint import solve
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.paper import muscle
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
 from tests.harness.patients import Patient, make_record
 
 NOISY = 0.05

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from identify.dynamics import pulse_grid
-from identify.dynamics.boundary import boundary_states
-from identify.dynamics.linear import SecondOrder
-from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import runs
-from identify.dynamics.second_order import transition
-from identify.errors import BadRecord
-from identify.noise.ar1 import best_ar1, log_likelihood, whiten
-from identify.records.record import Record
+from stimrig.identify.dynamics import pulse_grid
+from stimrig.identify.dynamics.boundary import boundary_states
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.pulse_grid import runs
+from stimrig.identify.dynamics.second_order import transition
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.noise.ar1 import best_ar1, log_likelihood, whiten
+from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
 
 PULSE_RATE_HZ = 40.0

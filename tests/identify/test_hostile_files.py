@@ -10,10 +10,10 @@ import h5py
 import numpy as np
 import pytest
 
-import identify
-from identify.records import bounds
-from identify.records.hdf5 import StrictFile
-from identify.strict_json import BadJson, parse
+from stimrig import identify
+from stimrig.identify.records import bounds
+from stimrig.identify.records.hdf5 import StrictFile
+from stimrig.identify.strict_json import BadJson, parse
 from tests.harness import hostile_shapes as shapes
 
 pytestmark = pytest.mark.slow

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import identify
-from identify.errors import BadRequest
-from identify.estimation.uncertainty import prediction_band
-from identify.model import Model
+from stimrig import identify
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.uncertainty import prediction_band
+from stimrig.identify.model import Model
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 from tests.identify.dear import fatigued, improved_with_a_delay

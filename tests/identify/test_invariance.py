@@ -13,10 +13,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from identify import Record, fit
-from identify.diagnosis import diagnose
-from identify.model import Model
-from identify.records.record import Pulses
+from stimrig.identify import Record, fit
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Pulses
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 

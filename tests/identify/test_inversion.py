@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-import identify
-from identify.dynamics.linear import Discrete, SecondOrder
-from identify.errors import BadModel, BadRequest, IdentifyError
-from identify.inversion import Inversion, Reference, invert
-from identify.inversion.demand import BEND, RIDGE, Banded, Bounds, best_demand
-from identify.inversion.plant import on_pulses
-from identify.inversion.table import read_reference
-from identify.model import Model
-from identify.recruitment.curve import Curve
-from identify.recruitment.sigmoid import SigmoidBasis
+from stimrig import identify
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder
+from stimrig.identify.errors import BadModel, BadRequest, IdentifyError
+from stimrig.identify.inversion import Inversion, Reference, invert
+from stimrig.identify.inversion.demand import BEND, RIDGE, Banded, Bounds, best_demand
+from stimrig.identify.inversion.plant import on_pulses
+from stimrig.identify.inversion.table import read_reference
+from stimrig.identify.model import Model
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment.sigmoid import SigmoidBasis
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 from tests.identify import hidden_muscles
 
@@ -190,7 +190,7 @@ def test_with_effects_the_prediction_follows_where_the_plain_inverse_does_not(hi
     wanted = smooth(0.5 * model.figures()["plateau_nm"]["value"])
     found = invert(model, Reference.of(wanted))
     plain = invert(model.with_(effects=()), Reference.of(wanted))
-    from identify.simulation.pulses import above_rest
+    from stimrig.identify.simulation.pulses import above_rest
 
     def error(widths_us: np.ndarray) -> float:
         return float(np.linalg.norm(above_rest(model, widths_us, 40.0) - wanted) / np.linalg.norm(wanted))

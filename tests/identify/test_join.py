@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import identify
-from identify import Record
-from identify.dynamics.make_grid import make_grid
-from identify.dynamics.pulse_grid import Grid, runs
-from identify.errors import BadRecord
-from identify.estimation.prepare import fit_plain, prepare
-from identify.records import parts_csv
-from identify.records.join import PAUSE_S, join
-from identify.records.record import Part, Pulses, Source
+from stimrig import identify
+from stimrig.identify import Record
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.records import parts_csv
+from stimrig.identify.records.join import PAUSE_S, join
+from stimrig.identify.records.record import Part, Pulses, Source
 
 
 def record(

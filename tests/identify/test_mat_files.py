@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
-import identify
-from identify import plain_mat
-from identify.records.mat_file import BadMat, variables
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify import plain_mat
+from stimrig.identify.records.mat_file import BadMat, variables
+from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 
 pytestmark = pytest.mark.slow

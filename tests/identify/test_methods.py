@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import identify
-from identify.dynamics.linear import Discrete, SecondOrder
-from identify.dynamics.make_grid import make_grid
-from identify.estimation.fit_statistics import best_fit_percent
-from identify.methods import Method, method_of, methods
-from identify.methods.support.output_error import choose_order, output_error
-from identify.paper import table1
+from stimrig import identify
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.methods import Method, method_of, methods
+from stimrig.identify.methods.support.output_error import choose_order, output_error
+from stimrig.identify.paper import table1
 from tests.harness.patients import Patient, make_record, multilevel, prbs
 
 ALL = ("maximum-likelihood", "narx", "ramp-deconvolution", "separable-least-squares", "two-stage")

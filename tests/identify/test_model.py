@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-import identify
-from identify.dynamics.linear import Discrete, SecondOrder
-from identify.estimation.quality import range_warnings
-from identify.records.record import Record
-from identify.recruitment.curve import Curve
-from identify.recruitment.power import PowerBasis
-from identify.recruitment.sigmoid import SigmoidBasis
-from identify.recruitment.spline import SplineBasis
+from stimrig import identify
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder
+from stimrig.identify.estimation.quality import range_warnings
+from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment.power import PowerBasis
+from stimrig.identify.recruitment.sigmoid import SigmoidBasis
+from stimrig.identify.recruitment.spline import SplineBasis
 from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 

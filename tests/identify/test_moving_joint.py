@@ -12,22 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-import identify
-from hardware_sim.arm_patient import arm_patient
-from hardware_sim.arm_records import changed, record
-from identify.dynamics.make_grid import make_grid
-from identify.effects import get
-from identify.effects.kernels import relaxed
-from identify.errors import BadModel, BadRequest
-from identify.estimation.quality import quality, range_warnings
-from identify.fitting import MOVING_JOINT
-from identify.inversion import Reference, invert
-from identify.inversion.table import read_reference
-from identify.model import Model
-from identify.records.join import join
-from identify.records.record import Record
-from identify.simulation.joint_surface import Surfaces
-from identify.simulation.pulses import Motion, above_rest
+from stimrig import identify
+from stimrig.hardware_sim.arm_patient import arm_patient
+from stimrig.hardware_sim.arm_records import changed, record
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.effects import get
+from stimrig.identify.effects.kernels import relaxed
+from stimrig.identify.errors import BadModel, BadRequest
+from stimrig.identify.estimation.quality import quality, range_warnings
+from stimrig.identify.fitting import MOVING_JOINT
+from stimrig.identify.inversion import Reference, invert
+from stimrig.identify.inversion.table import read_reference
+from stimrig.identify.model import Model
+from stimrig.identify.records.join import join
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.joint_surface import Surfaces
+from stimrig.identify.simulation.pulses import Motion, above_rest
 from tests.harness.made_once import made_once
 
 ARM = 12

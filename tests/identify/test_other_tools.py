@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import identify
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.records.record import Record
 from tests.harness.muscle import FINE_HZ
 from tests.harness.patients import Patient, make_record, protocol
 
@@ -318,7 +318,7 @@ def test_degrees_under_the_name_of_radians_are_refused(tmp_path: Path, header: t
 
 
 def test_joined_records_keep_what_was_said_of_their_parts(tmp_path: Path) -> None:
-    from identify.records.join import join
+    from stimrig.identify.records.join import join
 
     path = tmp_path / "data.csv"
     path.write_bytes(german(measured()))

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from identify import effects
-from identify.effects import own_file
+from stimrig.identify import effects
+from stimrig.identify.effects import own_file
 
 pytestmark = pytest.mark.slow
 
@@ -100,7 +100,7 @@ def test_the_command_line_says_it_in_one_line(tmp_path: Path, verb: list[str]) -
     (tmp_path / "nothing.csv").write_text((tmp_path / "r.csv").read_text())
     (tmp_path / "mine.py").write_text(good().replace('stage="output"', 'stage="outptu"'))
     environment = {"STIMRIG_EFFECTS_DIR": str(tmp_path), "PYTHONPATH": str(PAGE.parents[1])}
-    command = [sys.executable, "-m", "api.cli", *verb]
+    command = [sys.executable, "-m", "stimrig.api.cli", *verb]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.strip().splitlines()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
-from identify.effects import get
-from identify.estimation.prepare import fit_plain, prepare
-from identify.records.join import join
-from identify.simulation.problem import Problem
-from identify.simulation.setup import Setup
+from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.records.join import join
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
 from tests.identify.test_join import record
 
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import identify
-from identify.criticism import compare
-from identify.dynamics.make_grid import make_grid
-from identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent
-from identify.estimation.quality import quality
+from stimrig import identify
+from stimrig.identify.criticism import compare
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent
+from stimrig.identify.estimation.quality import quality
 from tests.harness.patients import Patient, make_record
 
 

@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 import pytest
 
-import identify
-from identify.errors import BadRecord
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records.record import Record
 from tests.identify.test_felt import seal
 
 
@@ -91,7 +91,7 @@ def test_impossible_angles_are_one_line(tmp_path: Path, spoil: str, says: str):
 
 
 def test_csv_keeps_both_columns(tmp_path: Path):
-    from api.workers.verbs import export_csv
+    from stimrig.api.workers.verbs import export_csv
 
     record = sealed(tmp_path / "a.h5")
     export_csv(str(tmp_path / "a.h5"), lambda *_: None, str(tmp_path / "a.csv"))

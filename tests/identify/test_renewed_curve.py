@@ -7,20 +7,20 @@ from functools import cache
 import numpy as np
 import pytest
 
-import identify
-from hardware_sim.arm_patient import ArmPatient, arm_patient
-from hardware_sim.arm_records import record
-from identify.diagnosis.result import steps
-from identify.diagnosis.search import search_effects
-from identify.effects import get
-from identify.estimation.effect_fit import fitted_with, with_effects
-from identify.estimation.joint import Fitted
-from identify.estimation.prepare import prepare
-from identify.estimation.renewed_curve import renewed_curve
-from identify.estimation.rows import fitted_rows
-from identify.fitting import MOVING_JOINT
-from identify.methods.maximum_likelihood import METHOD
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
+from stimrig.hardware_sim.arm_records import record
+from stimrig.identify.diagnosis.result import steps
+from stimrig.identify.diagnosis.search import search_effects
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.effect_fit import fitted_with, with_effects
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.prepare import prepare
+from stimrig.identify.estimation.renewed_curve import renewed_curve
+from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.fitting import MOVING_JOINT
+from stimrig.identify.methods.maximum_likelihood import METHOD
+from stimrig.identify.records.record import Record
 from tests.harness.made_once import made_once
 from tests.identify.test_moving_joint import as_record, joined
 
@@ -70,7 +70,7 @@ def test_a_model_is_not_lost_where_no_better_curve_is_found(monkeypatch: pytest.
         raise np.linalg.LinAlgError("not positive definite")
 
     base = first()
-    monkeypatch.setattr(f"identify.estimation.renewed_curve.{step}", fails)
+    monkeypatch.setattr(f"stimrig.identify.estimation.renewed_curve.{step}", fails)
     assert renewed_curve(base) is base
 
 

@@ -14,9 +14,9 @@ from typing import Any
 import jsonschema_rs
 import pytest
 
-import identify
-from identify.methods import methods
-from identify.shown import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
+from stimrig import identify
+from stimrig.identify.methods import methods
+from stimrig.identify.shown import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
 from tests.harness import few_effects
 from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
@@ -116,7 +116,7 @@ def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
 
 def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch):
     """Every effect that was tried is made a rival, so that there is a test to plan."""
-    monkeypatch.setattr(import_module("identify.diagnosis.result"), "RIVAL", 0.0)
+    monkeypatch.setattr(import_module("stimrig.identify.diagnosis.result"), "RIVAL", 0.0)
     with few_effects.only("fatigue", "potentiation", "threshold_drift"):
         found = identify.diagnose(record)
     assert found.missing[0]["next_experiment_plan"]["segments"] and errors("diagnosis", found.to_dict()) == []
@@ -196,7 +196,7 @@ def test_summaries_say_what_was_found(results):
 
 
 def _discrete():
-    from identify.dynamics.linear import Discrete
+    from stimrig.identify.dynamics.linear import Discrete
 
     return Discrete((0.1, 0.1), (1.0, -1.2, 0.4), 1, 0.025)
 
@@ -281,7 +281,7 @@ def test_an_estimate_without_a_deviation_has_no_plus_minus():
 
 
 def test_results_are_drawn_by_the_registered_plotter(results, record, monkeypatch):
-    monkeypatch.setattr("identify.shown._plotters", [])
+    monkeypatch.setattr("stimrig.identify.shown._plotters", [])
     with pytest.raises(identify.BadRequest, match="no plotter is registered"):
         results["model"].plot(record)
     drawn = []

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import identify
-from identify.errors import BadRequest
-from identify.experiments.adaptive import Target
-from identify.model import Model
-from identify.records.record import Record
+from stimrig import identify
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.experiments.adaptive import Target
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
 from tests.harness.adaptive import play, recorded, shaped, sigmoid
 
 pytestmark = pytest.mark.slow

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from numba.core.compiler_lock import global_compiler_lock
 
-from identify.diagnosis import candidates, diagnose
-from identify.diagnosis.side_by_side import side_by_side
-from identify.errors import Cancelled
+from stimrig.identify.diagnosis import candidates, diagnose
+from stimrig.identify.diagnosis.side_by_side import side_by_side
+from stimrig.identify.errors import Cancelled
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 

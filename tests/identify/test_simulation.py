@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import identify
-from hardware_sim.hidden_records import generate
-from identify.effects import get
-from identify.estimation.band_effect import predict_fitted
-from identify.estimation.effect_fit import fitted_with, try_effect
-from identify.estimation.prepare import fit_plain, prepare
-from identify.noise.level import NoiseLevel, band_part, profile, whitened
-from identify.noise.slow_and_white import whiten_rows
-from identify.records.record import Record
-from identify.simulation.problem import Problem
+from stimrig import identify
+from stimrig.hardware_sim.hidden_records import generate
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.band_effect import predict_fitted
+from stimrig.identify.estimation.effect_fit import fitted_with, try_effect
+from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.noise.level import NoiseLevel, band_part, profile, whitened
+from stimrig.identify.noise.slow_and_white import whiten_rows
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.problem import Problem
 from tests.identify import hidden_muscles
 
 
@@ -102,7 +102,7 @@ def test_held_out_rows_change_nothing_of_a_fit():
 
 
 def test_warming_up_runs_to_its_end():
-    from identify.diagnosis.warm_up import warm
+    from stimrig.identify.diagnosis.warm_up import warm
 
     warm()
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import identify
-from identify.effects import registry
-from identify.effects.base import Form, Scene
-from identify.model_schema import JOINT_SETTINGS
+from stimrig import identify
+from stimrig.identify.effects import registry
+from stimrig.identify.effects.base import Form, Scene
+from stimrig.identify.model_schema import JOINT_SETTINGS
 from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hardware_sim.offline import simulate
-from hardware_sim.patients import registry
-from identify.dynamics.make_grid import make_grid
-from identify.effects import registry as effects
-from identify.errors import BadModel
-from identify.fitting import fit
-from identify.model import Model
-from identify.records.record import Part, Record
-from identify.simulation.predict import predict, problem_of
-from identify.simulation.pulses import above_rest
-from identify.tracking import State, begin, follow, model_for_next, moved_model, passed
-from identify.tracking.carried import rested, slow_forms, with_states
+from stimrig.hardware_sim.offline import simulate
+from stimrig.hardware_sim.patients import registry
+from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.effects import registry as effects
+from stimrig.identify.errors import BadModel
+from stimrig.identify.fitting import fit
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Part, Record
+from stimrig.identify.simulation.predict import predict, problem_of
+from stimrig.identify.simulation.pulses import above_rest
+from stimrig.identify.tracking import State, begin, follow, model_for_next, moved_model, passed
+from stimrig.identify.tracking.carried import rested, slow_forms, with_states
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
@@ -179,7 +179,7 @@ def test_a_model_without_such_effects_is_followed_as_ever(plain: Model) -> None:
 
 
 class Person:
-    """`hardware_sim.patients.changing` on one clock."""
+    """`stimrig.hardware_sim.patients.changing` on one clock."""
 
     def __init__(self, **changes: float) -> None:
         self.muscle = registry.make("changing", {"natural_period_s": 0.2, **changes})

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from identify.errors import BadModel, BadRecord
-from identify.fitting import fit
-from identify.model import Model
-from identify.records.record import Record
-from identify.tracking import (
+from stimrig.identify.errors import BadModel, BadRecord
+from stimrig.identify.fitting import fit
+from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
+from stimrig.identify.tracking import (
     USUAL,
     Outcome,
     State,

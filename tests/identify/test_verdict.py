@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from identify.diagnosis import verdict
-from identify.diagnosis.held_out_error import HeldOutError
-from identify.diagnosis.residual_structure import ResidualStructure
-from identify.diagnosis.search import EffectSearch
-from identify.diagnosis.verdict import Verdict, judge, shares
-from identify.effects import get
+from stimrig.identify.diagnosis import verdict
+from stimrig.identify.diagnosis.held_out_error import HeldOutError
+from stimrig.identify.diagnosis.residual_structure import ResidualStructure
+from stimrig.identify.diagnosis.search import EffectSearch
+from stimrig.identify.diagnosis.verdict import Verdict, judge, shares
+from stimrig.identify.effects import get
 
 FIRST, SECOND, EFFORT, TREMOR = "fatigue", "output_saturation", "voluntary_effort", "tremor"
 

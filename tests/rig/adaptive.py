@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from rig.errors import RigError
-from rig.messages import AdaptivePlan, SegmentPlan
+from stimrig.rig.errors import RigError
+from stimrig.rig.messages import AdaptivePlan, SegmentPlan
 from tests.rig.fakes import VirtualRig, hold, rest
 
 RATE_HZ = 40.0

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.errors import DeviceError
-from rig.signals import ANGLE_SAMPLE, AngleScale, Block
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.signals import ANGLE_SAMPLE, AngleScale, Block
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 RATE_HZ = 200.0

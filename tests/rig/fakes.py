@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from rig import archive, assembly, journal, limits, plan
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.acquire.halt import Halt
-from rig.acquire.health import DEFAULT_WATCH, Watch
-from rig.acquire.receiver import Receiver
-from rig.acquire.run import RunResult, TestRun
-from rig.adapters.files import Files
-from rig.errors import DeviceError
-from rig.gate import Gate
-from rig.journal import Journal, Kind
-from rig.limits import Admitted, Steps
-from rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
-from rig.signals import SAMPLE, Ack, Block, LateError
-from rig.tasks import Outcome
+from stimrig.rig import archive, assembly, journal, limits, plan
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.acquire.halt import Halt
+from stimrig.rig.acquire.health import DEFAULT_WATCH, Watch
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.acquire.run import RunResult, TestRun
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.gate import Gate
+from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.limits import Admitted, Steps
+from stimrig.rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
+from stimrig.rig.signals import SAMPLE, Ack, Block, LateError
+from stimrig.rig.tasks import Outcome
 from tests.rig.angle import FakeSensor
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 

@@ -10,14 +10,14 @@ from typing import Any, TypeVar
 
 import pytest
 
-from rig import config
-from rig.control import pair
-from rig.control.rig import Rig
-from rig.errors import DeviceError
-from rig.machine import Disk
-from rig.messages import Event, Profile, Status, StopEvidence, TestPlan
-from rig.signals import Block
-from rig.tasks import Outcome, Task, Tasks
+from stimrig.rig import config
+from stimrig.rig.control import pair
+from stimrig.rig.control.rig import Rig
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.machine import Disk
+from stimrig.rig.messages import Event, Profile, Status, StopEvidence, TestPlan
+from stimrig.rig.signals import Block
+from stimrig.rig.tasks import Outcome, Task, Tasks
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, hold, rest
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 

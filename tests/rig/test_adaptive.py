@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig import plan
-from rig.errors import BusyError, RigError, TooLateError
-from rig.messages import AHEAD, SegmentPlan
+from stimrig.rig import plan
+from stimrig.rig.errors import BusyError, RigError, TooLateError
+from stimrig.rig.messages import AHEAD, SegmentPlan
 from tests.rig.adaptive import FIXED, RATE_HZ, adaptive, extend, hold, refusals, rest, widths_sent
 from tests.rig.fakes import VirtualRig, slow_work
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig import archive, assembly, journal
-from rig.errors import JournalError, RecordingError
-from rig.journal import Kind, LaidBlock
-from rig.signals import PulseStatus
+from stimrig.rig import archive, assembly, journal
+from stimrig.rig.errors import JournalError, RecordingError
+from stimrig.rig.journal import Kind, LaidBlock
+from stimrig.rig.signals import PulseStatus
 from tests.rig.adaptive import adaptive, extend, hold, refusals, widths_sent
 from tests.rig.test_damaged import blocks_of
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig import journal, limits
-from rig.errors import BusyError, PlanError, RefusedError, RigError
-from rig.journal import Kind
-from rig.messages import AdaptivePlan, SegmentPlan
-from rig.score import MAX_CHECKED, MAX_EXTENSION_S, MAX_EXTENSION_SEGMENTS
+from stimrig.rig import journal, limits
+from stimrig.rig.errors import BusyError, PlanError, RefusedError, RigError
+from stimrig.rig.journal import Kind
+from stimrig.rig.messages import AdaptivePlan, SegmentPlan
+from stimrig.rig.score import MAX_CHECKED, MAX_EXTENSION_S, MAX_EXTENSION_SEGMENTS
 from tests.rig.adaptive import RATE_HZ, adaptive, extend, hold, refusals, rest, widths_sent
 
 WRONG: dict[str, tuple[list[SegmentPlan], type[RigError], str]] = {

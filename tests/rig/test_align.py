@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rig.align import align, cell_time
+from stimrig.rig.align import align, cell_time
 
 RATE_HZ = 1600.0
 

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig import journal
-from rig.acquire.angle_receiver import AngleReceiver
-from rig.control import angle_calibration
-from rig.control.angle_calibration import AngleCalibrating
-from rig.control.calibration import check_range
-from rig.devices import can_angle_sensor
-from rig.errors import BusyError, DeviceError, LatchChangedError, PlanError, RefusedError, RigError
-from rig.journal import Kind
-from rig.limits import HARD_LIMITS
-from rig.messages import AngleCalibration, AnglePlan, AnglePoseRequest, Profile, Status, TestPlan
+from stimrig.rig import journal
+from stimrig.rig.acquire.angle_receiver import AngleReceiver
+from stimrig.rig.control import angle_calibration
+from stimrig.rig.control.angle_calibration import AngleCalibrating
+from stimrig.rig.control.calibration import check_range
+from stimrig.rig.devices import can_angle_sensor
+from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, PlanError, RefusedError, RigError
+from stimrig.rig.journal import Kind
+from stimrig.rig.limits import HARD_LIMITS
+from stimrig.rig.messages import AngleCalibration, AnglePlan, AnglePoseRequest, Profile, Status, TestPlan
 from tests.rig.angle import FakeSensor, OpenedSensor
 from tests.rig.live import SPEED, LiveRig
 from tests.simulator.virtual_time import VirtualMachine

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rig.acquire.angle_receiver import REOPEN_S, AngleReceiver
-from rig.acquire.stream import LOOK_S, SILENCE_S, CounterUnwrapper
-from rig.signals import AngleScale
+from stimrig.rig.acquire.angle_receiver import REOPEN_S, AngleReceiver
+from stimrig.rig.acquire.stream import LOOK_S, SILENCE_S, CounterUnwrapper
+from stimrig.rig.signals import AngleScale
 from tests.rig.angle import OpenedSensor
 from tests.simulator.virtual_time import VirtualMachine
 

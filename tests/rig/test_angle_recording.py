@@ -11,13 +11,13 @@ import h5py
 import numpy as np
 import pytest
 
-import identify
-from rig import align_angle, angle_velocity, archive, assembly, journal
-from rig.adapters.files import Files
-from rig.align_angle import Reference
-from rig.errors import RecordingError
-from rig.journal import Kind
-from rig.signals import ANGLE_SAMPLE, SAMPLE
+from stimrig import identify
+from stimrig.rig import align_angle, angle_velocity, archive, assembly, journal
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.align_angle import Reference
+from stimrig.rig.errors import RecordingError
+from stimrig.rig.journal import Kind
+from stimrig.rig.signals import ANGLE_SAMPLE, SAMPLE
 from tests.rig.fakes import VirtualRig
 from tests.rig.test_angle_run import swinging
 from tests.rig.test_damaged import blocks_of

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import identify
-from rig import archive, limits
-from rig.acquire.angle_check import outside
-from rig.acquire.angle_guard import check_start
-from rig.control.sealing import warnings
-from rig.errors import DeviceError, PlanError, RefusedError
-from rig.messages import AdaptivePlan, AnglePlan
-from rig.signals import Pulse, PulseStatus
+from stimrig import identify
+from stimrig.rig import archive, limits
+from stimrig.rig.acquire.angle_check import outside
+from stimrig.rig.acquire.angle_guard import check_start
+from stimrig.rig.control.sealing import warnings
+from stimrig.rig.errors import DeviceError, PlanError, RefusedError
+from stimrig.rig.messages import AdaptivePlan, AnglePlan
+from stimrig.rig.signals import Pulse, PulseStatus
 from tests.rig.adaptive import extend, refusals
 from tests.rig.fakes import VirtualRig, hold, rest
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rig import journal
-from rig.assembly import _Pulses
-from rig.journal import JournalContents, Kind
+from stimrig.rig import journal
+from stimrig.rig.assembly import _Pulses
+from stimrig.rig.journal import JournalContents, Kind
 
 
 def test_a_sender_that_lost_the_processor_wrote_before_the_ack() -> None:

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from rig import limits, plan
-from rig.clock import utc_text
-from rig.control.calibration import Calibration, check_profile, end_of_day_s
-from rig.errors import PlanError, RefusedError
-from rig.limits import HARD_LIMITS, Steps
-from rig.messages import CalibrateStartRequest, FinishedEvent, Profile
+from stimrig.rig import limits, plan
+from stimrig.rig.clock import utc_text
+from stimrig.rig.control.calibration import Calibration, check_profile, end_of_day_s
+from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.limits import HARD_LIMITS, Steps
+from stimrig.rig.messages import CalibrateStartRequest, FinishedEvent, Profile
 
 NOON_S = datetime(2026, 3, 4, 12, tzinfo=UTC).timestamp()
 

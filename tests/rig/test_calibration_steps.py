@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.control.calibration import ORDER, Calibration
-from rig.devices.p24 import P24
-from rig.devices.rehastim2 import RehaStim2
-from rig.errors import PlanError, RefusedError
-from rig.limits import HARD_LIMITS, Steps
-from rig.messages import CalibrateStartRequest, FinishedEvent, Profile
+from stimrig.rig.control.calibration import ORDER, Calibration
+from stimrig.rig.devices.p24 import P24
+from stimrig.rig.devices.rehastim2 import RehaStim2
+from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.limits import HARD_LIMITS, Steps
+from stimrig.rig.messages import CalibrateStartRequest, FinishedEvent, Profile
 from tests.rig.test_calibration import NOON_S, play
 
 UP = "up"

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig import config
-from rig.devices import can_angle_sensor, can_load_cell
-from rig.devices.can_angle_sensor import CanAngleSensor
-from rig.devices.can_load_cell import CanLoadCell
-from rig.errors import ConfigError, DeviceError
-from rig.machine import Frame
-from rig.signals import AngleScale
+from stimrig.rig import config
+from stimrig.rig.devices import can_angle_sensor, can_load_cell
+from stimrig.rig.devices.can_angle_sensor import CanAngleSensor
+from stimrig.rig.devices.can_load_cell import CanLoadCell
+from stimrig.rig.errors import ConfigError, DeviceError
+from stimrig.rig.machine import Frame
+from stimrig.rig.signals import AngleScale
 from tests.rig.test_config import GOOD, load
 from tests.simulator.virtual_time import VirtualMachine
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 import serial
 
-from rig.adapters import can_bus
-from rig.adapters.can_bus import CanBus
-from rig.adapters.read_ahead import ReadAhead
-from rig.clock import MonotonicClock
-from rig.devices import can_angle_sensor, can_load_cell
-from rig.devices.can_angle_sensor import CanAngleSensor
-from rig.devices.can_load_cell import CanLoadCell
-from rig.errors import DeviceError
+from stimrig.rig.adapters import can_bus
+from stimrig.rig.adapters.can_bus import CanBus
+from stimrig.rig.adapters.read_ahead import ReadAhead
+from stimrig.rig.clock import MonotonicClock
+from stimrig.rig.devices import can_angle_sensor, can_load_cell
+from stimrig.rig.devices.can_angle_sensor import CanAngleSensor
+from stimrig.rig.devices.can_load_cell import CanLoadCell
+from stimrig.rig.errors import DeviceError
 from tests.simulator.virtual_time import VirtualMachine
 
 FRAMES = 40  # of 22 bytes: they fit into the buffer of a pseudo-terminal

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rig import config
-from rig.devices import find
-from rig.errors import ConfigError
+from stimrig.rig import config
+from stimrig.rig.devices import find
+from stimrig.rig.errors import ConfigError
 from tests.harness.processes import CLINIC_WATCH
 
 GOOD = """

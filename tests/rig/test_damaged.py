@@ -9,12 +9,12 @@ import h5py
 import numpy as np
 import pytest
 
-from api.cli import main
-from rig import archive, assembly, journal, recover
-from rig.adapters.files import Files
-from rig.errors import RecordingError
-from rig.journal import Kind
-from rig.messages import SegmentPlan
+from stimrig.api.cli import main
+from stimrig.rig import archive, assembly, journal, recover
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.errors import RecordingError
+from stimrig.rig.journal import Kind
+from stimrig.rig.messages import SegmentPlan
 from tests.rig.fakes import VirtualRig, header, journal_at
 
 ROOT = Path(__file__).parents[2]

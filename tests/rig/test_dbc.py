@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rig.errors import ConfigError, WireError
-from rig.wire.dbc import CELL_FAULT, PACKAGED, SampleFrame
+from stimrig.rig.errors import ConfigError, WireError
+from stimrig.rig.wire.dbc import CELL_FAULT, PACKAGED, SampleFrame
 
 COUNTS = """VERSION ""
 BS_:
@@ -60,7 +60,7 @@ def test_a_value_that_has_a_word_is_no_reading(tmp_path: Path):
 
 
 def test_a_float_has_no_words(tmp_path: Path):
-    packaged = resources.files("rig.wire").joinpath(f"{PACKAGED}.dbc").read_text("utf-8")
+    packaged = resources.files("stimrig.rig.wire").joinpath(f"{PACKAGED}.dbc").read_text("utf-8")
     path = tmp_path / "float.dbc"
     path.write_text(packaged + 'VAL_ 385 Torque_Nm 0 "rest" ;\n')
     with pytest.raises(ConfigError, match="Torque_Nm: a floating-point signal has no words"):

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rig import journal
-from rig.journal import Kind
+from stimrig.rig import journal
+from stimrig.rig.journal import Kind
 from tests.rig.live import ACK_S, SPEED, LiveRig
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.world import World

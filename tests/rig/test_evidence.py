@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from rig.acquire.evidence import DECAY_S, NO_SIGNAL, SILENT_S, watch_decay
-from rig.messages import SegmentPlan
+from stimrig.rig.acquire.evidence import DECAY_S, NO_SIGNAL, SILENT_S, watch_decay
+from stimrig.rig.messages import SegmentPlan
 from tests.rig.fakes import VirtualRig, rest
 from tests.simulator.virtual_time import VirtualMachine
 

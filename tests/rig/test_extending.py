@@ -11,12 +11,12 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import journal as jn
-from rig.clock import utc_text
-from rig.control.building import previewed
-from rig.control.calibration import end_of_day_s
-from rig.errors import BusyError, PlanError, RefusedError, TooLateError
-from rig.messages import (
+from stimrig.rig import journal as jn
+from stimrig.rig.clock import utc_text
+from stimrig.rig.control.building import previewed
+from stimrig.rig.control.calibration import end_of_day_s
+from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
+from stimrig.rig.messages import (
     AdaptivePlan,
     EnoughRequest,
     Extended,
@@ -27,7 +27,7 @@ from rig.messages import (
     SegmentPlan,
     TestPlan,
 )  # fmt: skip
-from rig.signals import PulseStatus
+from stimrig.rig.signals import PulseStatus
 from tests.rig.fakes import VirtualRig, hold, rest
 from tests.rig.live import LiveRig
 

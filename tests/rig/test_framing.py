@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hardware_sim.stimulators import framing
-from hardware_sim.stimulators import sciencemode2 as emulated2
-from hardware_sim.stimulators import sciencemode4 as emulated4
-from hardware_sim.stimulators.framing import Packet
-from rig.errors import WireError
-from rig.wire import sciencemode2, sciencemode4
-from rig.wire.framing import Packet as RigsPacket
+from stimrig.hardware_sim.stimulators import framing
+from stimrig.hardware_sim.stimulators import sciencemode2 as emulated2
+from stimrig.hardware_sim.stimulators import sciencemode4 as emulated4
+from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.rig.errors import WireError
+from stimrig.rig.wire import sciencemode2, sciencemode4
+from stimrig.rig.wire.framing import Packet as RigsPacket
 
 FRAMES_2 = {
     "InitAck": ("f0 81 7f 81 56 00 02 00 0f", Packet(0, 2, b"\x00")),

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rig import journal, limits
-from rig.errors import DeviceError
-from rig.gate import Gate
-from rig.journal import Kind
-from rig.messages import Profile
-from rig.signals import Ack, Pulse, PulseStatus
+from stimrig.rig import journal, limits
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.gate import Gate
+from stimrig.rig.journal import Kind
+from stimrig.rig.messages import Profile
+from stimrig.rig.signals import Ack, Pulse, PulseStatus
 from tests.rig.fakes import FakeStimulator, journal_at
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from rig import journal as jn
-from rig import limits
-from rig.errors import DeviceError, JournalError
-from rig.journal import Kind
-from rig.messages import Profile
-from rig.signals import Ack, Pulse, PulseStatus
+from stimrig.rig import journal as jn
+from stimrig.rig import limits
+from stimrig.rig.errors import DeviceError, JournalError
+from stimrig.rig.journal import Kind
+from stimrig.rig.messages import Profile
+from stimrig.rig.signals import Ack, Pulse, PulseStatus
 from tests.rig.test_gate import Setup
 
 T0_S = 1000.0

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rig import journal
-from rig.control.sealing import RecordingStore
-from rig.errors import JournalError, RecordingError
-from rig.journal import Kind
+from stimrig.rig import journal
+from stimrig.rig.control.sealing import RecordingStore
+from stimrig.rig.errors import JournalError, RecordingError
+from stimrig.rig.journal import Kind
 from tests.rig.fakes import journal_at
 from tests.rig.live import LiveRig
 from tests.simulator.disk import SimulatedDisk

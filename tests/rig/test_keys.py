@@ -14,15 +14,15 @@ from pathlib import Path
 
 import pytest
 
-from rig import __main__ as program
-from rig.keys import StopKey, in_front
+from stimrig.rig import __main__ as program
+from stimrig.rig.keys import StopKey, in_front
 from tests.rig.live import LiveRig
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 30.0
 CHILD = """
 import asyncio, sys
-from rig.keys import StopKey
+from stimrig.rig.keys import StopKey
 async def main():
     pressed = asyncio.Event()
     with StopKey(asyncio.get_running_loop(), pressed.set) as key:

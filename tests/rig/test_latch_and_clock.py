@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from rig.adapters.files import Files
-from rig.clock import MonotonicClock, utc_text
-from rig.control.latch import Latch
-from rig.errors import BusyError
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.clock import MonotonicClock, utc_text
+from stimrig.rig.control.latch import Latch
+from stimrig.rig.errors import BusyError
 from tests.rig.fakes import slow_work
 from tests.simulator.virtual_time import VirtualMachine
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig import limits
-from rig.errors import RefusedError
-from rig.limits import HARD_LIMITS, Admitted, Refusal, admit
-from rig.messages import Profile, Status, TestPlan
-from rig.signals import Pulse
+from stimrig.rig import limits
+from stimrig.rig.errors import RefusedError
+from stimrig.rig.limits import HARD_LIMITS, Admitted, Refusal, admit
+from stimrig.rig.messages import Profile, Status, TestPlan
+from stimrig.rig.signals import Pulse
 
 anything = st.one_of(
     st.floats(allow_nan=True, allow_infinity=True),

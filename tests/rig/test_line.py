@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from rig.adapters import serial_port
-from rig.adapters.serial_port import SerialPort
-from rig.clock import MonotonicClock
-from rig.errors import DeviceError
+from stimrig.rig.adapters import serial_port
+from stimrig.rig.adapters.serial_port import SerialPort
+from stimrig.rig.clock import MonotonicClock
+from stimrig.rig.errors import DeviceError
 
 PATIENCE_S = 30.0
 

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rig import assembly, journal
-from rig.errors import RecordingError
-from rig.journal import Kind
-from rig.lsl_outlets.follow import Journals, Tail, refuse_locking
-from rig.lsl_outlets.live_test import MARGIN_S, Batch, LiveTest
-from rig.lsl_outlets.streaming import Streaming
-from rig.signals import SAMPLE
+from stimrig.rig import assembly, journal
+from stimrig.rig.errors import RecordingError
+from stimrig.rig.journal import Kind
+from stimrig.rig.lsl_outlets.follow import Journals, Tail, refuse_locking
+from stimrig.rig.lsl_outlets.live_test import MARGIN_S, Batch, LiveTest
+from stimrig.rig.lsl_outlets.streaming import Streaming
+from stimrig.rig.signals import SAMPLE
 from tests.rig.fakes import VirtualRig, journal_at
 
 RATE_HZ, PULSE_HZ, T0_S = 1600.0, 40.0, 100.0
@@ -212,7 +212,7 @@ def test_one_whose_end_could_not_be_written_keeps_no_later_one_from_being_sent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The disk was full: the journal lies there without an end, and cannot be sealed yet."""
-    monkeypatch.setattr("rig.lsl_outlets.streaming.LOOK_S", 0.0)
+    monkeypatch.setattr("stimrig.rig.lsl_outlets.streaming.LOOK_S", 0.0)
     streaming, sent = streaming_of(tmp_path)
     write_journal(tmp_path / "whole", 7, 0.6, 9.0)
     data = (tmp_path / "whole").read_bytes()
@@ -260,7 +260,7 @@ def test_a_tail_knows_when_its_journal_was_sealed_and_takes_no_lock(tmp_path: Pa
 
 
 def test_where_a_reader_could_hold_up_the_writer_nothing_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("rig.lsl_outlets.follow.FREE_TO_READ", {1: "none"})
+    monkeypatch.setattr("stimrig.rig.lsl_outlets.follow.FREE_TO_READ", {1: "none"})
     with pytest.raises(RecordingError, match="may hold up the rig"):
         refuse_locking(tmp_path)
     with pytest.raises(RecordingError, match="nowhere"):

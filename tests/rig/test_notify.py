@@ -14,11 +14,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from rig import __main__ as program
-from rig import config
-from rig.control import pair
-from rig.control.rig import Rig
-from rig.notify import Notifier
+from stimrig.rig import __main__ as program
+from stimrig.rig import config
+from stimrig.rig.control import pair
+from stimrig.rig.control.rig import Rig
+from stimrig.rig.notify import Notifier
 from tests.rig.fakes import FakeCell, FakeStimulator
 from tests.rig.live import LINE
 from tests.simulator.virtual_time import VirtualClock

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from rig import limits, plan
-from rig.errors import PlanError, RefusedError
-from rig.limits import HARD_LIMITS
-from rig.messages import Profile, RecruitmentTable, SegmentPlan, TestPlan
+from stimrig.rig import limits, plan
+from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.limits import HARD_LIMITS
+from stimrig.rig.messages import Profile, RecruitmentTable, SegmentPlan, TestPlan
 
 
 def built(segments: list[SegmentPlan] | None = None, rate_hz: float = 40.0, **profile: float) -> plan.PlannedTest:

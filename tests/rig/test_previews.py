@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from rig.adapters import previews
-from rig.adapters.previews import Previews
-from rig.errors import BusyError
-from rig.limits import HARD_LIMITS
+from stimrig.rig.adapters import previews
+from stimrig.rig.adapters.previews import Previews
+from stimrig.rig.errors import BusyError
+from stimrig.rig.limits import HARD_LIMITS
 
 ROOT = Path(__file__).parents[2]
 PLAN = {"test_id": "t", "participant": "P", "profile": {"current_ma": 20.0}}

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from rig import limits, plan, protocols
-from rig.errors import PlanError, RefusedError
-from rig.messages import Profile, TestPlan
+from stimrig.rig import limits, plan, protocols
+from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.messages import Profile, TestPlan
 
 
 def built(protocol: str, **more: float) -> plan.PlannedTest:

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from rig.control.replies import refusal
-from rig.errors import BusyError, DeviceError, LatchChangedError, LatchedError, PlanError, RigError
-from rig.messages import CalibrateStartRequest
-from rig.tasks import Task
+from stimrig.rig.control.replies import refusal
+from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, LatchedError, PlanError, RigError
+from stimrig.rig.messages import CalibrateStartRequest
+from stimrig.rig.tasks import Task
 from tests.rig.live import LiveRig
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.world import World

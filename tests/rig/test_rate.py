@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.acquire.plausibility import PlausibilityCheck
-from rig.acquire.receiver import Receiver
-from rig.control.sealing import warnings
-from rig.signals import SAMPLE
+from stimrig.rig.acquire.plausibility import PlausibilityCheck
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.control.sealing import warnings
+from stimrig.rig.signals import SAMPLE
 from tests.rig.fakes import VirtualRig, hold
 
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.acquire.receiver import Receiver
-from rig.acquire.stream import LONGEST_READ_S, LOOK_S, SILENCE_S, CounterUnwrapper
-from rig.signals import SAMPLE, Block
+from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.acquire.stream import LONGEST_READ_S, LOOK_S, SILENCE_S, CounterUnwrapper
+from stimrig.rig.signals import SAMPLE, Block
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, journal_at
 from tests.simulator.virtual_time import VirtualMachine
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rig.errors import BusyError, PlanError, RigError
-from rig.messages import CalibrateFinishRequest, CalibrateStartRequest, CalibrationResult, Threshold
+from stimrig.rig.errors import BusyError, PlanError, RigError
+from stimrig.rig.messages import CalibrateFinishRequest, CalibrateStartRequest, CalibrationResult, Threshold
 from tests.rig.live import LiveRig
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.world import World

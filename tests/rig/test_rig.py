@@ -9,13 +9,13 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import limits
-from rig.control import core
-from rig.control.building import previewed
-from rig.control.calibration import end_of_day_s
-from rig.control.replies import refusal
-from rig.errors import BusyError, DeviceError, PlanError, RefusedError, RestError, UncertainError
-from rig.messages import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
+from stimrig.rig import limits
+from stimrig.rig.control import core
+from stimrig.rig.control.building import previewed
+from stimrig.rig.control.calibration import end_of_day_s
+from stimrig.rig.control.replies import refusal
+from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError, RestError, UncertainError
+from stimrig.rig.messages import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import SPEED, WORK_S, LiveRig
 
 Make = Callable[..., LiveRig]

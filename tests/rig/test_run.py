@@ -11,18 +11,18 @@ import h5py
 import numpy as np
 import pytest
 
-from hardware_sim.factory import make_devices
-from hardware_sim.settings import Settings
-from rig import archive
-from rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
-from rig.adapters.files import Files
-from rig.control.sealing import warnings
-from rig.devices import p24, rehastim2
-from rig.errors import WireError
-from rig.limits import Steps
-from rig.messages import SegmentPlan
-from rig.signals import Ack, Pulse, PulseStatus
-from rig.tasks import Task
+from stimrig.hardware_sim.factory import make_devices
+from stimrig.hardware_sim.settings import Settings
+from stimrig.rig import archive
+from stimrig.rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.control.sealing import warnings
+from stimrig.rig.devices import p24, rehastim2
+from stimrig.rig.errors import WireError
+from stimrig.rig.limits import Steps
+from stimrig.rig.messages import SegmentPlan
+from stimrig.rig.signals import Ack, Pulse, PulseStatus
+from stimrig.rig.tasks import Task
 from tests.rig.fakes import VirtualRig, hold, rest, slow_work, void
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.host import Computer, Process

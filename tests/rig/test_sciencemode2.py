@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from rig.errors import WireError
-from rig.wire import sciencemode2 as wire
-from rig.wire.framing import Packet
+from stimrig.rig.errors import WireError
+from stimrig.rig.wire import sciencemode2 as wire
+from stimrig.rig.wire.framing import Packet
 
 
 def test_results_are_signed():

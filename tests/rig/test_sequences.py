@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig import sequences
-from rig.errors import PlanError
-from rig.sequences import prbs
+from stimrig.rig import sequences
+from stimrig.rig.errors import PlanError
+from stimrig.rig.sequences import prbs
 
 
 def test_library_is_the_folder():

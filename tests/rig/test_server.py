@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from rig import __main__ as program
-from rig.adapters.server import Server
-from rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
-from rig.messages import Reply, StateEvent, Status, StopEvidence
+from stimrig.rig import __main__ as program
+from stimrig.rig.adapters.server import Server
+from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
+from stimrig.rig.messages import Reply, StateEvent, Status, StopEvidence
 
 READY = Status(state="ready")
 

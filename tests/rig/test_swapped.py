@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from rig.devices import p24, rehastim2
-from rig.errors import DeviceError
-from rig.machine import Told
-from rig.wire import sciencemode2, sciencemode4
+from stimrig.rig.devices import p24, rehastim2
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.machine import Told
+from stimrig.rig.wire import sciencemode2, sciencemode4
 from tests.simulator.virtual_time import VirtualMachine
 
 REHASTIM_OFFER = bytes.fromhex("f0814781560001010f")

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from rig.adapters.driver import Driver
-from rig.clock import MonotonicClock
-from rig.tasks import Signal, Turn
+from stimrig.rig.adapters.driver import Driver
+from stimrig.rig.clock import MonotonicClock
+from stimrig.rig.tasks import Signal, Turn
 from tests.rig.fakes import slow_work
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
-from rig.trial import LONGEST_REASON, TransitionError, Trial
+from stimrig.rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
+from stimrig.rig.trial import LONGEST_REASON, TransitionError, Trial
 
 STEPS = {
     "start": lambda t: t.start("id", "P"),

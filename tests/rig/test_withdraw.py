@@ -10,9 +10,9 @@ import h5py
 import numpy as np
 import pytest
 
-from rig.control.playing import MOST_WITHDRAWN
-from rig.errors import PlanError, WithdrawnError
-from rig.messages import WithdrawRequest
+from stimrig.rig.control.playing import MOST_WITHDRAWN
+from stimrig.rig.errors import PlanError, WithdrawnError
+from stimrig.rig.messages import WithdrawRequest
 from tests.rig.live import LiveRig
 from tests.rig.test_races import begin_test, moments, remembered
 from tests.simulator.clinic import answer

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from rig.control import desk
-from rig.control.replies import id_of, invalid_request, to_line
-from rig.control.rig import Rig
-from rig.messages import (
+from stimrig.rig.control import desk
+from stimrig.rig.control.replies import id_of, invalid_request, to_line
+from stimrig.rig.control.rig import Rig
+from stimrig.rig.messages import (
     EnoughRequest,
     Event,
     ExtendRequest,

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rig.errors import BusyError
+from stimrig.rig.errors import BusyError
 from tests.simulator.world import World
 
 ROOM_BYTES = 10**9
@@ -22,7 +22,7 @@ class _File:
 
 
 class SimulatedDisk:
-    """See `rig.machine.Disk`. Files outlive the processes; a power failure takes what was not synced."""
+    """See `stimrig.rig.machine.Disk`. Files outlive the processes; a power failure takes what was not synced."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -134,7 +134,7 @@ class SimulatedDisk:
 
 
 class SimulatedLog:
-    """See `rig.machine.Log`."""
+    """See `stimrig.rig.machine.Log`."""
 
     def __init__(self, disk: SimulatedDisk, path: Path) -> None:
         self.path, self._disk = path, disk

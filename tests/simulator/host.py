@@ -8,8 +8,8 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rig.machine import Bus, Disk, Port
-from rig.tasks import Outcome, Tasks
+from stimrig.rig.machine import Bus, Disk, Port
+from stimrig.rig.tasks import Outcome, Tasks
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.world import World
 

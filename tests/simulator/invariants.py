@@ -19,9 +19,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hardware_sim.angle_sensors.sensor import CAN_ID as ANGLE_ID
-from rig import journal
-from rig.errors import RecordingError
+from stimrig.hardware_sim.angle_sensors.sensor import CAN_ID as ANGLE_ID
+from stimrig.rig import journal
+from stimrig.rig.errors import RecordingError
 from tests.simulator.clinic import Asked
 from tests.simulator.life import FOLDER, Felt, Life
 

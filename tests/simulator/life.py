@@ -8,12 +8,12 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
-from hardware_sim.factory import make_devices
-from hardware_sim.settings import Settings
-from rig import config
-from rig.control.rig import Rig
-from rig.errors import RigError
-from rig.messages import Profile
+from stimrig.hardware_sim.factory import make_devices
+from stimrig.hardware_sim.settings import Settings
+from stimrig.rig import config
+from stimrig.rig.control.rig import Rig
+from stimrig.rig.errors import RigError
+from stimrig.rig.messages import Profile
 from tests.simulator import accidents
 from tests.simulator.clinic import Clinic
 from tests.simulator.disk import SimulatedDisk

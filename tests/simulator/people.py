@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rig.messages import (
+from stimrig.rig.messages import (
     AdaptivePlan,
     AnglePlan,
     CalibrateFinishRequest,

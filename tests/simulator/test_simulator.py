@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from rig.acquire.halt import Halt
-from rig.gate import Gate
+from stimrig.rig.acquire.halt import Halt
+from stimrig.rig.gate import Gate
 from tests.simulator.__main__ import live, shrink
 from tests.simulator.life import Life
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Coroutine, Iterator
 from itertools import count
 from typing import Any, TypeVar
 
-from rig.adapters.files import Files
-from rig.machine import Bus, Disk, Port
-from rig.tasks import Outcome, Tasks
+from stimrig.rig.adapters.files import Files
+from stimrig.rig.machine import Bus, Disk, Port
+from stimrig.rig.tasks import Outcome, Tasks
 
 T = TypeVar("T")
 

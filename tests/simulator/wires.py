@@ -7,9 +7,9 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from hardware_sim.devices import Devices
-from rig.errors import DeviceError
-from rig.machine import Bus, Frame, Listener, Port, Told
+from stimrig.hardware_sim.devices import Devices
+from stimrig.rig.errors import DeviceError
+from stimrig.rig.machine import Bus, Frame, Listener, Port, Told
 from tests.simulator.host import Ports, Process
 from tests.simulator.world import World
 
@@ -198,7 +198,7 @@ class Wires(Ports):
 
 
 class SimulatedPort:
-    """See `rig.machine.Port`."""
+    """See `stimrig.rig.machine.Port`."""
 
     def __init__(self, wires: Wires, process: Process, path: str) -> None:
         self.process, self.path, self._wires = process, path, wires
@@ -243,7 +243,7 @@ class SimulatedPort:
 
 
 class _SimulatedBus:
-    """See `rig.machine.Bus`."""
+    """See `stimrig.rig.machine.Bus`."""
 
     place = "simulated can0"
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from api.client.documents import Job, Participant, SessionTest, Version
-from api.web.responses.models import JobOut, VersionOut
-from api.web.responses.participants import ParticipantOut
-from api.web.responses.rig import TestOut
 from stimrig import Client, errors
+from stimrig.api.client.documents import Job, Participant, SessionTest, Version
+from stimrig.api.web.responses.models import JobOut, VersionOut
+from stimrig.api.web.responses.participants import ParticipantOut
+from stimrig.api.web.responses.rig import TestOut
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
 
 

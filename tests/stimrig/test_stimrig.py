@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 import stimrig
-from api.progress_bar import in_notebook
+from stimrig.api.progress_bar import in_notebook
 from stimrig.errors import BadRequest
 from tests.api.test_worker import made_up_csv
 
@@ -33,7 +33,7 @@ def model(record: stimrig.Record) -> stimrig.Model:
 
 
 def test_importing_it_loads_no_library() -> None:
-    code = "import sys, stimrig; print(*{name.partition('.')[0] for name in sys.modules})"
+    code = "import sys, stimrig; print(*{name.removeprefix('stimrig.').partition('.')[0] for name in sys.modules})"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "identify" in loaded
     assert not HEAVY & set(loaded)
@@ -116,7 +116,7 @@ def test_long_work_shows_a_bar_unless_it_is_turned_off(
     shown = io.StringIO()
     shown.isatty = lambda: True
     monkeypatch.setattr("sys.stderr", shown)
-    monkeypatch.setattr("api.progress_bar.PATIENCE_S", 0.0)
+    monkeypatch.setattr("stimrig.api.progress_bar.PATIENCE_S", 0.0)
     stimrig.fit(record, effects=["fatigue"], progress=progress)
     assert ("fitting fatigue" in shown.getvalue()) == told
 

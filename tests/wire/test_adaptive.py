@@ -14,8 +14,8 @@ import httpx
 import numpy as np
 import pytest
 
-from api.settings import Settings
-from api.web.app import create_app
+from stimrig.api.settings import Settings
+from stimrig.api.web.app import create_app
 from tests.api.conftest import TOKEN, Server, wait_done
 from tests.harness.looks_first import LooksFirst
 from tests.harness.processes import Bench

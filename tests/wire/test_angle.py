@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-import identify
-from rig import archive
+from stimrig import identify
+from stimrig.rig import archive
 from tests.harness.processes import Bench, RigClient, control, default_plan, made_ready
 
 pytestmark = [pytest.mark.wire, pytest.mark.slow]

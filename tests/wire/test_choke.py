@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from rig.messages import stop_socket
+from stimrig.rig.messages import stop_socket
 from tests.harness.processes import Bench, RigClient, children_of, default_plan
 
 pytestmark = pytest.mark.wire

@@ -1,4 +1,4 @@
-"""`python -m rig`: mistakes are one line and exit 2; what is not there yet is a state, not a mistake."""
+"""`python -m stimrig.rig`: mistakes are one line and exit 2; what is not there yet is a state, not a mistake."""
 
 from __future__ import annotations
 
@@ -29,7 +29,12 @@ bus = {{ interface = "socketcand", host = "127.0.0.1", port = 9, channel = "can0
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "rig", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-m", "stimrig.rig", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
 
 
@@ -67,7 +72,7 @@ def test_the_rig_ends_with_its_parent_where_asked(bench: Bench, tmp_path: Path):
         "print(p.stdout.readline()); print(p.pid)"
     )
     options = ["--data", str(tmp_path / "data"), "--socket", str(tmp_path / "rig.sock"), "--die-with-parent"]
-    rig = [sys.executable, "-m", "rig", "--emulator-json", json.dumps(bench.emulator.ready), *options]
+    rig = [sys.executable, "-m", "stimrig.rig", "--emulator-json", json.dumps(bench.emulator.ready), *options]
     done = subprocess.run([sys.executable, "-c", launcher, *rig], cwd=ROOT, capture_output=True, text=True, timeout=30)
     pid = int(done.stdout.split()[-1])
     end = time.monotonic() + 10

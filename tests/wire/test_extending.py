@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from identify.records.read import read
+from stimrig.identify.records.read import read
 from tests.harness.processes import Bench, RigClient, default_plan
 
 pytestmark = pytest.mark.wire

@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import archive
-from rig.config import EMULATOR_WATCH
+from stimrig.rig import archive
+from stimrig.rig.config import EMULATOR_WATCH
 from tests.harness.processes import Bench, RigClient, control, default_plan, kill_hard, short_plan
 
 pytestmark = pytest.mark.wire

@@ -107,7 +107,7 @@ def test_killed_and_started_again_in_a_test_nothing_is_doubled_and_the_rig_does_
 
 
 def ended(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "rig.lsl_outlets", *arguments]
+    command = [sys.executable, "-m", "stimrig.rig.lsl_outlets", *arguments]
     return subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}
     )

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from identify.records.read import read
-from identify.records.record import Record
+from stimrig.identify.records.read import read
+from stimrig.identify.records.record import Record
 from tests.harness.processes import Bench, default_plan
 
 pytestmark = pytest.mark.wire

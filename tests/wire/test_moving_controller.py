@@ -17,9 +17,9 @@ import h5py
 import numpy as np
 import pytest
 
-from api.cli.launcher import Services
-from api.client.rest import Client
-from api.settings import Settings
+from stimrig.api.cli.launcher import Services
+from stimrig.api.client.rest import Client
+from stimrig.api.settings import Settings
 from tests.harness.processes import control
 
 pytestmark = [pytest.mark.wire, pytest.mark.slow]

@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from rig import align, archive
-from rig.signals import PulseStatus
+from stimrig.rig import align, archive
+from stimrig.rig.signals import PulseStatus
 from tests.harness.processes import Bench, control, short_plan
 
 pytestmark = pytest.mark.wire

@@ -8,11 +8,11 @@ from typing import Any
 from fastapi import Request
 from jinja2 import ChoiceLoader, FileSystemLoader, PrefixLoader
 
-from api.centre import warnings
-from api.centre.pages import warning_words
-from api.people.auth import Principal
-from api.web.pages.environment import HERE, environment, in_its_language
-from api.web.pages.render import Face
+from stimrig.api.centre import warnings
+from stimrig.api.centre.pages import warning_words
+from stimrig.api.people.auth import Principal
+from stimrig.api.web.pages.environment import HERE, environment, in_its_language
+from stimrig.api.web.pages.render import Face
 
 WEB = FileSystemLoader(HERE / "templates")
 own = environment.overlay(

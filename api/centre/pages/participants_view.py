@@ -10,17 +10,17 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 from sqlalchemy import select
 
-from api.centre import directory
-from api.centre.context import Context, Ctx
-from api.centre.routes.participants import VERDICT_NAMES, asked, page_key
-from api.charts import trend_charts
-from api.effect_words import effect_words
-from api.errors import ApiError, NotFoundError
-from api.models import changes
-from api.models.summary import followed
-from api.store.centre_tables import CentreEffect
-from api.web.dependencies import ModelReader
-from api.web.pages.render import page
+from stimrig.api.centre import directory
+from stimrig.api.centre.context import Context, Ctx
+from stimrig.api.centre.routes.participants import VERDICT_NAMES, asked, page_key
+from stimrig.api.charts import trend_charts
+from stimrig.api.effect_words import effect_words
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models import changes
+from stimrig.api.models.summary import followed
+from stimrig.api.store.centre_tables import CentreEffect
+from stimrig.api.web.dependencies import ModelReader
+from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
 MOST_EFFECTS = 100

@@ -8,22 +8,22 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
-from api.centre import warnings
-from api.centre.check import UNSEEN_S
-from api.centre.context import Context, Ctx
-from api.centre.ingest import LEAST_DISK_BYTES, LEAST_DISK_SHARE, MOST_CLOCK_S
-from api.clock import unix_of
-from api.errors import ApiError
-from api.people.auth import LOCKED, Scope
-from api.store.centre_tables import CentreRig
-from api.web.dependencies import Administrator, ModelReader
-from api.web.guards import identified
-from api.web.pages.home import sign_in_page
-from api.web.pages.render import page, problem_page
+from stimrig.api.centre import warnings
+from stimrig.api.centre.check import UNSEEN_S
+from stimrig.api.centre.context import Context, Ctx
+from stimrig.api.centre.ingest import LEAST_DISK_BYTES, LEAST_DISK_SHARE, MOST_CLOCK_S
+from stimrig.api.clock import unix_of
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import LOCKED, Scope
+from stimrig.api.store.centre_tables import CentreRig
+from stimrig.api.web.dependencies import Administrator, ModelReader
+from stimrig.api.web.guards import identified
+from stimrig.api.web.pages.home import sign_in_page
+from stimrig.api.web.pages.render import page, problem_page
 
 router = APIRouter(include_in_schema=False)
 FINE_STATES = ("ready", "calibrating", "arming", "running", "sealing", "stopping")
-"""Of `rig.messages.RigState`. Any other one, also of a newer rig, is something to look at."""
+"""Of `stimrig.rig.messages.RigState`. Any other one, also of a newer rig, is something to look at."""
 
 
 @router.get("/")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from api import language
-from api.language import lazy
+from stimrig.api import language
+from stimrig.api.language import lazy
 
 TITLES: dict[str, Any] = {
     "restored": lazy("The rig was restored from a backup"),

@@ -15,11 +15,11 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from sqlalchemy import text
 
-from api.centre import warnings
-from api.centre.context import Context, Ctx
-from api.centre.responses import CentreHealthOut
-from api.clock import unix_of
-from api.web.responses.base import answers
+from stimrig.api.centre import warnings
+from stimrig.api.centre.context import Context, Ctx
+from stimrig.api.centre.responses import CentreHealthOut
+from stimrig.api.clock import unix_of
+from stimrig.api.web.responses.base import answers
 
 router = APIRouter(tags=["operation"])
 

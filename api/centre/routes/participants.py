@@ -8,15 +8,15 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
-from api.centre import clean, directory, handed_out
-from api.centre.context import Context, Ctx
-from api.centre.directory import Search
-from api.centre.responses import ParticipantsOut, SessionsOut
-from api.errors import ApiError, NotFoundError
-from api.models.summary import VERDICTS
-from api.store.centre_tables import CentreModel
-from api.web.dependencies import PROBLEM, ModelReader
-from api.web.responses.base import answers
+from stimrig.api.centre import clean, directory, handed_out
+from stimrig.api.centre.context import Context, Ctx
+from stimrig.api.centre.directory import Search
+from stimrig.api.centre.responses import ParticipantsOut, SessionsOut
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models.summary import VERDICTS
+from stimrig.api.store.centre_tables import CentreModel
+from stimrig.api.web.dependencies import PROBLEM, ModelReader
+from stimrig.api.web.responses.base import answers
 
 router = APIRouter(prefix="/v1", tags=["participants"], responses=PROBLEM)
 Day = Annotated[str | None, Query(description="a day, as 2026-11-23")]

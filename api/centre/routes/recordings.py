@@ -8,15 +8,15 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from fastapi.responses import Response
 
-from api.centre import clean, directory, handed_out
-from api.centre.context import Ctx
-from api.centre.directory import Cohort
-from api.centre.responses import RecordingsOut
-from api.centre.routes.participants import the_rig
-from api.errors import ApiError, NotFoundError
-from api.store.centre_tables import CentreRecording
-from api.web.dependencies import PROBLEM, ModelReader
-from api.web.responses.base import answers
+from stimrig.api.centre import clean, directory, handed_out
+from stimrig.api.centre.context import Ctx
+from stimrig.api.centre.directory import Cohort
+from stimrig.api.centre.responses import RecordingsOut
+from stimrig.api.centre.routes.participants import the_rig
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.store.centre_tables import CentreRecording
+from stimrig.api.web.dependencies import PROBLEM, ModelReader
+from stimrig.api.web.responses.base import answers
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 HDF5 = "application/x-hdf5"

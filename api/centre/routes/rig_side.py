@@ -8,14 +8,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Security
 from fastapi.security import HTTPBearer
 
-from api.centre.chain import BatchIn, HelloIn, read
-from api.centre.context import Ctx
-from api.centre.responses import HeadsOut, HelloOut, LackingFilesOut, PieceOut, PlaceOut
-from api.centre.spool import MOST_LISTED, MOST_PIECE_BYTES
-from api.errors import ApiError
-from api.store.centre_tables import CentreRig
-from api.web.openapi import problem
-from api.web.responses.base import answers
+from stimrig.api.centre.chain import BatchIn, HelloIn, read
+from stimrig.api.centre.context import Ctx
+from stimrig.api.centre.responses import HeadsOut, HelloOut, LackingFilesOut, PieceOut, PlaceOut
+from stimrig.api.centre.spool import MOST_LISTED, MOST_PIECE_BYTES
+from stimrig.api.errors import ApiError
+from stimrig.api.store.centre_tables import CentreRig
+from stimrig.api.web.openapi import problem
+from stimrig.api.web.responses.base import answers
 
 BYTES = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 KEY = HTTPBearer(scheme_name="rig", description="a rig's key", auto_error=False)

@@ -7,12 +7,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, ConfigDict, StringConstraints
 
-from api.centre import warnings
-from api.centre.context import Ctx
-from api.centre.responses import RigKeyOut, RigOut, WarningOut
-from api.store.centre_tables import CentreRig
-from api.web.dependencies import PROBLEM, Administrator, ModelReader
-from api.web.responses.base import answers
+from stimrig.api.centre import warnings
+from stimrig.api.centre.context import Ctx
+from stimrig.api.centre.responses import RigKeyOut, RigOut, WarningOut
+from stimrig.api.store.centre_tables import CentreRig
+from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
+from stimrig.api.web.responses.base import answers
 
 router = APIRouter(prefix="/v1", tags=["rigs"], responses=PROBLEM)
 SECRET = ("id", "key_hash", "key_prefix", "audit_hash")

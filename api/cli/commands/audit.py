@@ -10,17 +10,17 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.errors import InputError
-from api.cli.terminal import Json, given, say, say_json, write
-from api.clock import Clock
-from api.errors import ApiError
-from api.outbox import receipts
-from api.outbox.errors import PushError
-from api.outbox.link import Link
-from api.outbox.receipts import Receipt
-from api.settings import Settings
-from api.store import Store, audit
-from api.store.tables import AuditEntry
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.terminal import Json, given, say, say_json, write
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.outbox import receipts
+from stimrig.api.outbox.errors import PushError
+from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.receipts import Receipt
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import AuditEntry
 
 DataDir = Annotated[Path | None, typer.Option("--data", help="data folder; default ./var, or STIMRIG_DATA_DIR")]
 

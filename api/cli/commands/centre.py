@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 from tqdm import tqdm
 
-from api.cli.errors import CommandError, InputError
-from api.cli.terminal import given, say, say_json, sign_in_lines
+from stimrig.api.cli.errors import CommandError, InputError
+from stimrig.api.cli.terminal import given, say, say_json, sign_in_lines
 
 DataOption = Annotated[Path | None, typer.Option(help="data folder; default ./centre, or STIMRIG_CENTRE_DATA_DIR")]
 DatabaseOption = Annotated[
@@ -50,13 +50,13 @@ def serve(
         context.obj = named
         return
     if demo:
-        from api.cli.centre_demo import play
+        from stimrig.api.cli.centre_demo import play
 
         if database or files:
             raise InputError("--demo makes its own database and bucket: leave --database and --files out.")
         play(data or Path("centre-demo"), 8100 if port is None else port)
         return
-    from api.centre.server import prepared, run
+    from stimrig.api.centre.server import prepared, run
 
     settings = settings_of(**named)
     try:
@@ -70,14 +70,14 @@ def serve(
 
 def settings_of(**named):
     """The centre's settings. Raises SettingsError."""
-    from api.centre.settings import CentreSettings
+    from stimrig.api.centre.settings import CentreSettings
 
     return CentreSettings(**named)
 
 
 def _opened(context: typer.Context, data: Path | None, database: str | None):
     """Settings, and the database of the centre."""
-    from api.centre.context import opened
+    from stimrig.api.centre.context import opened
 
     settings = settings_of(**{**(context.obj or {}), **given(data_dir=data, database_url=database)})
     if not {"data_dir", "database_url"} & settings.model_fields_set and not (settings.data_dir / "centre.db").exists():
@@ -90,9 +90,9 @@ def _opened(context: typer.Context, data: Path | None, database: str | None):
 @contextmanager
 def _rigs(context: typer.Context, data: Path | None, database: str | None):
     """The rigs of the centre; in the end its database is let go."""
-    from api.centre.rigs import Rigs
-    from api.clock import Clock
-    from api.people.pace import Guesses
+    from stimrig.api.centre.rigs import Rigs
+    from stimrig.api.clock import Clock
+    from stimrig.api.people.pace import Guesses
 
     with closing(_opened(context, data, database)[1]) as store:
         yield Rigs(store, Clock(), Guesses(Clock()))
@@ -132,11 +132,11 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="print what was found as JSON")] = False,
 ) -> None:
     """Read the bucket's files again and compare them with their hashes; exit 1 where one differs."""
-    from api.centre import check as checking
-    from api.centre import clean
-    from api.centre.bucket import BucketError
-    from api.centre.context import ready_bucket
-    from api.clock import Clock
+    from stimrig.api.centre import check as checking
+    from stimrig.api.centre import clean
+    from stimrig.api.centre.bucket import BucketError
+    from stimrig.api.centre.context import ready_bucket
+    from stimrig.api.clock import Clock
 
     clock = Clock()
     begun = since or clock.utc()

@@ -15,9 +15,9 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.cohort_report import changed_lines, run_lines, telling
-from api.cli.errors import CommandError, InputError
-from api.cli.terminal import Json, names, say, say_json, write
+from stimrig.api.cli.cohort_report import changed_lines, run_lines, telling
+from stimrig.api.cli.errors import CommandError, InputError
+from stimrig.api.cli.terminal import Json, names, say, say_json, write
 
 NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
 METHOD = "maximum-likelihood"
@@ -117,15 +117,15 @@ def run(
 ) -> None:
     """One run."""
     need_extra()
-    from api.cohort import cluster
-    from api.cohort.errors import CutOffError
-    from api.cohort.parts import Results as Table
-    from api.cohort.run import Run
-    from api.cohort.select import Selection
-    from api.cohort.sources.addresses import sources_of
-    from api.cohort.tasks import Task, checked
-    from api.cohort.worker import Bounds
-    from api.version import software_version
+    from stimrig.api.cohort import cluster
+    from stimrig.api.cohort.errors import CutOffError
+    from stimrig.api.cohort.parts import Results as Table
+    from stimrig.api.cohort.run import Run
+    from stimrig.api.cohort.select import Selection
+    from stimrig.api.cohort.sources.addresses import sources_of
+    from stimrig.api.cohort.tasks import Task, checked
+    from stimrig.api.cohort.worker import Bounds
+    from stimrig.api.version import software_version
 
     given = (verb, Selection(select).text, method, names(effects), tuple(columns or ()), software_version())
     task = checked(Task(*given))
@@ -171,7 +171,7 @@ def changed(
 ) -> None:
     """Whose results differ between two runs, and why: what a new release is judged by before it is used on people."""
     need_extra()
-    from api.cohort.changed import compared
+    from stimrig.api.cohort.changed import compared
 
     found = compared(old, new).to_dict()
     say_json(found) if as_json else say(*changed_lines(found))
@@ -184,8 +184,8 @@ def figures(
 ) -> None:
     """Draw a cohort: effects by prevalence, parameters over sessions, repeatability, errors by reason."""
     need_extra()
-    from api.cohort import drawn, page
-    from api.cohort.gathered import gather
+    from stimrig.api.cohort import drawn, page
+    from stimrig.api.cohort.gathered import gather
 
     found = gather(results)
     write(html, page.html(found, results.name))

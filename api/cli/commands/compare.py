@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-import identify
-from api.cli.terminal import (
+from stimrig import identify
+from stimrig.api.cli.terminal import (
     ColumnMap,
     Json,
     ModelFile,
@@ -35,8 +35,8 @@ def compare(
 
     The model runs free: it is given the pulse widths alone, never the measured torque.
     """
-    from api.web.pages.report_file import comparison_html
-    from api.workers.verbs import clean, curves, thinned
+    from stimrig.api.web.pages.report_file import comparison_html
+    from stimrig.api.workers.verbs import clean, curves, thinned
 
     model = load_model(model_json)
     record = load_joined(data, columns)

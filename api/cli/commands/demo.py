@@ -12,12 +12,12 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.errors import CommandError
-from api.cli.launcher import Services
-from api.cli.session_report import report_lines, run_test
-from api.cli.terminal import Json, number, say, say_json
-from api.client.rest import Client
-from api.settings import Settings
+from stimrig.api.cli.errors import CommandError
+from stimrig.api.cli.launcher import Services
+from stimrig.api.cli.session_report import report_lines, run_test
+from stimrig.api.cli.terminal import Json, number, say, say_json
+from stimrig.api.client.rest import Client
+from stimrig.api.settings import Settings
 
 PARTICIPANT = "DEMO"
 
@@ -91,7 +91,7 @@ def cpu(services: Services) -> dict[str, Any]:
 
 def write_files(folder: Path, found: dict[str, Any]) -> dict[str, str]:
     """The model, and a report with charts, beside the recording."""
-    from api.web.pages.report_file import comparison_html
+    from stimrig.api.web.pages.report_file import comparison_html
 
     model_path, report_path = folder / "MODEL.json", folder / "report.html"
     model_path.write_text(json.dumps(found["model"], indent=1, ensure_ascii=False))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import identify
-from api.cli.terminal import ColumnMap, HeldModel, Json, SeveralData, load_held, number, percent, say, say_json
-from api.progress_bar import progress_bar
-from api.structure import in_words, worded
+from stimrig import identify
+from stimrig.api.cli.terminal import ColumnMap, HeldModel, Json, SeveralData, load_held, number, percent, say, say_json
+from stimrig.api.progress_bar import progress_bar
+from stimrig.api.structure import in_words, worded
 
 VERDICTS = {
     "effect_missing": "An effect is missing in the model.",
@@ -34,8 +34,8 @@ def diagnose(
 
 def diagnosis_lines(found: dict[str, Any]) -> list[str]:
     """A diagnosis for people."""
-    from identify.caution import caution
-    from identify.shown import held_out_label, probability, sure
+    from stimrig.identify.caution import caution
+    from stimrig.identify.shown import held_out_label, probability, sure
 
     base, verdict, doubt = found["base"], found["verdict"], caution(found)
     said = str(VERDICTS.get(verdict, verdict)).rstrip(".")
@@ -80,7 +80,7 @@ def next_step(found: dict[str, Any], doubt: str) -> str:
 
 def effect_lines(effect: dict[str, Any]) -> list[str]:
     """One candidate."""
-    from identify.shown import probability, sure
+    from stimrig.identify.shown import probability, sure
 
     p = float(effect.get("probability") or 0.0)
     lines = [

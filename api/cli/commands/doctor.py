@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from api.cli import doctor as checks
-from api.cli.terminal import Json, given, say, say_json
-from api.settings import Settings
+from stimrig.api.cli import doctor as checks
+from stimrig.api.cli.terminal import Json, given, say, say_json
+from stimrig.api.settings import Settings
 
 MARKS = {"ok": "ok   ", "care": "care ", "fails": "FAILS"}
 

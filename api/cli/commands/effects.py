@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from api.cli.terminal import Json, say, say_json
+from stimrig.api.cli.terminal import Json, say, say_json
 
 
 def effects(as_json: Json = False) -> None:
     """The library of effects: equation, parameters, source, signature, what each is confused with."""
-    from identify import effects as library
+    from stimrig.identify import effects as library
 
     found = library.library()
     if as_json:

@@ -17,4 +17,4 @@ def register(app: typer.Typer) -> None:
 def emulate(context: typer.Context) -> None:
     """The emulated rig alone: devices on a pseudo-terminal and a CAN server (--help lists its options)."""
     sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-m", "hardware_sim", *context.args])
+    os.execv(sys.executable, [sys.executable, "-m", "stimrig.hardware_sim", *context.args])

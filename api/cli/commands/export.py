@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.commands.cohort import Columns, Given, Select, Token, need_extra
-from api.cli.errors import CommandError, InputError
-from api.cli.terminal import Json, say, say_json
+from stimrig.api.cli.commands.cohort import Columns, Given, Select, Token, need_extra
+from stimrig.api.cli.errors import CommandError, InputError
+from stimrig.api.cli.terminal import Json, say, say_json
 
 
 def export(
@@ -30,15 +30,15 @@ def export(
         raise InputError("give --parquet FOLDER or --bids FOLDER, one of them.")
     if no_dates and shift_days:
         raise InputError("give --no-dates or --shift-days, not both.")
-    from api.cohort import bids as bids_files
-    from api.cohort import parquet_files
-    from api.cohort.errors import CutOffError
-    from api.cohort.export import Export
-    from api.cohort.export_state import State
-    from api.cohort.handed_on import ERRORS, Days
-    from api.cohort.select import Selection
-    from api.cohort.sources.addresses import sources_of
-    from api.progress_bar import progress_bar
+    from stimrig.api.cohort import bids as bids_files
+    from stimrig.api.cohort import parquet_files
+    from stimrig.api.cohort.errors import CutOffError
+    from stimrig.api.cohort.export import Export
+    from stimrig.api.cohort.export_state import State
+    from stimrig.api.cohort.handed_on import ERRORS, Days
+    from stimrig.api.cohort.select import Selection
+    from stimrig.api.cohort.sources.addresses import sources_of
+    from stimrig.api.progress_bar import progress_bar
 
     selection, sources, mapped = Selection(select), sources_of(data, token), columns or []
     writer = bids_files if parquet is None else parquet_files

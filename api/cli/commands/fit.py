@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-import identify
-from api.cli.errors import InputError
-from api.cli.terminal import (
+from stimrig import identify
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.terminal import (
     ColumnMap,
     Json,
     SeveralData,
@@ -22,7 +22,7 @@ from api.cli.terminal import (
     say_json,
     write_model,
 )
-from api.progress_bar import progress_bar
+from stimrig.api.progress_bar import progress_bar
 
 METHOD = "maximum-likelihood"
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-import identify
-from api.cli.commands.diagnose import VERDICTS
-from api.cli.terminal import (
+from stimrig import identify
+from stimrig.api.cli.commands.diagnose import VERDICTS
+from stimrig.api.cli.terminal import (
     ColumnMap,
     HeldModel,
     Json,
@@ -24,8 +24,8 @@ from api.cli.terminal import (
     write,
     write_model,
 )
-from api.progress_bar import progress_bar
-from api.structure import in_words
+from stimrig.api.progress_bar import progress_bar
+from stimrig.api.structure import in_words
 
 FEW = 3
 """Refused effects that are named."""
@@ -71,9 +71,9 @@ def report(
     """The report: what was found, what each effect is, what is left before and after."""
     import numpy as np
 
-    from api.web.pages.report_file import improvement_html
-    from api.workers.diagnosis_verbs import diagnosed
-    from api.workers.verbs import runs, thinned
+    from stimrig.api.web.pages.report_file import improvement_html
+    from stimrig.api.workers.diagnosis_verbs import diagnosed
+    from stimrig.api.workers.verbs import runs, thinned
 
     before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from api.cli.errors import InputError
-from api.cli.terminal import Json, ModelFile, load_model, number, percent, say, say_json, table, writing
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.terminal import Json, ModelFile, load_model, number, percent, say, say_json, table, writing
 
 
 def invert(
@@ -24,10 +24,10 @@ def invert(
     as_json: Json = False,
 ) -> None:
     """Pulse widths whose predicted torque follows a reference best, and what of it is out of reach."""
-    from api.models import inverted
-    from identify.errors import IdentifyError
-    from identify.inversion import invert as widths_for
-    from identify.inversion.table import read_reference
+    from stimrig.api.models import inverted
+    from stimrig.identify.errors import IdentifyError
+    from stimrig.identify.inversion import invert as widths_for
+    from stimrig.identify.inversion.table import read_reference
 
     model = load_model(model_json)
     try:

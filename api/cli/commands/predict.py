@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-import identify
-from api.cli.terminal import (
+from stimrig import identify
+from stimrig.api.cli.terminal import (
     ColumnMap,
     Data,
     Json,
@@ -34,7 +34,7 @@ def predict(
     """Free-run simulation from the recorded pulse widths: time_s,torque_nm,predicted_torque_nm."""
     import numpy as np
 
-    from identify.estimation.fit_statistics import best_fit_percent
+    from stimrig.identify.estimation.fit_statistics import best_fit_percent
 
     model = load_model(model_json)
     record = load_joined([data], columns)

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from api.cli.errors import InputError, LaunchError
-from api.cli.terminal import Json
+from stimrig.api.cli.errors import InputError, LaunchError
+from stimrig.api.cli.terminal import Json
 
 
 def recover(
@@ -20,7 +20,7 @@ def recover(
 ) -> None:
     """Make a sealed recording from a journal, and say what is missing. The journal is kept."""
     options = [*(["-o", str(output)] if output else []), *(["--json"] if as_json else [])]
-    command = [sys.executable, "-m", "rig.recover", *options, "--", str(journal)]
+    command = [sys.executable, "-m", "stimrig.rig.recover", *options, "--", str(journal)]
     ended = subprocess.run(command, capture_output=True, text=True)
     if ended.returncode:
         words = (ended.stderr.strip().splitlines() or ["it ended without a message"])[-1].removeprefix("recover: ")

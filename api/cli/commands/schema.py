@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from api import schemas
-from api.cli.errors import InputError
-from api.cli.terminal import say
+from stimrig.api import schemas
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.terminal import say
 
 
 def schema(

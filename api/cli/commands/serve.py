@@ -10,12 +10,12 @@ from typing import Annotated
 
 import typer
 
-from api.cli.errors import InputError
-from api.cli.launcher import Ended, Services
-from api.cli.stop_key import StopKey, at_rig
-from api.cli.terminal import given, say, sign_in_lines
-from api.settings import Settings
-from rig.messages import Status
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.launcher import Ended, Services
+from stimrig.api.cli.stop_key import StopKey, at_rig
+from stimrig.api.cli.terminal import given, say, sign_in_lines
+from stimrig.api.settings import Settings
+from stimrig.rig.messages import Status
 
 
 def serve(
@@ -57,9 +57,9 @@ def attachable(settings: Settings, emulate: str) -> Status:
     InputError
         A rig to be started was named, too, or none listens at the socket.
     """
-    from api.clock import Clock
-    from api.errors import ApiError
-    from api.sessions.rig_client import RigClient
+    from stimrig.api.clock import Clock
+    from stimrig.api.errors import ApiError
+    from stimrig.api.sessions.rig_client import RigClient
 
     place = settings.rig_socket
     if settings.rig_file is not None or emulate.strip():
@@ -73,7 +73,7 @@ def attachable(settings: Settings, emulate: str) -> Status:
     except ApiError as error:
         raise InputError(
             f"--rig-socket {place}: no rig answers there ({error.detail}) Start it first: "
-            f"python -m rig --config RIG.toml --data DIR --socket {place}"
+            f"python -m stimrig.rig --config RIG.toml --data DIR --socket {place}"
         ) from error
 
 

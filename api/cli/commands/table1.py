@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.terminal import Json, number, say, say_json, table
-from api.progress_bar import progress_bar
+from stimrig.api.cli.terminal import Json, number, say, say_json, table
+from stimrig.api.progress_bar import progress_bar
 
 
 def table1(
@@ -15,7 +15,7 @@ def table1(
     as_json: Json = False,
 ) -> None:
     """Best-fit rates at each noise level, ours beside the paper's."""
-    from identify.paper import table1 as table_one
+    from stimrig.identify.paper import table1 as table_one
 
     with progress_bar() as progress:
         found = table_one.run(trials, progress)

@@ -13,13 +13,13 @@ from typing import Annotated, Any
 
 import typer
 
-from api.cli.errors import InputError
-from api.cli.launcher import Services
-from api.cli.session_report import report_lines, run_test
-from api.cli.stop_key import StopKey, at_rig, at_service
-from api.cli.terminal import Json, given, say, say_json, writing
-from api.client.rest import Client
-from api.settings import Settings
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.launcher import Services
+from stimrig.api.cli.session_report import report_lines, run_test
+from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
+from stimrig.api.cli.terminal import Json, given, say, say_json, writing
+from stimrig.api.client.rest import Client
+from stimrig.api.settings import Settings
 
 
 def test(

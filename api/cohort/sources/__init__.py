@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from api.cohort.select import Selection
+from stimrig.api.cohort.select import Selection
 
 SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 """What counts as a record in a folder. A file that is named itself is taken whatever its name."""
@@ -35,7 +35,7 @@ class Entry:
     sha256 : str
         Of the content, where the listing says it.
     known : dict
-        Fields (`api.cohort.fields`) that are known without reading the record.
+        Fields (`stimrig.api.cohort.fields`) that are known without reading the record.
     """
 
     address: str

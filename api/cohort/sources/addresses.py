@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from api.cohort.errors import CohortError
-from api.cohort.sources import Source
-from api.cohort.sources.bucket import Bucket
-from api.cohort.sources.centre import Centre
-from api.cohort.sources.folder import Folder
-from api.settings import loopback
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.sources import Source
+from stimrig.api.cohort.sources.bucket import Bucket
+from stimrig.api.cohort.sources.centre import Centre
+from stimrig.api.cohort.sources.folder import Folder
+from stimrig.api.settings import loopback
 
 
 def sources_of(addresses: Sequence[str], token: str = "", scheduler: str = "") -> list[Source]:

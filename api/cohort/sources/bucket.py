@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from api.cohort.errors import CohortError
-from api.cohort.select import Selection
-from api.cohort.sources import Entry, Source, SourceError, is_record
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.sources import Entry, Source, SourceError, is_record
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from api.client.connection import Connection
-from api.client.errors import ServiceError
-from api.cohort.errors import CohortError
-from api.cohort.fields import as_day
-from api.cohort.select import Selection
-from api.cohort.sources import Entry, Source, SourceError
+from stimrig.api.client.connection import Connection
+from stimrig.api.client.errors import ServiceError
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.fields import as_day
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.sources import Entry, Source, SourceError
 
 MOST_PAGES = 1_000_000
 """A centre that answers the same page for ever is not believed."""
@@ -69,7 +69,7 @@ def _bounded(line: Connection, path: str, most_bytes: int) -> bytes:
     """An answer's bytes, no more than wanted: a centre may be anybody."""
     import httpx
 
-    from api.client.errors import Unreachable, refused
+    from stimrig.api.client.errors import Unreachable, refused
 
     try:
         with line.http.stream("GET", path) as answer:

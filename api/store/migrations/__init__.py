@@ -14,8 +14,8 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, inspect, text
 
-from api.store import centre_tables
-from api.store.engines import WRITES
+from stimrig.api.store import centre_tables
+from stimrig.api.store.engines import WRITES
 
 FOLDER = Path(__file__).parent
 METADATA = centre_tables.Table.metadata
@@ -81,7 +81,7 @@ def _newer(found: object) -> SchemaError:
 
 
 def _refuse_lacking(connection: Connection) -> None:
-    """Compare the database's columns with those of `api.store.tables`."""
+    """Compare the database's columns with those of `stimrig.api.store.tables`."""
     found = inspect(connection).get_multi_columns()
     kept = {table: {column["name"] for column in columns} for (_, table), columns in found.items()}
     for table in METADATA.sorted_tables:

@@ -9,15 +9,15 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
-from api.language import lazy
-from api.outbox import receipts, status
-from api.people.auth import Scope
-from api.store.tables import AuditEntry
-from api.web.dependencies import Administrator, Context, Ctx
-from api.web.pages import typed
-from api.web.pages.environment import environment
-from api.web.pages.render import page
-from api.web.routes import people, tokens
+from stimrig.api.language import lazy
+from stimrig.api.outbox import receipts, status
+from stimrig.api.people.auth import Scope
+from stimrig.api.store.tables import AuditEntry
+from stimrig.api.web.dependencies import Administrator, Context, Ctx
+from stimrig.api.web.pages import typed
+from stimrig.api.web.pages.environment import environment
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes import people, tokens
 
 router = APIRouter(include_in_schema=False, prefix="/administration")
 NEWEST = 60

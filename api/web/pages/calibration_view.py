@@ -12,18 +12,18 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
-from api.errors import ApiError
-from api.language import lazy
-from api.sessions import profiles
-from api.sessions.questions import Question, Row
-from api.sessions.requests import CalibrationIn, MarkIn, StepIn
-from api.store import seen
-from api.store.tables import Participant
-from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import typed
-from api.web.pages.render import page
-from api.web.routes import calibration, participants
-from rig.messages import Status
+from stimrig.api.errors import ApiError
+from stimrig.api.language import lazy
+from stimrig.api.sessions import profiles
+from stimrig.api.sessions.questions import Question, Row
+from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
+from stimrig.api.store import seen
+from stimrig.api.store.tables import Participant
+from stimrig.api.web.dependencies import Context, Ctx, Tester
+from stimrig.api.web.pages import typed
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes import calibration, participants
+from stimrig.rig.messages import Status
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/calibration")
 DEFAULTS = CalibrationIn.model_validate({})

@@ -7,14 +7,14 @@ from typing import Any
 
 from fastapi import Request
 
-from api import decisions
-from api.clinical_words import decision_words
-from api.language import _, lazy, localised, plain, translated
-from api.people.auth import Principal, Scope
-from api.sessions import angles, profiles
-from api.store.seen import MOST_TOLD, ChangedError
-from api.web.pages.limits_form import LABELS
-from api.web.pages.starting import site_words
+from stimrig.api import decisions
+from stimrig.api.clinical_words import decision_words
+from stimrig.api.language import _, lazy, localised, plain, translated
+from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.sessions import angles, profiles
+from stimrig.api.store.seen import MOST_TOLD, ChangedError
+from stimrig.api.web.pages.limits_form import LABELS
+from stimrig.api.web.pages.starting import site_words
 
 KEPT_OUT = ("csrf", "seen", "password", "latch")
 """Fields of a form that are not sent again as they were."""

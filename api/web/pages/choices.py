@@ -8,11 +8,11 @@ from typing import Annotated
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
-from api.errors import ApiError
-from api.language import CODES
-from api.web.browser_session import local, same_origin
-from api.web.dependencies import Ctx
-from api.web.headers import COOKIE
+from stimrig.api.errors import ApiError
+from stimrig.api.language import CODES
+from stimrig.api.web.browser_session import local, same_origin
+from stimrig.api.web.dependencies import Ctx
+from stimrig.api.web.headers import COOKIE
 
 router = APIRouter(include_in_schema=False)
 COLOURS = "stimrig_colours"

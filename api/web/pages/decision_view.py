@@ -13,16 +13,16 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 from starlette.datastructures import FormData
 
-from api.errors import ApiError
-from api.language import _, lazy, localised
-from api.models import advice, headline, reasons, stored
-from api.models.tracking import QUANTITIES, Limits
-from api.store.tables import Model
-from api.web.dependencies import Approver, Context, Ctx
-from api.web.pages import typed
-from api.web.pages.environment import environment
-from api.web.pages.render import page
-from api.web.routes import models
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _, lazy, localised
+from stimrig.api.models import advice, headline, reasons, stored
+from stimrig.api.models.tracking import QUANTITIES, Limits
+from stimrig.api.store.tables import Model
+from stimrig.api.web.dependencies import Approver, Context, Ctx
+from stimrig.api.web.pages import typed
+from stimrig.api.web.pages.environment import environment
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes import models
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 Reason = Annotated[str, Form()]

@@ -12,10 +12,10 @@ from babel.support import LazyProxy
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 
-from api import clinical_words, effect_words, language
-from api.charts.config import PAGE_CONFIG
-from api.language import words
-from api.models.summary import followed
+from stimrig.api import clinical_words, effect_words, language
+from stimrig.api.charts.config import PAGE_CONFIG
+from stimrig.api.language import words
+from stimrig.api.models.summary import followed
 
 HERE = Path(__file__).parent
 

@@ -9,16 +9,16 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
-from api.errors import ApiError
-from api.people.auth import LOCKED, Principal, Scope
-from api.sessions import directory
-from api.web.browser_session import local, same_origin, set_cookie
-from api.web.dependencies import Anyone, Context, Ctx, EvenLocked, Tester
-from api.web.guards import identified
-from api.web.pages import typed
-from api.web.pages.render import look, page, problem_page
-from api.web.requests import ParticipantIn
-from api.web.routes import participants
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import LOCKED, Principal, Scope
+from stimrig.api.sessions import directory
+from stimrig.api.web.browser_session import local, same_origin, set_cookie
+from stimrig.api.web.dependencies import Anyone, Context, Ctx, EvenLocked, Tester
+from stimrig.api.web.guards import identified
+from stimrig.api.web.pages import typed
+from stimrig.api.web.pages.render import look, page, problem_page
+from stimrig.api.web.requests import ParticipantIn
+from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 50

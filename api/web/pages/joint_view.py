@@ -8,21 +8,21 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
-from api.errors import ApiError
-from api.models import together
-from api.sessions import angles
-from api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE
-from api.sessions.joint_tests import target_of
-from api.sessions.requests import AngleIn, TestIn
-from api.sessions.trials import SEQUENCE
-from api.store.seen import ChangedError
-from api.store.tables import Participant, Test
-from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import limits_form, next_view, starting, typed
-from api.web.pages.model_view import to_job
-from api.web.pages.render import page
-from api.web.routes import joint, participants
-from api.web.routes.joint import PoseIn, TogetherIn
+from stimrig.api.errors import ApiError
+from stimrig.api.models import together
+from stimrig.api.sessions import angles
+from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE
+from stimrig.api.sessions.joint_tests import target_of
+from stimrig.api.sessions.requests import AngleIn, TestIn
+from stimrig.api.sessions.trials import SEQUENCE
+from stimrig.api.store.seen import ChangedError
+from stimrig.api.store.tables import Participant, Test
+from stimrig.api.web.dependencies import Context, Ctx, Tester
+from stimrig.api.web.pages import limits_form, next_view, starting, typed
+from stimrig.api.web.pages.model_view import to_job
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes import joint, participants
+from stimrig.api.web.routes.joint import PoseIn, TogetherIn
 
 router = APIRouter(include_in_schema=False)
 OF_PERSON = "/participants/{code}/joint"

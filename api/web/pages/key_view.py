@@ -9,14 +9,14 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 from pydantic import StringConstraints
 
-from api.errors import NotFoundError
-from api.people import controller_keys
-from api.sessions.controller_trials import PlanIn, plan_within
-from api.sessions.refusals import refuse_archived
-from api.store import seen
-from api.web.dependencies import Approver, Ctx, Tester
-from api.web.pages import participant_view, typed
-from api.web.routes import participants
+from stimrig.api.errors import NotFoundError
+from stimrig.api.people import controller_keys
+from stimrig.api.sessions.controller_trials import PlanIn, plan_within
+from stimrig.api.sessions.refusals import refuse_archived
+from stimrig.api.store import seen
+from stimrig.api.web.dependencies import Approver, Ctx, Tester
+from stimrig.api.web.pages import participant_view, typed
+from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/keys")
 Text = Annotated[str, Form()]

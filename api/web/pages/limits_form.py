@@ -12,10 +12,10 @@ from typing import Any
 
 from starlette.datastructures import FormData
 
-from api.sessions import angles, profiles
-from api.web.pages import typed
-from api.web.routes.participants import calibrated_utc
-from rig.messages import Bound, Status
+from stimrig.api.sessions import angles, profiles
+from stimrig.api.web.pages import typed
+from stimrig.api.web.routes.participants import calibrated_utc
+from stimrig.rig.messages import Bound, Status
 
 LONGEST_SHOWN = 60
 ANGLES = ("angle_from_deg", "angle_to_deg")

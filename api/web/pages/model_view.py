@@ -8,20 +8,20 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
-from api import language
-from api.charts import diagnosis_charts, joint_charts, model_charts
-from api.charts.overview import LARGE, overview
-from api.errors import ApiError
-from api.models import advice, carried_structure, explanation, headline, next_step, stored, summary
-from api.people.auth import Scope
-from api.sessions.requests import TestIn
-from api.store.tables import Model
-from api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester
-from api.web.pages import next_view, starting, trend_view, typed
-from api.web.pages.render import page
-from api.web.requests import EffectsIn
-from api.web.routes import criticism, participants
-from api.workers.tracker import FIT_TOGETHER, Job
+from stimrig.api import language
+from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
+from stimrig.api.charts.overview import LARGE, overview
+from stimrig.api.errors import ApiError
+from stimrig.api.models import advice, carried_structure, explanation, headline, next_step, stored, summary
+from stimrig.api.people.auth import Scope
+from stimrig.api.sessions.requests import TestIn
+from stimrig.api.store.tables import Model
+from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester
+from stimrig.api.web.pages import next_view, starting, trend_view, typed
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.requests import EffectsIn
+from stimrig.api.web.routes import criticism, participants
+from stimrig.api.workers.tracker import FIT_TOGETHER, Job
 
 router = APIRouter(include_in_schema=False)
 TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model",

@@ -6,13 +6,13 @@ import asyncio
 
 from fastapi import APIRouter
 
-from api import language
-from api.models import next_step
-from api.sessions.trials import SEQUENCE
-from api.store.tables import OPEN_STATES, Model, Participant, Test
-from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import rig_state, starting
-from api.web.routes import participants
+from stimrig.api import language
+from stimrig.api.models import next_step
+from stimrig.api.sessions.trials import SEQUENCE
+from stimrig.api.store.tables import OPEN_STATES, Model, Participant, Test
+from stimrig.api.web.dependencies import Context, Ctx, Tester
+from stimrig.api.web.pages import rig_state, starting
+from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
 

@@ -8,19 +8,19 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form
 from fastapi.responses import RedirectResponse, Response
 
-from api.errors import ApiError
-from api.language import _, lazy
-from api.models.places import site_of
-from api.sessions.questions import Question, Row
-from api.sessions.requests import MuscleIn, NoteIn
-from api.store import seen
-from api.web.browser_session import local
-from api.web.dependencies import Ctx, Tester
-from api.web.pages import typed
-from api.web.pages.environment import environment
-from api.web.pages.starting import site_words
-from api.web.requests import RanByIn
-from api.web.routes import muscle, notes, participants, tests
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _, lazy
+from stimrig.api.models.places import site_of
+from stimrig.api.sessions.questions import Question, Row
+from stimrig.api.sessions.requests import MuscleIn, NoteIn
+from stimrig.api.store import seen
+from stimrig.api.web.browser_session import local
+from stimrig.api.web.dependencies import Ctx, Tester
+from stimrig.api.web.pages import typed
+from stimrig.api.web.pages.environment import environment
+from stimrig.api.web.pages.starting import site_words
+from stimrig.api.web.requests import RanByIn
+from stimrig.api.web.routes import muscle, notes, participants, tests
 
 router = APIRouter(include_in_schema=False)
 ONE = "/participants/{code}"

@@ -10,19 +10,19 @@ from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 from starlette.datastructures import FormData
 
-from api.errors import ApiError
-from api.people import controller_keys
-from api.people.auth import Principal
-from api.sessions import angles, profiles
-from api.sessions.questions import LIFE_S, Question, Row, gone
-from api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, TargetIn, TestIn
-from api.store import seen
-from api.store.tables import Participant, Test
-from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import limits_form, next_view, starting, trials_view, typed
-from api.web.pages.limits_form import LimitsForm
-from api.web.pages.render import page
-from api.web.routes import participants, recordings
+from stimrig.api.errors import ApiError
+from stimrig.api.people import controller_keys
+from stimrig.api.people.auth import Principal
+from stimrig.api.sessions import angles, profiles
+from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
+from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, TargetIn, TestIn
+from stimrig.api.store import seen
+from stimrig.api.store.tables import Participant, Test
+from stimrig.api.web.dependencies import Context, Ctx, Tester
+from stimrig.api.web.pages import limits_form, next_view, starting, trials_view, typed
+from stimrig.api.web.pages.limits_form import LimitsForm
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes import participants, recordings
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
 

@@ -13,15 +13,15 @@ from jinja2 import Environment
 from markupsafe import Markup
 from sqlalchemy.exc import SQLAlchemyError
 
-from api import language
-from api.clock import zone_name
-from api.errors import ApiError
-from api.people.auth import LOCKED, Principal, Scope
-from api.store import seen
-from api.web.dependencies import Context
-from api.web.pages import changes, choices, rig_state
-from api.web.pages.changes import Again
-from api.web.pages.environment import environment
+from stimrig.api import language
+from stimrig.api.clock import zone_name
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import LOCKED, Principal, Scope
+from stimrig.api.store import seen
+from stimrig.api.web.dependencies import Context
+from stimrig.api.web.pages import changes, choices, rig_state
+from stimrig.api.web.pages.changes import Again
+from stimrig.api.web.pages.environment import environment
 
 environment.filters["what_to_check"] = rig_state.what_to_check
 environment.globals["colours_media"] = choices.MEDIA

@@ -8,10 +8,10 @@ from typing import Any
 
 from markupsafe import Markup
 
-from api.charts import diagnosis_charts, joint_charts, model_charts
-from api.models import explanation, summary
-from api.web.pages.environment import HERE, environment
-from api.web.pages.static import packaged
+from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
+from stimrig.api.models import explanation, summary
+from stimrig.api.web.pages.environment import HERE, environment
+from stimrig.api.web.pages.static import packaged
 
 
 def comparison_html(
@@ -28,7 +28,7 @@ def comparison_html(
     document : dict
         MODEL.json.
     curves : dict
-        As `api.workers.verbs.curves` gives them.
+        As `stimrig.api.workers.verbs.curves` gives them.
     name : str
         What was measured: a file's or a test's name.
     test : dict or None
@@ -70,15 +70,15 @@ def improvement_html(
     Parameters
     ----------
     found : dict
-        As `identify.diagnosis.improvement` gives it.
+        As `stimrig.identify.diagnosis.improvement` gives it.
     name : str
         The record's.
     diagnosis : dict or None
-        As `api.workers.diagnosis_verbs.diagnosis` gives it: explanations, parameters, signatures.
+        As `stimrig.api.workers.diagnosis_verbs.diagnosis` gives it: explanations, parameters, signatures.
     before, after : dict or None
         Comparisons of the first model and of the last one with the record.
     segments : list of dict or None
-        The record's, as `api.workers.verbs.runs` gives them.
+        The record's, as `stimrig.api.workers.verbs.runs` gives them.
     """
     rows = explanation.of_steps(found)
     view = explanation.view(diagnosis, before, []) if diagnosis else None

@@ -9,16 +9,16 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from api.charts import joint_charts, model_charts
-from api.charts.svg import svg
-from api.clock import local_day
-from api.language import _
-from api.models import advice, explanation, stored
-from api.models.places import Site, site_of, site_of_recording
-from api.store.tables import Model, Note, Participant, Recording, Test
-from api.web.dependencies import Context, Ctx, ModelReader
-from api.web.pages.model_view import facts, measurement
-from api.web.pages.render import page
+from stimrig.api.charts import joint_charts, model_charts
+from stimrig.api.charts.svg import svg
+from stimrig.api.clock import local_day
+from stimrig.api.language import _
+from stimrig.api.models import advice, explanation, stored
+from stimrig.api.models.places import Site, site_of, site_of_recording
+from stimrig.api.store.tables import Model, Note, Participant, Recording, Test
+from stimrig.api.web.dependencies import Context, Ctx, ModelReader
+from stimrig.api.web.pages.model_view import facts, measurement
+from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
 TALL, LOW = 312.0, 215.0

@@ -6,10 +6,10 @@ import hashlib
 import math
 from typing import Any
 
-from api.language import clock, lazy
-from api.people.auth import Principal
-from api.sessions.joint_plan import PASSIVE
-from api.web.dependencies import Context
+from stimrig.api.language import clock, lazy
+from stimrig.api.people.auth import Principal
+from stimrig.api.sessions.joint_plan import PASSIVE
+from stimrig.api.web.dependencies import Context
 
 SILENT_S = 1.6
 """The rig answers once a second and sends its torque more often. After such a silence its state is unknown."""

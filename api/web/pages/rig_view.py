@@ -8,13 +8,13 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from sqlalchemy.exc import SQLAlchemyError
 
-from api.errors import ApiError
-from api.people.auth import LOCKED
-from api.web.browser_session import local
-from api.web.dependencies import Anyone, Ctx, Rearmer
-from api.web.pages import rig_state
-from api.web.pages.render import fragment, look, page
-from api.web.routes.rig import rearm_rig
+from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import LOCKED
+from stimrig.api.web.browser_session import local
+from stimrig.api.web.dependencies import Anyone, Ctx, Rearmer
+from stimrig.api.web.pages import rig_state
+from stimrig.api.web.pages.render import fragment, look, page
+from stimrig.api.web.routes.rig import rearm_rig
 
 router = APIRouter(include_in_schema=False)
 

@@ -8,21 +8,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from api.clinical_words import degrees, test_kind_words
-from api.errors import ApiError
-from api.language import _, lazy, localised, translated, until, when
-from api.models.places import Site, site_of
-from api.people.auth import Principal
-from api.sessions import angles, profiles
-from api.sessions.joint_plan import HELD, PASSIVE
-from api.sessions.questions import Question, Row
-from api.sessions.refusals import other_than, refuse_archived
-from api.sessions.requests import TestIn
-from api.store import seen
-from api.store.tables import Participant
-from api.web.dependencies import Context
-from api.web.pages.environment import environment, number
-from api.web.routes import participants
+from stimrig.api.clinical_words import degrees, test_kind_words
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _, lazy, localised, translated, until, when
+from stimrig.api.models.places import Site, site_of
+from stimrig.api.people.auth import Principal
+from stimrig.api.sessions import angles, profiles
+from stimrig.api.sessions.joint_plan import HELD, PASSIVE
+from stimrig.api.sessions.questions import Question, Row
+from stimrig.api.sessions.refusals import other_than, refuse_archived
+from stimrig.api.sessions.requests import TestIn
+from stimrig.api.store import seen
+from stimrig.api.store.tables import Participant
+from stimrig.api.web.dependencies import Context
+from stimrig.api.web.pages.environment import environment, number
+from stimrig.api.web.routes import participants
 
 NOBODY = lazy("today nobody has tested which pulse widths are felt, move the arm and are comfortable")
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, Response
 
-from api.errors import NotFoundError
-from api.web.pages.environment import HERE, environment
+from stimrig.api.errors import NotFoundError
+from stimrig.api.web.pages.environment import HERE, environment
 
 router = APIRouter(include_in_schema=False)
 

@@ -9,16 +9,16 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from api import language
-from api.charts import compare_charts, trend_charts
-from api.charts.compare_charts import MOST
-from api.errors import ApiError
-from api.models import changes, stored, trend_words
-from api.models.trend import Session
-from api.store.tables import Model
-from api.web.dependencies import Context, Ctx, ModelReader
-from api.web.pages.render import page
-from api.web.routes import trend as rest
+from stimrig.api import language
+from stimrig.api.charts import compare_charts, trend_charts
+from stimrig.api.charts.compare_charts import MOST
+from stimrig.api.errors import ApiError
+from stimrig.api.models import changes, stored, trend_words
+from stimrig.api.models.trend import Session
+from stimrig.api.store.tables import Model
+from stimrig.api.web.dependencies import Context, Ctx, ModelReader
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes import trend as rest
 
 router = APIRouter(include_in_schema=False)
 COLUMNS = (

@@ -8,19 +8,19 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse, Response
 
-from api.charts import tracking_charts
-from api.clock import unix_of
-from api.errors import ApiError
-from api.language import _, clock, ngettext
-from api.models.tracking import OUTCOMES, Limits, sentences
-from api.people.auth import Principal
-from api.store import seen
-from api.store.tables import Recording
-from api.web.dependencies import Context, Ctx, Tester
-from api.web.pages import rig_state
-from api.web.pages.environment import environment
-from api.web.pages.render import signed
-from api.web.routes import participants
+from stimrig.api.charts import tracking_charts
+from stimrig.api.clock import unix_of
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _, clock, ngettext
+from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
+from stimrig.api.people.auth import Principal
+from stimrig.api.store import seen
+from stimrig.api.store.tables import Recording
+from stimrig.api.web.dependencies import Context, Ctx, Tester
+from stimrig.api.web.pages import rig_state
+from stimrig.api.web.pages.environment import environment
+from stimrig.api.web.pages.render import signed
+from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
 TABLE = ("gain", "threshold_shift_us", "time_scale")

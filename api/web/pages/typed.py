@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from api.errors import ApiError
+from stimrig.api.errors import ApiError
 
 PLAIN = re.compile(r"(0|[1-9][0-9]{0,4})(?:[.,]([0-9]{1,2}))?")
 NAMES = {"scopes": "role", "effects": "effect"}

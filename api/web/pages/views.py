@@ -9,18 +9,18 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 
-from api.charts import model_charts
-from api.charts.svg import svg
-from api.clinical_words import missing_words
-from api.errors import ApiError
-from api.language import _, plain, translated
-from api.models import stored
-from api.store.tables import Test
-from api.web.dependencies import Context, Ctx, LiveReader, Tester
-from api.web.pages.model_view import measurement
-from api.web.pages.render import page
-from api.web.routes import tests
-from rig.messages import Status
+from stimrig.api.charts import model_charts
+from stimrig.api.charts.svg import svg
+from stimrig.api.clinical_words import missing_words
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _, plain, translated
+from stimrig.api.models import stored
+from stimrig.api.store.tables import Test
+from stimrig.api.web.dependencies import Context, Ctx, LiveReader, Tester
+from stimrig.api.web.pages.model_view import measurement
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes import tests
+from stimrig.rig.messages import Status
 
 router = APIRouter(include_in_schema=False)
 

@@ -8,15 +8,15 @@ from typing import Annotated, Any
 from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import PlainTextResponse, Response
 
-from api.charts.compare_charts import inversion
-from api.charts.svg import svg
-from api.errors import ApiError
-from api.language import _
-from api.models import inverted as words
-from api.store.tables import Model
-from api.web.dependencies import Context, Ctx, ModelReader
-from api.web.pages.render import page
-from api.web.routes.prediction import inverted
+from stimrig.api.charts.compare_charts import inversion
+from stimrig.api.charts.svg import svg
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _
+from stimrig.api.models import inverted as words
+from stimrig.api.store.tables import Model
+from stimrig.api.web.dependencies import Context, Ctx, ModelReader
+from stimrig.api.web.pages.render import page
+from stimrig.api.web.routes.prediction import inverted
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from api.schemas import component_name
+from stimrig.api.schemas import component_name
 
 
 class Document(BaseModel):
@@ -66,7 +66,7 @@ class SchemaOut(Document):
 
 
 def published(name: str, description: str) -> dict[str, Any]:
-    """An answer that holds to a published schema (`api.schemas`)."""
+    """An answer that holds to a published schema (`stimrig.api.schemas`)."""
     schema = {"$ref": f"#/components/schemas/{component_name(name)}"}
     return {"description": description, "content": {"application/json": {"schema": schema}}}
 

@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from api.web.responses.base import Document
-from rig.messages import AngleStatus
+from stimrig.api.web.responses.base import Document
+from stimrig.rig.messages import AngleStatus
 
 
 class AngleOut(AngleStatus, Document):

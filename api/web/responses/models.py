@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from api.web.responses.base import Document, Problem, SegmentOut
+from stimrig.api.web.responses.base import Document, Problem, SegmentOut
 
 
 class ParameterOut(Document):

@@ -6,9 +6,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from api.sessions.requests import NoteKind
-from api.web.responses.base import Document
-from rig.messages import CalibrationStatus, RigState
+from stimrig.api.sessions.requests import NoteKind
+from stimrig.api.web.responses.base import Document
+from stimrig.rig.messages import CalibrationStatus, RigState
 
 
 class ProfileOut(Document):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field, JsonValue
 
-from api.people.auth import Scope
-from api.web.responses.base import Document
+from stimrig.api.people.auth import Scope
+from stimrig.api.web.responses.base import Document
 
 
 class UserOut(Document):

@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from api.web.responses.base import Document, Holder, SegmentOut
-from api.web.responses.joint import JointOut
-from api.web.responses.models import SegmentSpan, VersionOut
-from rig.messages import AngleStatus, Bound, CalibrationStatus, ProtocolInfo, RigState, StopEvidence
+from stimrig.api.web.responses.base import Document, Holder, SegmentOut
+from stimrig.api.web.responses.joint import JointOut
+from stimrig.api.web.responses.models import SegmentSpan, VersionOut
+from stimrig.rig.messages import AngleStatus, Bound, CalibrationStatus, ProtocolInfo, RigState, StopEvidence
 
 
 class DeviceOut(Document):

@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from api.web.responses.base import Document
-from api.web.responses.models import TrackingLimits
+from stimrig.api.web.responses.base import Document
+from stimrig.api.web.responses.models import TrackingLimits
 
 
 class TrendFigureOut(Document):

@@ -12,17 +12,17 @@ from typing import Any
 from fastapi import APIRouter, Response
 from sqlalchemy.orm import Session
 
-from api.errors import ApiError
-from api.sessions import profiles
-from api.sessions.refusals import refuse_archived
-from api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
-from api.store import audit, seen
-from api.store.holds import LIMITS_TURN
-from api.web.dependencies import PROBLEM, Context, Ctx, Tester
-from api.web.responses.base import answers
-from api.web.responses.participants import CalibratedOut, CalibrationOut
-from api.web.routes import participants
-from rig.messages import (
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions import profiles
+from stimrig.api.sessions.refusals import refuse_archived
+from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
+from stimrig.api.store import audit, seen
+from stimrig.api.store.holds import LIMITS_TURN
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.participants import CalibratedOut, CalibrationOut
+from stimrig.api.web.routes import participants
+from stimrig.rig.messages import (
     Calibrated,
     CalibrateFinishRequest,
     CalibrateMarkRequest,

@@ -8,12 +8,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse
 
-from api.store.tables import Model
-from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
-from api.web.requests import EffectsIn
-from api.web.responses.base import answers, published
-from api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
-from api.workers.tracker import Job
+from stimrig.api.store.tables import Model
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
+from stimrig.api.web.requests import EffectsIn
+from stimrig.api.web.responses.base import answers, published
+from stimrig.api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
+from stimrig.api.workers.tracker import Job
 
 router = APIRouter(prefix="/v1", tags=["criticism"], responses=PROBLEM)
 LATER: dict[int | str, dict[str, Any]] = {202: {"model": JobOut, "description": "begun; see `Location`"}}

@@ -8,23 +8,23 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 from pydantic import AfterValidator, Field, StrictBool, StringConstraints
 
-from api.clock import local_day
-from api.errors import ApiError
-from api.models import together
-from api.sessions import angles
-from api.sessions.requests import AngleRad, Body
-from api.store import audit, seen
-from api.store.holds import LIMITS_TURN
-from api.store.seen import Seen
-from api.store.tables import Model, Participant
-from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
-from api.web.responses.base import answers
-from api.web.responses.joint import AngleOut, JointOverviewOut
-from api.web.responses.models import VersionOut
-from api.web.routes import participants
-from api.web.routes.criticism import LATER, later
-from api.workers.tracker import FIT_TOGETHER, Job
-from rig.messages import AnglePoseRequest, AngleStatus, Status
+from stimrig.api.clock import local_day
+from stimrig.api.errors import ApiError
+from stimrig.api.models import together
+from stimrig.api.sessions import angles
+from stimrig.api.sessions.requests import AngleRad, Body
+from stimrig.api.store import audit, seen
+from stimrig.api.store.holds import LIMITS_TURN
+from stimrig.api.store.seen import Seen
+from stimrig.api.store.tables import Model, Participant
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.joint import AngleOut, JointOverviewOut
+from stimrig.api.web.responses.models import VersionOut
+from stimrig.api.web.routes import participants
+from stimrig.api.web.routes.criticism import LATER, later
+from stimrig.api.workers.tracker import FIT_TOGETHER, Job
+from stimrig.rig.messages import AnglePoseRequest, AngleStatus, Status
 
 router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
 

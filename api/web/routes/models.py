@@ -8,19 +8,19 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Response
 
-from api.clock import unix_of
-from api.errors import ApiError
-from api.models import stored
-from api.models.tracking import Limits
-from api.store import seen
-from api.store.tables import Model
-from api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader
-from api.web.headers import entity_tags
-from api.web.requests import ApprovalIn, DecisionIn
-from api.web.responses.base import answers, published
-from api.web.responses.models import VersionOut
-from api.web.responses.trend import TrackingOut
-from api.web.routes import participants
+from stimrig.api.clock import unix_of
+from stimrig.api.errors import ApiError
+from stimrig.api.models import stored
+from stimrig.api.models.tracking import Limits
+from stimrig.api.store import seen
+from stimrig.api.store.tables import Model
+from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader
+from stimrig.api.web.headers import entity_tags
+from stimrig.api.web.requests import ApprovalIn, DecisionIn
+from stimrig.api.web.responses.base import answers, published
+from stimrig.api.web.responses.models import VersionOut
+from stimrig.api.web.responses.trend import TrackingOut
+from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 TAG = {"description": "send it as `If-None-Match`", "schema": {"type": "string"}}

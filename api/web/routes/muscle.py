@@ -11,17 +11,17 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 
-from api.errors import ApiError
-from api.models.places import Site, in_words, site_of
-from api.sessions import profiles
-from api.sessions.requests import MuscleIn
-from api.store import audit, seen
-from api.store.holds import LIMITS_TURN
-from api.store.tables import Participant
-from api.web.dependencies import PROBLEM, Context, Ctx, Tester
-from api.web.responses.base import answers
-from api.web.responses.participants import ParticipantOut
-from api.web.routes import participants
+from stimrig.api.errors import ApiError
+from stimrig.api.models.places import Site, in_words, site_of
+from stimrig.api.sessions import profiles
+from stimrig.api.sessions.requests import MuscleIn
+from stimrig.api.store import audit, seen
+from stimrig.api.store.holds import LIMITS_TURN
+from stimrig.api.store.tables import Participant
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.participants import ParticipantOut
+from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1/participants/{code}", tags=["participants"], responses=PROBLEM)
 

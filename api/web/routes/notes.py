@@ -7,13 +7,13 @@ from typing import Any
 
 from fastapi import APIRouter, Response
 
-from api.sessions import notes
-from api.sessions.requests import NoteIn
-from api.store.tables import Note
-from api.web.dependencies import PROBLEM, Context, Ctx, Tester
-from api.web.responses.base import answers
-from api.web.responses.participants import NoteOut
-from api.web.routes import participants
+from stimrig.api.sessions import notes
+from stimrig.api.sessions.requests import NoteIn
+from stimrig.api.store.tables import Note
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.participants import NoteOut
+from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)
 

@@ -16,11 +16,11 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from sqlalchemy import func, select, text
 
-from api.outbox import status
-from api.store.tables import AuditEntry, Model, Participant, Test
-from api.web.dependencies import Context, Ctx
-from api.web.responses.base import answers
-from api.web.responses.rig import HealthOut
+from stimrig.api.outbox import status
+from stimrig.api.store.tables import AuditEntry, Model, Participant, Test
+from stimrig.api.web.dependencies import Context, Ctx
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.rig import HealthOut
 
 router = APIRouter(tags=["operation"])
 

@@ -8,20 +8,20 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 from sqlalchemy.orm import Session
 
-from api.clock import local_day
-from api.errors import ApiError, NotFoundError
-from api.sessions import angles, directory, profiles
-from api.sessions.requests import ProfileIn
-from api.store import audit, seen
-from api.store.holds import LIMITS_TURN
-from api.store.seen import Seen
-from api.store.tables import Participant, Test
-from api.web.dependencies import PROBLEM, Context, Ctx, Tester
-from api.web.requests import ParticipantIn
-from api.web.responses.base import answers
-from api.web.responses.participants import ChangedOut, ParticipantOut
-from api.web.responses.rig import TestOut
-from rig.messages import Status
+from stimrig.api.clock import local_day
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.sessions import angles, directory, profiles
+from stimrig.api.sessions.requests import ProfileIn
+from stimrig.api.store import audit, seen
+from stimrig.api.store.holds import LIMITS_TURN
+from stimrig.api.store.seen import Seen
+from stimrig.api.store.tables import Participant, Test
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from stimrig.api.web.requests import ParticipantIn
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.participants import ChangedOut, ParticipantOut
+from stimrig.api.web.responses.rig import TestOut
+from stimrig.rig.messages import Status
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
 

@@ -9,16 +9,16 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from api.clock import utc_label
-from api.errors import ApiError, NotFoundError
-from api.people import names
-from api.people.auth import Principal, Scope, unauthorized
-from api.store import seen
-from api.web.browser_session import local, same_origin, set_cookie
-from api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx, EvenLocked
-from api.web.openapi import TOO_MANY
-from api.web.responses.base import answers
-from api.web.responses.people import KeyOut, ListedUser, SessionOut, UserOut
+from stimrig.api.clock import utc_label
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.people import names
+from stimrig.api.people.auth import Principal, Scope, unauthorized
+from stimrig.api.store import seen
+from stimrig.api.web.browser_session import local, same_origin, set_cookie
+from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx, EvenLocked
+from stimrig.api.web.openapi import TOO_MANY
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.people import KeyOut, ListedUser, SessionOut, UserOut
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 

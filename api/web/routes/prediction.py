@@ -8,12 +8,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter
 from pydantic import Field, FiniteFloat, StrictBool, model_validator
 
-from api.sessions.limits import tighter
-from api.sessions.requests import Body
-from api.store.tables import Participant
-from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
-from api.web.responses.base import answers
-from api.web.responses.models import InversionOut, PredictionOut
+from stimrig.api.sessions.limits import tighter
+from stimrig.api.sessions.requests import Body
+from stimrig.api.store.tables import Participant
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.models import InversionOut, PredictionOut
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 

@@ -14,16 +14,16 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
-from api.errors import ApiError, NotFoundError
-from api.models.places import site_of
-from api.people.auth import Principal, Scope
-from api.store import audit, seen, uploads
-from api.store.tables import Model, Participant, Recording
-from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
-from api.web.openapi import problem
-from api.web.responses.base import answers
-from api.web.responses.rig import UploadOut
-from api.web.routes import participants
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models.places import site_of
+from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.store import audit, seen, uploads
+from stimrig.api.store.tables import Model, Participant, Recording
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
+from stimrig.api.web.openapi import problem
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.rig import UploadOut
+from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
@@ -100,7 +100,7 @@ async def upload(
     `of`, by who may approve models; the audit trail keeps both codes.
     """
     await asyncio.to_thread(participants.find, context, code)
-    data = await request.body()  # `api.web.body_limit` bounds it
+    data = await request.body()  # `stimrig.api.web.body_limit` bounds it
     if not data:
         raise ApiError(422, "empty", "The upload is empty", "Send a CSV or MAT file or a sealed recording as the body.")
     row, model, warnings = await take_in(context, code, data, who, columns, of)

@@ -8,16 +8,16 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 
-from api.errors import ApiError
-from api.sessions.requests import StopIn, TestIn
-from api.sessions.stop_log import StopResult
-from api.store import audit, seen
-from api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
-from api.web.headers import wants_html
-from api.web.responses.base import answers
-from api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
-from api.web.stop_guard import Press
-from rig.messages import RearmRequest, SequencesRequest, StopEvidence
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.requests import StopIn, TestIn
+from stimrig.api.sessions.stop_log import StopResult
+from stimrig.api.store import audit, seen
+from stimrig.api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
+from stimrig.api.web.headers import wants_html
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
+from stimrig.api.web.stop_guard import Press
+from stimrig.rig.messages import RearmRequest, SequencesRequest, StopEvidence
 
 router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
 FORM = {"schema": StopIn.model_json_schema()}

@@ -7,10 +7,10 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.responses import JSONResponse
 
-from api import schemas
-from api.errors import NotFoundError
-from api.web.openapi import problem
-from api.web.responses.base import SchemaOut, SchemasOut, answers
+from stimrig.api import schemas
+from stimrig.api.errors import NotFoundError
+from stimrig.api.web.openapi import problem
+from stimrig.api.web.responses.base import SchemaOut, SchemasOut, answers
 
 router = APIRouter(prefix="/v1/schemas", tags=["schemas"])
 FOUND: dict[int | str, dict[str, Any]] = {

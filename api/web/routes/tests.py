@@ -11,22 +11,22 @@ from urllib.parse import urlsplit
 from fastapi import APIRouter, Response, WebSocket, WebSocketDisconnect
 from sqlalchemy.exc import SQLAlchemyError
 
-from api import language
-from api.clinical_words import missing_words
-from api.errors import ApiError, NotFoundError
-from api.people.auth import Principal, Scope
-from api.sessions import controller_trials
-from api.sessions.refusals import other_than
-from api.sessions.requests import TestIn
-from api.store import audit, seen
-from api.store.holds import KEY_TURN
-from api.store.tables import Test
-from api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
-from api.web.headers import chosen_language
-from api.web.key_guard import refuse_outside
-from api.web.requests import RanByIn
-from api.web.responses.base import answers
-from api.web.responses.rig import LeftOut, TestOut
+from stimrig.api import language
+from stimrig.api.clinical_words import missing_words
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.sessions import controller_trials
+from stimrig.api.sessions.refusals import other_than
+from stimrig.api.sessions.requests import TestIn
+from stimrig.api.store import audit, seen
+from stimrig.api.store.holds import KEY_TURN
+from stimrig.api.store.tables import Test
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
+from stimrig.api.web.headers import chosen_language
+from stimrig.api.web.key_guard import refuse_outside
+from stimrig.api.web.requests import RanByIn
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.rig import LeftOut, TestOut
 
 log = logging.getLogger("stimrig.live")
 LOOK_S = 1.0

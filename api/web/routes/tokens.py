@@ -6,14 +6,14 @@ from typing import Any
 
 from fastapi import APIRouter
 
-from api.errors import ApiError, NotFoundError
-from api.outbox import receipts
-from api.people.auth import Scope
-from api.store.tables import AuditEntry, Token
-from api.web.dependencies import PROBLEM, Administrator, Ctx
-from api.web.requests import TokenIn
-from api.web.responses.base import answers
-from api.web.responses.people import AuditOut, ListedToken, TokenOut
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.outbox import receipts
+from stimrig.api.people.auth import Scope
+from stimrig.api.store.tables import AuditEntry, Token
+from stimrig.api.web.dependencies import PROBLEM, Administrator, Ctx
+from stimrig.api.web.requests import TokenIn
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.people import AuditOut, ListedToken, TokenOut
 
 router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)
 

@@ -8,14 +8,14 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.responses import Response
 
-from api import language
-from api.models import changes, trend_words
-from api.models.trend import Session
-from api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
-from api.web.responses.base import answers
-from api.web.responses.trend import TrendOut
-from api.web.routes import participants
-from identify.records.cells import lines
+from stimrig.api import language
+from stimrig.api.models import changes, trend_words
+from stimrig.api.models.trend import Session
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
+from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.trend import TrendOut
+from stimrig.api.web.routes import participants
+from stimrig.identify.records.cells import lines
 
 router = APIRouter(prefix="/v1/participants/{code}", tags=["trend"], responses=PROBLEM)
 CSV: dict[int | str, dict[str, Any]] = {

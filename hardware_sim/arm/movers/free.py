@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hardware_sim.arm.motion import Begin, Drive, Motion
+from stimrig.hardware_sim.arm.motion import Begin, Drive, Motion
 
 
 class Mover:

@@ -12,8 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians, within
-from hardware_sim.arm.servo import Leg, Path, Servo
+from stimrig.hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians, within
+from stimrig.hardware_sim.arm.servo import Leg, Path, Servo
 
 BANDWIDTH_HZ = 3.0
 PIECES = 5

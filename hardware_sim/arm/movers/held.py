@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.arm.curve import Quintic, lasting_s
-from hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians
+from stimrig.hardware_sim.arm.curve import Quintic, lasting_s
+from stimrig.hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians
 
 
 class Mover:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians, within
-from hardware_sim.arm.servo import Leg, Path, Servo
+from stimrig.hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians, within
+from stimrig.hardware_sim.arm.servo import Leg, Path, Servo
 
 
 class Mover:

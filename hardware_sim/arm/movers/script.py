@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from hardware_sim.arm.curve import Quintic, lasting_s
-from hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians
-from hardware_sim.errors import ArmError
+from stimrig.hardware_sim.arm.curve import Quintic, lasting_s
+from stimrig.hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians
+from stimrig.hardware_sim.errors import ArmError
 
 STOPS_WITHIN_S = 0.3
 

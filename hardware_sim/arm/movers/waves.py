@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from hardware_sim.arm.curve import Quintic, lasting_s
-from hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians, within
-from hardware_sim.errors import ArmError
+from stimrig.hardware_sim.arm.curve import Quintic, lasting_s
+from stimrig.hardware_sim.arm.motion import FASTEST_DEG_S, SLOWEST_DEG_S, Begin, Drive, Motion, radians, within
+from stimrig.hardware_sim.errors import ArmError
 
 
 class Mover:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hardware_sim.arm.law import Number, PassiveLaw
+from stimrig.hardware_sim.arm.law import Number, PassiveLaw
 
 
 @dataclass(frozen=True)

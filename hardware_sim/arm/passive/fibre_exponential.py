@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hardware_sim.arm.law import Number, PassiveLaw
+from stimrig.hardware_sim.arm.law import Number, PassiveLaw
 
 STIFFNESS, STRAIN = 4.0, 0.6
 

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hardware_sim.arm.law import Number, PassiveLaw
+from stimrig.hardware_sim.arm.law import Number, PassiveLaw
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hardware_sim.arm.law import Number, PassiveLaw
+from stimrig.hardware_sim.arm.law import Number, PassiveLaw
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from hardware_sim.arm.law import Number, PassiveLaw
+from stimrig.hardware_sim.arm.law import Number, PassiveLaw
 
 
 @dataclass(frozen=True)

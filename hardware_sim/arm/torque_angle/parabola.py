@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hardware_sim.arm.law import Number
+from stimrig.hardware_sim.arm.law import Number
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hardware_sim.arm.law import Number
+from stimrig.hardware_sim.arm.law import Number
 
 D1, D2, D3, D4 = -0.318, -8.149, -0.374, 0.886
 AT_REST = D1 * math.asinh(D3) + D4

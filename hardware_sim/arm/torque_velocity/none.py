@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hardware_sim.arm.law import Number
+from stimrig.hardware_sim.arm.law import Number
 
 
 @dataclass(frozen=True)

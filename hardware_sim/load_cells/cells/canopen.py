@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import Frame, Sample
+from stimrig.hardware_sim.load_cells.frames import Frame, Sample
 
 NODE = 1
 NMT_ID = 0x000

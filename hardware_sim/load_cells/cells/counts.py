@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import AlwaysOn, Frame, Sample
+from stimrig.hardware_sim.load_cells.frames import AlwaysOn, Frame, Sample
 
 CAN_ID = 610
 ZERO_COUNTS = 32768

@@ -9,7 +9,7 @@ import math
 import struct
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import AlwaysOn, Frame, Sample
+from stimrig.hardware_sim.load_cells.frames import AlwaysOn, Frame, Sample
 
 CAN_ID = 0x181
 LAYOUT = struct.Struct("<fHBB")

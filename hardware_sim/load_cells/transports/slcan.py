@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import LARGEST_STANDARD_ID, Frame, FrameHandler
-from hardware_sim.pseudo_terminal import PseudoTerminal
-from hardware_sim.reactor import Reactor
+from stimrig.hardware_sim.load_cells.frames import LARGEST_STANDARD_ID, Frame, FrameHandler
+from stimrig.hardware_sim.pseudo_terminal import PseudoTerminal
+from stimrig.hardware_sim.reactor import Reactor
 
 OK, ERROR = b"\r", b"\a"
 LONGEST_LINE = 64

@@ -10,8 +10,8 @@ import socket
 import time
 from collections.abc import Sequence
 
-from hardware_sim.load_cells.frames import LARGEST_STANDARD_ID, Frame, FrameHandler
-from hardware_sim.reactor import Reactor
+from stimrig.hardware_sim.load_cells.frames import LARGEST_STANDARD_ID, Frame, FrameHandler
+from stimrig.hardware_sim.reactor import Reactor
 
 CHANNEL = "can0"
 QUIET_S = 0.05

@@ -10,8 +10,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hardware_sim.patients.hidden.draw import Scenario
-    from hardware_sim.patients.hidden.live import HiddenMuscle
+    from stimrig.hardware_sim.patients.hidden.draw import Scenario
+    from stimrig.hardware_sim.patients.hidden.live import HiddenMuscle
 
 __all__ = ["drawn", "make", "movement", "reveal"]
 
@@ -25,7 +25,7 @@ shows at any joint; its probability."""
 
 @lru_cache(maxsize=8)
 def _scenario(seed: int, moving: bool) -> Scenario:
-    from hardware_sim.patients.hidden import draw
+    from stimrig.hardware_sim.patients.hidden import draw
 
     rng = draw.rng_of(seed, "hidden patient, moving" if moving else "hidden patient")
     kinds = MOVING_KINDS if moving else {"one": 0.64, "nothing": 0.12, "two": 0.1, "outside": 0.14}
@@ -63,7 +63,7 @@ def make(seed: int, moving: bool = False) -> HiddenMuscle:
     ValueError
         A negative seed.
     """
-    from hardware_sim.patients.hidden.live import HiddenMuscle
+    from stimrig.hardware_sim.patients.hidden.live import HiddenMuscle
 
     return HiddenMuscle(_scenario(seed, moving))
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden import recruitment
-from hardware_sim.patients.hidden.kernels import (
+from stimrig.hardware_sim.patients.hidden import recruitment
+from stimrig.hardware_sim.patients.hidden.kernels import (
     ACTIVATION,
     FORCE,
     LARGEST_NM,

@@ -7,8 +7,8 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from hardware_sim.patients.hidden import kernels
-from hardware_sim.patients.hidden.kernels import (
+from stimrig.hardware_sim.patients.hidden import kernels
+from stimrig.hardware_sim.patients.hidden.kernels import (
     ANGLE_RAD,
     CONTEXT_SIZE,
     COUNT,

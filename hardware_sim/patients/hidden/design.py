@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.kernels import Floats
+from stimrig.hardware_sim.patients.hidden.kernels import Floats
 
 PULSES_PER_S = 40
 DESIGNS = ("full", "short", "long")

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden import effects, outside, outside_kept
-from hardware_sim.patients.hidden.base import Base, draw_base
-from hardware_sim.patients.hidden.design import Design, make_design
-from hardware_sim.patients.hidden.kernels import Formulation, NotSuited, Stage
-from hardware_sim.patients.hidden.scenario import BANDS, HiddenEffect, combine, find_magnitude, jsonable
+from stimrig.hardware_sim.patients.hidden import effects, outside, outside_kept
+from stimrig.hardware_sim.patients.hidden.base import Base, draw_base
+from stimrig.hardware_sim.patients.hidden.design import Design, make_design
+from stimrig.hardware_sim.patients.hidden.kernels import Formulation, NotSuited, Stage
+from stimrig.hardware_sim.patients.hidden.scenario import BANDS, HiddenEffect, combine, find_magnitude, jsonable
 
 ATTEMPTS = 40
 CALIBRATION_STEP_S = 1.0 / 1600.0

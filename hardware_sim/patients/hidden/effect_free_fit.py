@@ -14,8 +14,8 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import least_squares
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import Floats, helper
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import Floats, helper
 
 PULSE_RATE_HZ = 40.0
 STIFFNESS = 1e-3

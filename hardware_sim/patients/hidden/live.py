@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.patients.hidden.chain import Chain
-from hardware_sim.patients.hidden.draw import Scenario
-from hardware_sim.patients.hidden.kernels import Floats
-from hardware_sim.patients.hidden.scenario import split
+from stimrig.hardware_sim.patients.hidden.chain import Chain
+from stimrig.hardware_sim.patients.hidden.draw import Scenario
+from stimrig.hardware_sim.patients.hidden.kernels import Floats
+from stimrig.hardware_sim.patients.hidden.scenario import split
 
 STEPS_PER_S = 1600.0
 PULSE_PERIOD_S = 0.025

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from scipy.interpolate import PchipInterpolator
 from scipy.special import ndtr
 
-from hardware_sim.patients.hidden.kernels import Floats
+from stimrig.hardware_sim.patients.hidden.kernels import Floats
 
 
 def _paper_sigmoid(u: Floats, middle: float, rise: float, _rng: Generator) -> Floats:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.chain import Chain
-from hardware_sim.patients.hidden.design import Design
-from hardware_sim.patients.hidden.effect_free_fit import PULSE_RATE_HZ, EffectFreeFit
-from hardware_sim.patients.hidden.kernels import SLOTS, Floats, Formulation, NotSuited, Stage
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.chain import Chain
+from stimrig.hardware_sim.patients.hidden.design import Design
+from stimrig.hardware_sim.patients.hidden.effect_free_fit import PULSE_RATE_HZ, EffectFreeFit
+from stimrig.hardware_sim.patients.hidden.kernels import SLOTS, Floats, Formulation, NotSuited, Stage
 
 BANDS = {"weak": (2.0, 5.0), "middle": (5.0, 10.0), "strong": (10.0, 25.0)}
 """Excess error over the noise's standard deviation."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import lfilter
 
-from hardware_sim.patients.hidden.kernels import Floats
+from stimrig.hardware_sim.patients.hidden.kernels import Floats
 
 NOISES = ("white", "ar1", "slow")
 SLOW_CORRELATION_S = 0.075

@@ -8,8 +8,8 @@ from typing import Any
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import Formulation, Kernel, Stage
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import Formulation, Kernel, Stage
 
 Draw = Any
 """How a number is drawn: `(low, high)` uniformly, a list: one of it, a number: that number, or a function of generator

@@ -8,22 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from identify.dynamics.pulse_grid import Grid
-from identify.errors import BadRequest
-from identify.estimation.averaged import averaged
-from identify.estimation.earlier import Change, Earlier
-from identify.estimation.joint import Fitted
-from identify.estimation.projected_search import project, search
-from identify.estimation.projection import Projection, Solution
-from identify.estimation.short_record import fit_short
-from identify.estimation.short_result import Short
-from identify.model import Model
-from identify.noise.ar1 import log_likelihood, whiten
-from identify.recruitment.near_shape import DEVIATIONS
-from identify.recruitment.power import PowerBasis
-from identify.recruitment.sigmoid import SigmoidBasis
-from identify.recruitment.sigmoid_fit import basis_at
+from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
+from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.averaged import averaged
+from stimrig.identify.estimation.earlier import Change, Earlier
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.projected_search import project, search
+from stimrig.identify.estimation.projection import Projection, Solution
+from stimrig.identify.estimation.short_record import fit_short
+from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.model import Model
+from stimrig.identify.noise.ar1 import log_likelihood, whiten
+from stimrig.identify.recruitment.near_shape import DEVIATIONS
+from stimrig.identify.recruitment.power import PowerBasis
+from stimrig.identify.recruitment.sigmoid import SigmoidBasis
+from stimrig.identify.recruitment.sigmoid_fit import basis_at
 
 HIGHEST_POWER = 9
 DRAWS = 1500

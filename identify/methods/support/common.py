@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from identify.dynamics.pulse_grid import Grid, runs
-from identify.errors import BadRequest, NotIdentifiable
-from identify.estimation.rows import rows_of
+from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.rows import rows_of
 
 
 def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarray:

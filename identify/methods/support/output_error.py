@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from identify.dynamics.linear import Discrete
-from identify.dynamics.second_order import recursion
-from identify.errors import NotIdentifiable
+from stimrig.identify.dynamics.linear import Discrete
+from stimrig.identify.dynamics.second_order import recursion
+from stimrig.identify.errors import NotIdentifiable
 
 LARGEST_POLE = 0.9995
 MOST_DELAYS = 4

@@ -11,10 +11,10 @@ from typing import Any
 import httpx
 import pytest
 
-from api.centre.app import create_app
-from api.centre.settings import CentreSettings
-from api.clock import Clock
-from api.store.centre_tables import CentreRig
+from stimrig.api.centre.app import create_app
+from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.clock import Clock
+from stimrig.api.store.centre_tables import CentreRig
 from tests.api.conftest import PATIENCE_S, TOKEN, Server
 from tests.harness.postgres import Cluster
 

@@ -15,10 +15,10 @@ import httpx
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from api.centre import check
-from api.centre.bucket import Bucket, BucketError
-from api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
-from api.store.centre_tables import CentreFile, CentreItem, CentreModel, CentreWanted
+from stimrig.api.centre import check
+from stimrig.api.centre.bucket import Bucket, BucketError
+from stimrig.api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
+from stimrig.api.store.centre_tables import CentreFile, CentreItem, CentreModel, CentreWanted
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller, sha256
 from tests.api.conftest import PATIENCE_S, soon
@@ -143,7 +143,7 @@ def test_so_many_bytes_of_a_rigs_parts_and_no_more(
     centre: Centre, rig: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A rig that begins one large file after the other fills no disk of the centre."""
-    monkeypatch.setattr("api.centre.spool.MOST_BYTES", 50)
+    monkeypatch.setattr("stimrig.api.centre.spool.MOST_BYTES", 50)
     told = Teller()
     data = [b"%03d" % n * 10 for n in range(6)]
     names = [told.add("recording", f"r{n}", {"participant": "P1"}, one)["file"] for n, one in enumerate(data)]

@@ -12,8 +12,8 @@ import httpx
 import pytest
 from sqlalchemy import update
 
-from api.centre import warnings
-from api.store.centre_tables import CentreItem, CentreRecording, CentreWarning
+from stimrig.api.centre import warnings
+from stimrig.api.store.centre_tables import CentreItem, CentreRecording, CentreWarning
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import AT, ZEROS, Teller, canonical, sha256
 
@@ -171,8 +171,8 @@ def test_the_key_is_looked_at_again_within_the_batchs_transaction(centre: Centre
     row = centre.row()
     centre.context.rigs.revoke("Ward 1", "test")
     told = Teller()
-    from api.centre.chain import BatchIn, read
-    from api.errors import ApiError
+    from stimrig.api.centre.chain import BatchIn, read
+    from stimrig.api.errors import ApiError
 
     with pytest.raises(ApiError, match="revoked"):
         centre.context.ingest.take(row, read(BatchIn, json.dumps(told.batch()).encode()))
@@ -238,7 +238,7 @@ def test_a_greeting_warns_of_clock_disk_and_damage_until_it_is_over(
 
 
 def test_a_rig_that_is_not_seen_for_a_day_is_told_once(centre: Centre, rig: httpx.Client) -> None:
-    from api.centre import check
+    from stimrig.api.centre import check
 
     rig.post("/v1/rig/hello", json=Teller().hello(centre.clock.utc()))
     check.look(centre.context.spool)

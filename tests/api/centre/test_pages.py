@@ -13,12 +13,12 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from api.centre import app as centre_app
-from api.centre import pages, routes
-from api.centre.pages.rigs_view import doubts
-from api.store.centre_tables import CentreRig
-from api.web.scan import routers
-from rig.messages import RigState
+from stimrig.api.centre import app as centre_app
+from stimrig.api.centre import pages, routes
+from stimrig.api.centre.pages.rigs_view import doubts
+from stimrig.api.store.centre_tables import CentreRig
+from stimrig.api.web.scan import routers
+from stimrig.rig.messages import RigState
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller
 from tests.api.conftest import TOKEN

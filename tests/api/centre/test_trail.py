@@ -13,15 +13,15 @@ from typing import Any
 import pytest
 from sqlalchemy import delete, insert, select
 
-from api.cli import main
-from api.clock import Clock
-from api.outbox import receipts
-from api.outbox.link import Link
-from api.outbox.pusher import Pusher
-from api.settings import Settings
-from api.store import audit
-from api.store.audit import entry_hash
-from api.store.tables import AuditEntry, OutboxItem
+from stimrig.api.cli import main
+from stimrig.api.clock import Clock
+from stimrig.api.outbox import receipts
+from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.pusher import Pusher
+from stimrig.api.settings import Settings
+from stimrig.api.store import audit
+from stimrig.api.store.audit import entry_hash
+from stimrig.api.store.tables import AuditEntry, OutboxItem
 from tests.api.centre.conftest import Centre
 from tests.api.outbox.rigs import Rig
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from api.cli.cohort_report import changed_lines
-from api.cohort import changed
-from api.cohort.changed import compared
-from api.cohort.errors import CohortError
-from api.cohort.parts import Results
-from api.cohort.tasks import Task
+from stimrig.api.cli.cohort_report import changed_lines
+from stimrig.api.cohort import changed
+from stimrig.api.cohort.changed import compared
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.parts import Results
+from stimrig.api.cohort.tasks import Task
 
 
 def row(name: str, **more: Any) -> dict[str, Any]:

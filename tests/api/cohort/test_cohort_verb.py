@@ -18,18 +18,18 @@ import jsonschema_rs
 import pyarrow.parquet as pq
 import pytest
 
-from api import schemas
-from api.cli import main
-from api.cohort import cluster
-from api.cohort.fields import FIELDS
+from stimrig.api import schemas
+from stimrig.api.cli import main
+from stimrig.api.cohort import cluster
+from stimrig.api.cohort.fields import FIELDS
 from tests.harness.cohort_records import cohort
 
 PATIENCE_S = 240.0
 SESSIONS = 30
 COMMAND = """
 import time
-import api.cohort.run as run
-from api.cli.main import main
+from stimrig.api.cohort import run as run
+from stimrig.api.cli.main import main
 
 take, run.FLUSH_S = run.Run._add, 0.0
 run.Run._add = lambda self, row: (time.sleep(0.1), take(self, row))

@@ -15,12 +15,12 @@ from typing import Any
 
 import pytest
 
-from api.cohort import parent
-from api.cohort.parent import Computing
-from api.cohort.sources import Entry
-from api.cohort.tasks import Task
-from api.cohort.worker import Bounds, Done, run_parcel, run_record
-from api.version import software_version
+from stimrig.api.cohort import parent
+from stimrig.api.cohort.parent import Computing
+from stimrig.api.cohort.sources import Entry
+from stimrig.api.cohort.tasks import Task
+from stimrig.api.cohort.worker import Bounds, Done, run_parcel, run_record
+from stimrig.api.version import software_version
 from tests.harness.cohort_records import Session, write
 from tests.harness.hostile_shapes import SECRET, hdf5_shapes
 
@@ -59,7 +59,7 @@ def pid(computing: Computing) -> int:
 
 
 def test_a_fit_gives_what_the_verb_gives(computing: Computing, good: bytes, tmp_path: Path) -> None:
-    import identify
+    from stimrig import identify
 
     found = row(computing, good)
     (tmp_path / "good.h5").write_bytes(good)

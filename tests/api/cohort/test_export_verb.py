@@ -18,18 +18,18 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 
-import identify
-from api import schemas
-from api.cli import main
-from api.cohort import parquet_files
-from api.cohort.errors import CohortError, CutOffError
-from api.cohort.export import Export
-from api.cohort.export_state import FOLDER, State
-from api.cohort.handed_on import Days, Writer
-from api.cohort.parquet_files import STATUS
-from api.cohort.select import Selection
-from api.cohort.sources.addresses import sources_of
-from rig import archive, assembly, journal
+from stimrig import identify
+from stimrig.api import schemas
+from stimrig.api.cli import main
+from stimrig.api.cohort import parquet_files
+from stimrig.api.cohort.errors import CohortError, CutOffError
+from stimrig.api.cohort.export import Export
+from stimrig.api.cohort.export_state import FOLDER, State
+from stimrig.api.cohort.handed_on import Days, Writer
+from stimrig.api.cohort.parquet_files import STATUS
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.sources.addresses import sources_of
+from stimrig.rig import archive, assembly, journal
 from tests.harness.cohort_records import Session, broken, write
 from tests.rig.fakes import VirtualRig
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from api.cohort import drawn, page
-from api.cohort.errors import CohortError
-from api.cohort.gathered import gather, wilson
+from stimrig.api.cohort import drawn, page
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.gathered import gather, wilson
 from tests.api.cohort.test_changed import failed, row, written
 
 

@@ -12,14 +12,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from api.cohort import parts
-from api.cohort import table as read_tables
-from api.cohort.errors import CohortError
-from api.cohort.parts import Results
-from api.cohort.sources import Entry
-from api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, options_of, table_of
-from api.cohort.tasks import Task
-from api.cohort.worker import COPY, LEFT_OUT
+from stimrig.api.cohort import parts
+from stimrig.api.cohort import table as read_tables
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.parts import Results
+from stimrig.api.cohort.sources import Entry
+from stimrig.api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, options_of, table_of
+from stimrig.api.cohort.tasks import Task
+from stimrig.api.cohort.worker import COPY, LEFT_OUT
 
 TASK = Task("fit", software="1.0")
 

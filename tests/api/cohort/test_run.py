@@ -15,19 +15,19 @@ import pytest
 from distributed import Client, LocalCluster
 from distributed.scheduler import KilledWorker
 
-from api.cli.cohort_report import duration, words
-from api.cohort import flight, worker
-from api.cohort.cluster import check_versions
-from api.cohort.errors import CohortError, CutOffError
-from api.cohort.flight import LARGEST_PARCEL, Flight
-from api.cohort.parent import close_all
-from api.cohort.parts import Results
-from api.cohort.run import AHEAD, Run, Tally
-from api.cohort.select import Selection
-from api.cohort.sources import Entry, Source
-from api.cohort.sources.addresses import sources_of
-from api.cohort.tasks import Task, checked
-from api.version import software_version
+from stimrig.api.cli.cohort_report import duration, words
+from stimrig.api.cohort import flight, worker
+from stimrig.api.cohort.cluster import check_versions
+from stimrig.api.cohort.errors import CohortError, CutOffError
+from stimrig.api.cohort.flight import LARGEST_PARCEL, Flight
+from stimrig.api.cohort.parent import close_all
+from stimrig.api.cohort.parts import Results
+from stimrig.api.cohort.run import AHEAD, Run, Tally
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.sources import Entry, Source
+from stimrig.api.cohort.sources.addresses import sources_of
+from stimrig.api.cohort.tasks import Task, checked
+from stimrig.api.version import software_version
 from tests.harness.cohort_records import broken, cohort
 
 pytestmark = pytest.mark.slow
@@ -266,7 +266,7 @@ def test_a_worker_of_another_version_ends_the_run(
 
 def test_versions_are_compared_before_the_first_record(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     check_versions(client)
-    monkeypatch.setattr("api.cohort.cluster.software_version", lambda: "9.9")
+    monkeypatch.setattr("stimrig.api.cohort.cluster.software_version", lambda: "9.9")
     with pytest.raises(CohortError, match=r"stimrig .*, here 9\.9"):
         check_versions(client)
 

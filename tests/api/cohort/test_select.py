@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from api.cohort.errors import CohortError
-from api.cohort.fields import FIELDS
-from api.cohort.select import Selection
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.fields import FIELDS
+from stimrig.api.cohort.select import Selection
 
 RECORD = {
     "participant": "P001", "day": "2026-03-01", "kind": "pre-session", "rig": None, "name": "a calib.h5",

@@ -15,13 +15,13 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from api.cohort.errors import CohortError
-from api.cohort.select import Selection
-from api.cohort.sources import Entry, Source, SourceError
-from api.cohort.sources.addresses import sources_of
-from api.cohort.sources.bucket import Bucket
-from api.cohort.sources.centre import Centre
-from api.cohort.sources.folder import Folder
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.sources import Entry, Source, SourceError
+from stimrig.api.cohort.sources.addresses import sources_of
+from stimrig.api.cohort.sources.bucket import Bucket
+from stimrig.api.cohort.sources.centre import Centre
+from stimrig.api.cohort.sources.folder import Folder
 
 MOST = 1000
 

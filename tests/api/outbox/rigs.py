@@ -11,13 +11,13 @@ from typing import Any
 
 import httpx
 
-from api.clock import Clock
-from api.outbox.feed import Feed
-from api.outbox.link import Link
-from api.outbox.pusher import POLL_S, Pusher
-from api.settings import Settings
-from api.store import Store, audit
-from api.store.tables import Approval, Model, OutboxItem, Participant, Recording, Test, Tracked
+from stimrig.api.clock import Clock
+from stimrig.api.outbox.feed import Feed
+from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.pusher import POLL_S, Pusher
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import Approval, Model, OutboxItem, Participant, Recording, Test, Tracked
 from tests.api.conftest import put_database
 from tests.harness.fake_centre import KEY, FakeCentre, canonical, sha256
 

@@ -20,7 +20,7 @@ from tests.harness.fake_centre import KEY, BadLine, FakeCentre
 
 LOADED = """
 import api.outbox.__main__, sys
-print([name for name in sys.modules if f"{name}.".startswith(("rig.", "api.sessions.", "api.web."))])
+print([name for name in sys.modules if f"{name}.".startswith(("rig.", "stimrig.api.sessions.", "stimrig.api.web."))])
 """
 
 
@@ -44,7 +44,9 @@ def test_whatever_a_centre_answers_nobody_comes_to_the_rigs_socket(tmp_path: Pat
             "STIMRIG_RIG_SOCKET": str(place),
         }  # fmt: skip
         with (tmp_path / "outbox.log").open("ab") as log:
-            running = subprocess.Popen([sys.executable, "-m", "api.outbox"], cwd=ROOT, env=environment, stderr=log)
+            running = subprocess.Popen(
+                [sys.executable, "-m", "stimrig.api.outbox"], cwd=ROOT, env=environment, stderr=log
+            )
         try:
             end = time.monotonic() + 2 * PATIENCE_S
             while line.requests < 4:  # it waits for real, longer each time

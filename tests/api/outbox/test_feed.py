@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from sqlalchemy import inspect
 
-from api.outbox import chain, feed, items
-from api.outbox.feed import Feed
-from api.store import audit, uploads
-from api.store.tables import Approval, Model, Note, OutboxItem, Participant, Recording, Test
+from stimrig.api.outbox import chain, feed, items
+from stimrig.api.outbox.feed import Feed
+from stimrig.api.store import audit, uploads
+from stimrig.api.store.tables import Approval, Model, Note, OutboxItem, Participant, Recording, Test
 from tests.api.outbox.rigs import Rig, assert_chain, sha256
 
 

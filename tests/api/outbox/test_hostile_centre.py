@@ -6,7 +6,7 @@ import itertools
 
 import httpx
 
-from api.outbox import files
+from stimrig.api.outbox import files
 from tests.api.outbox.rigs import Rig, run
 from tests.harness.fake_centre import KEY, FakeCentre, answer, problem
 

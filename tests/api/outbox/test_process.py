@@ -1,4 +1,4 @@
-"""`python -m api.outbox` as a process: killed at any moment it goes on; a wrong setting is one line; who starts it."""
+"""`python -m stimrig.api.outbox` as a process: killed at any moment it goes on; wrong settings; who starts it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pathlib import Path
 import httpx
 import pytest
 
-from api.cli import launcher
-from api.cli.doctor import check_centre
-from api.cli.launcher import Services
-from api.errors import SettingsError
-from api.outbox import status
-from api.outbox.status import Status
-from api.settings import Settings
-from api.store.tables import OutboxItem
+from stimrig.api.cli import launcher
+from stimrig.api.cli.doctor import check_centre
+from stimrig.api.cli.launcher import Services
+from stimrig.api.errors import SettingsError
+from stimrig.api.outbox import status
+from stimrig.api.outbox.status import Status
+from stimrig.api.settings import Settings
+from stimrig.api.store.tables import OutboxItem
 from tests.api.conftest import PATIENCE_S, STUB, run_service
 from tests.api.outbox.rigs import Rig, assert_told
 from tests.harness.fake_centre import KEY, BadLine, FakeCentre
@@ -76,7 +76,7 @@ def serving(line: BadLine) -> Iterator[str]:
 def start(folder: Path, url: str) -> subprocess.Popen[bytes]:
     environment = {**os.environ, "STIMRIG_DATA_DIR": str(folder), "STIMRIG_CENTRE_URL": url, "STIMRIG_CENTRE_KEY": KEY}
     with (folder / "outbox.log").open("ab") as log:
-        return subprocess.Popen([sys.executable, "-m", "api.outbox"], cwd=ROOT, env=environment, stderr=log)
+        return subprocess.Popen([sys.executable, "-m", "stimrig.api.outbox"], cwd=ROOT, env=environment, stderr=log)
 
 
 def everything_over(rig: Rig, centre: FakeCentre) -> bool:
@@ -135,7 +135,7 @@ def test_killed_at_random_it_loses_and_doubles_nothing(tmp_path: Path, seed: int
 )
 def test_a_wrong_setting_is_one_line_and_exit_code_2(tmp_path: Path, given: dict[str, str], words: str) -> None:
     environment = {**os.environ, "STIMRIG_DATA_DIR": str(tmp_path), **given}
-    command = [sys.executable, "-m", "api.outbox"]
+    command = [sys.executable, "-m", "stimrig.api.outbox"]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
     lines = done.stderr.splitlines()
     assert done.returncode == 2 and len(lines) == 1 and words in lines[0], done.stderr

@@ -19,11 +19,11 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from sqlalchemy.exc import OperationalError
 
-from api.outbox import status
-from api.outbox.files import CHUNK
-from api.outbox.pusher import HELLO_S, REVOKED_S
-from api.store import audit
-from api.store.tables import AuditEntry, Participant, Recording
+from stimrig.api.outbox import status
+from stimrig.api.outbox.files import CHUNK
+from stimrig.api.outbox.pusher import HELLO_S, REVOKED_S
+from stimrig.api.store import audit
+from stimrig.api.store.tables import AuditEntry, Participant, Recording
 from tests.api.outbox.rigs import Rig, assert_chain, assert_told, run, sha256
 from tests.harness.fake_centre import KEY, RUBBISH, BadLine, FakeCentre
 

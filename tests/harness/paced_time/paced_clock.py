@@ -28,7 +28,7 @@ from typing import Any
 
 VARIABLE = "STIMRIG_TESTS_PACED_TIME"
 """The environment variable that holds the file's path."""
-KEEPERS = ("rig", "hardware_sim", "tests", "bench")
+KEEPERS = ("stimrig.rig", "stimrig.hardware_sim", "tests", "bench")
 """Packages whose programs (`python -m …`) time waits for."""
 SLOTS, MEMBERS, BYTES = 64, 64, 4096
 FIRST_MEMBER = 1 + 3 * SLOTS
@@ -170,5 +170,5 @@ def join_as_child() -> None:
         clock.follow(path)
         clock.rule()
         program = line[line.index("-m") + 1] if "-m" in line[:-1] else ""
-        if program.partition(".")[0] in KEEPERS:
+        if f"{program}.".startswith(tuple(f"{keeper}." for keeper in KEEPERS)):
             clock.keep()

@@ -40,5 +40,5 @@ def upgrade() -> None:
 
 
 def _folded(name: str) -> str:
-    """As `api.people.names` did when this was written."""
+    """As `stimrig.api.people.names` did when this was written."""
     return " ".join(unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold()).split())

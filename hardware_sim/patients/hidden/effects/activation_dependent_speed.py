@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.patients.hidden.base import lag_after
-from hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, SPEED, STEP_S, kernel
-from hardware_sim.patients.hidden.written import Sign, Written, even, two_lags
+from stimrig.hardware_sim.patients.hidden.base import lag_after
+from stimrig.hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, SPEED, STEP_S, kernel
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written, even, two_lags
 
 
 @kernel("delay")

@@ -6,9 +6,9 @@ import math
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base, lag_after, second_order_step
-from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, kernel
-from hardware_sim.patients.hidden.written import Sign, Written, mostly, second_order_of, two_lags
+from stimrig.hardware_sim.patients.hidden.base import Base, lag_after, second_order_step
+from stimrig.hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, kernel
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written, mostly, second_order_of, two_lags
 
 
 @kernel("dynamics")

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel, smooth_table
-from hardware_sim.patients.hidden.written import Sign, Written, even
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel, smooth_table
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written, even
 
 
 @kernel("additive")

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base, delayed
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.base import Base, delayed
+from stimrig.hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("delay")

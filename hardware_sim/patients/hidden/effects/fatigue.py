@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import (
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import (
     ACTIVATION,
     FORCE,
     LARGEST_NM,
@@ -16,7 +16,7 @@ from hardware_sim.patients.hidden.kernels import (
     Stage,
     kernel,
 )
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("gain")

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base, second_order_step
-from hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, Stage, kernel
-from hardware_sim.patients.hidden.written import Written, second_order_of
+from stimrig.hardware_sim.patients.hidden.base import Base, second_order_step
+from stimrig.hardware_sim.patients.hidden.kernels import FORCE, LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written, second_order_of
 
 
 @kernel("dynamics")

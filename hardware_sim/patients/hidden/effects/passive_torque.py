@@ -6,9 +6,9 @@ import math
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ANGLE_RAD, STEP_S, VELOCITY_RAD_S, Formulation, Stage, kernel
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import ANGLE_RAD, STEP_S, VELOCITY_RAD_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("additive")

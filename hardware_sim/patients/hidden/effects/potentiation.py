@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, PULSE, STEP_S, kernel
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, PULSE, STEP_S, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("gain")

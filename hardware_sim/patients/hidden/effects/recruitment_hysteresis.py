@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base, look_up
-from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.base import Base, look_up
+from stimrig.hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, Formulation, Stage, kernel
 
 
 @kernel("electrode")

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, helper, kernel
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, helper, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @helper

@@ -7,9 +7,17 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, WIDTH_US, Formulation, Stage, kernel, smooth_table
-from hardware_sim.patients.hidden.written import Sign, Written, mostly
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import (
+    STEP_S,
+    TIME_S,
+    WIDTH_US,
+    Formulation,
+    Stage,
+    kernel,
+    smooth_table,
+)
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written, mostly
 
 
 @kernel("electrode")

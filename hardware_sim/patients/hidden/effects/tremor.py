@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import FORCE, STEP_S, TIME_S, Formulation, Stage, kernel, normal
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import FORCE, STEP_S, TIME_S, Formulation, Stage, kernel, normal
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("additive")

@@ -6,8 +6,8 @@ import math
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base, second_order_step
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.base import Base, second_order_step
+from stimrig.hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, Formulation, Stage, kernel
 
 
 @kernel("additive")

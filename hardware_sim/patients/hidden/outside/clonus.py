@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S, kernel
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.kernels import ACTIVATION, LARGEST_NM, STEP_S, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("additive")

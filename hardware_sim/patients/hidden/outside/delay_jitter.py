@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.patients.hidden.base import delayed
-from hardware_sim.patients.hidden.kernels import STEP_S, kernel, normal
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.base import delayed
+from stimrig.hardware_sim.patients.hidden.kernels import STEP_S, kernel, normal
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("delay")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
 
 
 @kernel("electrode")

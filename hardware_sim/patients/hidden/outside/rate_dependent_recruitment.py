@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.patients.hidden.kernels import STEP_S, WIDTH_US, kernel
-from hardware_sim.patients.hidden.written import Sign, Written, weighted
+from stimrig.hardware_sim.patients.hidden.kernels import STEP_S, WIDTH_US, kernel
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written, weighted
 
 
 @kernel("electrode")

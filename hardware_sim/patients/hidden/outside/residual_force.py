@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, kernel
-from hardware_sim.patients.hidden.written import Sign, Written
+from stimrig.hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, kernel
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written
 
 
 @kernel("gain")

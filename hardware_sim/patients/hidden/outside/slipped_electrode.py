@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
-from hardware_sim.patients.hidden.written import Sign, Written, weighted
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import TIME_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written, weighted
 
 
 @kernel("gain")

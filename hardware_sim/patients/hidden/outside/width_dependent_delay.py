@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base
-from hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.base import Base
+from stimrig.hardware_sim.patients.hidden.kernels import ACTIVATION, STEP_S, Formulation, Stage, kernel
 
 
 @kernel("delay")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base, second_order_step
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.base import Base, second_order_step
+from stimrig.hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, Formulation, Stage, kernel
 
 
 @kernel("additive")

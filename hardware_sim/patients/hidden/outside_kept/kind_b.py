@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hardware_sim.patients.hidden.kernels import TIME_S, kernel, uniform
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.kernels import TIME_S, kernel, uniform
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("electrode")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hardware_sim.patients.hidden.kernels import STEP_S, kernel
-from hardware_sim.patients.hidden.written import Written, largest_width_us
+from stimrig.hardware_sim.patients.hidden.kernels import STEP_S, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written, largest_width_us
 
 
 @kernel("electrode")

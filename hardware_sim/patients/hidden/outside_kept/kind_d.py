@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, kernel
-from hardware_sim.patients.hidden.written import Sign, Written, largest_width_us
+from stimrig.hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, kernel
+from stimrig.hardware_sim.patients.hidden.written import Sign, Written, largest_width_us
 
 
 @kernel("sensor")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.kernels import LARGEST_NM, STEP_S, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("sensor")

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from hardware_sim.patients.hidden.kernels import LARGEST_NM, kernel
-from hardware_sim.patients.hidden.written import Written
+from stimrig.hardware_sim.patients.hidden.kernels import LARGEST_NM, kernel
+from stimrig.hardware_sim.patients.hidden.written import Written
 
 
 @kernel("structure")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from numpy.random import Generator
 
-from hardware_sim.patients.hidden.base import Base, delayed
-from hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Stage, kernel
+from stimrig.hardware_sim.patients.hidden.base import Base, delayed
+from stimrig.hardware_sim.patients.hidden.kernels import STEP_S, TIME_S, Formulation, Stage, kernel
 
 
 @kernel("structure")
