@@ -33,7 +33,7 @@ from stimrig.api.people.auth import Auth
 from stimrig.api.people.idle_lock import FLUSH_S, IdleLock
 from stimrig.api.people.pace import Guesses
 from stimrig.api.store import Store
-from stimrig.api.store.secrets import shared
+from stimrig.api.store.holds import shared_secret as shared
 
 log = logging.getLogger("stimrig.centre")
 MOST_DOWNLOADS, MOST_PUTS, MOST_PUTS_OF_A_RIG = 4, 8, 3

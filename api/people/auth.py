@@ -22,7 +22,7 @@ from stimrig.api.people.idle_lock import IdleLock
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.hashes import digest
-from stimrig.api.store.secrets import shared
+from stimrig.api.store.holds import shared_secret as shared
 from stimrig.api.store.tables import Confirmation, PageSession, Token
 
 LOCKED = ("locked", "This page is locked")

@@ -17,8 +17,9 @@ from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, Engine, inspect, text
 
 from stimrig.api.store import centre_tables
-from stimrig.api.store.engines import WRITES
 
+WRITES = {"stimrig_writes": True}
+"""Execution option of a transaction that writes."""
 METADATA = centre_tables.Table.metadata
 """Of all tables: the centre's, too."""
 NUMBERED = {0: "0001", 1: "0001", 2: "0002", 3: "0003", 4: "0004"}

@@ -13,7 +13,7 @@ from starlette.types import ASGIApp
 
 from stimrig.api.clock import Clock
 from stimrig.api.settings import Settings
-from stimrig.api.store.lock import ServiceLock
+from stimrig.api.store.holds import ServiceLock
 from stimrig.api.version import software_version
 from stimrig.api.web import openapi, pages, problems, routes, strict_body
 from stimrig.api.web.body_limit import BodyLimit

@@ -36,9 +36,8 @@ from stimrig.api.sessions.stop_log import StopLog
 from stimrig.api.sessions.stop_right import StopRights
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, holds, secrets, uploads
-from stimrig.api.store.holds import Holds
-from stimrig.api.store.lock import ServiceLock
+from stimrig.api.store import Store, holds, uploads
+from stimrig.api.store.holds import Holds, ServiceLock
 from stimrig.api.store.tables import Recording
 from stimrig.api.web.guards import anyone_even_locked, anyone_signed_in, require
 from stimrig.api.web.openapi import problem
@@ -161,7 +160,7 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     runner = Runner(store, clock, rig, pool, versions, analyses, adviser, trials, settings.recordings_dir, follower)
     jobs = Jobs(pool)
     people = People(store, clock, auth, guesses)
-    rights = StopRights(secrets.shared(store, "stop-right", settings.data_dir / "stop-right.key"), clock)
+    rights = StopRights(holds.shared_secret(store, "stop-right", settings.data_dir / "stop-right.key"), clock)
     questions = Questions(clock)
     return Context(
         settings, clock, store, auth, people, rights, rig, pool, versions, tracked, runner, analyses,

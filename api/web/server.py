@@ -19,7 +19,7 @@ from stimrig.api import logs
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.models import carried_structure
 from stimrig.api.settings import ServerSettings, Settings, loopback
-from stimrig.api.store.lock import ServiceLock
+from stimrig.api.store.holds import ServiceLock
 from stimrig.api.web.app import create_app
 from stimrig.api.web.connections import protocol, raise_file_limit
 

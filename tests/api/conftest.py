@@ -24,7 +24,7 @@ from sqlalchemy import text
 from stimrig.api.clock import Clock
 from stimrig.api.people import passwords
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, engines
+from stimrig.api.store import Store, database
 from stimrig.api.web import connections
 from stimrig.api.web.app import create_app
 from tests.api import thread_process
@@ -41,7 +41,7 @@ QUICK_SPEED = 600.0
 """Times the world's: a whole test is played within a frame or two."""
 NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 """Services of tests speak plain HTTP: without it every client would read the machine's certificates, 20 ms each."""
-DURABLE = engines._durable_sqlite
+DURABLE = database._durable_sqlite
 STUB, REAL = thread_process.STUB, thread_process.REAL
 """Workers as threads: one that fits nothing, and one that does what a worker does."""
 
@@ -93,7 +93,7 @@ def databases_that_need_not_last() -> Iterator[None]:
         connection.execute("PRAGMA synchronous=OFF")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engines, "_durable_sqlite", quick)
+        patch.setattr(database, "_durable_sqlite", quick)
         yield
 
 

@@ -21,8 +21,8 @@ from stimrig.api.cli import main
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.launcher import Services
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, lock
-from stimrig.api.store.lock import HeldError, ServiceLock
+from stimrig.api.store import Store, holds
+from stimrig.api.store.holds import HeldError, ServiceLock
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 from tests.harness.looks_first import LooksFirst
 
@@ -188,6 +188,6 @@ def test_the_message_names_nobody_who_is_gone(tmp_path: Path) -> None:
     first.release()
     second = held(data_dir=tmp_path)
     with pytest.raises(HeldError) as caught:
-        lock.refuse_if_held(Settings(data_dir=tmp_path))
+        holds.refuse_if_held(Settings(data_dir=tmp_path))
     assert "1234" not in str(caught.value)
     second.release()

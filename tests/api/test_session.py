@@ -11,7 +11,7 @@ import pytest
 from websockets.sync.client import connect
 
 from stimrig.api.errors import ApiError
-from stimrig.api.store import Store, engines
+from stimrig.api.store import Store, database
 from tests.api.conftest import DURABLE, TOKEN, Service, run_test, soon, wait_done
 
 
@@ -174,7 +174,7 @@ def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(
 
 @pytest.mark.sqlite
 def test_database_is_durable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engines, "_durable_sqlite", DURABLE)
+    monkeypatch.setattr(database, "_durable_sqlite", DURABLE)
     store = Store(f"sqlite:///{tmp_path}/durable.db")
     with store.engine.connect() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"

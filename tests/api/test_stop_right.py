@@ -18,7 +18,7 @@ from sqlalchemy.exc import OperationalError
 from stimrig.api.clock import Clock
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.stop_right import RIGHT_S, StopRights
-from stimrig.api.store import Store, secrets
+from stimrig.api.store import Store, holds
 from tests.api.conftest import TOKEN, Service, SetClock, soon
 from tests.api.test_people import standing_still
 
@@ -219,7 +219,7 @@ def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
 def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Service) -> None:
     context = service.app.state.context
     right, gone = context.stop_rights.give("Ada", None), service.data / "stop-right.key"
-    assert StopRights(secrets.shared(context.store, "stop-right", gone), Clock()).holder(right) == "Ada"
+    assert StopRights(holds.shared_secret(context.store, "stop-right", gone), Clock()).holder(right) == "Ada"
 
 
 def test_the_upgrade_keeps_them_too(tmp_path: Path) -> None:
@@ -227,8 +227,8 @@ def test_the_upgrade_keeps_them_too(tmp_path: Path) -> None:
     path, store = tmp_path / "stop-right.key", Store(f"sqlite:///{tmp_path}/stimrig.db")
     path.write_bytes(bytes(range(32)))
     for _ in range(2):
-        assert secrets.shared(store, "stop-right", path) == bytes(range(32)) and not path.exists()
-    assert len(set(secrets.shared(store, "another", path))) > 1
+        assert holds.shared_secret(store, "stop-right", path) == bytes(range(32)) and not path.exists()
+    assert len(set(holds.shared_secret(store, "another", path))) > 1
     store.close()
 
 
