@@ -18,7 +18,7 @@ from stimrig.api.centre.settings import CentreSettings
 from stimrig.api.cli.main import build
 from stimrig.api.settings import Settings
 from stimrig.api.web import routes
-from stimrig.api.web.scan import routers
+from stimrig.api.web.app import routers
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.effects import registry
 from stimrig.identify.estimation.prepare import prepare

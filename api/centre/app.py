@@ -16,10 +16,8 @@ from stimrig.api.clock import Clock
 from stimrig.api.web import openapi, problems
 from stimrig.api.web import pages as web_pages
 from stimrig.api.web import routes as web_routes
-from stimrig.api.web.app import Service
-from stimrig.api.web.body_limit import BODY_BYTES, BODY_S, BodyLimit
-from stimrig.api.web.scan import routers
-from stimrig.api.web.strict_body import StrictBody
+from stimrig.api.web.app import Service, routers
+from stimrig.api.web.middleware import BODY_BYTES, BODY_S, BodyLimit, StrictBody
 
 DESCRIPTION = """
 Rigs push with their own keys to `/v1/rig/…`; everything else is for people and programs, who only read: programs send
@@ -53,11 +51,9 @@ class CentreBodyLimit(BodyLimit):
 class CentreStrictBody(StrictBody):
     """What rigs send is read strictly by its route: in a thread, and only after the key."""
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and scope["path"].startswith(RIG_SIDE):
-            await self.app(scope, receive, send)
-        else:
-            await super().__call__(scope, receive, send)
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """As the base class."""
+        await (self.app if scope["path"].startswith(RIG_SIDE) else super().serve)(scope, receive, send)
 
 
 def create_app(settings: CentreSettings | None = None, clock: Clock | None = None) -> FastAPI:

@@ -20,8 +20,7 @@ from stimrig.api import logs
 from stimrig.api.centre.app import create_app
 from stimrig.api.centre.settings import CentreSettings
 from stimrig.api.errors import ApiError, SettingsError
-from stimrig.api.web.connections import raise_file_limit
-from stimrig.api.web.server import address_of, bind, configuration, refuse_open_door, serve
+from stimrig.api.web.server import address_of, bind, configuration, raise_file_limit, refuse_open_door, serve
 
 
 def main() -> int:

@@ -306,7 +306,7 @@ class Auth:
         """Who stands behind a request or a WebSocket.
 
         A controller's key, which is bound to a participant, is refused (403) unless whoever asks looks after that
-        (`bound`): `stimrig.api.web.key_guard`, and stop.
+        (`bound`): `stimrig.api.web.guards`, and stop.
         """
         try:
             who = self._identify(connection, forgive_age, forgive_lock)

@@ -13,7 +13,7 @@ from stimrig.api.store.hashes import digest
 from stimrig.api.store.tables import Token
 
 SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
-"""Of these only what `stimrig.api.web.key_guard` opens."""
+"""Of these only what `stimrig.api.web.guards` opens."""
 
 
 def refuse_without(maker: Principal) -> None:

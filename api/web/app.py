@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from functools import cache
+from types import ModuleType
 from typing import Any
 
 from fastapi import APIRouter, FastAPI
@@ -15,12 +18,9 @@ from stimrig.api.clock import Clock
 from stimrig.api.settings import Settings
 from stimrig.api.store.holds import ServiceLock
 from stimrig.api.version import software_version
-from stimrig.api.web import openapi, pages, problems, routes, strict_body
-from stimrig.api.web.body_limit import BodyLimit
+from stimrig.api.web import openapi, pages, problems, routes
 from stimrig.api.web.dependencies import build
-from stimrig.api.web.headers import Headers, PageLanguage
-from stimrig.api.web.look_again import LookAgain
-from stimrig.api.web.scan import routers
+from stimrig.api.web.middleware import BodyLimit, Headers, LookAgain, StrictBody
 from stimrig.api.workers.pool import WORKER
 
 
@@ -39,7 +39,7 @@ class Service(FastAPI):
 
     def build_middleware_stack(self) -> ASGIApp:
         """Starlette's, within the headers and the language."""
-        return Headers(PageLanguage(super().build_middleware_stack()))
+        return Headers(super().build_middleware_stack())
 
 
 def create_app(
@@ -75,7 +75,7 @@ def create_app(
         routes=list(_routes()),
     )
     app.add_middleware(LookAgain, context=context)
-    app.add_middleware(strict_body.StrictBody)
+    app.add_middleware(StrictBody)
     app.add_middleware(BodyLimit, context=context)  # the last one added stands outside
     problems.install(app)
     openapi.describe(app)
@@ -101,3 +101,9 @@ def _lifespan(context: Any):
             await context.close()
 
     return lifespan
+
+
+def routers(*packages: ModuleType) -> list[APIRouter]:
+    """The routers of all files in these packages that have one, by name."""
+    names = [f"{one.__name__}.{info.name}" for one in packages for info in sorted(pkgutil.iter_modules(one.__path__))]
+    return [module.router for name in names if hasattr(module := importlib.import_module(name), "router")]

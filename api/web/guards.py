@@ -1,23 +1,36 @@
-"""What a route asks of whoever comes: a scope, and of a session's form its CSRF token."""
+"""What a route asks of whoever comes: a scope, of a session's form its CSRF token, of a decision its version.
+
+Also what a controller's key opens: the routes in `OPEN` for its participant, and nothing else. `Auth.identify` refuses
+a bound key to whoever does not ask here, so a new route is closed to it. What a trial may be: `api.sessions.trials`.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import hmac
+import re
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from typing import Annotated, Any
+from urllib.parse import urlsplit
 
 from fastapi import Request, Security
+from fastapi.responses import Response
 from fastapi.security import APIKeyCookie, HTTPBearer
 
+from stimrig.api import decisions
+from stimrig.api.clock import local_day
+from stimrig.api.decisions import MODEL_TAG, OF_RIG, Decision
 from stimrig.api.errors import ApiError
-from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.models.places import kept, site_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.people.auth import Principal, Scope, outside
+from stimrig.api.sessions.controller_trials import unapproved
+from stimrig.api.sessions.requests import PARTICIPANT_CODE
 from stimrig.api.store import seen
-from stimrig.api.web import decisions
-from stimrig.api.web.headers import wants_html
-from stimrig.api.web.key_guard import refuse_outside
+from stimrig.api.store.tables import Model, Participant, Recording, Test
+from stimrig.api.web.middleware import PARSED, SAFE_METHODS, STOP, entity_tags, wants_html
 
-SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
 POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")
 """What pages ask for again and again by themselves."""
 BEARER = HTTPBearer(scheme_name="token", description="a token, or a controller's key", auto_error=False)
@@ -40,7 +53,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
             detail = f"This needs the scope {scope}; {who} holds {', '.join(sorted(principal.scopes))}."
             raise ApiError(403, "forbidden", "Not allowed", detail)
         await check_csrf(request, principal)
-        await decisions.take(request)
+        await note_version(request)
         if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
             await request.app.state.context.people.confirmed(request, principal)
         return principal
@@ -95,3 +108,163 @@ async def check_csrf(request: Request, principal: Principal) -> None:
         sent = (await request.form()).get("csrf")
     if not isinstance(sent, str) or not hmac.compare_digest(sent.encode(), principal.csrf.encode()):
         raise ApiError(403, "csrf", "The form is out of date", "Load the page again and repeat what you did.")
+
+
+OPEN = [
+    (method, re.compile(path), table)
+    for method, path, table in (
+        ("POST", STOP, None),
+        ("POST", "/v1/tests", None),
+        ("GET", "/v1/participants/([^/]+)/(?:model|tracking)", str),
+        ("POST", "/v1/models/([^/]+)/prediction", Model),
+        ("POST", "/v1/models/([^/]+)/widths", Model),
+        ("GET", "/v1/tests/([^/]+)", Test),
+        ("WS", "/v1/tests/([^/]+)/live", Test),
+        ("GET", "/v1/recordings/([^/]+)(?:/csv)?", Recording),
+    )
+]
+"""Method, path, and the table in whose row the participant stands; str: the path names it; None: the body does.
+
+Of the models it is the approved one, and what was tracked from it under the approval that holds."""
+
+
+def refuse_outside(versions: Versions, who: Principal, method: str, path: str) -> None:
+    """Let pass who is bound to nobody, and a key on what it opens.
+
+    Raises
+    ------
+    ApiError
+        403: the key is of another site; or, the same for what is another participant's, for what is not there, and for
+        routes that no key opens. 409: a model is asked, and none of the key's participant is approved.
+    """
+    if who.participant is None:
+        return
+    if not _opens(versions, who.participant, method, path):
+        raise outside(who.participant)
+    row: Participant = versions.store.get(Participant, who.participant)
+    if kept((who.plan or {}).get("site")) != site_of(row):
+        detail = "The participant is stimulated at another site now. A person makes a key for it."
+        raise ApiError(403, "other-site", "This key is of another site", detail)
+
+
+def _opens(versions: Versions, participant: str, method: str, path: str) -> bool:
+    for own_method, pattern, table in OPEN:
+        found = pattern.fullmatch(path)
+        if method != own_method or found is None:
+            continue
+        if table is None:
+            return True
+        if table is str:
+            return found[1] == participant
+        if table is Model:
+            return _approved(versions, participant, found[1])
+        row = versions.store.get(table, found[1])
+        of_test = table is not Recording or (row is not None and row.test_id is not None)
+        return row is not None and row.participant == participant and of_test
+    return False
+
+
+def _approved(versions: Versions, participant: str, model_id: str) -> bool:
+    """Whether a person allows this version today: the approved one, or one tracked from it. Raises ApiError (409)."""
+    approval = versions.approved(participant)
+    if approval is None:
+        raise unapproved(participant)
+    own = re.escape(approval.model_id)
+    return re.fullmatch(rf"{own}(\.{approval.id}\.[0-9]+)?", model_id) is not None
+
+
+def same_origin(request: Request) -> None:
+    """Refuse a sign-in that another site's page sends: there is no session yet whose CSRF token could be asked for."""
+    origin = request.headers.get("origin")
+    if origin and urlsplit(origin).netloc != request.headers.get("host"):
+        raise ApiError(403, "forbidden", "Not allowed", "The request came from a page of another site.")
+
+
+def set_cookie(context: Any, answer: Response, cookie: str) -> None:
+    """The session's cookie: not for scripts, not for other sites."""
+    age_s, secure = int(context.auth.session_s), context.settings.secure_cookies
+    name = context.auth.cookie_name
+    answer.set_cookie(name, cookie, max_age=age_s, httponly=True, samesite="strict", secure=secure)
+
+
+def local(target: str) -> str:
+    """An address on this host, or the first page."""
+    plain = target.startswith("/") and not target.startswith("//") and target.isprintable() and "\\" not in target
+    return target if plain else "/"
+
+
+MOST_TAGS = 20
+"""Of `If-Match`: the others are not read."""
+
+
+async def note_version(request: Request) -> None:
+    """Note what the request was decided on, for `stimrig.api.store.seen.check`.
+
+    Raises
+    ------
+    ApiError
+        428: it does not say; 409: another day has begun since, or what it says is no version.
+    """
+    found = decisions.find(request.method, request.url.path)
+    if found is None:
+        return
+    decision, names = found
+    document = decision.document.format(**{**await _names(request, decision), **names})
+    text, marks = await _sent(request, decision, seen.mark_of(document))
+    if decision.field == "latch" and not request.app.state.context.rig.latch_known:
+        raise old_rig()
+    if not decision.needed and request.url.path.startswith("/v1/") and "if-match" not in request.headers:
+        return
+    seen.today.set(lambda: local_day(request.app.state.context.clock.utc()))
+    if not re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII):
+        raise version_missing(document, decision)
+    seen.sent.set(text)
+    place = seen.read(text, *marks)
+    if decision.field in OF_RIG or (decision.path == "/v1/tests" and len(text) == MODEL_TAG):
+        return
+    if place is None:
+        raise seen.another_document(document)
+    seen.refuse_another_day(place)
+    seen.shown.set(place)
+
+
+async def _names(request: Request, decision: Decision) -> dict[str, str]:
+    """What a request's body names of the document: a test's participant."""
+    code = "{code}"
+    if decision.path == "/v1/tests" and request.url.path == decision.path:
+        await request.body()
+        with suppress(KeyError, TypeError):  # the route says what is wrong with it
+            said = request.scope[PARSED]["participant"]
+            code = said if isinstance(said, str) and re.fullmatch(PARTICIPANT_CODE, said, re.ASCII) else code
+    return {"code": code}
+
+
+async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, tuple[str, ...]]:
+    """The version, as `If-Match` or the form's field has it, and the marks that it may have: a page's has none.
+
+    Of several the newest of this document.
+    """
+    fields = request.headers.getlist("if-match")
+    if fields:
+        tags = [tag.strip('"') for field in fields for tag in entity_tags(field)][:MOST_TAGS]
+        places = {place.entry: tag for tag in tags if (place := seen.read(tag, mark))}
+        return (places[max(places)] if places else tags[0]), (mark,)
+    if "form" not in request.headers.get("content-type", ""):
+        return "", (mark,)
+    return str((await request.form()).get(decision.field) or ""), ("", mark)
+
+
+def old_rig() -> ApiError:
+    """409: the rig says nothing by which a stop could be named."""
+    detail = "Its program does not say which stop it stands at. Update and restart the rig's program; then re-arm."
+    return ApiError(409, "rig-outdated", "The rig's program is older than this service", detail)
+
+
+def version_missing(document: str, decision: Decision) -> ApiError:
+    """428: nobody says what this was decided on (RFC 6585, section 3)."""
+    trial = f" (a controller's key: of GET {document}/model)" if decision.path == "/v1/tests" else ""
+    detail = (
+        f"Send the ETag of GET {document}{trial} as If-Match, as you last saw it. On a page: load it again and repeat "
+        "what you did. Nothing was done."
+    )
+    return ApiError(428, "seen-missing", "Say what this was decided on", detail)

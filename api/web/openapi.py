@@ -8,8 +8,8 @@ from fastapi import FastAPI
 
 from stimrig.api import schemas
 from stimrig.api.decisions import DECISIONS
+from stimrig.api.web.middleware import REFUSALS
 from stimrig.api.web.responses.base import Problem
-from stimrig.api.web.strict_body import REFUSALS
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 EMBEDDED = ("model", "effects")

@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from stimrig.api.errors import ApiError, not_answering
 from stimrig.api.store import seen
 from stimrig.api.store.seen import ChangedError
-from stimrig.api.web.headers import wants_html
+from stimrig.api.web.middleware import wants_html
 from stimrig.api.web.pages import changes
 from stimrig.api.web.pages.render import look, problem_page
 

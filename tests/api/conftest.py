@@ -25,8 +25,8 @@ from stimrig.api.clock import Clock
 from stimrig.api.people import passwords
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, database
-from stimrig.api.web import connections
 from stimrig.api.web.app import create_app
+from stimrig.api.web.server import protocol
 from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness import postgres
@@ -241,7 +241,7 @@ class Server:
     """What stands between it and the application."""
 
     def __init__(self, app: Any, http: Any = None) -> None:
-        http, app = http or connections.protocol(), self.behind(app)
+        http, app = http or protocol(), self.behind(app)
         self.server = PromptServer(
             uvicorn.Config(app, port=0, log_level="warning", ws_ping_interval=None, http=http, lifespan="on")
         )

@@ -18,7 +18,7 @@ import pytest
 
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions.rig_client import LONGEST_LINE, line_of
-from stimrig.api.web import body_limit, connections
+from stimrig.api.web import middleware, server
 from stimrig.rig.messages import PreviewRequest, Profile, SegmentPlan, TestPlan
 from tests.api.conftest import Server, Service, soon
 from tests.api.test_stop_right import stops_noted
@@ -68,7 +68,7 @@ def test_a_stop_is_answered_while_every_thread_waits_for_the_database(
 @pytest.fixture
 def patient_door(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who says nothing is let go for the crowd alone: on a busy machine its time would be over in the test."""
-    monkeypatch.setattr(connections, "protocol", partial(connections.protocol, request_s=600.0))
+    monkeypatch.setattr(server, "protocol", partial(server.protocol, request_s=600.0))
 
 
 @pytest.mark.usefixtures("patient_door")
@@ -86,7 +86,7 @@ def test_a_stop_gets_in_past_a_crowd_that_says_nothing(service: Service, client:
 
 
 def test_who_says_nothing_is_let_go_after_a_while(service: Service):
-    with Server(service.app, http=connections.protocol(request_s=2.0)) as url:
+    with Server(service.app, http=server.protocol(request_s=2.0)) as url:
         first, second = connect(url), connect(url, b"GET /health HTTP/1.1\r\nHost: x\r\n\r\n")
         assert second.recv(12) == b"HTTP/1.1 200"
         with contextlib.suppress(ConnectionError):  # no TimeoutError: that would be a door kept open
@@ -102,7 +102,7 @@ def test_a_pipelined_request_that_is_being_served_is_not_cut_off():
             await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
             await send({"type": "http.response.body"})
 
-    with Server(app, http=connections.protocol(request_s=0.2)) as url:
+    with Server(app, http=server.protocol(request_s=0.2)) as url:
         two = connect(url, b"".join(b"GET %s HTTP/1.1\r\nHost: x\r\n\r\n" % path for path in (b"/quick", b"/slow")))
         said = b""
         with contextlib.suppress(ConnectionResetError):
@@ -112,7 +112,7 @@ def test_a_pipelined_request_that_is_being_served_is_not_cut_off():
 
 
 def test_a_body_that_does_not_come_is_not_waited_for(service: Service, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(body_limit, "BODY_S", 0.2)
+    monkeypatch.setattr(middleware, "BODY_S", 0.2)
     head = "POST /v1/participants HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 10\r\n"
     connection = connect(service.url, f"{head}Authorization: Bearer x\r\n\r\n{{".encode())
     assert connection.recv(12) == b"HTTP/1.1 408"
@@ -121,7 +121,7 @@ def test_a_body_that_does_not_come_is_not_waited_for(service: Service, monkeypat
 def test_too_many_previews_at_once_are_refused_before_they_are_read(
     service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(body_limit, "MOST_PREVIEWS", 1)
+    monkeypatch.setattr(middleware, "MOST_PREVIEWS", 1)
     asked, go_on = threading.Event(), threading.Event()
 
     async def slow(_body: object) -> dict[str, Any]:

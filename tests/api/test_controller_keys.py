@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 
 from stimrig.api.store.hashes import digest
 from stimrig.api.store.tables import AuditEntry, Test, Token
-from stimrig.api.web.key_guard import OPEN
+from stimrig.api.web.guards import OPEN
 from tests.api.browser import without_values
 from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done
 from tests.api.test_scopes import ROWS

@@ -15,7 +15,7 @@ import pytest
 
 from stimrig.api.people import controller_keys
 from stimrig.api.web import routes
-from stimrig.api.web.scan import routers
+from stimrig.api.web.app import routers
 from tests.api.browser import bring_to_rest
 from tests.api.conftest import REAL, Service, run_service
 from tests.api.test_worker import made_up_csv

@@ -18,7 +18,7 @@ from stimrig.api.centre import pages as centre_pages
 from stimrig.api.centre import routes as centre_routes
 from stimrig.api.decisions import DECISIONS
 from stimrig.api.web import pages, routes
-from stimrig.api.web.scan import routers
+from stimrig.api.web.app import routers
 from tests.api.conftest import Service, run_test, shared_service, soon
 from tests.api.fake_arm import still
 

@@ -9,7 +9,7 @@ import pytest
 from fastapi.routing import APIRoute
 
 from stimrig.api.web import pages
-from stimrig.api.web.scan import routers
+from stimrig.api.web.app import routers
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 
 HTML = {"Accept": "text/html"}

@@ -11,7 +11,7 @@ from fastapi.routing import APIRoute
 
 from stimrig.api.people.auth import Scope
 from stimrig.api.web import pages, routes
-from stimrig.api.web.scan import routers
+from stimrig.api.web.app import routers
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 
 SCOPES = ("read-live", "run-test", "rearm", "approve-model", "read-model", "administer")

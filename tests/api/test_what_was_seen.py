@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from stimrig.api import decisions
 from stimrig.api.client.errors import Conflict
 from stimrig.api.client.rest import Client
 from stimrig.api.clock import Clock
@@ -17,7 +18,6 @@ from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import Scope
 from stimrig.api.store import audit
 from stimrig.api.store.tables import Token
-from stimrig.api.web import decisions
 from stimrig.rig import messages as m
 from stimrig.rig.messages import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon

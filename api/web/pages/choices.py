@@ -10,9 +10,9 @@ from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
 from stimrig.api.language import CODES
-from stimrig.api.web.browser_session import local, same_origin
 from stimrig.api.web.dependencies import Ctx
-from stimrig.api.web.headers import COOKIE
+from stimrig.api.web.guards import local, same_origin
+from stimrig.api.web.middleware import LANGUAGE_COOKIE
 
 router = APIRouter(include_in_schema=False)
 COLOURS = "stimrig_colours"
@@ -36,7 +36,7 @@ async def choose_language(
     """Write the pages in this language from now on."""
     answer = _back(request, language, CODES, back, ("no-such-language", "There is no such language"))
     secure = context.settings.secure_cookies
-    answer.set_cookie(COOKIE, language, KEPT_S, httponly=True, samesite="lax", secure=secure)
+    answer.set_cookie(LANGUAGE_COOKIE, language, KEPT_S, httponly=True, samesite="lax", secure=secure)
     return answer
 
 

@@ -14,12 +14,11 @@ from stimrig.api.charts.overview import LARGE, overview
 from stimrig.api.errors import ApiError
 from stimrig.api.models import advice, carried_structure, explanation, headline, next_step, stored, summary
 from stimrig.api.people.auth import Scope
-from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.requests import EffectsIn, TestIn
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester
 from stimrig.api.web.pages import next_view, starting, trend_view, typed
 from stimrig.api.web.pages.render import page
-from stimrig.api.web.requests import EffectsIn
 from stimrig.api.web.routes import criticism, participants
 from stimrig.api.workers.tracker import FIT_TOGETHER, Job
 

@@ -12,14 +12,13 @@ from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy
 from stimrig.api.models.places import site_of
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.requests import MuscleIn, NoteIn
+from stimrig.api.sessions.requests import MuscleIn, NoteIn, RanByIn
 from stimrig.api.store import seen
-from stimrig.api.web.browser_session import local
 from stimrig.api.web.dependencies import Ctx, Tester
+from stimrig.api.web.guards import local
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.starting import site_words
-from stimrig.api.web.requests import RanByIn
 from stimrig.api.web.routes import muscle, notes, participants, tests
 
 router = APIRouter(include_in_schema=False)

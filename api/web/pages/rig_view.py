@@ -10,8 +10,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import LOCKED
-from stimrig.api.web.browser_session import local
 from stimrig.api.web.dependencies import Anyone, Ctx, Rearmer
+from stimrig.api.web.guards import local
 from stimrig.api.web.pages import rig_state
 from stimrig.api.web.pages.render import fragment, look, page
 from stimrig.api.web.routes.rig import rearm_rig

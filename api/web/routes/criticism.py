@@ -8,9 +8,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse
 
+from stimrig.api.sessions.requests import EffectsIn
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
-from stimrig.api.web.requests import EffectsIn
 from stimrig.api.web.responses.base import answers, published
 from stimrig.api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
 from stimrig.api.workers.tracker import Job

@@ -12,11 +12,11 @@ from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored
 from stimrig.api.models.tracking import Limits
+from stimrig.api.sessions.requests import ApprovalIn, DecisionIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader
-from stimrig.api.web.headers import entity_tags
-from stimrig.api.web.requests import ApprovalIn, DecisionIn
+from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.responses.base import answers, published
 from stimrig.api.web.responses.models import VersionOut
 from stimrig.api.web.responses.trend import TrackingOut

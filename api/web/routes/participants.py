@@ -11,13 +11,12 @@ from sqlalchemy.orm import Session
 from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.sessions import angles, directory, profiles
-from stimrig.api.sessions.requests import ProfileIn
+from stimrig.api.sessions.requests import ParticipantIn, ProfileIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.seen import Seen
 from stimrig.api.store.tables import Participant, Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
-from stimrig.api.web.requests import ParticipantIn
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.participants import ChangedOut, ParticipantOut
 from stimrig.api.web.responses.rig import TestOut

@@ -14,8 +14,8 @@ from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.people import names
 from stimrig.api.people.auth import Principal, Scope, unauthorized
 from stimrig.api.store import seen
-from stimrig.api.web.browser_session import local, same_origin, set_cookie
 from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx, EvenLocked
+from stimrig.api.web.guards import local, same_origin, set_cookie
 from stimrig.api.web.openapi import TOO_MANY
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.people import KeyOut, ListedUser, SessionOut, UserOut

@@ -100,7 +100,7 @@ async def upload(
     `of`, by who may approve models; the audit trail keeps both codes.
     """
     await asyncio.to_thread(participants.find, context, code)
-    data = await request.body()  # `stimrig.api.web.body_limit` bounds it
+    data = await request.body()  # `stimrig.api.web.middleware` bounds it
     if not data:
         raise ApiError(422, "empty", "The upload is empty", "Send a CSV or MAT file or a sealed recording as the body.")
     row, model, warnings = await take_in(context, code, data, who, columns, of)

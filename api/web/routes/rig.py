@@ -13,7 +13,7 @@ from stimrig.api.sessions.requests import StopIn, TestIn
 from stimrig.api.sessions.stop_log import StopResult
 from stimrig.api.store import audit, seen
 from stimrig.api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
-from stimrig.api.web.headers import wants_html
+from stimrig.api.web.middleware import wants_html
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
 from stimrig.api.web.stop_guard import Press

@@ -17,14 +17,13 @@ from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controller_trials
 from stimrig.api.sessions.refusals import other_than
-from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.requests import RanByIn, TestIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import KEY_TURN
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
-from stimrig.api.web.headers import chosen_language
-from stimrig.api.web.key_guard import refuse_outside
-from stimrig.api.web.requests import RanByIn
+from stimrig.api.web.guards import refuse_outside
+from stimrig.api.web.middleware import chosen_language
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.rig import LeftOut, TestOut
 

@@ -9,9 +9,9 @@ from fastapi import APIRouter
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.outbox import receipts
 from stimrig.api.people.auth import Scope
+from stimrig.api.sessions.requests import TokenIn
 from stimrig.api.store.tables import AuditEntry, Token
 from stimrig.api.web.dependencies import PROBLEM, Administrator, Ctx
-from stimrig.api.web.requests import TokenIn
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.people import AuditOut, ListedToken, TokenOut
 

@@ -17,7 +17,7 @@ from stimrig.api.centre import app as centre_app
 from stimrig.api.centre import pages, routes
 from stimrig.api.centre.pages.rigs_view import doubts
 from stimrig.api.store.centre_tables import CentreRig
-from stimrig.api.web.scan import routers
+from stimrig.api.web.app import routers
 from stimrig.rig.messages import RigState
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller
