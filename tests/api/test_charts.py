@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from stimrig.api.charts import diagnosis_charts, figure, model_charts
+from stimrig.api.charts import diagnosis_charts, model_charts
+from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import LIGHT, in_light
 from stimrig.api.charts.svg import svg
 from stimrig.api.language import using
@@ -91,17 +92,17 @@ def test_every_line_that_is_seen_says_its_unit(figures: dict[str, Any]) -> None:
 def test_a_curves_band_is_said_at_the_curves_own_points() -> None:
     band = {"at": [0.0, 10.0], "whole_lower": [1.0, 2.0], "whole_upper": [1.2, 2.6]}
     with using("en"):
-        found = figure.hover_band("model", figure.TORQUE, [0.0, 5.0, 10.0, 12.0], band, "at")
+        found = fig.hover_band("model", fig.TORQUE, [0.0, 5.0, 10.0, 12.0], band, "at")
     assert found["customdata"] == ["0.10", "0.20", "0.30", "0.30"]
     with using("de"):
-        assert figure.hover_band("model", figure.TORQUE, [0.0], band, "at")["customdata"] == ["0,10"]
-    assert "±" not in figure.hover_band("model", figure.TORQUE, [0.0], {}, "at")["hovertemplate"]
+        assert fig.hover_band("model", fig.TORQUE, [0.0], band, "at")["customdata"] == ["0,10"]
+    assert "±" not in fig.hover_band("model", fig.TORQUE, [0.0], {}, "at")["hovertemplate"]
 
 
 def test_each_time_has_the_segment_it_lies_in() -> None:
     segments = [{"name": name, "start_s": start} for name, start in (("a", 0.0), ("b", 1.0), ("c", 2.0))]
-    assert figure.name_segments([0.0, 0.9, 1.0, 1.5, 2.0, 9.0], segments, str.upper) == ["A", "A", "B", "B", "C", "C"]
-    assert figure.name_segments([0.0], [], str.upper) == [""]
+    assert fig.name_segments([0.0, 0.9, 1.0, 1.5, 2.0, 9.0], segments, str.upper) == ["A", "A", "B", "B", "C", "C"]
+    assert fig.name_segments([0.0], [], str.upper) == [""]
 
 
 def test_figures_hold_roles_and_no_colours(figures: dict[str, Any]) -> None:
