@@ -92,7 +92,8 @@ def measured_lines(curves: dict[str, Any], series: dict[str, Any] | None) -> lis
     ]
     names = fig.name_segments(time_s, curves["segments"])
     data = [
-        line(time_s, torque_nm, _("measured"), MEASURED, 3.2, **fig.hover(_("measured"), fig.TORQUE + fig.BESIDE, names)),
+        line(time_s, torque_nm, _("measured"), MEASURED, 3.2,
+             **fig.hover(_("measured"), fig.TORQUE + fig.BESIDE, names)),
         line(time_s, predicted_nm, _("model, free run"), MODEL, 1.8, **fig.hover(_("model"), fig.TORQUE)),
         line(time_s, residual, _("measured − model"), INK, 1.0, yaxis="y2", showlegend=False,
              **fig.hover(_("measured − model"), fig.RESIDUAL)),
