@@ -100,7 +100,7 @@ def test_the_command_line_says_it_in_one_line(tmp_path: Path, verb: list[str]) -
     (tmp_path / "nothing.csv").write_text((tmp_path / "r.csv").read_text())
     (tmp_path / "mine.py").write_text(good().replace('stage="output"', 'stage="outptu"'))
     environment = {"STIMRIG_EFFECTS_DIR": str(tmp_path), "PYTHONPATH": str(PAGE.parents[1])}
-    command = [sys.executable, "-m", "stimrig.api.cli", *verb]
+    command = [sys.executable, "-m", "stimrig", *verb]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.strip().splitlines()
