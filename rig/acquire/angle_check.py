@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig.acquire.rate import RateCheck
+from stimrig.rig.acquire.plausibility import RateCheck
 from stimrig.rig.acquire.stream import steps_from
 from stimrig.rig.limits import Limit
 from stimrig.rig.messages import HELD, TestPlan

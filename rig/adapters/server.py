@@ -16,9 +16,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stimrig.rig.adapters.connections import Connections
 from stimrig.rig.adapters.previews import Previews
-from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
+from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connections, StopServer
 from stimrig.rig.control import desk
 from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from stimrig.rig.control.rig import Rig

@@ -9,8 +9,7 @@ from typing import Any
 
 from stimrig.rig import limits
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
-from stimrig.rig.acquire.halt import Cause, Halt
-from stimrig.rig.acquire.run import TestRun
+from stimrig.rig.acquire.run import Cause, Halt, TestRun
 from stimrig.rig.config import RigConfig
 from stimrig.rig.control.angle_calibration import AngleCalibrating
 from stimrig.rig.control.calibration import Calibration

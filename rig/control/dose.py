@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig import intended
-from stimrig.rig.acquire.torque_time import TorqueTime
+from stimrig.rig.acquire.receiver import TorqueTime
 from stimrig.rig.assembly import Recording
 from stimrig.rig.journal import JournalContents, Kind
 from stimrig.rig.limits import HARD_LIMITS

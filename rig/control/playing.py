@@ -12,8 +12,7 @@ import math
 import re
 
 from stimrig.rig import limits, plan
-from stimrig.rig.acquire.halt import Halt
-from stimrig.rig.acquire.run import RunResult, TestRun
+from stimrig.rig.acquire.run import Halt, RunResult, TestRun
 from stimrig.rig.control.core import Core
 from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError
 from stimrig.rig.messages import (
