@@ -75,7 +75,7 @@ class Receiver(Stream):
         wrong: Callable[[NDArray[Any]], str | None] = lambda _: None,
     ) -> None:
         """From now on write every sample to the journal and check it; faults are reported at once."""
-        self._record(journal, on_fault, on_fault, wrong)
+        self.write_to(journal, wrong, on_fault, on_fault)
         self._limits_nm, self.torque_time, self.peak_nm = limits_nm, TorqueTime(), 0.0
         self.begin_range()
 
