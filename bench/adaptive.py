@@ -25,7 +25,8 @@ import numpy as np
 
 from bench.particles import HOLD, Particles
 from stimrig import identify
-from stimrig.hardware_sim.patients.hidden.draw import draw_scenario, rng_of, still_effect_ids
+from stimrig.hardware_sim.hidden.library import STILL
+from stimrig.hardware_sim.hidden.scenario import draw_scenario, rng_of
 from stimrig.identify.diagnosis import candidates as workers
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
@@ -230,7 +231,7 @@ def hidden_muscle(seed: int) -> tuple[str, str, Hidden]:
     """Name and strength of one hidden effect, and the muscle."""
     for attempt in range(20):
         rng = rng_of(seed, "adaptive", str(attempt))
-        effect, strength = str(rng.choice(still_effect_ids())), str(rng.choice(["weak", "middle", "strong"]))
+        effect, strength = str(rng.choice(STILL)), str(rng.choice(["weak", "middle", "strong"]))
         try:
             return effect, strength, Hidden(draw_scenario((effect,), strength, seed + attempt, noise_sd_nm=NOISE_NM))
         except ValueError:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from stimrig import identify
-from stimrig.hardware_sim.patients.hidden.draw import Scenario
+from stimrig.hardware_sim.hidden.scenario import Scenario
 from stimrig.identify.caution import caution
 from stimrig.identify.diagnosis import candidates
 from tests.harness.carried_sessions import SESSIONS, muscle, session

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.hardware_sim.hidden.scenario import rng_of
 from stimrig.hardware_sim.hidden_records import SLOWEST_SIMULATION_HZ
-from stimrig.hardware_sim.patients.hidden.draw import rng_of
 from tests.harness.carried_sessions import SESSIONS, as_record, fine_session, muscle, session
 
 REFERENCE_EVERY = 8

@@ -159,7 +159,7 @@ def served(emulate: str = "", tree: str = "") -> Iterator[str]:
         command = [
             sys.executable,
             "-m",
-            "stimrig",
+            "stimrig.api.cli",
             "serve",
             "--port",
             "0",

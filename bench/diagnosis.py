@@ -131,15 +131,15 @@ def _structure_said(result: dict[str, Any]) -> bool:
 
 def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str, Any]]]:
     """What a set is made of."""
-    from stimrig.hardware_sim.patients.hidden.draw import effect_ids, outside_ids, outside_kept_ids
+    from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS, OUTSIDERS_HELD_BACK
 
     seeds = list(seeds)
     if kind == "single":
-        return [(e, s, seed, {}) for e in effect_ids() for s in STRENGTHS for seed in seeds]
+        return [(e, s, seed, {}) for e in EFFECTS for s in STRENGTHS for seed in seeds]
     if kind == "slow":
-        return [(e, s, seed, {"noise": "slow"}) for e in effect_ids() for s in STRENGTHS[1:] for seed in seeds[:1]]
+        return [(e, s, seed, {"noise": "slow"}) for e in EFFECTS for s in STRENGTHS[1:] for seed in seeds[:1]]
     if kind in ("outside", "kept"):
-        foreign = outside_ids() if kind == "outside" else outside_kept_ids()
+        foreign = OUTSIDERS if kind == "outside" else OUTSIDERS_HELD_BACK
         return [(e, s, seed, {}) for e in foreign for s in STRENGTHS[1:] for seed in seeds]
     if kind == "two":
         return [(pair, "middle", seed, {}) for pair in PAIRS for seed in seeds]

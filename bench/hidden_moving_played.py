@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.hidden_played import agrees, reveal
-from stimrig.hardware_sim.hidden_records import of_patient, write_csv
+from stimrig.hardware_sim.hidden_records import patient_record, write_csv
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.records.read import read
 from stimrig.identify.records.record import Record
@@ -59,7 +59,7 @@ def run(seed: int, speed: float, folder: Path) -> dict[str, Any]:
     wire = read(Path(event["recording_path"]))
     if wire.angle_rad is None:
         raise RuntimeError("the sealed recording was read without an angle")
-    write_csv(of_patient(seed, moving=True), folder / "same.csv")
+    write_csv(patient_record(seed, moving=True), folder / "same.csv")
     truth = reveal(seed, *DESIGN)
     return {
         "seed": seed,

@@ -3,7 +3,7 @@
     python -m bench.protocols [--seeds 1000:1020] [--steep] [--noise-sd-nm 0.05] [--json]
     python -m bench.protocols --hidden [--strengths middle,strong] [--seeds 1100:1164]
 
-Plain Hammerstein muscles of the emulator (`hardware_sim.patients.hidden`), sampled at 400 Hz. Each protocol's record is
+Plain Hammerstein muscles of the emulator (`hardware_sim.hidden`), sampled at 400 Hz. Each protocol's record is
 fitted; the model then predicts 30 s of levels that no protocol plays, without noise. Development used seeds below 100.
 With `--hidden` each seed is a muscle with one hidden effect, in turn every effect in each strength, and every fourth
 one a muscle without any; told is what the diagnosis of each protocol's record names. `--steep` and `--json` have no
@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.hardware_sim.hidden.design import Design, make_design
+from stimrig.hardware_sim.hidden.library import STILL
+from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario, rng_of
 from stimrig.hardware_sim.hidden_records import sampled
-from stimrig.hardware_sim.patients.hidden.design import Design, make_design
-from stimrig.hardware_sim.patients.hidden.draw import Scenario, draw_scenario, rng_of, still_effect_ids
 from stimrig.identify.diagnosis import candidates as workers
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.fitting import fit
@@ -61,7 +62,7 @@ def name_hidden(seeds: range, strengths: list[str], noise_sd_nm: float) -> list[
     workers.WORKERS = 1
     rows = []
     for seed in seeds:
-        names, number = still_effect_ids(), seed - seed // 4
+        names, number = STILL, seed - seed // 4
         effect = names[number % len(names)] if seed % 4 else ""
         strength = strengths[number // len(names) % len(strengths)]
         scenario = draw_scenario((effect,) if effect else (), strength, seed, noise_sd_nm=noise_sd_nm)

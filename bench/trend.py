@@ -21,8 +21,8 @@ from bench.stamp import RESULTS, written_by
 from stimrig import identify
 from stimrig.api.models import changes, headline
 from stimrig.api.models.changes import State
+from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden_records import generate
-from stimrig.hardware_sim.patients.hidden.draw import still_effect_ids
 from stimrig.identify.errors import IdentifyError
 from tests.harness.carried_sessions import as_record
 
@@ -76,7 +76,7 @@ def pairs(seed: int) -> Iterator[Pair]:
     """The sets of one seed."""
     for kind, noise in (("nothing hidden", "white"), ("slow noise", "slow")):
         yield Pair(kind, seed, *(state(record) for record in records(None, seed, noise)))
-    names = [name for name in still_effect_ids() if name not in DRIFTING]
+    names = [name for name in STILL if name not in DRIFTING]
     effect = names[seed % len(names)]
     both = records(effect, seed, "white")
     plain = [state(record) for record in both]

@@ -14,7 +14,7 @@ from stimrig.hardware_sim.arm import registry
 from stimrig.hardware_sim.arm.law import Floats
 from stimrig.hardware_sim.arm.motion import Begin, Motion, MoverProtocol
 from stimrig.hardware_sim.arm_patient import ArmPatient
-from stimrig.hardware_sim.patients.hidden.design import PULSES_PER_S, levels, make_design, staircase
+from stimrig.hardware_sim.hidden.design import PULSES_PER_S, levels, make_design, staircase
 
 SIMULATION_HZ = 1600
 LARGEST_COMPLIANCE_RAD_PER_NM = 0.003

@@ -2,7 +2,7 @@
 
     T = g(x, ẋ) · (G f(u)) + h(x, ẋ) − I ẍ
 
-f and G are those of `hardware_sim.patients.hidden.base`: eight shapes of recruitment, 3 to 15 N·m at 250 to 400 µs, 10
+f and G are those of `hardware_sim.hidden.base`: eight shapes of recruitment, 3 to 15 N·m at 250 to 400 µs, 10
 to 90 % within 26 to 150 µs; second order with 0.1 to 0.6 s and damping 0.6 to 1.2, two lags, or calcium then force. G
 is linear. x = 90 degrees, ẋ = 0 is where g is 1.
 
@@ -42,8 +42,8 @@ from scipy.signal import cont2discrete, lfilter
 from stimrig.hardware_sim.arm.law import Floats, Number
 from stimrig.hardware_sim.arm.mechanics import Mechanics
 from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Tissue, law
-from stimrig.hardware_sim.patients.hidden.base import Base, draw_base
-from stimrig.hardware_sim.patients.hidden.draw import rng_of
+from stimrig.hardware_sim.hidden.base import Base, draw_base
+from stimrig.hardware_sim.hidden.scenario import rng_of
 
 SMALLEST_G, LARGEST_G = 0.15, 2.0
 

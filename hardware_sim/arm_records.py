@@ -17,8 +17,8 @@ from scipy.signal import savgol_filter
 from stimrig.hardware_sim.arm.law import Floats
 from stimrig.hardware_sim.arm_designs import KINDS, SIMULATION_HZ, ArmDesign, Asked, Parts
 from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
-from stimrig.hardware_sim.patients.hidden.design import PULSES_PER_S
-from stimrig.hardware_sim.patients.hidden.draw import rng_of
+from stimrig.hardware_sim.hidden.design import PULSES_PER_S
+from stimrig.hardware_sim.hidden.scenario import rng_of
 
 __all__ = ["KINDS", "arm_patient", "changed", "held_angles_rad", "record"]
 

@@ -56,7 +56,7 @@ def hidden_patients() -> Any:
     PatientError
         This installation has none.
     """
-    module = "stimrig.hardware_sim.patients.hidden"
+    module = "stimrig.hardware_sim.hidden"
     try:
         hidden = importlib.import_module(module)
     except ModuleNotFoundError as error:

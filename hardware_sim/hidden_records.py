@@ -15,22 +15,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
+from scipy.signal import lfilter
 
-from stimrig.hardware_sim.patients import hidden
-from stimrig.hardware_sim.patients.hidden.design import UNRECORDED, Design, make_design
-from stimrig.hardware_sim.patients.hidden.draw import (
-    Scenario,
-    draw_pair,
-    draw_scenario,
-    effect_ids,
-    outside_ids,
-    rng_of,
-)
-from stimrig.hardware_sim.patients.hidden.kernels import Floats
-from stimrig.hardware_sim.patients.hidden.scenario import simulate
-from stimrig.hardware_sim.patients.hidden.sensor_noise import NOISES, SLOW_CORRELATION_S, draw_noise
+from stimrig.hardware_sim import hidden
+from stimrig.hardware_sim.hidden.chain import simulate
+from stimrig.hardware_sim.hidden.design import UNRECORDED, Design, make_design
+from stimrig.hardware_sim.hidden.kernels import Floats
+from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS
+from stimrig.hardware_sim.hidden.scenario import Scenario, draw_pair, draw_scenario, rng_of
 
 SLOWEST_SIMULATION_HZ = 1600
+NOISES = ("white", "ar1", "slow")
+SLOW_CORRELATION_S = 0.075
 
 
 def generate(
@@ -133,12 +130,41 @@ def generate(
     return record | {"truth": scenario.truth(noise_sd_nm) | about}
 
 
-def of_patient(seed: int, moving: bool = False) -> dict[str, Any]:
+def _ar1(rng: Generator, count: int, sd_nm: float, rho: float) -> Floats:
+    innovations = rng.normal(0.0, sd_nm * math.sqrt(1.0 - rho * rho), count)
+    innovations[0] = rng.normal(0.0, sd_nm)
+    return np.asarray(lfilter([1.0], [1.0, -rho], innovations))
+
+
+def draw_noise(
+    kind: str, rng: Generator, count: int, rate_hz: float, sd_nm: float, rho_40hz: float, slow_sd_nm: float
+) -> Floats:
+    """Sensor noise at the record's rate, N·m, shape (count,).
+
+    `white`; `ar1`: first-order, with autocorrelation `rho_40hz` over 25 ms and standard deviation `sd_nm`; `slow`: the
+    white noise and beside it noise of `slow_sd_nm` with a correlation time of 75 ms.
+
+    Raises
+    ------
+    ValueError
+        No such kind.
+    """
+    if kind == "white":
+        return rng.normal(0.0, sd_nm, count)
+    if kind == "ar1":
+        return _ar1(rng, count, sd_nm, rho_40hz ** (40.0 / rate_hz))
+    if kind == "slow":
+        slow = _ar1(rng, count, slow_sd_nm, math.exp(-1.0 / (rate_hz * SLOW_CORRELATION_S)))
+        return rng.normal(0.0, sd_nm, count) + slow
+    raise ValueError(f"noise {kind!r}: one of {', '.join(NOISES)}")
+
+
+def patient_record(seed: int, moving: bool = False) -> dict[str, Any]:
     """A record of the patient that `--hidden SEED` plays (with an arm if `moving`), by the design that sized it.
 
     White noise of 0.04 N·m, against which its strength was chosen.
     """
-    scenario = hidden.drawn(seed, moving)
+    scenario = hidden.draw_patient(seed, moving)
     rng = rng_of(seed, "noise of a patient", "moving" if moving else "still")
     noise_nm = lambda count: rng.normal(0.0, hidden.NOISE_SD_NM, count)  # noqa: E731
     return sampled(scenario, scenario.design, 400.0, 0.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
@@ -227,7 +253,7 @@ def main(arguments: list[str] | None = None) -> int:
     settings.out.mkdir(parents=True, exist_ok=True)
     effects: list[str | None] = []
     for word in settings.effects.split(","):
-        effects += {"all": effect_ids(), "outside": outside_ids(), "none": (None,)}.get(word, (word,))
+        effects += {"all": EFFECTS, "outside": OUTSIDERS, "none": (None,)}.get(word, (word,))
     truths = {}
     for effect in effects:
         for strength in settings.strengths.split(",") if effect else ["none"]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from stimrig.hardware_sim.patients.hidden.draw import rng_of
+from stimrig.hardware_sim.hidden.scenario import rng_of
 
 KINDS = ("plain", "real", "offset", "start", "counts", "negative", "scaled", "shifted", "gap")
 COUNT_NM = 0.005

@@ -7,21 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.patients.hidden.base import Base, draw_base
-from stimrig.hardware_sim.patients.hidden.chain import Chain
-from stimrig.hardware_sim.patients.hidden.design import make_design
-from stimrig.hardware_sim.patients.hidden.draw import (
-    Writer,
-    draw_scenario,
-    effect_ids,
-    formulations,
-    outside_ids,
-    outside_kept_ids,
-    rng_of,
-)
-from stimrig.hardware_sim.patients.hidden.effect_free_fit import EffectFreeFit
-from stimrig.hardware_sim.patients.hidden.kernels import Formulation, NotSuited
-from stimrig.hardware_sim.patients.hidden.scenario import BANDS, combine, excess_nm, simulate
+from stimrig.hardware_sim.hidden.base import Base, draw_base
+from stimrig.hardware_sim.hidden.chain import Chain, combine, simulate
+from stimrig.hardware_sim.hidden.design import make_design
+from stimrig.hardware_sim.hidden.forms import Formulation
+from stimrig.hardware_sim.hidden.kernels import NotSuited
+from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS, OUTSIDERS_HELD_BACK, find_forms
+from stimrig.hardware_sim.hidden.scenario import BANDS, draw_scenario, rng_of
+from stimrig.hardware_sim.hidden.strength import EffectFreeFit, excess_nm
 
 pytestmark = pytest.mark.slow
 
@@ -35,8 +28,8 @@ STEP_S = 1.0 / 1600.0
 NOISE_SD_NM = 0.04
 ALL = [
     pytest.param(effect, index, id=f"{effect}-{index}")
-    for effect in (*effect_ids(), *outside_ids(), *outside_kept_ids())
-    for index in range(len(formulations(effect)))
+    for effect in (*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK)
+    for index in range(len(find_forms(effect)))
 ]
 # noise drawn at each step, or a moment that is rounded to a step and changes all that follows
 RANDOM_BY_STEP = {
@@ -53,17 +46,17 @@ def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
         rng = rng_of(seed, effect, str(index), str(attempt))
         base = draw_base(rng)
         try:
-            return base, formulations(effect)[index](rng, base)
+            return base, find_forms(effect)[index](rng, base)
         except NotSuited:
             continue
     raise AssertionError("no suitable base in 30")
 
 
 def test_every_id_of_the_contract_has_its_file_and_some_are_foreign() -> None:
-    assert set(effect_ids()) == CONTRACT
-    assert {"rate_dependent_recruitment", "antagonist", "slipped_electrode"} <= set(outside_ids())
-    assert len(outside_ids()) >= 8 and len(outside_kept_ids()) >= 5
-    foreign = [*outside_ids(), *outside_kept_ids()]
+    assert set(EFFECTS) == CONTRACT
+    assert {"rate_dependent_recruitment", "antagonist", "slipped_electrode"} <= set(OUTSIDERS)
+    assert len(OUTSIDERS) >= 8 and len(OUTSIDERS_HELD_BACK) >= 5
+    foreign = [*OUTSIDERS, *OUTSIDERS_HELD_BACK]
     assert len(set(foreign)) == len(foreign) and not set(foreign) & CONTRACT
 
 
@@ -78,18 +71,14 @@ def test_magnitude_zero_is_the_base_muscle(effect: str, index: int) -> None:
     assert np.abs(full - plain).max() > 0.05
 
 
-def name_of(writer: Writer) -> str | None:
-    return getattr(writer, "name", None)
-
-
 def depends_on_the_step(effect: str, index: int) -> bool:
-    return effect in BY_STEP or (effect, name_of(formulations(effect)[index])) in RANDOM_BY_STEP
+    return effect in BY_STEP or (effect, find_forms(effect)[index].name) in RANDOM_BY_STEP
 
 
 def test_what_depends_on_the_step_is_there() -> None:
-    known = {(effect, name_of(writer)) for effect in effect_ids() for writer in formulations(effect)}
+    known = {(effect, form.name) for effect in EFFECTS for form in find_forms(effect)}
     assert known >= RANDOM_BY_STEP
-    assert {*effect_ids(), *outside_ids(), *outside_kept_ids()} >= BY_STEP
+    assert {*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK} >= BY_STEP
 
 
 @pytest.mark.parametrize(("effect", "index"), [p for p in ALL if not depends_on_the_step(*p.values)])
@@ -113,7 +102,7 @@ BY_TURNS = [("weak", KEPT_BACK), ("strong", DEVELOPMENT)]
     ("effect", "strength", "seed"),
     [
         pytest.param(effect, *drawn, marks=[] if drawn == BY_TURNS[place % 2] else [pytest.mark.campaign])
-        for place, effect in enumerate([*effect_ids(), *outside_ids(), *outside_kept_ids()])
+        for place, effect in enumerate([*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK])
         for drawn in DRAWN
     ],
 )
@@ -131,7 +120,7 @@ def test_the_excess_is_that_of_a_fit_made_anew() -> None:
     torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)[::40]
     held_out = scenario.design.held_out
     residual = EffectFreeFit(scenario.base, scenario.design.width_us, held_out).fit(torque)
-    again = excess_nm("fatigue", residual, held_out)
+    again = excess_nm("larger", residual, held_out)
     assert again["held_out_nm"] == pytest.approx(scenario.hidden[0].excess["held_out_nm"], rel=0.05)
 
 
@@ -165,8 +154,8 @@ def test_the_base_follows_the_closed_form_step_response() -> None:
 
 
 def test_formulations_kept_back_are_not_drawn_for_development() -> None:
-    for effect in effect_ids():
-        assert len(formulations(effect, 1000)) > len(formulations(effect, 999)) >= 3
+    for effect in EFFECTS:
+        assert len(find_forms(effect, 1000)) > len(find_forms(effect, 999)) >= 3
 
 
 def test_bursts_of_pulses_ripple_about_the_held_width() -> None:

@@ -8,14 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim.__main__ import main
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.limb import Limb
 from stimrig.hardware_sim.arm.tissue import bare
-from stimrig.hardware_sim.patients import hidden
-from stimrig.hardware_sim.patients.hidden.draw import MOVING, Scenario, draw_scenario
-from stimrig.hardware_sim.patients.hidden.live import HiddenMuscle
-from stimrig.hardware_sim.patients.hidden.scenario import simulate
+from stimrig.hardware_sim.hidden.chain import simulate
+from stimrig.hardware_sim.hidden.library import MOVING
+from stimrig.hardware_sim.hidden.live import HiddenMuscle
+from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario
 from tests.hardware_sim.emulated import emulated, wait_for
 from tests.hardware_sim.test_hidden_patient import RATE_HZ, play
 

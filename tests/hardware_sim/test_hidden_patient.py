@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stimrig.hardware_sim import hidden
+from stimrig.hardware_sim.hidden.chain import simulate
+from stimrig.hardware_sim.hidden.live import HiddenMuscle
+from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario
 from stimrig.hardware_sim.load_cells.cells.plain import Cell
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
-from stimrig.hardware_sim.patients import hidden
-from stimrig.hardware_sim.patients.hidden.draw import Scenario, draw_scenario
-from stimrig.hardware_sim.patients.hidden.live import HiddenMuscle
-from stimrig.hardware_sim.patients.hidden.scenario import simulate
 from stimrig.hardware_sim.sampling import Noise
 
 pytestmark = pytest.mark.slow
@@ -95,7 +95,7 @@ def test_reveal_tells_of_the_muscle_that_make_gives() -> None:
     for seed in range(40, 47):
         told = hidden.reveal(seed)
         json.dumps(told)
-        hidden._scenario.cache_clear()  # or the scenario would be compared with itself
+        hidden.draw_patient.cache_clear()  # or the scenario would be compared with itself
         assert told == hidden.reveal(seed)
         assert len(told["effects"]) == len(told["formulation"]) == len(told["parameters"])
         kinds.add((len(told["effects"]), told["outside_library"]))

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.hidden_records import generate, main, write_csv
-from stimrig.hardware_sim.patients.hidden.sensor_noise import draw_noise
+from stimrig.hardware_sim.hidden_records import draw_noise, generate, main, write_csv
 
 
 def read_csv(path: Path) -> dict[str, list[str]]:

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.hardware_sim.patients.hidden import recruitment
-from stimrig.hardware_sim.patients.hidden.chain import Chain
-from stimrig.hardware_sim.patients.hidden.draw import Scenario
-from stimrig.hardware_sim.patients.hidden.scenario import split
+from stimrig.hardware_sim.hidden import recruitment
+from stimrig.hardware_sim.hidden.chain import Chain, split
+from stimrig.hardware_sim.hidden.scenario import Scenario
 from stimrig.identify.experiments.adaptive import Decision, Target, decide
 from stimrig.identify.records.record import Record
 from tests.harness.muscle import FINE_HZ, Patient, second_order

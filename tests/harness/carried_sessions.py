@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from stimrig.hardware_sim.hidden import NOISE_SD_NM
+from stimrig.hardware_sim.hidden.design import make_design
+from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario, rng_of
 from stimrig.hardware_sim.hidden_records import SLOWEST_SIMULATION_HZ, sampled
-from stimrig.hardware_sim.patients.hidden import NOISE_SD_NM
-from stimrig.hardware_sim.patients.hidden.design import make_design
-from stimrig.hardware_sim.patients.hidden.draw import Scenario, draw_scenario, rng_of
 from stimrig.hardware_sim.recorders import recorded
 from stimrig.identify.records.record import Record
 

@@ -19,9 +19,8 @@ from tests.api.outbox.test_process import ROOT, serving
 from tests.harness.fake_centre import KEY, BadLine, FakeCentre
 
 LOADED = """
-import stimrig.api.outbox.__main__, sys
-rooms = ("stimrig.rig.", "stimrig.api.sessions.", "stimrig.api.web.")
-print([name for name in sys.modules if f"{name}.".startswith(rooms)])
+import api.outbox.__main__, sys
+print([name for name in sys.modules if f"{name}.".startswith(("rig.", "stimrig.api.sessions.", "stimrig.api.web."))])
 """
 
 

@@ -1,0 +1,64 @@
+"""Figures for programs and notebooks, drawn by the functions that draw the page's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stimrig.api.charts import diagnosis_charts, model_charts
+from stimrig.api.charts.local_figure import LocalFigure
+from stimrig.api.charts.palette import in_light
+from stimrig.api.models import explanation
+from stimrig.api.workers.verbs import curves, runs, thinned
+from stimrig.identify import BadRequest, Comparison, Improvement, Model, Record, compare
+
+BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]
+"""Widths of the measurement and of the recruitment curve beside it."""
+
+
+def plot(what: Any, record: Record | None = None) -> LocalFigure:
+    """Draw a model beside its measurement, what a comparison left over, or how the error fell.
+
+    Parameters
+    ----------
+    what : Model, Comparison or Improvement
+        A model needs a record.
+    record : Record, optional
+        The measurement.
+
+    Returns
+    -------
+    LocalFigure
+        A `plotly.graph_objects.Figure` without a button to upload it.
+
+    Raises
+    ------
+    BadRequest
+        It is none of these, or a model without a record.
+    """
+    if isinstance(what, Model) and record is not None:
+        return LocalFigure(in_light(_model(what, record)))
+    if isinstance(what, Comparison):
+        return LocalFigure(in_light(_residual(what.to_dict())))
+    if isinstance(what, Improvement):
+        found = {**what.to_dict(), "models": []}
+        return LocalFigure(in_light(diagnosis_charts.falling(explanation.of_steps(found))))
+    message = "plot takes a model and its record, a comparison, or what improve found: plot(model, record)"
+    raise BadRequest(message, place="plot")
+
+
+def _model(model: Model, record: Record) -> dict[str, Any]:
+    """Measurement and model with the residual and the pulse widths; the recruitment curve beside them."""
+    document, drawn = model.to_dict(), curves(model, record)
+    series = thinned(compare(model, record).to_dict())["series"]
+    figure = model_charts.measurement(drawn, model.fit.get("noise_sd_nm"), series)
+    curve = model_charts.recruitment(document, drawn)
+    figure["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in curve["data"]]
+    figure["layout"]["xaxis"]["domain"] = BESIDE
+    figure["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": ALONE, "anchor": "y4"}
+    figure["layout"]["yaxis4"] = {**curve["layout"]["yaxis"], "anchor": "x2"}
+    return figure
+
+
+def _residual(found: dict[str, Any]) -> dict[str, Any]:
+    segments = runs(found["series"]["segment"], found["series"]["time_s"])
+    return diagnosis_charts.residual(thinned(found), segments, diagnosis_charts.places_of(found))

@@ -1,0 +1,149 @@
+"""Drawing a muscle with hidden effects by a seed."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from stimrig.hardware_sim.hidden.base import Base, draw_base
+from stimrig.hardware_sim.hidden.chain import combine
+from stimrig.hardware_sim.hidden.design import Design, make_design
+from stimrig.hardware_sim.hidden.forms import Form, Formulation
+from stimrig.hardware_sim.hidden.kernels import NotSuited, Stage
+from stimrig.hardware_sim.hidden.library import EFFECTS, MOVING, STILL, find_effect, find_forms
+from stimrig.hardware_sim.hidden.strength import find_magnitude
+
+BANDS = {"weak": (2.0, 5.0), "middle": (5.0, 10.0), "strong": (10.0, 25.0)}
+"""Excess error over the noise's standard deviation."""
+ATTEMPTS = 40
+
+
+@dataclass(frozen=True)
+class HiddenEffect:
+    """One effect: its formulation, its magnitude, and the error that a fit without it leaves."""
+
+    effect: str
+    formulation: Formulation
+    magnitude: float
+    strength: str
+    excess: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A base muscle, its hidden effects, and the design on which their magnitudes were found."""
+
+    base: Base
+    hidden: tuple[HiddenEffect, ...]
+    design: Design
+
+    def stages(self) -> list[Stage]:
+        """All stages of the muscle."""
+        return combine(self.base, [(one.formulation, one.magnitude) for one in self.hidden])
+
+    def truth(self, noise_sd_nm: float) -> dict[str, Any]:
+        """What is hidden, as plain values."""
+        return {
+            "effects": [one.effect for one in self.hidden],
+            "formulation": [one.formulation.name for one in self.hidden],
+            "source": [one.formulation.source for one in self.hidden],
+            "strength": self.hidden[0].strength if self.hidden else "none",
+            "parameters": {
+                one.effect: jsonable({one.formulation.magnitude_name: one.magnitude, **one.formulation.parameters})
+                for one in self.hidden
+            },
+            "outside_library": any(one.effect not in EFFECTS for one in self.hidden),
+            "excess": {one.effect: jsonable(one.excess) for one in self.hidden},
+            "excess_over_noise": [round(one.excess["counted_nm"] / noise_sd_nm, 3) for one in self.hidden],
+            "base": jsonable(self.base.describe()),
+        }
+
+
+def rng_of(seed: int, *labels: str) -> Generator:
+    """The random generator of this seed and these labels."""
+    return np.random.default_rng([seed, *(zlib.crc32(label.encode()) for label in labels)])
+
+
+def draw_scenario(
+    names: tuple[str, ...],
+    strength: str,
+    seed: int,
+    *,
+    noise_sd_nm: float = 0.04,
+    steep: bool = False,
+    moving: bool = False,
+    pulsed: bool = False,
+    formulation: int | None = None,
+    design: str = "full",
+    **design_settings: Any,
+) -> Scenario:
+    """A scenario with the effects `names`, each of the given strength on its own.
+
+    Bases, formulations and magnitudes are drawn until the strength's band is reached.
+
+    Raises
+    ------
+    ValueError
+        Unknown effect, strength or design; or no muscle found that shows the effect this strongly.
+    """
+    if strength not in BANDS:
+        raise ValueError(f"strength {strength!r}: one of {', '.join(BANDS)}")
+    moving = moving or bool(MOVING & set(names))
+    for attempt in range(ATTEMPTS):
+        rng = rng_of(seed, *names, strength, str(attempt))
+        base = draw_base(rng, steep)
+        if pulsed:
+            base = replace(base, burst_s=float(rng.uniform(0.003, 0.012)))
+        sequence = make_design(design, rng, float(base.largest_width_us), moving=moving, **design_settings)
+        try:
+            hidden = tuple(
+                _draw_effect(rng, name, strength, noise_sd_nm, base, sequence, find_forms(name, seed), formulation)
+                for name in names
+            )
+            combine(base, [(one.formulation, one.magnitude) for one in hidden])
+        except NotSuited:
+            continue
+        return Scenario(base, hidden, sequence)
+    raise ValueError(f"{' and '.join(names)}, {strength}: no muscle found that shows it this strongly")
+
+
+def _draw_effect(
+    rng: Generator,
+    effect: str,
+    strength: str,
+    noise_sd_nm: float,
+    base: Base,
+    design: Design,
+    forms: list[Form],
+    choice: int | None,
+) -> HiddenEffect:
+    """One effect of this strength on this base; `choice` is its form, drawn if None."""
+    low, high = BANDS[strength]
+    formulation = forms[int(rng.integers(len(forms))) if choice is None else choice](rng, base)
+    target_nm = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
+    band_nm = noise_sd_nm * low, noise_sd_nm * high
+    magnitude, excess = find_magnitude(find_effect(effect).counted, formulation, base, design, target_nm, band_nm)
+    return HiddenEffect(effect, formulation, magnitude, strength, excess)
+
+
+def draw_pair(rng: Generator) -> tuple[str, str]:
+    """Two different effects of the library that need no movement."""
+    first, second = rng.choice(len(STILL), 2, replace=False)
+    return STILL[int(first)], STILL[int(second)]
+
+
+def jsonable(value: Any) -> Any:
+    """The value as plain numbers, lists and dictionaries."""
+    if isinstance(value, dict):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [jsonable(v) for v in value]
+    if isinstance(value, bool | str) or value is None:
+        return value
+    if isinstance(value, int | np.integer):
+        return int(value)
+    return round(float(value), 6)
