@@ -5,16 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import select
 
-from stimrig.api.outbox.answers import Progress, Wanted, whole_number
-from stimrig.api.outbox.errors import RefusedError, UnreachableError, WrongAnswerError
 from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.messages import LackingOut, PieceOut, RefusedError, UnreachableError, WrongAnswerError
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Model, OutboxItem, Recording, Tracked
+from stimrig.api.whole_file import sha256_of
 
 CHUNK = 8_000_000
 PIECE = 65536
@@ -113,12 +113,15 @@ class Files:
             return Source(sha256, None, body, len(body)) if hashlib.sha256(body).hexdigest() == sha256 else None
         path = Path(row.path)
         seen = _signature(path)
+        if self._whole != (sha256, path, seen):
+            try:
+                if sha256_of(path) != sha256 or _signature(path) != seen:
+                    return None
+            except OSError:
+                return None
         if seen is None:
             return None
-        if self._whole != (sha256, path, seen):
-            if _digest(path) != sha256 or _signature(path) != seen:
-                return None
-            self._whole = (sha256, path, seen)
+        self._whole = (sha256, path, seen)
         return Source(sha256, path, None, seen[1])
 
 
@@ -140,21 +143,12 @@ def _signature(path: Path) -> Signature | None:
     return (found.st_ino, found.st_size, found.st_mtime_ns)
 
 
-def _digest(path: Path) -> str:
-    """SHA-256 of a file; empty where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return ""
-
-
 class Sending:
     """Sends a centre the files that it lacks.
 
     Attributes
     ----------
-    queue : deque of Wanted
+    queue : deque of LackingOut
         What it lacked when it was last asked, without what is damaged here.
     asked : bool
         Whether it was asked since something new was told.
@@ -162,7 +156,7 @@ class Sending:
 
     def __init__(self, link: Link, files: Files) -> None:
         self.link, self.files = link, files
-        self.queue: deque[Wanted] = deque()
+        self.queue: deque[LackingOut] = deque()
         self.asked = False
         self._other_offset = False
 
@@ -191,16 +185,16 @@ class Sending:
         if source is None:
             self.queue.popleft()
             return not self.files.unknown(wanted.sha256)
-        if wanted.have > source.size:
+        if wanted.have_bytes > source.size:
             self.queue.popleft()
             raise WrongAnswerError(f"{self.link.url}: has more of {wanted.sha256[:12]}… than there is")
         self._send(wanted, source, max(1, int(CHUNK * share)))
-        return wanted.have < source.size
+        return wanted.have_bytes < source.size
 
-    def _send(self, wanted: Wanted, source: Source, most: int) -> None:
-        length = min(most, source.size - wanted.have)
+    def _send(self, wanted: LackingOut, source: Source, most: int) -> None:
+        length = min(most, source.size - wanted.have_bytes)
         try:
-            given = self.link.send(wanted.sha256, wanted.have, source.pieces(wanted.have, length), length)
+            given = self.link.send(wanted.sha256, wanted.have_bytes, source.pieces(wanted.have_bytes, length), length)
         except RefusedError as error:
             self._refused(wanted, source, error)
             return
@@ -210,23 +204,23 @@ class Sending:
         self._other_offset = False
         self._took(wanted, source, length, given)
 
-    def _took(self, wanted: Wanted, source: Source, length: int, given: Progress) -> None:
-        if given.whole and given.have == source.size:
+    def _took(self, wanted: LackingOut, source: Source, length: int, given: PieceOut) -> None:
+        if given.whole and given.have_bytes == source.size:
             self.queue.popleft()
-        elif given.whole or given.have != wanted.have + length or length == 0:
+        elif given.whole or given.have_bytes != wanted.have_bytes + length or length == 0:
             self.queue.clear()
             self.asked = False
             raise WrongAnswerError(f"{self.link.url}: counts the bytes of {wanted.sha256[:12]}… otherwise than the rig")
         else:
-            self.queue[0] = replace(wanted, have=given.have)
+            self.queue[0] = wanted.model_copy(update={"have_bytes": given.have_bytes})
 
-    def _refused(self, wanted: Wanted, source: Source, error: RefusedError) -> None:
+    def _refused(self, wanted: LackingOut, source: Source, error: RefusedError) -> None:
         """Go on from where the centre says it is, once; else it is asked again, later."""
         if error.code == "other-offset" and not self._other_offset:
-            have = whole_number(error.said, "have_bytes")
+            have = error.number("have_bytes")
             if have <= source.size:
                 self._other_offset = True
-                self.queue[0] = replace(wanted, have=have)
+                self.queue[0] = wanted.model_copy(update={"have_bytes": have})
                 return
         self._other_offset = False
         self.files.doubt(wanted.sha256)

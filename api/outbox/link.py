@@ -10,16 +10,28 @@ from urllib.parse import urlsplit
 import httpx
 
 from stimrig.api.clock import Clock
-from stimrig.api.outbox import answers
-from stimrig.api.outbox.answers import Progress, Wanted
 from stimrig.api.outbox.chain import Position
-from stimrig.api.outbox.errors import BucketError, KeyRefusedError, RefusedError, UnreachableError, WrongAnswerError
+from stimrig.api.outbox.messages import (
+    BucketError,
+    HeadsOut,
+    KeyRefusedError,
+    LackingFilesOut,
+    LackingOut,
+    PieceOut,
+    PlaceOut,
+    RefusedError,
+    UnreachableError,
+    WrongAnswerError,
+    document,
+    read,
+)
 from stimrig.api.outbox.receipts import Receipt
 from stimrig.api.settings import loopback
 
 LONGEST_ANSWER = 1_000_000
 LONGEST_S = 120.0
 """For an answer that has begun."""
+LONGEST_TEXT = 200
 TIMEOUT = httpx.Timeout(30.0, connect=10.0)
 
 
@@ -53,27 +65,28 @@ class Link:
 
     def hello(self, said: dict[str, Any]) -> Position:
         """Say who is there; where the centre stands in the chain."""
-        return answers.position(self._ask("POST", "/v1/rig/hello", json=said))
+        return read(PlaceOut, self._ask("POST", "/v1/rig/hello", json=said)).position()
 
     def items(self, chain: str, items: list[dict[str, Any]]) -> Position:
         """Send items; where the centre stands after them."""
-        return answers.position(self._ask("POST", "/v1/rig/items", json={"chain": chain, "items": items}))
+        return read(PlaceOut, self._ask("POST", "/v1/rig/items", json={"chain": chain, "items": items})).position()
 
     def heads(self, chain: str, item: int) -> list[Receipt]:
         """What the centre countersigned of the audit trail, after the receipt of an item."""
-        return answers.receipts(self._ask("GET", "/v1/rig/heads", params={"chain": chain, "item": item}))
+        found = read(HeadsOut, self._ask("GET", "/v1/rig/heads", params={"chain": chain, "item": item})).heads
+        if not all(one.key and one.holds for one in found):
+            raise WrongAnswerError("the answer's `heads` are not as the centre signed them")
+        return found
 
-    def wanted(self, limit: int) -> list[Wanted]:
+    def wanted(self, limit: int) -> list[LackingOut]:
         """The files that the centre lacks."""
-        return answers.wanted(self._ask("GET", "/v1/rig/files", params={"limit": limit}), limit)
+        return read(LackingFilesOut, self._ask("GET", "/v1/rig/files", params={"limit": limit}), limit).files
 
-    def send(self, sha256: str, offset: int, pieces: Iterator[bytes], length: int) -> Progress:
+    def send(self, sha256: str, offset: int, pieces: Iterator[bytes], length: int) -> PieceOut:
         """Send a file's bytes from a place on."""
         headers = {"Content-Length": str(length), "Content-Type": "application/octet-stream"}
         where = f"/v1/rig/files/{sha256}"
-        return answers.progress(
-            self._ask("PUT", where, params={"offset": offset}, content=pieces, headers=headers),
-        )
+        return read(PieceOut, self._ask("PUT", where, params={"offset": offset}, content=pieces, headers=headers))
 
     def close(self) -> None:
         """Let the line go."""
@@ -91,7 +104,7 @@ class Link:
             raise KeyRefusedError(f"{self.url}: key revoked, or unknown there; set STIMRIG_CENTRE_KEY to a new one")
         try:
             if 200 <= status < 300:
-                return answers.document(body)
+                return document(body)
             if 400 <= status < 600:
                 raise self._refusal(status, body)
         except WrongAnswerError as error:
@@ -113,10 +126,10 @@ class Link:
 
     def _refusal(self, status: int, body: bytes) -> RefusedError | BucketError:
         try:
-            said = answers.document(body)
+            said = document(body)
         except WrongAnswerError:  # a proxy in between says it in its own way
             said = {}
-        code = answers.text(said.get("type")).rpartition("/")[2]
+        code = one_line(said.get("type")).rpartition("/")[2]
         words = self._words(f"{said.get('title') or 'refused'}: {said.get('detail') or status}")
         if status == 507:
             return BucketError(f"{self.url}: the centre's bucket is full or gone ({words})")
@@ -124,4 +137,10 @@ class Link:
 
     def _words(self, said: object) -> str:
         """What came, for people; without the key, which something in between may have sent back."""
-        return answers.text(str(said or "").replace(self._key, "…"))
+        return one_line(str(said or "").replace(self._key, "…"))
+
+
+def one_line(value: object) -> str:
+    """Words of the centre for people: on one line, and not many."""
+    words = " ".join("".join(sign if sign.isprintable() else " " for sign in str(value or "")).split())
+    return words if len(words) <= LONGEST_TEXT else words[: LONGEST_TEXT - 1] + "…"

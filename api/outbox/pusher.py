@@ -5,26 +5,33 @@ It keeps no marks of what was sent: the centre says what it has.
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import random
 import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
+import httpx
+from sqlalchemy import select, tuple_
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.clock import Clock, utc_label
-from stimrig.api.outbox import feed, rig_state, status
-from stimrig.api.outbox.collecting import Collecting
-from stimrig.api.outbox.errors import Backoff, KeyRefusedError, PushError, UnreachableError
+from stimrig.api.outbox import feed, receipts, status
 from stimrig.api.outbox.files import Files, Sending
 from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.messages import KeyRefusedError, PushError, RefusedError, UnreachableError
+from stimrig.api.outbox.receipts import Receipt
 from stimrig.api.outbox.status import Status
 from stimrig.api.outbox.telling import Telling
-from stimrig.api.settings import Settings
+from stimrig.api.settings import Settings, loopback
 from stimrig.api.store import Store
+from stimrig.api.store.hashes import digest
+from stimrig.api.store.tables import OutboxItem
 from stimrig.api.version import software_version
 
 HELLO_S = 30.0
@@ -35,8 +42,28 @@ TOLD_S = 30.0
 GOOD_S = 180.0
 """One that is older was left by a pusher that does not run: a chunk on a slow line takes a while."""
 LEAST_SHARE = 1 / 32
+FIRST_S, LONGEST_S = 1.0, 300.0
+"""Waits after failures."""
+HEALTH_S, LONGEST_HEALTH = 2.0, 65536
 MOST_DAMAGED_TOLD, MOST_DAMAGED_SHOWN = 1000, 20
 log = logging.getLogger("stimrig.outbox")
+
+
+class Backoff:
+    """Waits from 1 s to 5 min, longer each time, and by chance up to half shorter: never all rigs at once."""
+
+    def __init__(self, chance: random.Random) -> None:
+        self.chance, self.failures = chance, 0
+
+    def next_s(self) -> float:
+        """The next wait, s."""
+        wait_s = min(LONGEST_S, FIRST_S * 2.0 ** min(self.failures, 20))
+        self.failures += 1
+        return max(FIRST_S, wait_s * self.chance.uniform(0.5, 1.0))
+
+    def reset(self) -> None:
+        """It went well."""
+        self.failures = 0
 
 
 class Pusher:
@@ -205,7 +232,7 @@ class Pusher:
             "utc": self.clock.utc(),
             "disk_free_bytes": disk.free,
             "disk_total_bytes": disk.total,
-            **rig_state.of(self.settings),
+            **rig_state(self.settings),
             "damaged": sorted(self.files.damaged)[:MOST_DAMAGED_TOLD],
             "waiting_items": items,
             "waiting_files": files + len(self.sending.queue),
@@ -264,3 +291,85 @@ def _file_of(store: Store) -> tuple[int, int] | None:
     except OSError:
         return None
     return None if found is None else (found.st_dev, found.st_ino)
+
+
+def rig_state(settings: Settings) -> dict[str, Any]:
+    """`state` and `reason` as `GET /health` tells anybody on this machine; its address stands in the service's lock."""
+    unknown = {"state": None, "reason": None}
+    try:
+        address = json.loads((settings.data_dir / "service.lock").read_text("utf-8"))["address"]
+        if not loopback(urlsplit(address).hostname or ""):
+            return unknown
+        with (
+            httpx.Client(timeout=HEALTH_S, trust_env=False) as http,
+            http.stream("GET", f"{address}/health") as answer,
+        ):
+            body = next(answer.iter_bytes(LONGEST_HEALTH), b"")
+        rig = json.loads(body)["rig"]
+        return {"state": _text(rig.get("state")), "reason": _text(rig.get("reason"))}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, httpx.HTTPError, httpx.InvalidURL):
+        return unknown
+
+
+def _text(value: object) -> str | None:
+    return value[:200] if isinstance(value, str) else None
+
+
+class Collecting:
+    """Asks a centre for its receipts, and keeps them: a file for each centre and key, so that none are mixed up.
+
+    Attributes
+    ----------
+    asked : bool
+        Whether it was asked since something new was told.
+    """
+
+    def __init__(self, store: Store, settings: Settings, link: Link) -> None:
+        self.store, self.link, self.asked = store, link, False
+        key = settings.centre_key.get_secret_value() if settings.centre_key else ""
+        self.path = settings.data_dir / f"receipts-{digest(f'{settings.centre_url} {key}')[:16]}.jsonl"
+        self._after, self._row_id = ("", 0), 0
+        if self.path.exists():
+            self._take_up()
+
+    def step(self) -> bool:
+        """Ask for the next ones; whether there may be more. Raises PushError, but where the centre is an older one."""
+        if self.asked:
+            return False
+        self.asked = True
+        try:
+            given = self.link.heads(*self._after)
+            kept = self._of_ours(given)
+            if kept:
+                receipts.append(self.path, kept)
+        except (RefusedError, OSError) as error:
+            log.warning("receipts of the audit trail: %s", error)
+            return False
+        if given:
+            self._after = (given[-1].chain, given[-1].item)
+        self.asked = not kept
+        return bool(kept)
+
+    def _of_ours(self, given: list[Receipt]) -> list[Receipt]:
+        """Those of items that this rig has told, each once: a centre that makes up others fills no disk."""
+        place = tuple_(OutboxItem.chain, OutboxItem.seq).in_([(one.chain, one.item) for one in given])
+        columns = (OutboxItem.chain, OutboxItem.seq, OutboxItem.id)
+        with self.store.read() as session:
+            rows = session.execute(select(*columns).where(OutboxItem.kind == "audit", place))
+            ids = {(chain, seq): row_id for chain, seq, row_id in rows}
+        kept = []
+        for one in given:
+            row_id = ids.get((one.chain, one.item), 0)
+            if row_id > self._row_id:
+                self._row_id = row_id
+                kept.append(one)
+        return kept
+
+    def _take_up(self) -> None:
+        """Go on after the last one; half a line that a loss of power left is taken away."""
+        whole = self.path.read_bytes().rpartition(b"\n")
+        if whole[2]:
+            os.truncate(self.path, len(whole[0]) + len(whole[1]))
+        for _, one in receipts.read(self.path):
+            if one is not None:
+                self._after = (one.chain, one.item)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from stimrig.api import owner_only
 from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.language import lazy
 from stimrig.api.settings import Settings
+from stimrig.api.whole_file import whole_file
 
 NAME = "outbox.json"
 WORDS: dict[str, Any] = {
@@ -85,10 +84,8 @@ class Status:
 
 def write(folder: Path, status: Status) -> None:
     """Put it into its place: whoever reads has the one before, or this one, whole."""
-    new = folder / f".{NAME}.{os.getpid()}"
-    owner_only.file(new)
-    new.write_text(json.dumps(asdict(status)) + "\n", encoding="utf-8")
-    new.replace(folder / NAME)
+    with whole_file(folder / NAME, mode=0o600) as file:
+        file.write(json.dumps(asdict(status)).encode() + b"\n")
 
 
 def read(settings: Settings, now_unix_s: float) -> Status | None:

@@ -11,14 +11,12 @@ from sqlalchemy import distinct, func, select
 
 from stimrig.api.clock import Clock, unix_of, utc_label
 from stimrig.api.outbox import chain
-from stimrig.api.outbox.answers import whole_number
 from stimrig.api.outbox.chain import NOWHERE, Head, Position
-from stimrig.api.outbox.errors import RefusedError, WrongAnswerError
 from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.messages import MOST_ITEMS, RefusedError, WrongAnswerError
 from stimrig.api.store import Store, audit
 from stimrig.api.store.tables import OutboxItem
 
-MOST_ITEMS = 500
 MOST_BYTES = 3_500_000
 AROUND_ITEM = 700
 """Bytes of an item beside its body, at most."""
@@ -142,7 +140,7 @@ class Telling:
         if error.code != "out-of-order" or self._out_of_order:
             self._out_of_order = False
             raise error
-        seq = whole_number(error.said, "seq")
+        seq = error.number("seq")
         with self.store.read() as session:
             known = chain.at(session, head.chain, seq)
         if known is None:

@@ -19,8 +19,8 @@ from tests.api.outbox.test_process import ROOT, serving
 from tests.harness.fake_centre import KEY, BadLine, FakeCentre
 
 LOADED = """
-import api.outbox.__main__, sys
-print([name for name in sys.modules if f"{name}.".startswith(("rig.", "stimrig.api.sessions.", "stimrig.api.web."))])
+import stimrig.api.outbox.__main__, sys
+print([name for name in sys.modules if f"{name}.".startswith(("stimrig.rig.", "stimrig.api.sessions.", "stimrig.api.web."))])
 """
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from sqlalchemy import inspect
 
-from stimrig.api.outbox import chain, feed, items
+from stimrig.api.outbox import chain, feed
 from stimrig.api.outbox.feed import Feed
 from stimrig.api.store import audit, uploads
 from stimrig.api.store.tables import Approval, Model, Note, OutboxItem, Participant, Recording, Test
@@ -113,7 +113,7 @@ def test_a_row_that_cannot_be_told_keeps_nobody_from_working(rig: Rig, monkeypat
         raise ValueError("on purpose")
 
     with monkeypatch.context() as patch:
-        patch.setattr(items, "_bounded", broken)
+        patch.setattr(feed, "_bounded", broken)
         rig.participant("P1")
     assert rig.store.get(Participant, "P1") is not None and [kind for kind, _ in rig.told()] == ["begin", "audit"]
     assert sum(feed.batches(rig.store, rig.clock)) == 1, "it is found the next time"
@@ -142,7 +142,7 @@ def test_what_json_cannot_hold_and_what_is_too_long_are_left_out(rig: Rig) -> No
         deep = [deep]
     test_id = rig.begin_test("P1")
     summary = {"nan": float("nan"), "long": [0.5] * 200_000, "deep": deep, "n": 1, "surrogate": "\ud800"}
-    told = items.telling(Test(id="T0", state="completed", plan={}, summary=summary))
+    told = feed.telling(Test(id="T0", state="completed", plan={}, summary=summary))
     assert told is not None and told.body["summary"]["nan"] is None and told.body["summary"]["surrogate"] == "?"
     with rig.store.write() as session:
         row = session.get(Test, test_id)
