@@ -24,9 +24,8 @@ import psycopg
 from sqlalchemy import event, text
 
 from bench.stamp import RESULTS, written_by
-from stimrig.api.centre import directory, warnings
+from stimrig.api.centre import directory, pages, warnings
 from stimrig.api.centre.directory import Cohort, Search
-from stimrig.api.centre.pages import participants_view
 from stimrig.api.charts import trend_charts
 from stimrig.api.store import Store
 from tests.harness.postgres import running
@@ -181,7 +180,7 @@ def questions(store: Store, codes: list[str], draw: random.Random) -> dict[str, 
 
     def drawn() -> None:
         code = draw.choice(codes)
-        trend_charts.panels(participants_view.documents(code, directory.stood(store, code)))
+        trend_charts.panels(pages.documents(code, directory.stood(store, code)))
 
     def search(**asked: Any) -> Callable[[], Any]:
         return lambda: directory.participants(store, Search(**asked))

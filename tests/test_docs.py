@@ -14,7 +14,7 @@ import typer
 from fastapi.routing import APIRoute
 
 from stimrig import identify
-from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.centre.context import CentreSettings
 from stimrig.api.cli.main import build
 from stimrig.api.settings import Settings
 from stimrig.api.web import routes

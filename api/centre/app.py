@@ -6,11 +6,9 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from starlette.types import Receive, Scope, Send
 
-from stimrig.api.centre import pages, routes
-from stimrig.api.centre.chain import MOST_ITEM_BYTES
-from stimrig.api.centre.context import build
-from stimrig.api.centre.pages.face import FACE
-from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.centre import pages, rig_routes, routes
+from stimrig.api.centre.context import CentreSettings, build
+from stimrig.api.centre.ingest import MOST_BATCH_BYTES
 from stimrig.api.centre.spool import MOST_PIECE_BYTES
 from stimrig.api.clock import Clock
 from stimrig.api.web import openapi, problems
@@ -25,6 +23,7 @@ Rigs push with their own keys to `/v1/rig/…`; everything else is for people an
 """
 RIG_SIDE = "/v1/rig/"
 PIECE_S = 300.0
+ROUTERS = (routes.operation, routes.v1, rig_routes.router, pages.router)
 SHARED = (
     "/sign-in", "/sign-out", "/locked", "/unlock", "/lock", "/rig/acted", "/language", "/colours", "/static/{name}",
     "/docs", "/administration", "/administration/users", "/administration/users/{name}/password",
@@ -44,7 +43,7 @@ class CentreBodyLimit(BodyLimit):
         if path.startswith(f"{RIG_SIDE}files/"):
             return MOST_PIECE_BYTES, PIECE_S
         if path.rstrip("/") == f"{RIG_SIDE}items":
-            return MOST_ITEM_BYTES, PIECE_S
+            return MOST_BATCH_BYTES, PIECE_S
         return BODY_BYTES, BODY_S
 
 
@@ -68,11 +67,11 @@ def create_app(settings: CentreSettings | None = None, clock: Clock | None = Non
     """
     context = build(settings or CentreSettings(), clock)
     app = Service(context, title="stimrig centre", summary="What rigs have pushed.", description=DESCRIPTION)
-    app.state.face = FACE
+    app.state.face = pages.FACE
     app.add_middleware(CentreStrictBody)
     app.add_middleware(CentreBodyLimit, context=context)  # the last one added stands outside
     problems.install(app)
-    for router in routers(routes, pages):
+    for router in ROUTERS:
         app.include_router(router)
     app.router.routes.extend(shared())
     openapi.describe(app)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import secrets
 import shutil
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.whole_file import whole_file
 
 PIECE = 2**20
 PROBE = "stimrig-centre"
@@ -86,21 +86,8 @@ class Bucket:
             raise FileNotFoundError(2, GONE)
         final.parent.mkdir(mode=0o700, exist_ok=True)
         part = final.with_name(f"{final.name}.{secrets.token_hex(4)}.part")
-        try:
-            made = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with path.open("rb") as source, os.fdopen(made, "wb") as out:
-                shutil.copyfileobj(source, out, PIECE)
-                out.flush()
-                os.fsync(out.fileno())
-            part.replace(final)
-        finally:
-            with contextlib.suppress(FileNotFoundError):
-                part.unlink()
-        folder = os.open(final.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        with path.open("rb") as source, whole_file(final, part, 0o600) as out:
+            shutil.copyfileobj(source, out, PIECE)
 
     def copy(self, sha256: str, out: IO[bytes] | None = None, seen: Callable[[int], object] | None = None) -> bool:
         """Read a file, into `out` if given; whether it is what its name says.

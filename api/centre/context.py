@@ -1,4 +1,4 @@
-"""The centre's parts, made once and handed to its routes; what those of `api.web` ask of theirs is here, too."""
+"""The centre's settings and parts, made once and handed to its routes; what those of `api.web` ask is here, too."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
 from fastapi import Depends, Request
+from pydantic import Field
+from pydantic_settings import SettingsConfigDict
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api import owner_only
@@ -23,7 +26,6 @@ from stimrig.api.centre.bucket import Bucket, BucketError
 from stimrig.api.centre.heads import Heads
 from stimrig.api.centre.ingest import Ingest
 from stimrig.api.centre.rigs import Rigs
-from stimrig.api.centre.settings import CentreSettings
 from stimrig.api.centre.spool import Spool
 from stimrig.api.clock import Clock, set_zone
 from stimrig.api.errors import ApiError, SettingsError
@@ -32,11 +34,48 @@ from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import Auth
 from stimrig.api.people.idle_lock import FLUSH_S, IdleLock
 from stimrig.api.people.pace import Guesses
+from stimrig.api.settings import ServerSettings
 from stimrig.api.store import Store
 from stimrig.api.store.holds import shared_secret as shared
 
 log = logging.getLogger("stimrig.centre")
 MOST_DOWNLOADS, MOST_PUTS, MOST_PUTS_OF_A_RIG = 4, 8, 3
+
+
+class CentreSettings(ServerSettings):
+    """Settings of the centre: ``data_dir`` is ``STIMRIG_CENTRE_DATA_DIR``."""
+
+    model_config = SettingsConfigDict(env_prefix="STIMRIG_CENTRE_", extra="ignore")
+    centre_url: ClassVar[None] = None
+    """A centre tells no other one."""
+    structure: ClassVar[tuple[str, ...]] = ()
+    """A centre fits nothing."""
+
+    data_dir: Path = Field(default=Path("centre"), description="files that are coming in, and logs")
+    database_url: str | None = Field(
+        default=None,
+        description="as postgresql+psycopg://user:password@host/stimrig; default: SQLite in the data folder",
+    )
+    files: str | None = Field(
+        default=None, description="the bucket: a folder, file:// or s3://bucket/prefix; default: in the data folder"
+    )
+    port: Annotated[int, Field(ge=0, le=65535)] = 8100
+    max_file_mb: Annotated[float, Field(gt=0)] = Field(default=4096.0, description="longest file that is taken, MB")
+
+    @property
+    def database(self) -> str:
+        """The database's SQLAlchemy URL."""
+        return self.database_url or f"sqlite:///{self.data_dir.absolute() / 'centre.db'}"
+
+    @property
+    def bucket(self) -> str:
+        """Where whole files lie."""
+        return self.files or str(self.data_dir.absolute() / "files")
+
+    @property
+    def spool_dir(self) -> Path:
+        """Where a file lies until it is whole."""
+        return self.data_dir / "spool"
 
 
 @dataclass

@@ -10,7 +10,8 @@ from sqlalchemy import Select, exists, select, tuple_
 
 from stimrig.api.centre import clean
 from stimrig.api.clock import local_day
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models.summary import VERDICTS
 from stimrig.api.store import Store
 from stimrig.api.store.centre_tables import (
     CentreDecision,
@@ -26,6 +27,7 @@ from stimrig.api.store.centre_tables import (
 PARTICIPANTS, SESSIONS = 50, 12
 MOST_IN_A_SESSION = 400
 """Recordings, tests, models of a page of sessions."""
+VERDICT_NAMES = (*VERDICTS, "unknown")
 LAST = "\U0010ffff"
 """Sorts after every text."""
 
@@ -41,6 +43,38 @@ class Search:
     effect: str | None = None
     verdict: str | None = None
     after: str = ""
+
+
+def asked(
+    store: Store, q: str = "", rig: str | None = None, from_: str | None = None, to: str | None = None,
+    effect: str | None = None, verdict: str | None = None, after: str | None = None,
+) -> Search:  # fmt: skip
+    """A search, each part checked.
+
+    Raises
+    ------
+    ApiError
+        422: a part does not hold; 404: no such rig.
+    """
+    for name, given in (("from", from_), ("to", to)):
+        if given and clean.a_day(given) is None:
+            raise ApiError(422, "invalid-input", "The request is not valid", f"{name}: give a day as 2026-11-23")
+    if effect and not clean.EFFECT.fullmatch(effect):
+        raise ApiError(422, "invalid-input", "The request is not valid", "effect: give an effect's id, as fatigue")
+    if verdict and verdict not in VERDICT_NAMES:
+        raise ApiError(422, "invalid-input", "The request is not valid", f"verdict: one of {', '.join(VERDICT_NAMES)}")
+    if after and clean.code(after) is None:
+        raise ApiError(422, "invalid-input", "The request is not valid", "after: give it as the last page gave it")
+    rig_id = the_rig(store, rig).id if rig else None
+    return Search(q.strip()[:32], rig_id, from_ or None, to or None, effect or None, verdict or None, after or "")
+
+
+def the_rig(store: Store, name: str) -> CentreRig:
+    """A rig by its name. Raises NotFoundError."""
+    found = store.all(CentreRig, CentreRig.name == name[:80], limit=1)
+    if not found:
+        raise NotFoundError("rig", name[:80], "GET /v1/rigs lists them.")
+    return found[0]
 
 
 def participants(store: Store, asked: Search, limit: int = PARTICIPANTS) -> tuple[list[dict[str, Any]], str | None]:
@@ -87,6 +121,12 @@ def person(store: Store, code: str) -> list[dict[str, Any]]:
     return [{**row.as_dict(), "rig": name} for row, name in rows]
 
 
+def require(store: Store, code: str) -> None:
+    """Whether there is such a participant. Raises NotFoundError."""
+    if not person(store, code):
+        raise NotFoundError("participant", code, "GET /v1/participants lists them.")
+
+
 def sessions(
     store: Store, code: str, before: tuple[str, int] | None = None, limit: int = SESSIONS
 ) -> tuple[list[dict[str, Any]], tuple[str, int] | None]:
@@ -101,6 +141,16 @@ def sessions(
     found = [{**row.as_dict(), "rig": name} for row, name in rows[:limit]]
     _fill(store, code, found)
     return found, more
+
+
+def page_key(before: str | None) -> tuple[str, int] | None:
+    """Where a page of sessions begins. Raises ApiError (422)."""
+    if not before:
+        return None
+    day, _, number = before.partition("~")
+    if clean.a_day(day) is None or (number and (not number.isdecimal() or len(number) > 9)):
+        raise ApiError(422, "invalid-input", "The request is not valid", "before: give it as the last page gave it")
+    return day, int(number or 0)
 
 
 def _fill(store: Store, code: str, found: list[dict[str, Any]]) -> None:

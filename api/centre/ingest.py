@@ -1,27 +1,83 @@
-"""What rigs tell: a greeting, and batches of items, each batch one transaction."""
+"""What rigs tell: a greeting, and batches of items, read strictly, each batch one transaction (decision 0013)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
+from pydantic import BaseModel, ValidationError
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.centre import clean, rigs, warnings
-from stimrig.api.centre.chain import BatchIn, HelloIn, Item, ItemIn, checked
 from stimrig.api.centre.project import Projector
 from stimrig.api.clock import Clock, unix_of
 from stimrig.api.errors import ApiError
-from stimrig.api.outbox.chain import NOWHERE, Position
+from stimrig.api.outbox.chain import BEGIN, NOWHERE, Position, item_hash
+from stimrig.api.outbox.messages import BatchIn, HelloIn, ItemIn
 from stimrig.api.store import Store
 from stimrig.api.store.centre_tables import CentreChain, CentreItem, CentreRig
-from stimrig.api.store.hashes import storable
+from stimrig.api.store.hashes import canonical, digest, storable
+from stimrig.identify.strict_json import BadJson, parse
 
+MOST_BATCH_BYTES = 4_000_000
+DEEPEST = 40
+"""Brackets within one another, of a batch: an item's body is in its third."""
 MOST_CLOCK_S = 2.0
 LEAST_DISK_SHARE, LEAST_DISK_BYTES = 0.05, 5_000_000_000
 """A disk is nearly full below both of them."""
 MOST_DAMAGED = 50
 """Files that one greeting warns of."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """An item whose hashes hold; `text` is its body's canonical text."""
+
+    sent: ItemIn
+    text: str
+
+
+def read(model: type[BaseModel], raw: bytes) -> Any:
+    """A body of a rig, strictly.
+
+    Raises
+    ------
+    ApiError
+        400: no sound JSON; 422: a field does not hold.
+    """
+    try:
+        return model.model_validate(parse(raw, deepest=DEEPEST))
+    except BadJson as error:
+        raise ApiError(400, "bad-request", "The body cannot be read", f"{error}. Send JSON (RFC 8259).") from error
+    except ValidationError as error:
+        first = error.errors(include_input=False, include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "body"
+        detail = f"{place[:120]}: {first['msg']}"
+        raise ApiError(422, "invalid-input", "The request is not valid", detail) from error
+
+
+def checked(sent: ItemIn) -> Item:
+    """The item, its hashes compared.
+
+    Raises
+    ------
+    ApiError
+        422 `hash-differs`.
+    """
+    try:
+        text = canonical(sent.body)
+        held = digest(text) == sent.sha256 and item_hash(sent.model_dump(exclude={"body"})) == sent.hash
+    except (ValueError, RecursionError) as error:
+        detail = f"Item {sent.seq} cannot be written as canonical JSON. Nothing of the batch was taken."
+        raise ApiError(422, "hash-differs", "An item differs from its hash", detail) from error
+    if not held:
+        detail = f"Item {sent.seq} ({sent.kind}) differs from its hash. Nothing of the batch was taken."
+        raise ApiError(422, "hash-differs", "An item differs from its hash", detail)
+    if (sent.seq == 1) != (sent.kind == BEGIN) or (sent.file is None) != (sent.file_bytes is None):
+        detail = f"Item {sent.seq}: only the first item is `begin`, and a file has its length."
+        raise ApiError(422, "invalid-input", "The request is not valid", detail)
+    return Item(sent, text)
 
 
 class Ingest:
@@ -118,7 +174,7 @@ class Ingest:
         projector = Projector(session, rig, now, self.most_file_bytes)
         with session.no_autoflush:
             for item in new:
-                projector.take(item)
+                projector.take(item.sent)
         return place
 
     def _keep(self, session: Session, rig_id: int, chain: str, items: list[Item], now: str) -> None:

@@ -9,8 +9,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from stimrig.api.centre import clean, heads, warnings
-from stimrig.api.centre.chain import Item
 from stimrig.api.clock import local_day
+from stimrig.api.outbox.messages import ItemIn
 from stimrig.api.store.centre_tables import (
     CentreDecision,
     CentreEffect,
@@ -43,30 +43,30 @@ class Projector:
     def __init__(self, session: Session, rig: CentreRig, now_utc: str, most_file_bytes: int) -> None:
         self.session, self.rig, self.now_utc, self.most_file_bytes = session, rig, now_utc, most_file_bytes
         self._rows: dict[tuple[Any, ...], Any] = {}
-        self._kinds: dict[str, Callable[[Item, dict[str, Any]], bool]] = {
+        self._kinds: dict[str, Callable[[ItemIn, dict[str, Any]], bool]] = {
             "begin": self._begin, "participant": self._participant, "test": self._test, "recording": self._recording,
             "model": self._model, "decision": self._decision, "audit": self._audit,
         }  # fmt: skip
 
-    def take(self, item: Item) -> None:
+    def take(self, item: ItemIn) -> None:
         """Put one item where pages find it."""
-        make = self._kinds.get(item.sent.kind)
-        if make is not None and not make(item, item.sent.body):
-            self._tell("unreadable", f"{item.sent.kind} {item.sent.seq}", of=item.sent.kind, seq=item.sent.seq)
-        if item.sent.file is not None:
-            self._want(item.sent.file, item.sent.file_bytes or 0)
+        make = self._kinds.get(item.kind)
+        if make is not None and not make(item, item.body):
+            self._tell("unreadable", f"{item.kind} {item.seq}", of=item.kind, seq=item.seq)
+        if item.file is not None:
+            self._want(item.file, item.file_bytes or 0)
 
-    def _begin(self, item: Item, body: dict[str, Any]) -> bool:
+    def _begin(self, item: ItemIn, body: dict[str, Any]) -> bool:
         after = body.get("after")
-        if isinstance(after, dict) or (self.rig.chain is not None and self.rig.chain != item.sent.key):
+        if isinstance(after, dict) or (self.rig.chain is not None and self.rig.chain != item.key):
             after = after if isinstance(after, dict) else {}
             known = after.get("seq")
             subject = clean.text(after.get("chain"), 32) or self.rig.chain or ""
             self._tell("restored", subject, seq=known if isinstance(known, int) and 0 <= known < 2**53 else None)
-        self.rig.chain = item.sent.key[:32]
+        self.rig.chain = item.key[:32]
         return True
 
-    def _participant(self, _item: Item, body: dict[str, Any]) -> bool:
+    def _participant(self, _item: ItemIn, body: dict[str, Any]) -> bool:
         code = clean.code(body.get("code"))
         if code is None:
             return False
@@ -75,8 +75,8 @@ class Projector:
         row.archived_utc = clean.label(body.get("archived_utc"), "") or None
         return True
 
-    def _test(self, item: Item, body: dict[str, Any]) -> bool:
-        code, key = clean.code(body.get("participant")), clean.text(item.sent.key, 64)
+    def _test(self, item: ItemIn, body: dict[str, Any]) -> bool:
+        code, key = clean.code(body.get("participant")), clean.text(item.key, 64)
         if code is None or not key:
             return False
         at_utc = clean.label(body.get("requested_utc"), self._at(item))
@@ -91,8 +91,8 @@ class Projector:
         row.recording_id, row.model_id = clean.text(body.get("recording_id"), 64), clean.text(body.get("model_id"), 64)
         return True
 
-    def _recording(self, item: Item, body: dict[str, Any]) -> bool:
-        code, key = clean.code(body.get("participant")), clean.text(item.sent.key, 64)
+    def _recording(self, item: ItemIn, body: dict[str, Any]) -> bool:
+        code, key = clean.code(body.get("participant")), clean.text(item.key, 64)
         if code is None or not key:
             return False
         row = self._recorded(key)
@@ -104,16 +104,16 @@ class Projector:
             self._day(code, at_utc).recordings += 1
             self._person(code).recordings += 1
             self.rig.recordings += 1
-        if item.sent.file is None:
+        if item.file is None:
             return True
-        if row.file is not None and row.file != item.sent.file:
-            self._tell("changed", key, kept=row.file[:12], told=item.sent.file[:12])
+        if row.file is not None and row.file != item.file:
+            self._tell("changed", key, kept=row.file[:12], told=item.file[:12])
             return True
-        row.file, row.file_bytes = item.sent.file, item.sent.file_bytes
+        row.file, row.file_bytes = item.file, item.file_bytes
         return True
 
-    def _model(self, item: Item, body: dict[str, Any]) -> bool:
-        code, key = clean.code(body.get("participant")), clean.text(item.sent.key, 64)
+    def _model(self, item: ItemIn, body: dict[str, Any]) -> bool:
+        code, key = clean.code(body.get("participant")), clean.text(item.key, 64)
         if code is None or not key:
             return False
         row = self._get(CentreModel, (self.rig.id, key))
@@ -125,9 +125,9 @@ class Projector:
         row.effects, row.fit = clean.effects(body.get("effects")), clean.fit(body.get("fit"))
         row.verdict = row.fit["verdict"]
         if row.file is None:
-            row.file, row.file_bytes = item.sent.file, item.sent.file_bytes
-        elif item.sent.file not in (None, row.file):  # a version never changes
-            self._tell("changed", key, kept=row.file[:12], told=str(item.sent.file)[:12])
+            row.file, row.file_bytes = item.file, item.file_bytes
+        elif item.file not in (None, row.file):  # a version never changes
+            self._tell("changed", key, kept=row.file[:12], told=str(item.file)[:12])
         for effect in row.effects:
             if self._get(CentreEffect, (effect, code, self.rig.id)) is None:
                 new = CentreEffect(effect=effect, participant=code, rig_id=self.rig.id)
@@ -137,12 +137,12 @@ class Projector:
             self._stands(day, row)
         return True
 
-    def _decision(self, item: Item, body: dict[str, Any]) -> bool:
+    def _decision(self, item: ItemIn, body: dict[str, Any]) -> bool:
         code, model_id = clean.code(body.get("participant")), clean.text(body.get("model_id"), 64)
         approved = body.get("approved")
         if code is None or not model_id or not isinstance(approved, bool):
             return False
-        key = (self.rig.id, item.sent.sha256)
+        key = (self.rig.id, item.sha256)
         by = clean.text(body.get("by"), 80) or "?"
         if self._get(CentreDecision, key) is None:
             row = CentreDecision(rig_id=key[0], sha256=key[1], participant=code, model_id=model_id, approved=approved)
@@ -160,7 +160,7 @@ class Projector:
             day.approved_by = None
         return True
 
-    def _audit(self, _item: Item, body: dict[str, Any]) -> bool:
+    def _audit(self, _item: ItemIn, body: dict[str, Any]) -> bool:
         if not heads.readable(body):
             return False
         heads.compare(self.session, self.now_utc, self.rig, body)
@@ -178,8 +178,8 @@ class Projector:
             return
         want(self.session, self.rig.id, sha256, length)
 
-    def _at(self, item: Item) -> str:
-        return clean.label(item.sent.at_utc, self.now_utc)
+    def _at(self, item: ItemIn) -> str:
+        return clean.label(item.at_utc, self.now_utc)
 
     def _person(self, code: str) -> CentreParticipant:
         row = self._get(CentreParticipant, (code, self.rig.id))

@@ -4,48 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field, JsonValue
 
-from stimrig.api.outbox.receipts import Receipt
 from stimrig.api.web.responses.base import Document
-
-
-class PlaceOut(Document):
-    """Where a chain stands."""
-
-    seq: int = Field(description="newest item that the centre has; 0: none")
-    hash: str = Field(description="its hash; 64 zeros: none")
-
-
-class HelloOut(PlaceOut):
-    """The answer to a greeting."""
-
-    utc: str
-
-
-class LackingOut(Document):
-    """A file that the centre lacks."""
-
-    sha256: str
-    bytes: int
-    have_bytes: int = Field(description="go on from there")
-
-
-class LackingFilesOut(Document):
-    """Files that the centre lacks, oldest first."""
-
-    files: list[LackingOut]
-
-
-class HeadsOut(Document):
-    """Heads of the rig's audit trail, as the centre countersigned them, in the order in which they were told."""
-
-    heads: list[Receipt]
-
-
-class PieceOut(Document):
-    """A piece was taken."""
-
-    have_bytes: int
-    whole: bool
 
 
 class RigOut(Document):

@@ -18,7 +18,7 @@ from fastapi import FastAPI
 
 from stimrig.api import logs
 from stimrig.api.centre.app import create_app
-from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.centre.context import CentreSettings
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.web.server import address_of, bind, configuration, raise_file_limit, refuse_open_door, serve
 

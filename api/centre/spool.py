@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.store import Store
 from stimrig.api.store.centre_tables import CentreFile, CentreRig, CentreWanted
+from stimrig.api.whole_file import sha256_of
 
 MOST_PIECE_BYTES = 8_000_000
 MOST_LISTED = 1000
@@ -104,9 +104,7 @@ class Spool:
         return have + len(data)
 
     def _finish(self, part: Path, sha256: str, length: int) -> None:
-        with part.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
-        if found != sha256:
+        if sha256_of(part) != sha256:
             part.unlink(missing_ok=True)
             raise _differs("Its content is another than its name says")
         self.bucket.put(part, sha256)

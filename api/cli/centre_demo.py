@@ -10,10 +10,9 @@ import threading
 from pathlib import Path
 
 from stimrig.api import owner_only
-from stimrig.api.centre.context import opened
+from stimrig.api.centre.context import CentreSettings, opened
 from stimrig.api.centre.postgres import Cluster
 from stimrig.api.centre.rigs import Rigs
-from stimrig.api.centre.settings import CentreSettings
 from stimrig.api.cli.child import Child
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.launcher import Ended, Endings

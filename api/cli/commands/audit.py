@@ -15,8 +15,8 @@ from stimrig.api.cli.terminal import Json, given, say, say_json, write
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.outbox import receipts
-from stimrig.api.outbox.messages import PushError
 from stimrig.api.outbox.link import Link
+from stimrig.api.outbox.messages import PushError
 from stimrig.api.outbox.receipts import Receipt
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, audit

@@ -70,7 +70,7 @@ def serve(
 
 def settings_of(**named):
     """The centre's settings. Raises SettingsError."""
-    from stimrig.api.centre.settings import CentreSettings
+    from stimrig.api.centre.context import CentreSettings
 
     return CentreSettings(**named)
 

@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from stimrig.api.centre.app import create_app
-from stimrig.api.centre.settings import CentreSettings
+from stimrig.api.centre.context import CentreSettings
 from stimrig.api.clock import Clock
 from stimrig.api.store.centre_tables import CentreRig
 from tests.api.conftest import PATIENCE_S, TOKEN, Server

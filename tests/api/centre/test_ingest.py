@@ -171,8 +171,9 @@ def test_the_key_is_looked_at_again_within_the_batchs_transaction(centre: Centre
     row = centre.row()
     centre.context.rigs.revoke("Ward 1", "test")
     told = Teller()
-    from stimrig.api.centre.chain import BatchIn, read
+    from stimrig.api.centre.ingest import read
     from stimrig.api.errors import ApiError
+    from stimrig.api.outbox.messages import BatchIn
 
     with pytest.raises(ApiError, match="revoked"):
         centre.context.ingest.take(row, read(BatchIn, json.dumps(told.batch()).encode()))

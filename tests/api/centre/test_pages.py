@@ -14,10 +14,8 @@ import pytest
 from fastapi.routing import APIRoute
 
 from stimrig.api.centre import app as centre_app
-from stimrig.api.centre import pages, routes
-from stimrig.api.centre.pages.rigs_view import doubts
+from stimrig.api.centre.pages import doubts
 from stimrig.api.store.centre_tables import CentreRig
-from stimrig.api.web.app import routers
 from stimrig.rig.messages import RigState
 from tests.api.centre.conftest import Centre, run_centre
 from tests.api.centre.told import Teller
@@ -92,7 +90,7 @@ def filled(path: str) -> str:
 
 
 def test_the_table_names_every_route() -> None:
-    there = [route for router in routers(routes, pages) for route in router.routes]
+    there = [route for router in centre_app.ROUTERS for route in router.routes]
     named = {
         (method, filled(route.path))
         for route in [*there, *centre_app.shared()]

@@ -20,7 +20,8 @@ from tests.harness.fake_centre import KEY, BadLine, FakeCentre
 
 LOADED = """
 import stimrig.api.outbox.__main__, sys
-print([name for name in sys.modules if f"{name}.".startswith(("stimrig.rig.", "stimrig.api.sessions.", "stimrig.api.web."))])
+apart = ("stimrig.rig.", "stimrig.api.sessions.", "stimrig.api.web.")
+print([name for name in sys.modules if f"{name}.".startswith(apart)])
 """
 
 

@@ -20,7 +20,7 @@ from stimrig.api.store.centre_tables import CentreFile
 IN_MEMORY = 8_000_000
 
 
-async def file(context: Context, sha256: str | None, name: str, kind: str) -> Response:
+async def hand_out(context: Context, sha256: str | None, name: str, kind: str) -> Response:
     """The answer.
 
     Raises

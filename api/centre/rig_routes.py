@@ -8,11 +8,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Security
 from fastapi.security import HTTPBearer
 
-from stimrig.api.centre.chain import BatchIn, HelloIn, read
 from stimrig.api.centre.context import Ctx
-from stimrig.api.centre.responses import HeadsOut, HelloOut, LackingFilesOut, PieceOut, PlaceOut
+from stimrig.api.centre.ingest import read
 from stimrig.api.centre.spool import MOST_LISTED, MOST_PIECE_BYTES
 from stimrig.api.errors import ApiError
+from stimrig.api.outbox.messages import BatchIn, HeadsOut, HelloIn, HelloOut, LackingFilesOut, PieceOut, PlaceOut
 from stimrig.api.store.centre_tables import CentreRig
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import answers

@@ -1,1 +1,0 @@
-"""The centre's pages. A file here with a `router` is a page; the others help them."""

@@ -1,1 +1,0 @@
-"""The centre's REST routes: one file a subject, each with a `router`."""
