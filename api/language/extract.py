@@ -36,7 +36,7 @@ SENTENCES = (
 )  # fmt: skip
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {
-    "app.py", "openapi.py", "headers.py", "dependencies.py", "server.py", "static.py", "schemas.py", "own_file.py",
+    "app.py", "openapi.py", "dependencies.py", "server.py", "static.py", "schemas.py", "own_file.py",
     "hdf5_chunks.py", "confinement.py", "child.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
@@ -55,6 +55,7 @@ NOT_SHOWN = {
     "_",
     "lazy",
     "ngettext",
+    "policy",
 }
 """Calls whose texts no page shows: descriptions of the API, patterns, logs, and what is extracted already."""
 

@@ -51,13 +51,13 @@ class HttpMiddleware:
 
 LANGUAGE_COOKIE = "stimrig_language"
 """The choice; it says nothing about who chose."""
-PAGE_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-)
-"""A page's. plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own."""
-DATA_POLICY = "default-src 'none'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
-"""Everything else's, should a browser be led to show it."""
+
+
+def policy(text: str) -> str:
+    """A Content-Security-Policy that nothing outside of this service answers."""
+    return f"default-src 'none'; {text}; base-uri 'none'; frame-ancestors 'none'"
+
+
 ALWAYS = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -66,10 +66,13 @@ ALWAYS = {
 }
 PAGE = {
     **ALWAYS,
-    "Content-Security-Policy": PAGE_POLICY,
+    "Content-Security-Policy": policy(
+        "script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self'; "
+        "form-action 'self'"
+    ),  # plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own
     "Referrer-Policy": "same-origin",  # with no-referrer a form's Origin is "null", and the door asks for it
 }
-DATA = {**ALWAYS, "Content-Security-Policy": DATA_POLICY, "Referrer-Policy": "no-referrer"}
+DATA = {**ALWAYS, "Content-Security-Policy": policy("form-action 'none'"), "Referrer-Policy": "no-referrer"}
 
 
 class Headers(HttpMiddleware):
