@@ -53,11 +53,12 @@ LANGUAGE_COOKIE = "stimrig_language"
 """The choice; it says nothing about who chose."""
 
 
-def policy(text: str) -> str:
-    """A Content-Security-Policy that nothing outside of this service answers."""
-    return f"default-src 'none'; {text}; base-uri 'none'; frame-ancestors 'none'"
+def policy(*parts: str) -> str:
+    """A Content-Security-Policy."""
+    return "; ".join(parts)
 
 
+NOTHING, NOWHERE = policy("default-src 'none'"), policy("base-uri 'none'", "frame-ancestors 'none'")
 ALWAYS = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -67,12 +68,21 @@ ALWAYS = {
 PAGE = {
     **ALWAYS,
     "Content-Security-Policy": policy(
-        "script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self'; "
-        "form-action 'self'"
-    ),  # plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own
+        NOTHING,
+        "script-src 'self'",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data: blob:",
+        "connect-src 'self'",
+        "form-action 'self'",
+        NOWHERE,
+    ),  # fmt: skip  # plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own
     "Referrer-Policy": "same-origin",  # with no-referrer a form's Origin is "null", and the door asks for it
 }
-DATA = {**ALWAYS, "Content-Security-Policy": policy("form-action 'none'"), "Referrer-Policy": "no-referrer"}
+DATA = {
+    **ALWAYS,
+    "Content-Security-Policy": policy(NOTHING, "form-action 'none'", NOWHERE),
+    "Referrer-Policy": "no-referrer",
+}
 
 
 class Headers(HttpMiddleware):
