@@ -59,6 +59,9 @@ def policy(*parts: str) -> str:
 
 
 NOTHING, NOWHERE = policy("default-src 'none'"), policy("base-uri 'none'", "frame-ancestors 'none'")
+DRAWS = policy("style-src 'self' 'unsafe-inline'", "img-src 'self' data: blob:")
+"""plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own."""
+PAGE_POLICY = policy(NOTHING, "script-src 'self'", DRAWS, "connect-src 'self'", "form-action 'self'", NOWHERE)
 ALWAYS = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -67,15 +70,7 @@ ALWAYS = {
 }
 PAGE = {
     **ALWAYS,
-    "Content-Security-Policy": policy(
-        NOTHING,
-        "script-src 'self'",
-        "style-src 'self' 'unsafe-inline'",
-        "img-src 'self' data: blob:",
-        "connect-src 'self'",
-        "form-action 'self'",
-        NOWHERE,
-    ),  # fmt: skip  # plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own
+    "Content-Security-Policy": PAGE_POLICY,
     "Referrer-Policy": "same-origin",  # with no-referrer a form's Origin is "null", and the door asks for it
 }
 DATA = {
