@@ -1,266 +1,229 @@
-"""Follows a test that stops itself: at each boundary asks the adviser what to play, and has the rig lay it.
+"""Tests that stop themselves: what they can reach, their plan, who follows them, and what became of them.
 
-The rig never waits. What comes too late falls away: the fixed plan's next piece plays, and the next boundary is
-decided with the longer record. Each boundary is asked about twice: early, so that there is an answer whatever happens,
-and late, with the newest samples, which then starts from the early answer's fit and is quick.
+The fixed plan plays where nobody chooses in time.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
-import secrets
-from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+import hashlib
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, ClassVar
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.models import stored
+from stimrig.api.models.places import Place, differ, place_of, site_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.sessions.adaptive_follower import Follower, Told
+from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Tell, Watched, begun
+from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.sessions.samples import samples_of
+from stimrig.api.store.tables import Participant, Test
 from stimrig.api.workers.adviser import Adviser
-from stimrig.rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
+from stimrig.rig.messages import SAFE_END_S, AdaptivePlan, FinishedEvent, PreviewRequest, SegmentPlan, TestPlan
 
-log = logging.getLogger("stimrig.adaptive")
-
-EARLY_S = 0.75
-"""Before the rig decides on a boundary: the first question."""
-LATE_S = 0.35
-"""The second one, with the newest samples."""
-SEND_S = 0.06
-"""The early answer is sent if the late one is not there."""
-LEAST_S = 2.05
-"""A shorter record tells nothing."""
-SHORTEST_PIECE_S = 1.0
-"""Of the pieces that are chosen."""
-SERVICE = "stimrig"
-"""Who says enough where the target is reached."""
+ADAPTIVE = "adaptive"
+"""Kind of test."""
+KEPT = 20
+"""Outlooks that are remembered: the question before a test and its start need the same one."""
+MOST_MODELS = 10
+"""Sessions from which is learnt how much a person changes between two."""
+DURATION_S = 50.0
+"""The longest test, where nobody says: the opening, some ten seconds of pieces, then the whole default test fit in."""
+TAIL_S = 0.4
+"""Silence behind the opening: when it ends, enough was measured to decide what follows."""
+PIECE_S = 2.0
+"""The fixed plan is cut into pieces of this length, so that a late answer costs no more."""
 
 
-@dataclass(frozen=True)
-class Answer:
-    """What the adviser says, when its newest sample was heard (monotonic, s), and the line that is kept of it."""
-
-    said: dict[str, Any]
-    heard_s: float
-    row: dict[str, Any]
-
-
-@dataclass
-class Turn:
-    """One boundary: what is asked, and what came of it."""
-
-    laid: int
-    asked: int = 0
-    """1: with early samples; 2: with the newest ones."""
-    answer: Answer | None = None
-    sent: bool = False
-
-
-@dataclass
-class Told:
-    """What is known of the test, for pages and for its document."""
-
-    target: dict[str, float]
-    reach: dict[str, Any] | None
-    state: str = "choosing"
-    """choosing; fixed: the fixed plan plays on, `problem` says why; ending."""
-    words: str = ""
-    problem: str = ""
-    knowledge: dict[str, Any] | None = None
-    least_known: dict[str, Any] | None = None
-    ended: str = ""
-    decisions: list[dict[str, Any]] = field(default_factory=list)
-
-
-class Follower:
-    """One test from its first sample to its end.
+class AdaptiveTests(Watched):
+    """All of them.
 
     Parameters
     ----------
-    plan : TestPlan
-        As the rig plays it; each of its segments holds its widths.
-    how : dict
-        For the adviser: target, bounds, largest width, pulse rate, the participant's models.
-    reach : dict
-        What was said of the target before the test.
-    tell : callable
-        Called whenever there is something new for pages.
+    adviser : Adviser
+        Says what a test can reach, and what to play next.
     """
 
-    def __init__(
-        self, plan: TestPlan, how: dict[str, Any], reach: dict[str, Any], rig: RigClient, adviser: Adviser,
-        clock: Clock, tell: Callable[[], None],
-    ) -> None:  # fmt: skip
-        self.plan, self.how, self.rig, self.adviser, self.clock, self.tell = plan, how, rig, adviser, clock, tell
-        self.key = secrets.token_urlsafe(24)
-        self.told = Told(how["target"], reach)
-        self._fixed = [segment.settings["pulse_width_us"] for segment in plan.segments or []]
-        self._added: list[list[float]] = []
-        self._new: dict[str, list[Any]] = {"host_time_s": [], "counter": [], "torque_nm": []}
-        self._newest: LiveEvent | None = None
-        self._heard_s = 0.0
-        self._took_s = 0.0
-        self._turn = Turn(-1)
-        self._asking: asyncio.Task[None] | None = None
-        self._sending: asyncio.Task[None] | None = None
+    names, part = (ADAPTIVE,), "adaptive"
+    ends: ClassVar[Mapping[str, str]] = {"torque_time": "torque-time", "plan": "fixed-rest"}
 
-    async def run(self, path: Path | None) -> None:
-        """Follow it to its end."""
-        self._asking = self._begun(self._begin())  # beside the samples, of which none may be missed
-        try:
-            await self._guarded(self._listen(path))
-        finally:
-            left = [task for task in (self._asking, self._sending) if task is not None]
-            for task in left:
-                task.cancel()
-            await asyncio.gather(*left, return_exceptions=True)
+    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, adviser: Adviser, tell: Tell) -> None:
+        super().__init__(clock, rig, versions, tell)
+        self.adviser = adviser
+        self._outlooks: OrderedDict[str, dict[str, Any]] = OrderedDict()
+        self._looking = asyncio.Lock()
 
-    async def _begin(self) -> None:
-        await self.adviser.ask("adaptive_begin", **self.how)
+    # ---- before ----------------------------------------------------------------------------------------------
 
-    async def _listen(self, path: Path | None) -> None:
-        async with contextlib.aclosing(samples_of(path, self.plan.test_id)) as events:
-            async for event in events:
-                self._hear(event)
+    async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:
+        """The plan with its bounds and its fixed plan.
 
-    def _begun(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        return asyncio.create_task(self._guarded(work))
-
-    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
-        """Whatever goes wrong in it ends in the fixed plan, told."""
-        try:
-            await work
-        except ApiError as error:
-            self._give_up(f"{error.title}. {error.detail}")
-        except Exception as error:
-            log.exception("an adaptive test is not followed any more")
-            self._give_up(f"{type(error).__name__}.")
-
-    def _give_up(self, why: str) -> None:
-        if self.told.state == "choosing":
-            self.told.state, self.told.problem = "fixed", f"The fixed plan plays on: {why}"
-            log.warning("%s", self.told.problem, extra={"test_id": self.plan.test_id})
-            self.tell()
-
-    @property
-    def torque_time_nm_s(self) -> float:
-        """Measured so far, N·m·s."""
-        return 0.0 if self._newest is None else self._newest.torque_time_nms
-
-    # ---- what the rig says ----------------------------------------------------------------------------------
-
-    def _hear(self, event: LiveEvent) -> None:
-        self._newest, self._heard_s = event, self.clock.monotonic_s()
-        if event.samples is not None:
-            for name, values in self._new.items():
-                values.extend(getattr(event.samples, name))
-        if event.laid != self._turn.laid:
-            self._turn = Turn(event.laid)
-        if event.ended_by or self.told.state != "choosing":
-            return
-        left_s = self._left_s(event.elapsed_s)
-        idle = self._asking is None or self._asking.done()
-        turn = self._turn
-        early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
-        if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
-            turn.asked = 2 if left_s <= LATE_S else 1
-            self._asking = self._begun(self._ask(turn, event))
-        elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
-            self._sending = self._begun(self._carry_out(turn, turn.answer))
-
-    def _left_s(self, now_s: float) -> float:
-        """From a time on the test's clock until the rig decides what follows what is laid, s."""
-        assert self._newest is not None
-        return self._newest.boundary_s - AHEAD / self.plan.pulse_rate_hz - now_s
-
-    def _now_s(self) -> float:
-        """The time on the test's clock."""
-        assert self._newest is not None
-        return self._newest.elapsed_s + self.clock.monotonic_s() - self._heard_s
-
-    # ---- deciding ------------------------------------------------------------------------------------------
-
-    async def _ask(self, turn: Turn, event: LiveEvent) -> None:
-        heard_s = self._heard_s
-        news, self._new = self._new, {name: [] for name in self._new}
-        widths, segments = self._laid(event)
-        said = await self.adviser.ask(
-            "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
-            late=[(pulse.index, pulse.by_s) for pulse in event.late],
-            torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
-        )  # fmt: skip
-        self._took_s = self.clock.monotonic_s() - heard_s
-        answer = self._take(said, event, heard_s)
-        if turn is not self._turn or turn.sent:
-            answer.row["late"] = True
-            return
-        turn.answer = answer
-        if turn.asked == 2 or self._left_s(self._now_s()) <= SEND_S:
-            await self._carry_out(turn, answer)
-
-    def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
-        told, known = self.told, said["knowledge"]
-        fits = said["kind"] != "misfit"  # else that is told as the problem, and its bands mean nothing
-        if fits:
-            told.words = said["words"]
-        row = {
-            "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
-            "segments": [segment["name"] for segment in said["segments"]],
-            "expected_torque_time_nm_s": said["expected_torque_time_nm_s"],
-            "answer_ms": round(1e3 * self._took_s, 1),
+        Raises
+        ------
+        ApiError
+            422: the target cannot be reached, and nobody said that the test is to be played anyway; what the rig
+            refuses. 500: the worker died.
+        """
+        bounds = bounds_of(body, plan)
+        how = {
+            "target": body.target.model_dump(),
+            "playable_s": bounds.max_duration_s - SAFE_END_S, "max_torque_time_nm_s": bounds.max_torque_time_nms,
+            "largest_us": plan.largest_us, "pulse_rate_hz": plan.pulse_rate_hz,
+            "models": await asyncio.to_thread(self._models_for, plan),
         }  # fmt: skip
-        if known is not None:
-            if fits:
-                told.knowledge, told.least_known = known, said["least_known"]
-            row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
-        told.decisions.append(row)
-        self.tell()
-        return Answer(said, heard_s, row)
+        found = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
+        default = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None), timeout_s=preview_s)
+        segments = fixed_plan(found["opening_us"], default, plan.pulse_rate_hz, bounds)
+        if not found["reach"]["reachable"] and not body.anyway:
+            raise out_of_reach(found["reach"])
+        plan = plan.model_copy(update={"segments": segments, "adaptive": bounds})
+        reach = {**found["reach"], "known": found["known"]}
+        return Planned(plan, {"target": how["target"], "reach": reach, "bounds": bounds.model_dump()}, how)
 
-    async def _carry_out(self, turn: Turn, answer: Answer) -> None:
-        turn.sent = True
-        kind, test_id = answer.said["kind"], self.plan.test_id
-        if kind == "misfit":
-            self._give_up(answer.said["words"])
-            return
-        chosen = [SegmentPlan(**segment) for segment in answer.said["segments"]]
-        ended = {"enough": "known-enough", "spent": self._spent()}.get(kind, "")
-        request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.laid, segments=chosen)
-        if ended:
-            request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
-        self._added += (widths := [segment.settings["pulse_width_us"] for segment in chosen])
-        try:
-            await self.rig.ask(request)
-        except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, and then it is asked again
-            if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
-                raise
-            del self._added[len(self._added) - len(widths) :]
-            answer.row["refused"] = error.detail
-            log.info("not laid: %s", error.detail, extra={"test_id": test_id})
-            return
-        answer.row["sample_to_plan_ms"] = round(1e3 * (self.clock.monotonic_s() - answer.heard_s), 1)
-        if ended:
-            self.told.state, self.told.ended = "ending", self.told.ended or ended
-        self.tell()
+    async def _outlook(self, wanted: dict[str, Any]) -> dict[str, Any]:
+        """What the test can reach. One after the other, so that a test which begins waits for one at most."""
+        name = hashlib.sha256(repr(wanted).encode()).hexdigest()
+        if name in self._outlooks:
+            return self._outlooks[name]
+        async with self._looking:
+            if name not in self._outlooks:
+                if self.watching:
+                    detail = "What a test can reach is computed once the one that runs has ended."
+                    raise ApiError(409, "rig-busy", "Another test is running", detail)
+                self._outlooks[name] = await self.adviser.ask("adaptive_outlook", **wanted)
+                while len(self._outlooks) > KEPT:
+                    self._outlooks.popitem(last=False)
+            return self._outlooks[name]
 
-    def _spent(self) -> str:
-        """Which bound leaves no room for another piece."""
-        assert self._newest is not None and self.plan.adaptive is not None
-        left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
-        return "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"
+    def _models_for(self, plan: TestPlan) -> list[str]:
+        person = self.versions.store.get(Participant, plan.participant)
+        return self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
 
-    def _laid(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
-        """Width of each pulse that is laid, and the segments."""
-        rate_hz = self.plan.pulse_rate_hz
-        sources = {"plan": iter(self._fixed), "extension": iter(self._added), "end": iter(())}
-        widths: list[float] = []
-        segments = []
-        for segment in event.laid_segments:
-            count = round(segment.end_s * rate_hz) - len(widths)
-            own = next(sources[segment.by], [])
-            segments.append((segment.name, len(widths), len(widths) + count))
-            widths += [*own, *[0.0] * count][:count]
-        return widths, segments
+    def _models(self, participant: str, place: Place) -> list[str]:
+        """The participant's approved models, oldest first.
+
+        Without those that are damaged, and those of tests at another place: they say nothing of this one.
+        """
+        rows = self.versions.all_approved_ones(participant)
+        tests = self.versions.store.all(Test, Test.recording_id.in_([row.recording_id for row in rows]))
+        elsewhere = {test.recording_id for test in tests if differ(place_of(test), place)}
+        found = []
+        for row in [row for row in rows if row.recording_id not in elsewhere][-MOST_MODELS:]:
+            with contextlib.suppress(ApiError):
+                found.append(stored.text(row))
+        return found
+
+    # ---- while it plays, and after it ------------------------------------------------------------------------
+
+    def begin(self, planned: Planned) -> str:
+        """As `Kind`."""
+        assert planned.how is not None
+        follower = Follower(
+            planned.plan, planned.how, planned.kept["reach"], self.rig, self.adviser, self.clock, self.tell_now
+        )
+        self.watch(follower)
+        return follower.key
+
+    async def close(self) -> None:
+        """As `Kind`."""
+        await super().close()
+        await self.adviser.close()
+
+    def end_of(self, row: Test, event: FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
+        """Where another piece of the fixed plan would have been too long, the time has ended it."""
+        by_time = rigs == "limit" and told["max_duration_s"] - event.summary["duration_s"] < PIECE_S
+        return "time" if by_time else ""
+
+    def fit_options(self, row: Test) -> dict[str, Any]:
+        """A short recording needs to know what a curve looks like, or looked like last time.
+
+        One that holds the whole default test needs no such help: its fixed plan was played, and was not cut off by a
+        bound.
+        """
+        ended = (row.summary.get("adaptive") or {}).get("ended")
+        planned = [segment["name"] for segment in (row.plan.get("preview") or {}).get("segments") or []]
+        if ended == "fixed-rest" and "validate" in planned:
+            return {}
+        return {"recruitment": "near-sigmoid", "models": self._models(row.participant, place_of(row))}
+
+    def unwatched(self, row: Test) -> dict[str, Any]:
+        """As `Watched`."""
+        bounds = row.plan.get("adaptive") or {}
+        why = "The fixed plan plays on: the service was restarted during the test." if begun(row) else ""
+        return {
+            "max_duration_s": bounds.get("max_duration_s"),
+            "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
+            "torque_time_nm_s": None,
+            **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach"), state="fixed", problem=why)),
+        }
+
+
+def bounds_of(body: TestIn, plan: TestPlan) -> AdaptivePlan:
+    """Longest duration and largest torque-time of the whole test."""
+    given_s, given_nm_s = body.max_duration_s, body.max_torque_time_nm_s
+    return AdaptivePlan(
+        max_duration_s=DURATION_S if given_s is None else given_s,
+        max_torque_time_nms=AT_STOPPING_TORQUE_S * plan.stopping_torque_nm if given_nm_s is None else given_nm_s,
+    )
+
+
+def fixed_plan(
+    opening_us: Sequence[float], default: dict[str, Any], rate_hz: float, bounds: AdaptivePlan
+) -> list[SegmentPlan]:
+    """The opening, then the default test in short pieces, as many as the bounds leave room for.
+
+    Parameters
+    ----------
+    opening_us
+        The opening's widths, one for each pulse, µs.
+    default
+        The rig's preview of the default test.
+
+    Raises
+    ------
+    ApiError
+        422: there is no room for the opening.
+    """
+    opening = [*opening_us, *[0.0] * round(TAIL_S * rate_hz)]
+    room = round((bounds.max_duration_s - SAFE_END_S) * rate_hz) - len(opening)
+    if not opening_us or room < 0:
+        detail = (
+            f"A test of at most {bounds.max_duration_s:g} s and {bounds.max_torque_time_nms:g} N·m·s has no room for a "
+            "first look at the muscle. Nothing was started. Allow more."
+        )
+        raise ApiError(422, "out-of-reach", "The target cannot be reached", detail)
+    found = [_segment("opening", opening)]
+    for name, widths in _pieces(default, rate_hz):
+        room -= len(widths)
+        if room < 0:
+            break
+        found.append(_segment(name, widths))
+    return found
+
+
+def _pieces(default: dict[str, Any], rate_hz: float) -> Iterator[tuple[str, list[float]]]:
+    """Name and widths of each piece, the rest at the start left out: the opening ends with one."""
+    widths, most = default["pulse_width_us"], round(PIECE_S * rate_hz)
+    for number, segment in enumerate(default["segments"]):
+        first, end = round(segment["start_s"] * rate_hz), round(segment["end_s"] * rate_hz)
+        if number or any(widths[first:end]):
+            for start in range(first, end, most):
+                yield segment["name"], widths[start : min(start + most, end)]
+
+
+def _segment(name: str, widths: list[float]) -> SegmentPlan:
+    return SegmentPlan(name=name, sequence="widths", settings={"pulse_width_us": widths, "jumps": True})
+
+
+def out_of_reach(reach: dict[str, Any]) -> ApiError:
+    """422: said before the first pulse, with what can be reached."""
+    detail = (
+        f'{reach["words"]} Nothing was started. Allow more torque-time or time, ask for less, or send "anyway": true '
+        "to play it all the same."
+    )
+    return ApiError(422, "out-of-reach", "The target cannot be reached", detail, reach=reach)

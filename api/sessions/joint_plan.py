@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from stimrig.api.sessions.angles import TOLERANCE_RAD
+from stimrig.api.sessions.profiles import TOLERANCE_RAD
 from stimrig.rig.messages import HELD, MOVING, PASSIVE
 
 KINDS = (PASSIVE, HELD, MOVING)

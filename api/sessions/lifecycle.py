@@ -8,24 +8,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import ColumnElement, or_
+from sqlalchemy.exc import SQLAlchemyError
+
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
-from stimrig.api.sessions.adaptive_tests import AdaptiveTests
-from stimrig.api.sessions.following import Follower
-from stimrig.api.sessions.joint_plan import KINDS
-from stimrig.api.sessions.joint_tests import JointTests
+from stimrig.api.sessions.kinds import Kinds
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store import Store, audit
+from stimrig.api.store.holds import Holds, Turn
 from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
 from stimrig.api.workers.pool import Call, Pool
 from stimrig.rig.messages import FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
-NOT_FITTED = (SEQUENCE, *KINDS)
-"""Kinds of tests that give no model by themselves: a trial is followed, a guided test is fitted with others."""
+ROW = (
+    "id", "participant", "kind", "reason", "requested_by", "requested_utc", "finished_utc", "recording_id", "model_id"
+)  # fmt: skip
+"""What a test's document has of its row as it is."""
 
 
 class LeftError(Exception):
@@ -43,14 +45,44 @@ class Lifecycle:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions,
-        analyses: Analyses, adaptive: AdaptiveTests, joint: JointTests, recordings_dir: Path, follower: Follower,
+        analyses: Analyses, kinds: Kinds, recordings_dir: Path, follower: Follower,
         on_progress: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
-        self.adaptive, self.joint, self.follower = adaptive, joint, follower
+        self.kinds, self.follower = kinds, follower
         self.calls: dict[str, Call] = {}
         self._ahead: set[asyncio.Task[None]] = set()
+
+    def document(self, row: Test, position: tuple[float, float, str | None] | None) -> dict[str, Any]:
+        """A test as clients see it: what became of it so far; while it runs also where it is, as the rig tells it."""
+        planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
+        running = row.state in ("requested", "running")
+        lasted_s = row.summary.get("duration_s", 0.0)
+        there = (position or (0.0, planned.get("duration_s", 0.0), None)) if running else (lasted_s, lasted_s, None)
+        elapsed_s, duration_s, segment = there
+        call, rig = self.calls.get(row.id), self.rig.status
+        sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
+        model = self.versions.get(row.model_id) if row.model_id else None
+        return {
+            **{name: getattr(row, name) for name in ROW},
+            "state": "sealing" if sealing else row.state,
+            "done": row.state not in OPEN_STATES,
+            "segment": segment,
+            "elapsed_s": elapsed_s,
+            "duration_s": duration_s,
+            "time_left_s": max(0.0, duration_s - elapsed_s),
+            "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
+            "identification": call.document() if call else None,
+            "ran_by": row.ran_by or row.requested_by,
+            **{name: row.plan.get(name) for name in ("side", "muscle", "joins")},
+            "planned": planned,
+            "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
+            "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
+            "summary": {name: value for name, value in row.summary.items() if name not in self.kinds.parts},
+            **self.kinds.documents(row),
+            "fit": self.versions.document(model) if model else None,
+        }
 
     def update(self, test_id: str, **fields: Any) -> Test:
         """Change a test's row."""
@@ -80,29 +112,23 @@ class Lifecycle:
             if row is None or row.recording_id is not None or not self.follower.mine(row):
                 return None
             if event.recording_path and event.recording_id:
-                recording = self._recording(row, event)
-                session.add(recording)
+                session.add(
+                    Recording(
+                        id=event.recording_id, participant=row.participant, test_id=row.id, path=event.recording_path,
+                        file_sha256=event.file_sha256 or "", origin="rig", created_utc=self.clock.utc(),
+                    )
+                )  # fmt: skip
                 session.flush()
                 row.recording_id = event.recording_id
-            identifies = event.outcome == "completed" and row.recording_id is not None and row.kind not in NOT_FITTED
+            kind = self.kinds[row.kind]
+            identifies = event.outcome == "completed" and row.recording_id is not None and kind.fitted
             row.state = "identifying" if identifies else event.outcome
             row.reason = event.reason
-            row.summary = {**event.summary, **self.adaptive.outcome(row, event), **self.joint.outcome(row, event)}
+            row.summary = {**event.summary, **kind.outcome(row, event)}
             row.finished_utc = now = self.clock.utc()
             audit.write(session, now, "rig", f"test {event.outcome}", row.id, reason=event.reason)
         log.info("the rig: test %s", event.outcome, extra={"test_id": row.id})
         return row
-
-    def _recording(self, row: Test, event: FinishedEvent) -> Recording:
-        return Recording(
-            id=event.recording_id,
-            participant=row.participant,
-            test_id=row.id,
-            path=event.recording_path,
-            file_sha256=event.file_sha256 or "",
-            origin="rig",
-            created_utc=self.clock.utc(),
-        )
 
     async def identify(self, test_id: str, last_sample_unix_s: float | None = None) -> None:
         """Identify a test's recording in a worker and store the model."""
@@ -145,7 +171,7 @@ class Lifecycle:
         """The first version of a test's recording, named by the test at once: it is there whatever comes after it."""
         if row.model_id is not None:
             return await asyncio.to_thread(self.versions.get, row.model_id)
-        how |= await asyncio.to_thread(self.adaptive.fit_options, row)
+        how |= await asyncio.to_thread(self.kinds[row.kind].fit_options, row)
         found, warning = await self.analyses.carried_structure.fit(row.participant, recording.path, take, **how)
         if not self.follower.mine(await asyncio.to_thread(self.store.get, Test, row.id)):
             raise LeftError  # one recording, one model
@@ -200,3 +226,78 @@ class Lifecycle:
         except ApiError as error:
             log.warning("looking for the recording of %s: %s", test_id, error)
             return {}
+
+
+PLAYED_STATES = OPEN_STATES[:3]
+LOOK_S = 3.0
+"""How often it is looked for what a service that died has left."""
+
+
+class Follower:
+    """This service as a follower of tests.
+
+    Parameters
+    ----------
+    holds : Holds
+        Says which services live.
+    rig : str
+        What the services of this rig call it.
+    """
+
+    def __init__(self, store: Store, holds: Holds, rig: str) -> None:
+        self.store, self.holds, self.rig = store, holds, rig
+
+    def mark(self, row: Test) -> None:
+        """This service begins this test."""
+        row.followed_by, row.rig = self.holds.me, self.rig
+
+    def mine(self, row: Test) -> bool:
+        """Whether this service follows the test; one from before it was written down is anybody's."""
+        return row.followed_by in (None, self.holds.me)
+
+    def rig_turn(self) -> Turn:
+        """Around the start of a test: of all services of this rig one starts."""
+        return self.holds.turn(f"rig {self.rig}")
+
+    def played_by_another(self) -> Test | None:
+        """The test that another service of this rig plays, or has begun to."""
+        if not self.store.several:
+            return None
+        of_others = (Test.state.in_(PLAYED_STATES), Test.rig == self.rig, Test.followed_by != self.holds.me)
+        found = self.store.all(Test, *of_others, limit=1)
+        return found[0] if found else None
+
+    def left(self) -> list[Test]:
+        """Open tests of this rig that nobody follows any more; from now on this service does."""
+        dead = self.holds.dead({name for name in self.store.all(Test.followed_by, *self._open()) if name})
+        with self.store.write() as session:
+            rows = [row for row in session.query(Test).filter(*self._open()) if row.followed_by in {None, *dead}]
+            for row in rows:
+                self.mark(row)
+        return rows
+
+    def _open(self) -> list[ColumnElement[bool]]:
+        of_others = [] if not self.store.several else [or_(Test.rig == self.rig, Test.rig.is_(None))]
+        return [Test.state.in_(OPEN_STATES), *of_others]
+
+    async def watch(self, take_up: Callable[[list[Test]], None], look_again: Callable[[], None]) -> None:
+        """Show that this service lives, and take up what others leave; `look_again` is called where there is some."""
+        if not self.store.several:
+            return
+        while True:
+            await asyncio.sleep(LOOK_S)
+            try:
+                await asyncio.to_thread(self.holds.keep)
+                left = await asyncio.to_thread(self._left_by_others)
+            except SQLAlchemyError:
+                log.exception("what other services left could not be read")
+                continue
+            if left:
+                log.warning("taken up from a service that ended: %s", ", ".join(row.id for row in left))
+                take_up(left)
+                look_again()
+
+    def _left_by_others(self) -> list[Test]:
+        """`left`, without a transaction that writes where there is nothing."""
+        followers = {name for name in self.store.all(Test.followed_by, *self._open()) if name}
+        return self.left() if self.holds.dead(followers) else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig.api.errors import ApiError
-from stimrig.api.sessions import angles
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.sessions.requests import TestIn
 from stimrig.rig.messages import Profile
@@ -39,12 +39,14 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
     assert own is not None
     profile = Profile(**own)
     wider = [words for name in LIMITS if name in asked if (words := _wider(name, asked[name], getattr(profile, name)))]
-    range_rad = angles.of(asked)
+    range_rad = profiles.range_of(asked)
     if range_rad is not None and profile.angle_range_rad is None:
-        wider.append(f"{angles.RANGE} {angles.words(range_rad)} narrows nothing: {body.participant} has no range")
-    elif range_rad is not None and not angles.within(range_rad, profile.angle_range_rad):
-        own_words = angles.words(profile.angle_range_rad or ())
-        wider.append(f"{angles.RANGE} {angles.words(range_rad)} is beyond the participant's {own_words}")
+        wider.append(
+            f"{profiles.RANGE} {profiles.range_words(range_rad)} narrows nothing: {body.participant} has no range"
+        )
+    elif range_rad is not None and not profiles.range_within(range_rad, profile.angle_range_rad):
+        own_words = profiles.range_words(profile.angle_range_rad or ())
+        wider.append(f"{profiles.RANGE} {profiles.range_words(range_rad)} is beyond the participant's {own_words}")
     if wider:
         detail = "; ".join(wider) + ". A test may narrow them; to widen them, calibrate anew or set the participant's."
         errors = [{"field": f"profile.{words.split()[0]}", "detail": words} for words in wider]
@@ -53,7 +55,7 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
         "profile": profile.model_copy(
             update={
                 "current_ma": asked.get("current_ma", profile.current_ma),
-                angles.RANGE: range_rad or profile.angle_range_rad,
+                profiles.RANGE: range_rad or profile.angle_range_rad,
             }
         ),
         "max_pulse_width_us": tighter(width_us, asked.get("max_pulse_width_us")),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from stimrig.api.clock import unix_of
-from stimrig.api.sessions import angles
 from stimrig.rig.messages import Bound
 
 Profile = Mapping[str, Any]
@@ -62,9 +62,9 @@ def changed(profile: Profile, asked: Mapping[str, Any]) -> tuple[dict[str, Any],
         Why the calibration does not hold with it; empty where nothing is lost.
     """
     new = {**profile, **asked}
-    if angles.RANGE in asked and asked[angles.RANGE] is None:
-        del new[angles.RANGE]
-        new.pop(angles.SET_AT, None)
+    if RANGE in asked and asked[RANGE] is None:
+        del new[RANGE]
+        new.pop(SET_AT, None)
     if all(profile.get(name) is None for name in FOUND):
         return new, ""
     voids = next((_above(name, new[name], profile[name]) for name in LIMITS if not (new[name] <= profile[name])), "")
@@ -142,3 +142,52 @@ def outside(asked: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bou
             most = f"above the {phase.hi:g} µC that this rig takes ({phase.owner})"
             found[of_charge[0]] = f"with it a pulse carries {charge_uc:.3g} µC, {most}"
     return found
+
+
+RANGE = "angle_range_rad"
+"""In a profile: lowest and highest angle that is comfortable today."""
+SET_AT = "angle_set_at_utc"
+"""In a profile: when the sensor was calibrated under which the range was said."""
+LEAST_RAD, MOST_RAD = -math.pi, math.pi
+NARROWEST_RAD = math.radians(10)
+TOLERANCE_RAD = 0.09
+"""How near to its angle a held joint must be (5°)."""
+
+
+def rising_range(range_rad: tuple[float, float]) -> tuple[float, float]:
+    """A range as it was sent. Raises ValueError where it is no range, or too narrow to move in."""
+    low, high = range_rad
+    if not (high - low >= NARROWEST_RAD - 1e-9):
+        raise ValueError(f"the second angle must be at least {NARROWEST_RAD:.2f} rad above the first")
+    return range_rad
+
+
+def range_of(profile: Profile) -> tuple[float, float] | None:
+    """The participant's range, rad; None where there is none."""
+    found = profile.get(RANGE)
+    return None if found is None else (float(found[0]), float(found[1]))
+
+
+def range_outdated(profile: Profile, set_at_utc: str | None) -> bool:
+    """Whether the range was said under another calibration of the angle sensor than that of `set_at_utc`."""
+    return range_of(profile) is not None and profile.get(SET_AT) != set_at_utc
+
+
+def range_within(inner: Sequence[float], outer: Sequence[float] | None) -> bool:
+    """Whether a range lies in another one; a hair beyond it does, for degrees that were rounded."""
+    return outer is None or (outer[0] - 1e-6 <= inner[0] and inner[1] <= outer[1] + 1e-6)
+
+
+def range_words(range_rad: Sequence[float]) -> str:
+    """A range for people: 20° … 110°."""
+    low, high = (f"{math.degrees(angle):.0f}".replace("-", "−") for angle in range_rad)
+    return f"{low}° … {high}°"
+
+
+def range_outside(asked: Profile, rig_rad: Sequence[float] | None) -> dict[str, str]:
+    """Why this rig would refuse the range that is asked for, by its field; empty where it takes it."""
+    range_rad = range_of(asked)
+    if range_rad is None or range_within(range_rad, rig_rad):
+        return {}
+    assert rig_rad is not None
+    return {RANGE: f"{range_words(range_rad)} is not within {range_words(rig_rad)}, as this rig asks"}

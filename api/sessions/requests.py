@@ -21,7 +21,7 @@ from pydantic import (
 from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.models.tracking import USUAL_PERCENT, Limits
 from stimrig.api.people import names
-from stimrig.api.sessions import angles
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.rig.messages import HELD, MOVING, PASSIVE
 
@@ -63,10 +63,10 @@ def _limit(name: str, description: str) -> Any:
 CurrentMa = Annotated[FiniteFloat, _limit("current_ma", "fixed current of every pulse, mA")]
 WidthUs = Annotated[FiniteFloat, _limit("max_pulse_width_us", "comfort maximum, µs")]
 TorqueNm = Annotated[FiniteFloat, _limit("max_torque_nm", "torque at which a test stops, N·m")]
-AngleRad = Annotated[FiniteFloat, Field(ge=angles.LEAST_RAD, le=angles.MOST_RAD)]
+AngleRad = Annotated[FiniteFloat, Field(ge=profiles.LEAST_RAD, le=profiles.MOST_RAD)]
 RangeRad = Annotated[
     tuple[AngleRad, AngleRad],
-    AfterValidator(angles.rising),
+    AfterValidator(profiles.rising_range),
     Field(strict=False, description="lowest and highest joint angle, rad; elbow: 0 is straight, flexion is positive"),
 ]
 ReferenceNm = Annotated[FiniteFloat, Field(ge=-LIMITS["max_torque_nm"].most, le=LIMITS["max_torque_nm"].most)]
@@ -110,8 +110,8 @@ class ProfileIn(Body):
     def sent(self) -> dict[str, Any]:
         """The limits that were sent, as a profile keeps them."""
         sent = self.model_dump(exclude_unset=True)
-        if (own := sent.get(angles.RANGE)) is not None:
-            sent[angles.RANGE] = list(own)
+        if (own := sent.get(profiles.RANGE)) is not None:
+            sent[profiles.RANGE] = list(own)
         return sent
 
 
@@ -154,7 +154,7 @@ class AngleIn(Body):
         default=None, description="kind `held`: the angle to hold; null: the next one that is open"
     )
     tolerance_rad: Annotated[FiniteFloat, Field(ge=0.02, le=0.35, description="around the target, at the start")] = (
-        angles.TOLERANCE_RAD
+        profiles.TOLERANCE_RAD
     )
     still_s: FiniteFloat | None = Field(
         default=None, ge=1, le=60, description="kinds `passive`, `moving` and `sequence`: the test stops after so long "

@@ -8,7 +8,6 @@ import math
 import secrets
 from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,30 +19,19 @@ from stimrig.api.logs import current_test
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.places import site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.sessions import document
-from stimrig.api.sessions.adaptive_plan import ADAPTIVE, Planned
-from stimrig.api.sessions.adaptive_tests import AdaptiveTests
-from stimrig.api.sessions.following import Follower
-from stimrig.api.sessions.joint_plan import KINDS
-from stimrig.api.sessions.joint_tests import JointTests
-from stimrig.api.sessions.lifecycle import Lifecycle
+from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
+from stimrig.api.sessions.joint import JointTests
+from stimrig.api.sessions.kinds import Kind, Kinds, Planned, Tasks
+from stimrig.api.sessions.lifecycle import Follower, Lifecycle
 from stimrig.api.sessions.limits import limits_of
 from stimrig.api.sessions.live import Hub
-from stimrig.api.sessions.refusals import (
-    Current,
-    busy,
-    not_what_was_seen,
-    other_than,
-    refuse_archived,
-    rests_of,
-    right_ended,
-)
+from stimrig.api.sessions.playing import Current, Playing, busy, other_than, refuse_archived, rests_of, right_ended
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
-from stimrig.api.sessions.trials import SEQUENCE, Trials
+from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
-from stimrig.api.store.tables import AuditEntry, Participant, Test, Token
+from stimrig.api.store.tables import Participant, Test, Token
 from stimrig.api.workers.adviser import Adviser
 from stimrig.api.workers.pool import Pool
 from stimrig.rig.messages import (
@@ -59,7 +47,6 @@ from stimrig.rig.messages import (
     StopEvidence,
     StopRequest,
     TestPlan,
-    WithdrawRequest,
 )
 
 log = logging.getLogger("stimrig.trials")
@@ -71,15 +58,11 @@ ANSWER_S = 15.0
 """So long the rig may take to answer a start."""
 PREVIEW_S = 35.0
 """More than the rig takes for one before it says that the computer is too busy."""
-ENDING_S = 2.0
-"""So long a start waits for a test whose end has been heard."""
 MISSED_POLLS = 3
 """After so many states that don't name the test, its end was lost: it comes within milliseconds of the state."""
 NOTE_S = 0.3
 """So long the answer to a stop waits for its entry in the audit trail; the entry is made all the same."""
 EMERGENCY = "Use the stimulator's own emergency switch now."
-LOOK_AGAIN_S = 0.25
-"""How often it is looked whether a test may still be played: another service's changes are seen so late at most."""
 
 
 def same(confirmed: dict[str, Any], preview: dict[str, Any]) -> bool:
@@ -87,46 +70,33 @@ def same(confirmed: dict[str, Any], preview: dict[str, Any]) -> bool:
     return {**confirmed, **preview, "torque_time_nms": None} == {**confirmed, "torque_time_nms": None}
 
 
-class Runner:
+class Runner(Playing):
     """Starts tests, one at a time, and follows each to its model."""
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
         adviser: Adviser, trials: Trials, recordings_dir: Path, follower: Follower,
     ) -> None:  # fmt: skip
-        self.store, self.clock, self.rig, self.versions, self.pool = store, clock, rig, versions, pool
+        super().__init__(store, clock, rig)
+        self.versions, self.pool, self.trials, self.follower = versions, pool, trials, follower
         self.hub = Hub(clock)
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
-        self.trials, self.follower = trials, follower
-        self.current: Current | None = None
+        self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint)
         self.lifecycle = Lifecycle(
-            store,
-            clock,
-            rig,
-            pool,
-            versions,
-            analyses,
-            self.adaptive,
-            self.joint,
-            recordings_dir,
-            follower,
-            self.announce,
+            store, clock, rig, pool, versions, analyses, self.kinds, recordings_dir, follower, self.announce
         )
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
         self._telling = ThreadPoolExecutor(1, "tells-how-tests-stand")
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._watching: asyncio.Task[None] | None = None
+        self._tasks = Tasks(log)
         rig.listeners.append(self._on_event)
         rig.link_listeners.append(self._on_link)
         rig.poll_listeners.append(self._on_poll)
 
     # ---- start and stop -------------------------------------------------------------------------------------
 
-    async def start(
-        self, body: TestIn, by: str, confirmed: dict[str, Any] | None = None, holder: str = ""
-    ) -> Test:  # fmt: skip
+    async def start(self, body: TestIn, by: str, confirmed: dict[str, Any] | None = None, holder: str = "") -> Test:
         """Begin a test.
 
         Parameters
@@ -148,37 +118,17 @@ class Runner:
         """
         if seen.shown.get() is None:  # then it rests on what is read from here on
             seen.shown.set(await asyncio.to_thread(self.store.seen, self.clock))
-        tokens = await asyncio.to_thread(self._tokens, holder)
-        await self._let_end()
+        tokens = await asyncio.to_thread(self.tokens_of, holder)
+        await self.let_end()
         self.refuse_second()
         if body.kind == ADAPTIVE:  # what it can reach is computed now, and not while others wait, and then remembered
             await self._planned(body, await self._participant(body))
         async with self.follower.rig_turn():
             self.refuse_second()
-            await self._refuse_beside_another_service()
+            if (row := await asyncio.to_thread(self.follower.played_by_another)) is not None:
+                raise busy(Current(row.id, row.participant, row.requested_by))
             participant = await self._participant(body)
             return await self._start(body, participant, by, confirmed, tokens)
-
-    def plays(self, test_id: str | None) -> bool:
-        """Whether the rig plays this test now."""
-        current = self.current
-        return current is not None and current.test_id == test_id and current.started and not current.ending
-
-    async def _let_end(self) -> None:
-        """A test is seen to be done a moment before the rig is let go: who starts the next one then is not refused."""
-        if self.current is not None and self.current.ending:
-            with suppress(TimeoutError):
-                await asyncio.wait_for(self.current.let_go.wait(), ENDING_S)
-
-    def refuse_second(self) -> None:
-        """409 while a test runs, its holder named."""
-        if self.current is not None:
-            raise busy(self.current)
-
-    async def _refuse_beside_another_service(self) -> None:
-        row = await asyncio.to_thread(self.follower.played_by_another)
-        if row is not None:
-            raise busy(Current(row.id, row.participant, row.requested_by))
 
     async def _participant(self, body: TestIn) -> Participant:
         participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
@@ -197,7 +147,7 @@ class Runner:
         plan = planned.plan
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body)
-        until_utc = await asyncio.to_thread(self._until_utc, tokens)
+        until_utc = await asyncio.to_thread(self.until_utc, tokens)
         current = self.current = Current(
             plan.test_id, plan.participant, by, plan.kind, tokens=tokens, until_utc=until_utc
         )
@@ -211,7 +161,7 @@ class Runner:
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
-            self._keep(self._look_again_and_again(current))
+            self._tasks.begin(self.look_again_and_again(current))
         except BaseException:
             self.current = None
             self._leave()
@@ -219,23 +169,23 @@ class Runner:
         try:
             return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
         except Exception:  # who asked is told that it failed: then nothing of it plays on
-            await self._stop_quietly(f"start of {plan.test_id} could not be written down")
+            await self.stop_quietly(f"start of {plan.test_id} could not be written down")
             raise
 
     async def _command(self, planned: Planned, current: Current) -> None:
         plan = planned.plan
         try:
             async with self.follower.holds.turn(LIMITS_TURN):
-                if changed := current.overtaken or await asyncio.to_thread(self._overtaking, current):
+                if changed := current.overtaken or await asyncio.to_thread(self.overtaking, current):
                     raise seen.overtaken(changed)
-                if self._is_over(current):
+                if self.is_over(current):
                     raise right_ended()
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
-                key = self.adaptive.begin(planned) or self.joint.begin(planned)
+                key = self.kinds[plan.kind].begin(planned)
                 await self.rig.ask(StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
-                await self._stop_quietly(f"start of {plan.test_id} was not answered")
+                await self.stop_quietly(f"start of {plan.test_id} was not answered")
             await asyncio.to_thread(
                 self.lifecycle.update, plan.test_id, state="refused", reason=error.detail or error.title
             )
@@ -244,7 +194,7 @@ class Runner:
                 error.extra["holder"] = {"test_id": status.test_id, "participant": status.participant}
             raise
         except Exception as error:  # whatever it was: no test stays open that never began
-            await self._stop_quietly(f"start of {plan.test_id} failed")
+            await self.stop_quietly(f"start of {plan.test_id} failed")
             await asyncio.to_thread(self.lifecycle.fail, plan.test_id, error)
             raise
 
@@ -256,73 +206,6 @@ class Runner:
         if not (self.clock.monotonic_s() - since_s <= START_S):
             detail = f"It could not begin within {START_S:g} s. Nothing was sent. Start again."
             raise ApiError(503, "too-late", "The start took too long", detail)
-
-    # ---- whether it may still be played ---------------------------------------------------------------------
-
-    def _overtaking(self, current: Current) -> list[AuditEntry]:
-        """What was changed since its intent was written, with which it would not have been begun."""
-        with self.store.read() as session:
-            if current.since is None and current.started:  # it plays although this service was restarted
-                current.since = seen.newest(session, "", seen.of(current.test_id, "start test"))
-                current.until_utc = self._until_utc(current.tokens)
-            return [] if current.since is None else seen.since(session, current.since, *current.rests_on)
-
-    async def look_again(self) -> None:
-        """Withdraw the test if what it rests on was changed: called before each change is answered.
-
-        A test that has not begun plays no pulse; a controller's trial whose right has ended ends at once. Where the rig
-        does not take that, it is stopped, and asked again.
-        """
-        current = self.current
-        if current is None:
-            return
-        async with current.looking:
-            over = self._is_over(current) and not current.over  # known here, also where the store cannot be read
-            changed = [] if over else await asyncio.to_thread(self._overtaking, current)
-            if not changed and not over:
-                return
-            current.overtaken = changed or current.overtaken
-            begun = over or (current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed))
-            what = changed[-1].action if changed else "its right ended"
-            reason = f"{what}, after this test was asked for"
-            try:
-                await self.rig.ask(WithdrawRequest(test_id=current.test_id, reason=reason, begun=begun))
-            except ApiError as error:
-                log.error("%s could not be withdrawn: %s", current.test_id, error)
-                await self._stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
-            else:
-                current.since = seen.at(changed[-1], "") if changed else current.since
-                current.over |= over
-
-    def _is_over(self, current: Current) -> bool:
-        """Whether the right to it has ended by itself."""
-        return current.until_utc is not None and current.until_utc <= self.clock.utc()
-
-    def _until_utc(self, tokens: list[str]) -> str | None:
-        """When the key ends by whose right a test is played, with its maker's; a person's may end before the test."""
-        rows = [row for token in tokens if (row := self.store.get(Token, token)) is not None]
-        by_key = any(row.participant for row in rows)
-        return min((row.expires_utc for row in rows if by_key and row.expires_utc), default=None)
-
-    def _tokens(self, holder: str) -> list[str]:
-        """Hashes of the tokens by whose right a test is played: the asker's, and that of who made a key."""
-        row: Token | None = self.store.get(Token, holder) if holder else None
-        return [token for token in (holder, row.made_by if row else None) if token]
-
-    async def _look_again_and_again(self, current: Current) -> None:
-        """Other services change things, too."""
-        while self.current is current and not current.ending:
-            await asyncio.sleep(LOOK_AGAIN_S)
-            try:
-                await self.look_again()
-            except Exception:
-                log.exception("whether %s may still be played could not be seen", current.test_id)
-
-    async def _stop_quietly(self, reason: str) -> None:
-        try:
-            await self.rig.request(StopRequest(reason=reason, by="service"))
-        except ApiError as error:
-            log.warning("stop after a failed start: %s", error)
 
     async def _planned(self, body: TestIn, participant: Participant) -> Planned:
         segments = None
@@ -337,11 +220,7 @@ class Runner:
             pulse_rate_hz=body.pulse_rate_hz,
             **limits_of(body, participant.profile),
         )
-        if body.kind in KINDS:
-            return await self.joint.planned(body, plan, PREVIEW_S)
-        if body.angle is not None:
-            plan = self.joint.watched(plan, body.angle)
-        return await self.adaptive.planned(body, plan, PREVIEW_S)
+        return await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:
         """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""
@@ -370,8 +249,8 @@ class Runner:
             "joins": body.joins,
             **dict(zip(("side", "muscle", "placement"), site_of(participant), strict=True)),
             "tokens": current.tokens,
-            **planned.kept(),
-            **self.trials.kept(body, len(preview["pulse_width_us"])),
+            **planned.kept,
+            **self.kinds[body.kind].kept(body, len(preview["pulse_width_us"])),
         }
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
@@ -391,7 +270,7 @@ class Runner:
     async def preview(self, body: TestIn) -> dict[str, Any]:
         """A test's duration, dose and pulse widths; nothing is played."""
         planned = await self._planned(body, await self._participant(body))
-        return {**await self._previewed(planned.plan), **planned.kept()}
+        return {**await self._previewed(planned.plan), **planned.kept}
 
     async def _previewed(self, plan: TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)
@@ -434,8 +313,7 @@ class Runner:
             409: it does not run, or is ending; 422: it has a fixed plan.
         """
         found = await self.rig.ask_for(Extended, EnoughRequest(test_id=row.id, by=by, at_once=True))
-        self.adaptive.said_enough(row.id)
-        self.joint.said_enough(row.id)
+        self.kinds[row.kind].said_enough(row.id)
         return found
 
     async def _note(self, by: str, action: str, subject: str, **detail: Any) -> None:
@@ -489,17 +367,7 @@ class Runner:
 
     def _follow(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
         """Do what leads a test to its last state, in the background and under the one guard."""
-        self._keep(self._guarded(test_id, work))
-
-    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._ended)
-
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            log.error("the end of a test could not be written down", exc_info=error)
+        self._tasks.begin(self._guarded(test_id, work))
 
     async def _guarded(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
         """Follow a test to its last state: an unexpected error is told as its reason, and the rig is let go.
@@ -525,7 +393,7 @@ class Runner:
             if row is None:
                 return
             self.announce(row.id)
-            if row.kind == SEQUENCE and row.state == "completed":
+            if row.kind in self.trials.names and row.state == "completed":
                 self._release(event.test_id)
                 await self.trials.follow(row.id, event.last_sample_unix_s)
         if row.state == "identifying":
@@ -540,8 +408,8 @@ class Runner:
             self._leave()
 
     def _leave(self) -> None:
-        self.adaptive.leave()
-        self.joint.leave()
+        for kind in self.kinds.all:
+            kind.leave()
 
     # ---- after a restart ------------------------------------------------------------------------------------
 
@@ -549,7 +417,7 @@ class Runner:
         """Take up what a restart of the service left open, and from now on what another service leaves."""
         self.trials.resume()
         self._take_up(await asyncio.to_thread(self.follower.left))
-        self._watching = asyncio.create_task(self.follower.watch(self._take_up, self.trials.resume))
+        self._tasks.begin(self.follower.watch(self._take_up, self.trials.resume))
 
     def _take_up(self, left: list[Test]) -> None:
         for row in left:
@@ -563,7 +431,7 @@ class Runner:
                 current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
                 self.current = current
                 self.hub.begin(row.id)
-                self._keep(self._look_again_and_again(current))
+                self._tasks.begin(self.look_again_and_again(current))
             else:
                 self._follow(row.id, self._recover(row.id, "the service was restarted during the test"))
 
@@ -596,16 +464,18 @@ class Runner:
 
     def document(self, row: Test) -> dict[str, Any]:
         """A test as clients see it."""
-        return document.of(row, self.hub, self.lifecycle, self.adaptive, self.joint)
+        return self.lifecycle.document(row, self.hub.position(row.id))
 
     async def close(self) -> None:
         """Leave what runs to the next start of the service."""
-        tasks = [*self._tasks, *([self._watching] if self._watching else [])]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        await self.adaptive.close()
-        await self.joint.close()
-        await self.trials.close()
+        await self._tasks.close()
+        for kind in self.kinds.all:
+            await kind.close()
         await asyncio.to_thread(self._notes.shutdown)
         await asyncio.to_thread(self._telling.shutdown)
+
+
+def not_what_was_seen() -> ApiError:
+    """409: a person said yes to something else."""
+    detail = "The rig would now play something else: it was set up anew. Nothing was started. Go back and check."
+    return ApiError(409, "changed-meanwhile", "This page is out of date", detail)

@@ -16,14 +16,16 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.models.places import differ, place_of
 from stimrig.api.models.tracked import TrackedVersions, Trial
+from stimrig.api.sessions.kinds import Kind, Tasks
 from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
 from stimrig.api.workers.adviser import Adviser
 
 log = logging.getLogger("stimrig.tracking")
 SEQUENCE = "sequence"
-"""A test of this kind is a controller's trial; nothing is identified from it."""
+"""A test of this kind is a controller's trial."""
 PATIENCE_S = 2.0
 """So long who fetches a tracked model waits for a trial that has just ended."""
 MOST_BETWEEN = 20
@@ -31,8 +33,8 @@ MOST_BETWEEN = 20
 ELSEWHERE = "It was played at another side, muscle or current than the approved model's test."
 
 
-class Trials:
-    """Follows what controllers play.
+class Trials(Kind):
+    """Follows what controllers play; nothing is identified from it.
 
     Parameters
     ----------
@@ -40,26 +42,21 @@ class Trials:
         A worker that does nothing else.
     """
 
-    def __init__(self, store: Store, clock: Clock, tracked: TrackedVersions, tracker: Adviser) -> None:
+    names, fitted = (SEQUENCE,), False
+
+    def __init__(self, rig: RigClient, store: Store, clock: Clock, tracked: TrackedVersions, tracker: Adviser) -> None:
+        super().__init__(rig)
         self.store, self.clock, self.tracked, self.tracker = store, clock, tracked, tracker
         self._turn = asyncio.Lock()
         self._ending = 0
         self._settled = asyncio.Event()
         self._settled.set()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks(log)
 
     # ---- before a trial ----------------------------------------------------------------------------------------
 
     def kept(self, body: TestIn, pulses: int) -> dict[str, Any]:
-        """What is kept beside the plan of a trial: its approval, and what the controller wants. Nothing of others.
-
-        Raises
-        ------
-        ApiError
-            422: the reference has not one value for each pulse.
-        """
-        if body.kind != SEQUENCE:
-            return {}
+        """Its approval, and what the controller wants: a value for each pulse, else ApiError (422)."""
         reference = body.reference_torque_nm
         if reference is not None and len(reference) != pulses:
             detail = f"reference_torque_nm: {len(reference)} values, but the whole test has {pulses} pulses."
@@ -69,7 +66,7 @@ class Trials:
 
     def warm(self, participant: str) -> None:
         """Have the worker load what a trial of this participant needs, so that none waits for it."""
-        self._start(self._warm(participant))
+        self._tasks.begin(self._warm(participant))
 
     async def _warm(self, participant: str) -> None:
         approval = await asyncio.to_thread(self.tracked.allowing, participant)
@@ -165,7 +162,7 @@ class Trials:
 
     def resume(self) -> None:
         """Follow what a restart left open, and warm the worker where a model may be tracked."""
-        self._start(self._resume())
+        self._tasks.begin(self._resume())
 
     async def _resume(self) -> None:
         for approval, left in await asyncio.to_thread(self._left):
@@ -191,19 +188,7 @@ class Trials:
         noted = {row.test_id for row in self.tracked.rows(approval.id)}
         return [test.id for test in played if test.plan.get("approval_id") == approval.id and test.id not in noted]
 
-    def _start(self, work: Any) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._ended)
-
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            log.error("trials could not be followed", exc_info=error)
-
     async def close(self) -> None:
         """Let everything go; what is open is followed at the next start."""
-        for task in list(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
         await self.tracker.close()

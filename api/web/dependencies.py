@@ -27,13 +27,12 @@ from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import Auth, Principal, Scope
 from stimrig.api.people.idle_lock import FLUSH_S, IdleLock
 from stimrig.api.people.pace import Guesses
-from stimrig.api.sessions.following import Follower
+from stimrig.api.sessions.lifecycle import Follower
 from stimrig.api.sessions.notes import Notes
 from stimrig.api.sessions.questions import Questions
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.runner import Runner
-from stimrig.api.sessions.stop_log import StopLog
-from stimrig.api.sessions.stop_right import StopRights
+from stimrig.api.sessions.stops import StopLog, StopRights
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, holds, uploads
@@ -154,7 +153,7 @@ def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: Serv
     analyses = Analyses(store, clock, pool, versions, settings)
     adviser = Adviser(worker, places(settings, store))  # its own: a folder that the pool learns ends no test
     tracked = TrackedVersions(store, clock, versions)
-    trials = Trials(store, clock, tracked, Adviser(worker, places(settings, store)))
+    trials = Trials(rig, store, clock, tracked, Adviser(worker, places(settings, store)))
     held = holds.of(store)
     follower = Follower(store, held, settings.rig)
     runner = Runner(store, clock, rig, pool, versions, analyses, adviser, trials, settings.recordings_dir, follower)

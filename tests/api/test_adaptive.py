@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from stimrig.api.sessions import runner
-from stimrig.api.sessions.adaptive_tests import KEPT, AdaptiveTests
+from stimrig.api.sessions.adaptive import KEPT, AdaptiveTests
 from stimrig.api.sessions.requests import TargetIn, TestIn
 from stimrig.api.sessions.rig_client import no_rig
 from stimrig.api.store.tables import Test

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from stimrig.api.sessions import adaptive
-from stimrig.api.sessions.adaptive import Follower
+from stimrig.api.sessions import adaptive_follower, kinds
+from stimrig.api.sessions.adaptive_follower import Follower
 from stimrig.rig.messages import (
     AHEAD,
     AdaptivePlan,
@@ -68,7 +68,7 @@ class World:
 
 
 def followed(world: World, rate_hz: float, monkeypatch: pytest.MonkeyPatch) -> Follower:
-    monkeypatch.setattr(adaptive, "samples_of", world.events)
+    monkeypatch.setattr(kinds, "samples_of", world.events)
     opening = SegmentPlan(name="opening", sequence="widths", settings={"pulse_width_us": [0.0] * round(3 * rate_hz)})
     plan = TestPlan(
         test_id="T1", participant="P017",
@@ -90,7 +90,7 @@ def test_the_early_answer_is_sent_before_the_rig_decides(monkeypatch: pytest.Mon
     [(at_s, request)] = world.requests
     assert isinstance(request, ExtendRequest) and request.after == 30
     decided_s = FIRST_S - AHEAD / rate_hz
-    assert decided_s - adaptive.SEND_S - 0.03 < at_s < decided_s
+    assert decided_s - adaptive_follower.SEND_S - 0.03 < at_s < decided_s
     assert follower.told.problem == ""
 
 
@@ -100,7 +100,7 @@ def test_the_newest_answer_is_sent_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     followed(world, 40.0, monkeypatch)
     [(at_s, request)] = world.requests
     assert request.segments[0].name == "ramp 2"
-    assert at_s == pytest.approx(FIRST_S - AHEAD / 40.0 - adaptive.LATE_S, abs=0.03)
+    assert at_s == pytest.approx(FIRST_S - AHEAD / 40.0 - adaptive_follower.LATE_S, abs=0.03)
 
 
 def test_the_adviser_learns_what_the_muscle_felt(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from stimrig.api.clock import Clock
 from stimrig.api.people import names
 from stimrig.api.people.pace import Guesses
-from stimrig.api.sessions.stop_right import StopRights
+from stimrig.api.sessions.stops import StopRights
 from tests.api.browser import PASSWORD
 from tests.api.conftest import STUB, Service, run_service
 

@@ -15,9 +15,9 @@ import httpx
 import pytest
 
 from stimrig.api.clock import Clock
-from stimrig.api.sessions import runner
-from stimrig.api.sessions.following import Follower
-from stimrig.api.sessions.lifecycle import Lifecycle
+from stimrig.api.sessions import playing
+from stimrig.api.sessions.kinds import Kind, Kinds
+from stimrig.api.sessions.lifecycle import Follower, Lifecycle
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store
 from stimrig.api.store.holds import Holds
@@ -96,7 +96,7 @@ def test_a_start_between_a_tests_end_and_the_rig_let_go_waits(
 
     monkeypatch.setattr(lifecycle, "take_recording", fails)
     monkeypatch.setattr(lifecycle, "fail", fails_slowly)
-    monkeypatch.setattr(runner, "ENDING_S", 60.0)
+    monkeypatch.setattr(playing, "ENDING_S", 60.0)
     first = run_test(client, participant)
     assert first["state"] == "failed" and client.get("/v1/rig").json()["holder"]["test_id"] == first["id"]
     threading.Timer(0.3, written_down.set).start()
@@ -178,10 +178,11 @@ def test_a_test_that_was_taken_up_during_the_fit_is_left_to_who_did(tmp_path: Pa
 
     carried = SimpleNamespace(fit=fit, carry=carry)
     analyses: Any = SimpleNamespace(carried_structure=carried, diagnose_ahead=diagnose_ahead)
-    nothing: Any = SimpleNamespace(fit_options=lambda _row: {}, add=add)
+    nothing: Any = SimpleNamespace(add=add)
+    kinds = Kinds(Kind(nothing))
     follower = Follower(store, holds, "rig")
     lifecycle = Lifecycle(
-        store, Clock(), nothing, nothing, nothing, analyses, nothing, nothing, tmp_path, follower, lambda _test_id: None
+        store, Clock(), nothing, nothing, nothing, analyses, kinds, tmp_path, follower, lambda _test_id: None
     )
     asyncio.run(lifecycle.identify("T1"))
     row = store.get(Test, "T1")

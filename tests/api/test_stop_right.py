@@ -17,7 +17,7 @@ from sqlalchemy.exc import OperationalError
 
 from stimrig.api.clock import Clock
 from stimrig.api.people.auth import Scope
-from stimrig.api.sessions.stop_right import RIGHT_S, StopRights
+from stimrig.api.sessions.stops import RIGHT_S, StopRights
 from stimrig.api.store import Store, holds
 from tests.api.conftest import TOKEN, Service, SetClock, soon
 from tests.api.test_people import standing_still

@@ -362,7 +362,7 @@ def test_a_trial_ends_with_its_right_also_while_the_store_cannot_be_read(
     def gone(_: object) -> list[Any]:
         raise OSError("the disk is gone")
 
-    monkeypatch.setattr(runner, "_overtaking", gone)
+    monkeypatch.setattr(runner, "overtaking", gone)
     runner.current.until_utc = "2026-01-01T00:00:00.000Z"
     soon(lambda: service.rig.withdrawn)
     assert [request.begun for request in service.rig.withdrawn] == [True] and approved

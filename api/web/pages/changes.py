@@ -11,7 +11,7 @@ from stimrig.api import decisions
 from stimrig.api.clinical_words import decision_words
 from stimrig.api.language import _, lazy, localised, plain, translated
 from stimrig.api.people.auth import Principal, Scope
-from stimrig.api.sessions import angles, profiles
+from stimrig.api.sessions import profiles
 from stimrig.api.store.seen import MOST_TOLD, ChangedError
 from stimrig.api.web.pages.limits_form import LABELS
 from stimrig.api.web.pages.starting import site_words
@@ -108,8 +108,8 @@ def limits(profile: dict[str, Any]) -> str:
     """A participant's limits."""
     known = {name: limit.unit for name, limit in profiles.LIMITS.items() if profile.get(name) is not None}
     found = [localised(f"{profile[name]:g} {unit}") for name, unit in known.items()]
-    range_rad = angles.of(profile)
-    return ", ".join([*found, *([] if range_rad is None else [angles.words(range_rad)])])
+    range_rad = profiles.range_of(profile)
+    return ", ".join([*found, *([] if range_rad is None else [profiles.range_words(range_rad)])])
 
 
 def for_reader(changes: list[dict[str, Any]], who: Principal | None) -> list[dict[str, Any]]:

@@ -10,9 +10,9 @@ from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
 from stimrig.api.models import together
-from stimrig.api.sessions import angles
+from stimrig.api.sessions import profiles
+from stimrig.api.sessions.joint import target_of
 from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE
-from stimrig.api.sessions.joint_tests import target_of
 from stimrig.api.sessions.requests import AngleIn, TestIn
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store.seen import ChangedError
@@ -47,7 +47,7 @@ def _gather(context: Context, row: Participant, found: dict[str, Any]) -> dict[s
     rows = _recorded_today(context, row.code)
     picked = _picked(rows)
     return {
-        "range_rad": angles.of(row.profile),
+        "range_rad": profiles.range_of(row.profile),
         "may_start": starting.calibrated(context, row).may_start,
         "archived": next_view.step(context, row).kind == "archived",
         "held": [{**each, "deg": _deg(each["angle_rad"])} for each in found["targets"]],

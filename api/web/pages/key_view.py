@@ -12,7 +12,7 @@ from pydantic import StringConstraints
 from stimrig.api.errors import NotFoundError
 from stimrig.api.people import controller_keys
 from stimrig.api.sessions.controller_trials import PlanIn, plan_within
-from stimrig.api.sessions.refusals import refuse_archived
+from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.store import seen
 from stimrig.api.web.dependencies import Approver, Ctx, Tester
 from stimrig.api.web.pages import participant_view, typed

@@ -12,7 +12,7 @@ from typing import Any
 
 from starlette.datastructures import FormData
 
-from stimrig.api.sessions import angles, profiles
+from stimrig.api.sessions import profiles
 from stimrig.api.web.pages import typed
 from stimrig.api.web.routes.participants import calibrated_utc
 from stimrig.rig.messages import Bound, Status
@@ -80,9 +80,9 @@ def _take_angles(form: LimitsForm, sent: FormData, profile: Mapping[str, Any], s
     if len(given) < len(ANGLES) or given.items() <= form.seen.items():
         return
     asked, errors = asked_angles(given, profile, status)
-    rigs = (status.angle.range_rad if status else None) or (angles.LEAST_RAD, angles.MOST_RAD)
-    if beyond := angles.outside(asked, rigs):
-        errors[ANGLES[1]] = beyond[angles.RANGE]
+    rigs = (status.angle.range_rad if status else None) or (profiles.LEAST_RAD, profiles.MOST_RAD)
+    if beyond := profiles.range_outside(asked, rigs):
+        errors[ANGLES[1]] = beyond[profiles.RANGE]
     form.texts |= given
     form.errors |= errors
     form.asked |= {} if errors else asked
@@ -121,8 +121,8 @@ def fields(status: Status | None) -> list[dict[str, str]]:
 
 def angle_texts(profile: Mapping[str, Any], status: Status | None) -> dict[str, str]:
     """What stands in the two fields; empty where there is no range, or the sensor was calibrated anew since."""
-    range_rad = angles.of(profile)
-    if range_rad is None or (has_sensor(status) and angles.outdated(profile, calibrated_utc(status))):
+    range_rad = profiles.range_of(profile)
+    if range_rad is None or (has_sensor(status) and profiles.range_outdated(profile, calibrated_utc(status))):
         return dict.fromkeys(ANGLES, "")
     return {name: angle_shown(angle) for name, angle in zip(ANGLES, range_rad, strict=True)}
 
@@ -141,7 +141,7 @@ def angle_fields(status: Status | None) -> list[dict[str, str]]:
     """What the fields are called, and what this rig takes in them."""
     if status is None or not status.angle.present:
         return []
-    within = "" if status.angle.range_rad is None else f"within {angles.words(status.angle.range_rad)} (rig)"
+    within = "" if status.angle.range_rad is None else f"within {profiles.range_words(status.angle.range_rad)} (rig)"
     help_of = {ANGLES[0]: "0° is a straight arm", ANGLES[1]: within}
     return [{"name": name, "label": ANGLE_LABELS[name], "help": help_of[name]} for name in ANGLES]
 
@@ -157,7 +157,7 @@ def of_pose(text: str, status: Status | None) -> float:
     angle_rad = math.radians(typed.signed(text))
     rigs = status.angle.range_rad if status else None
     if rigs is not None and not (rigs[0] <= angle_rad <= rigs[1]):
-        raise ValueError(f"{angle_shown(angle_rad) + '°'} is not within {angles.words(rigs)}, as this rig asks")
+        raise ValueError(f"{angle_shown(angle_rad) + '°'} is not within {profiles.range_words(rigs)}, as this rig asks")
     return angle_rad
 
 
@@ -172,19 +172,19 @@ def asked_angles(
     if dict(given) == before:
         return {}, {}
     if not any(text.strip() for text in given.values()):
-        return ({} if angles.of(profile) is None else {angles.RANGE: None}), {}
+        return ({} if profiles.range_of(profile) is None else {profiles.RANGE: None}), {}
     values, errors = typed.numbers(given, typed.signed)
     if errors:
         return {}, errors
     low, high = (math.radians(values[name]) for name in ANGLES)
-    if not (high - low >= angles.NARROWEST_RAD - 1e-9):
-        least = math.degrees(angles.NARROWEST_RAD)
+    if not (high - low >= profiles.NARROWEST_RAD - 1e-9):
+        least = math.degrees(profiles.NARROWEST_RAD)
         return {}, {ANGLES[1]: f"the second angle must be at least {least:.0f}° above the first"}
-    saved = angles.of(profile) if before[ANGLES[0]] else None
+    saved = profiles.range_of(profile) if before[ANGLES[0]] else None
     near = math.radians(HALF_A_STEP_DEG)
     if saved is not None and abs(saved[0] - low) < near and abs(saved[1] - high) < near:
         return {}, {}
-    return {angles.RANGE: [low, high]}, {}
+    return {profiles.RANGE: [low, high]}, {}
 
 
 LABELS = {

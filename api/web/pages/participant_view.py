@@ -13,7 +13,7 @@ from starlette.datastructures import FormData
 from stimrig.api.errors import ApiError
 from stimrig.api.people import controller_keys
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import angles, profiles
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
 from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, TargetIn, TestIn
 from stimrig.api.store import seen
@@ -119,9 +119,9 @@ def _question(row: Participant, new: dict[str, Any], doubts: list[str], save: An
         value, before = f"{new[name]:g} {limit.unit}", f"{row.profile[name]:g} {limit.unit}"
         lines.append(Row(limit.words.capitalize(), value, before if before != value else ""))
         values.append(value)
-    if (range_rad := angles.of(new)) is not None:
-        now, was = angles.words(range_rad), angles.of(row.profile)
-        before = angles.words(was) if was else "–"
+    if (range_rad := profiles.range_of(new)) is not None:
+        now, was = profiles.range_words(range_rad), profiles.range_of(row.profile)
+        before = profiles.range_words(was) if was else "–"
         lines.append(Row("Joint angles", now, before if before != now else ""))
     return Question(
         participant=row.code,

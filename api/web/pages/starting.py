@@ -13,10 +13,10 @@ from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised, translated, until, when
 from stimrig.api.models.places import Site, site_of
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import angles, profiles
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.joint_plan import HELD, PASSIVE
+from stimrig.api.sessions.playing import other_than, refuse_archived
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.refusals import other_than, refuse_archived
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
@@ -146,14 +146,19 @@ def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
     """Between which angles a held test starts, °; None of another one."""
     if joint["target_rad"] is None:
         return None
-    middle, half = math.degrees(joint["target_rad"]), math.degrees(joint.get("tolerance_rad", angles.TOLERANCE_RAD))
+    middle, half = math.degrees(joint["target_rad"]), math.degrees(joint.get("tolerance_rad", profiles.TOLERANCE_RAD))
     return round(middle - half, 2), round(middle + half, 2)
 
 
 def of_joint(joint: Mapping[str, Any], profile: Mapping[str, Any], long: str, dose: str) -> tuple[str, str, list[Row]]:
     """How long a guided test of a joint takes, at what dose, and the rows about the angle."""
-    range_rad = angles.of(profile)
-    more = [Row(_("Joint angles"), _("%(range)s; beyond them the test stops", range=angles.words(range_rad or (0, 0))))]
+    range_rad = profiles.range_of(profile)
+    more = [
+        Row(
+            _("Joint angles"),
+            _("%(range)s; beyond them the test stops", range=profiles.range_words(range_rad or (0, 0))),
+        )
+    ]
     if joint["kind"] == HELD:
         more.insert(0, Row(_("Hold at"), degrees(joint["target_rad"])))
         expected = joint["doses"]["held_each"]

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions import profiles
-from stimrig.api.sessions.refusals import refuse_archived
+from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, StrictBool, StringConstraints
 from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError
 from stimrig.api.models import together
-from stimrig.api.sessions import angles
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.requests import AngleRad, Body
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
@@ -109,8 +109,8 @@ async def overview_of(context: Context, row: Participant) -> dict[str, Any]:
     """What is open of today's guided tests, and the sensor; nothing of tests where there is no sensor or no range."""
     status = context.rig.status
     told = (status.angle if status is not None else AngleStatus()).model_dump()
-    if not told["present"] or angles.of(row.profile) is None:
-        return {"sensor": told, "range_rad": row.profile.get(angles.RANGE), **NOTHING_OPEN}
+    if not told["present"] or profiles.range_of(row.profile) is None:
+        return {"sensor": told, "range_rad": row.profile.get(profiles.RANGE), **NOTHING_OPEN}
     return {"sensor": told, **await context.runner.joint_overview(row)}
 
 

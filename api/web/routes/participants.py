@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.sessions import angles, directory, profiles
+from stimrig.api.sessions import directory, profiles
 from stimrig.api.sessions.requests import ParticipantIn, ProfileIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
@@ -80,7 +80,7 @@ def _change(
 ) -> tuple[Participant, Seen]:  # fmt: skip
     with context.store.write() as session:
         row = within(session, code)
-        poses = [] if asked.get(angles.RANGE) is None else [seen.poses()]
+        poses = [] if asked.get(profiles.RANGE) is None else [seen.poses()]
         seen.check(session, seen.participant(code), *poses)
         check_asked(context, row.profile, asked)
         profile, voids = profiles.changed(row.profile, with_calibration(context, asked))
@@ -104,7 +104,7 @@ def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]
         raise ApiError(422, "invalid-input", "Some limits are missing", f"Send {', '.join(lacking)}, too.")
     status = context.rig.status
     found = profiles.outside(asked, profile, status.limits if status else {})
-    if found := found | angles.outside(asked, status.angle.range_rad if status else None):
+    if found := found | profiles.range_outside(asked, status.angle.range_rad if status else None):
         errors = [{"field": name, "detail": words} for name, words in found.items()]
         detail = "; ".join(f"{name}: {words}" for name, words in found.items()) + ". Nothing was changed."
         raise ApiError(422, "invalid-input", "These limits cannot be used", detail, errors=errors)
@@ -112,9 +112,9 @@ def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]
 
 def with_calibration(context: Context, asked: dict[str, Any]) -> dict[str, Any]:
     """What is asked for; a range of joint angles holds as long as the angle sensor's calibration of now."""
-    if asked.get(angles.RANGE) is None:
+    if asked.get(profiles.RANGE) is None:
         return asked
-    return {**asked, angles.SET_AT: calibrated_utc(context.rig.status)}
+    return {**asked, profiles.SET_AT: calibrated_utc(context.rig.status)}
 
 
 def calibrated_utc(status: Status | None) -> str | None:

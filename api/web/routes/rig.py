@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions.requests import StopIn, TestIn
-from stimrig.api.sessions.stop_log import StopResult
+from stimrig.api.sessions.stops import StopResult
 from stimrig.api.store import audit, seen
 from stimrig.api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
 from stimrig.api.web.middleware import wants_html

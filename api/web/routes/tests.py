@@ -16,7 +16,7 @@ from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controller_trials
-from stimrig.api.sessions.refusals import other_than
+from stimrig.api.sessions.playing import other_than
 from stimrig.api.sessions.requests import RanByIn, TestIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import KEY_TURN

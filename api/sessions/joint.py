@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import secrets
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.models.registry import Versions
-from stimrig.api.sessions import angles, coverage, joint_plan
-from stimrig.api.sessions.adaptive_plan import Planned
+from stimrig.api.sessions import coverage, joint_plan, profiles
+from stimrig.api.sessions.coverage import Coverage
 from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Layout
-from stimrig.api.sessions.joint_watch import Watcher
+from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, SERVICE, Planned, Watched, Watcher, begun
 from stimrig.api.sessions.requests import AngleIn, TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Test
@@ -22,7 +23,9 @@ from stimrig.rig.messages import (
     SAFE_END_S,
     AdaptivePlan,
     AnglePlan,
+    EnoughRequest,
     FinishedEvent,
+    LiveEvent,
     PreviewRequest,
     SegmentPlan,
     TestPlan,
@@ -30,27 +33,17 @@ from stimrig.rig.messages import (
 
 SAME_ANGLE_RAD = math.radians(2.5)
 """A held test was at an angle that is listed where it is as near as this: half of the steps of the list."""
-AT_STOPPING_TORQUE_S = 12.0
-"""The largest torque-time of a moving test without a model: so many seconds at the torque that stops the test."""
-ENDS = {"torque_time": "torque-time", "plan": "time", "limit": "time"}
-"""Why a test ended, by the rig's reason, where it is told by another name."""
+SETTLED_S = 0.5
+"""After stimulation has begun: then the torque is that of the level."""
+TELL_S = 0.2
+"""Pages hear this often how much was seen."""
 
 
-class JointTests:
-    """All of them; at most one test runs.
+class JointTests(Watched):
+    """All of them."""
 
-    Parameters
-    ----------
-    tell : callable
-        Called with a message for the live channel.
-    """
-
-    def __init__(
-        self, clock: Clock, rig: RigClient, versions: Versions, tell: Callable[[dict[str, Any]], None]
-    ) -> None:  # fmt: skip
-        self.clock, self.rig, self.versions, self.tell = clock, rig, versions, tell
-        self.watcher: Watcher | None = None
-        self._task: asyncio.Task[None] | None = None
+    names, part, fitted = KINDS, "joint", False
+    ends: ClassVar[Mapping[str, str]] = {"torque_time": "torque-time", "plan": "time", "limit": "time"}
 
     # ---- before ----------------------------------------------------------------------------------------------
 
@@ -63,7 +56,7 @@ class JointTests:
             409: the rig has no angle sensor, or no angle is left to hold; 422: the participant has no range of angles,
             or one that is too small, or the target is not in it; what the rig refuses.
         """
-        range_rad = self._range(plan)
+        range_rad = self.range_of(plan)
         asked, longest_s = body.angle or AngleIn(), body.max_duration_s
         shared = await self._layout(plan, range_rad, longest_s, preview_s)
         angle = AnglePlan(range_rad=range_rad, tolerance_rad=asked.tolerance_rad)
@@ -83,26 +76,7 @@ class JointTests:
             told["longest_s"] = bounds.max_duration_s
         chosen = [SegmentPlan(**segment) for segment in segments]
         plan = plan.model_copy(update={"segments": chosen, "angle": angle, "adaptive": bounds})
-        return Planned(plan, joint=told)
-
-    def watched(self, plan: TestPlan, asked: AngleIn) -> TestPlan:
-        """A plan of another kind that the angle may stop, too. Raises ApiError as `planned`."""
-        return plan.model_copy(update={"angle": AnglePlan(range_rad=self._range(plan), still_s=asked.still_s)})
-
-    def _range(self, plan: TestPlan) -> tuple[float, float]:
-        """The participant's range of angles, where the rig can watch it."""
-        self._refuse_without_sensor()
-        range_rad = plan.profile.angle_range_rad
-        if range_rad is None:
-            detail = f"Set the angles that are comfortable for {plan.participant}: angle_range_rad of its profile."
-            raise ApiError(422, "no-angle-range", "The participant has no range of angles", detail)
-        return range_rad
-
-    def _refuse_without_sensor(self) -> None:
-        status = self.rig.status
-        if status is not None and not status.angle.present:
-            detail = "This rig has no angle sensor. The rig file names one under [angle_sensor]."
-            raise ApiError(409, "no-angle-sensor", "There is no angle sensor", detail)
+        return Planned(plan, {"joint": told})
 
     async def _layout(
         self, plan: TestPlan, range_rad: tuple[float, float], longest_s: float | None, preview_s: float
@@ -129,12 +103,14 @@ class JointTests:
         assert range_rad is not None
         if asked.target_rad is not None:
             if not (range_rad[0] <= asked.target_rad <= range_rad[1]):
-                detail = f"angle.target_rad {asked.target_rad:g} is not within the range {angles.words(range_rad)}."
+                detail = (
+                    f"angle.target_rad {asked.target_rad:g} is not within the range {profiles.range_words(range_rad)}."
+                )
                 raise ApiError(422, "invalid-input", "The angle is not in the participant's range", detail)
             return asked.target_rad
         if not shared.targets_rad:
             least = math.degrees(joint_plan.LEAST_RANGE_RAD)
-            detail = f"The range {angles.words(range_rad)} is smaller than {least:.0f}°. Send angle.target_rad."
+            detail = f"The range {profiles.range_words(range_rad)} is smaller than {least:.0f}°. Send angle.target_rad."
             raise ApiError(422, "small-range", "The range is too small", detail)
         open_ones = [row["angle_rad"] for row in self.targets(plan.participant, shared) if not row["done"]]
         if not open_ones:
@@ -142,69 +118,41 @@ class JointTests:
             raise ApiError(409, "all-held", "No angle is left", detail)
         return open_ones[0]
 
-    # ---- while it plays --------------------------------------------------------------------------------------
+    # ---- while it plays, and after it ------------------------------------------------------------------------
 
     def begin(self, planned: Planned) -> str:
-        """Watch a test that is about to start; the key with which it is started. Empty where there is nothing to."""
+        """As `Kind`."""
         plan = planned.plan
-        if planned.joint is None or plan.adaptive is None or plan.angle is None:
+        if plan.adaptive is None or plan.angle is None:
             return ""
-        self.leave()
         cells = coverage.grid(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
-        self.watcher = watcher = Watcher(plan, coverage.Coverage(cells), self.rig, self.clock, self._tell)
-        self._task = asyncio.create_task(watcher.run(self.rig.path))
+        self.watch(JointWatcher(plan, Seen(Coverage(cells)), self.rig, self.clock, self.tell_now))
         return secrets.token_urlsafe(24)
 
-    def _tell(self) -> None:
-        if self.watcher is not None:
-            self.tell({"type": "joint", "test_id": self.watcher.plan.test_id, **self.watcher.document()})
-
-    def said_enough(self, test_id: str) -> None:
-        """A person has ended it well."""
-        if (watcher := self._of(test_id)) is not None:
-            watcher.told.state, watcher.told.ended = "ending", watcher.told.ended or "enough"
-            self._tell()
-
-    def leave(self) -> None:
-        """Watch no test any more."""
-        if self._task is not None:
-            self._task.cancel()
-        self._task, self.watcher = None, None
-
-    async def close(self) -> None:
-        """Let everything go."""
-        task = self._task
-        self.leave()
-        if task is not None:
-            await asyncio.gather(task, return_exceptions=True)
-
-    # ---- what became of it -----------------------------------------------------------------------------------
-
-    def _of(self, test_id: str) -> Watcher | None:
-        return self.watcher if self.watcher is not None and self.watcher.plan.test_id == test_id else None
+    def end_of(self, row: Test, event: FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
+        """A held test has no other end than its outcome; a moving one's levels are as many as its share allows."""
+        if row.kind == HELD:
+            return event.outcome
+        return "torque-time" if row.kind == MOVING and rigs == "plan" else ""
 
     def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
-        """What is kept of a guided test, by the name it has in the summary; nothing of another one."""
-        if row.kind not in KINDS:
-            return {}
-        rigs, watcher = str(event.summary.get("ended_by") or event.outcome), self._of(row.id)
-        told = watcher.document() if watcher is not None else unwatched(row)
-        ended = told["ended"] if rigs == "enough" and told["ended"] else ENDS.get(rigs, rigs)
-        if row.kind == HELD:
-            ended = event.outcome
-        elif row.kind == MOVING and rigs == "plan":
-            ended = "torque-time"  # its levels were played: they are as many as its share allows
-        measured = event.summary.get("torque_time_nms", told["torque_time_nm_s"])
-        told |= {"state": "ended", "ended": ended, "torque_time_nm_s": measured}
-        return {"joint": {**told, "angle_rad": None, "velocity_rad_s": None}}
+        """As `Kind`."""
+        return {"joint": {**super().outcome(row, event)["joint"], "angle_rad": None, "velocity_rad_s": None}}
 
     def document(self, row: Test) -> dict[str, Any] | None:
-        """How a guided test stands or what became of it; None of a test of another kind."""
-        if row.kind not in KINDS:
-            return None
-        watcher, angle = self._of(row.id), row.plan.get("angle") or {}
-        told = row.summary.get("joint") or (watcher.document() if watcher is not None else unwatched(row))
-        return {**told, **(row.plan.get("joint") or {}), **angle}
+        """As `Kind`."""
+        return {**(super().document(row) or {}), **(row.plan.get("joint") or {}), **(row.plan.get("angle") or {})}
+
+    def unwatched(self, row: Test) -> dict[str, Any]:
+        """As `Watched`."""
+        lost = begun(row) and row.kind != HELD
+        why = "What is seen is not counted any more: the service was restarted during the test." if lost else ""
+        return {
+            "state": "alone" if lost else "watching", "problem": why, "ended": "", "angle_rad": None,
+            "velocity_rad_s": None, "torque_time_nm_s": None, "coverage": None,
+        }  # fmt: skip
+
+    # ---- today's ---------------------------------------------------------------------------------------------
 
     def targets(self, participant: str, shared: Layout) -> list[dict[str, Any]]:
         """The angles to hold, and which of them were held today."""
@@ -254,11 +202,75 @@ def target_of(row: Test) -> float:
     return math.nan if target is None else float(target)
 
 
-def unwatched(row: Test) -> dict[str, Any]:
-    """Of a test that this service does not watch: a held one, one that never began, or it was restarted meanwhile."""
-    begun = row.state not in ("requested", "refused") and row.kind != HELD
-    why = "What is seen is not counted any more: the service was restarted during the test." if begun else ""
-    return {
-        "state": "alone" if begun else "watching", "problem": why, "ended": "", "angle_rad": None,
-        "velocity_rad_s": None, "torque_time_nm_s": None, "coverage": None,
-    }  # fmt: skip
+@dataclass
+class Seen:
+    """What is known of the test, for pages and for its document."""
+
+    coverage: Coverage
+    state: str = "watching"
+    """watching; alone: nobody counts any more, `problem` says why; ending."""
+    problem: str = ""
+    ended: str = ""
+    angle_rad: float | None = None
+    velocity_rad_s: float | None = None
+    torque_time_nm_s: float = 0.0
+
+
+class JointWatcher(Watcher):
+    """Counts what was seen of angle and velocity in a test in which a joint moves; ends it well when that is enough."""
+
+    told: Seen
+    log = logging.getLogger("stimrig.joint")
+
+    def __init__(self, plan: TestPlan, told: Seen, rig: RigClient, clock: Clock, tell: Callable[[], None]) -> None:
+        super().__init__(plan, told, rig, clock, tell)
+        self._since_s: float | None = None
+        self._told_s = -TELL_S
+
+    def problem(self, why: str) -> str:
+        """As `Watcher`."""
+        return f"What is seen is not counted any more. The test goes on to its longest time: {why}"
+
+    def document(self) -> dict[str, Any]:
+        """As `Watcher`."""
+        return {**vars(self.told), "coverage": self.told.coverage.document()}
+
+    def hear(self, event: LiveEvent) -> None:
+        """As `Watcher`; where the samples are enough, have the rig end the test well."""
+        told = self.told
+        told.torque_time_nm_s = event.torque_time_nms
+        for at_s, width_us in zip(event.pulse_time_s, event.pulse_width_us, strict=True):
+            if not (width_us > 0.0):
+                self._since_s = None
+            elif self._since_s is None:
+                self._since_s = at_s
+        for row in event.angle or []:
+            self._take(row)
+        if told.state == "watching" and told.coverage.enough and not event.ended_by:
+            told.state, told.ended = "ending", "covered"
+            self.begin(self._say_enough())
+        now_s = self.clock.monotonic_s()
+        if now_s - self._told_s >= TELL_S or told.state == "ending":
+            self._told_s = now_s
+            self.tell()
+
+    def _take(self, row: list[float | None]) -> None:
+        time_s, angle_rad, velocity_rad_s = row
+        if time_s is None or angle_rad is None or velocity_rad_s is None:
+            return
+        self.told.angle_rad, self.told.velocity_rad_s = angle_rad, velocity_rad_s
+        self.told.coverage.add(time_s, angle_rad, velocity_rad_s, self._counts(time_s))
+
+    def _counts(self, time_s: float) -> bool:
+        """Without stimulation everything counts in a passive test, and nothing in another one."""
+        if self.plan.kind == PASSIVE:
+            return True
+        return self._since_s is not None and time_s - self._since_s >= SETTLED_S
+
+    async def _say_enough(self) -> None:
+        try:
+            await self.rig.ask(EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
+        except ApiError as error:  # it has ended by itself, or a person was quicker
+            if error.code != "rig-late":
+                self.told.state, self.told.ended = "watching", ""
+                raise

@@ -1,8 +1,4 @@
-"""The right to stop: whoever has the stop button in view may press it.
-
-A page that shows the button carries a signed value in its form. It allows a stop and nothing else, and asks neither
-the database nor a session: it outlives sign-out, the session's end, a new password and a revoked token.
-"""
+"""TODO."""
 
 from __future__ import annotations
 
@@ -10,9 +6,63 @@ import base64
 import binascii
 import hmac
 import json
+import secrets
 from collections.abc import Collection
+from dataclasses import dataclass
 
 from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.rig.messages import StopEvidence
+
+KEPT = 200
+
+
+@dataclass(frozen=True)
+class StopResult:
+    """One press of the button on a page, and its answer.
+
+    Parameters
+    ----------
+    right : str or None
+        The page's right to stop: the page with the answer carries it on.
+    answer : StopEvidence or ApiError
+        The rig's evidence, or why the stop is not confirmed.
+    """
+
+    by: str
+    reason: str
+    at_utc: str
+    test_id: str | None
+    right: str | None
+    answer: StopEvidence | ApiError
+
+
+class StopLog:
+    """The newest answers, each under a key that nobody guesses: who pressed may have no session any more."""
+
+    def __init__(self) -> None:
+        self._told: dict[str, StopResult] = {}
+
+    def keep(self, told: StopResult) -> str:
+        """Keep an answer; its key."""
+        while len(self._told) >= KEPT:
+            self._told.pop(next(iter(self._told)))
+        key = secrets.token_urlsafe(16)
+        self._told[key] = told
+        return key
+
+    def get(self, key: str) -> StopResult:
+        """An answer by its key; 404 where it is kept no longer."""
+        told = self._told.get(key)
+        if told is None:
+            detail = (
+                "The service was restarted, or many stops came after this one. The bar above shows what the rig "
+                "does now. If it does not say that the rig has stopped, press Stop, or use the "
+                "emergency switch on the stimulator. The audit trail lists each stop."
+            )
+            raise ApiError(404, "not-found", "The result of this stop is no longer kept here", detail)
+        return told
+
 
 RIGHT_S = 24 * 3600.0
 """A page's right holds this long, which no session exceeds, and beyond that while the test that it shows is running."""

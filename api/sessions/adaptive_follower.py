@@ -1,0 +1,240 @@
+"""Follows a test that stops itself: at each boundary asks the adviser what to play, and has the rig lay it.
+
+The rig never waits. What comes too late falls away: the fixed plan's next piece plays, and the next boundary is
+decided with the longer record. Each boundary is asked about twice: early, so that there is an answer whatever happens,
+and late, with the newest samples, which then starts from the early answer's fit and is quick.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.kinds import SERVICE, Watcher
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.workers.adviser import Adviser
+from stimrig.rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
+
+log = logging.getLogger("stimrig.adaptive")
+
+EARLY_S = 0.75
+"""Before the rig decides on a boundary: the first question."""
+LATE_S = 0.35
+"""The second one, with the newest samples."""
+SEND_S = 0.06
+"""The early answer is sent if the late one is not there."""
+LEAST_S = 2.05
+"""A shorter record tells nothing."""
+SHORTEST_PIECE_S = 1.0
+"""Of the pieces that are chosen."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the adviser says, when its newest sample was heard (monotonic, s), and the line that is kept of it."""
+
+    said: dict[str, Any]
+    heard_s: float
+    row: dict[str, Any]
+
+
+@dataclass
+class Turn:
+    """One boundary: what is asked, and what came of it."""
+
+    laid: int
+    asked: int = 0
+    """1: with early samples; 2: with the newest ones."""
+    answer: Answer | None = None
+    sent: bool = False
+
+
+@dataclass
+class Told:
+    """What is known of the test, for pages and for its document."""
+
+    target: dict[str, float]
+    reach: dict[str, Any] | None
+    state: str = "choosing"
+    """choosing; fixed: the fixed plan plays on, `problem` says why; ending."""
+    words: str = ""
+    problem: str = ""
+    knowledge: dict[str, Any] | None = None
+    least_known: dict[str, Any] | None = None
+    ended: str = ""
+    decisions: list[dict[str, Any]] = field(default_factory=list)
+
+
+class Follower(Watcher):
+    """One test from its first sample to its end.
+
+    Parameters
+    ----------
+    plan : TestPlan
+        Each of its segments holds its widths.
+    how : dict
+        For the adviser: target, bounds, largest width, pulse rate, the participant's models.
+    reach : dict
+        What was said of the target before the test.
+    """
+
+    watches, left = "choosing", "fixed"
+    log = log
+
+    def __init__(
+        self, plan: TestPlan, how: dict[str, Any], reach: dict[str, Any], rig: RigClient, adviser: Adviser,
+        clock: Clock, tell: Callable[[], None],
+    ) -> None:  # fmt: skip
+        super().__init__(plan, Told(how["target"], reach), rig, clock, tell)
+        self.how, self.adviser = how, adviser
+        self.key = secrets.token_urlsafe(24)
+        self._fixed = [segment.settings["pulse_width_us"] for segment in plan.segments or []]
+        self._added: list[list[float]] = []
+        self._new: dict[str, list[Any]] = {"host_time_s": [], "counter": [], "torque_nm": []}
+        self._newest: LiveEvent | None = None
+        self._heard_s = 0.0
+        self._took_s = 0.0
+        self._turn = Turn(-1)
+        self._asking: asyncio.Task[None] | None = None
+
+    async def _listen(self, path: Path | None) -> None:
+        self._asking = self.begin(self._begin())
+        await super()._listen(path)
+
+    async def _begin(self) -> None:
+        await self.adviser.ask("adaptive_begin", **self.how)
+
+    def problem(self, why: str) -> str:
+        """As `Watcher`."""
+        return f"The fixed plan plays on: {why}"
+
+    def document(self) -> dict[str, Any]:
+        """As `Watcher`."""
+        bounds = self.plan.adaptive
+        assert bounds is not None
+        limits = {"max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms}
+        measured_nm_s = 0.0 if self._newest is None else self._newest.torque_time_nms
+        return {**limits, "torque_time_nm_s": measured_nm_s, **asdict(self.told)}
+
+    # ---- what the rig says ----------------------------------------------------------------------------------
+
+    def hear(self, event: LiveEvent) -> None:
+        """As `Watcher`."""
+        self._newest, self._heard_s = event, self.clock.monotonic_s()
+        if event.samples is not None:
+            for name, values in self._new.items():
+                values.extend(getattr(event.samples, name))
+        if event.laid != self._turn.laid:
+            self._turn = Turn(event.laid)
+        if event.ended_by or self.told.state != "choosing":
+            return
+        left_s = self._left_s(event.elapsed_s)
+        idle = self._asking is None or self._asking.done()
+        turn = self._turn
+        early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
+        if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
+            turn.asked = 2 if left_s <= LATE_S else 1
+            self._asking = self.begin(self._ask(turn, event))
+        elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
+            self.begin(self._carry_out(turn, turn.answer))
+
+    def _left_s(self, now_s: float) -> float:
+        """From a time on the test's clock until the rig decides what follows what is laid, s."""
+        assert self._newest is not None
+        return self._newest.boundary_s - AHEAD / self.plan.pulse_rate_hz - now_s
+
+    def _now_s(self) -> float:
+        """The time on the test's clock."""
+        assert self._newest is not None
+        return self._newest.elapsed_s + self.clock.monotonic_s() - self._heard_s
+
+    # ---- deciding ------------------------------------------------------------------------------------------
+
+    async def _ask(self, turn: Turn, event: LiveEvent) -> None:
+        heard_s = self._heard_s
+        news, self._new = self._new, {name: [] for name in self._new}
+        widths, segments = self._laid(event)
+        said = await self.adviser.ask(
+            "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
+            late=[(pulse.index, pulse.by_s) for pulse in event.late],
+            torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
+        )  # fmt: skip
+        self._took_s = self.clock.monotonic_s() - heard_s
+        answer = self._take(said, event, heard_s)
+        if turn is not self._turn or turn.sent:
+            answer.row["late"] = True
+            return
+        turn.answer = answer
+        if turn.asked == 2 or self._left_s(self._now_s()) <= SEND_S:
+            await self._carry_out(turn, answer)
+
+    def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
+        told, known = self.told, said["knowledge"]
+        fits = said["kind"] != "misfit"  # else that is told as the problem, and its bands mean nothing
+        if fits:
+            told.words = said["words"]
+        row = {
+            "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
+            "segments": [segment["name"] for segment in said["segments"]],
+            "expected_torque_time_nm_s": said["expected_torque_time_nm_s"],
+            "answer_ms": round(1e3 * self._took_s, 1),
+        }  # fmt: skip
+        if known is not None:
+            if fits:
+                told.knowledge, told.least_known = known, said["least_known"]
+            row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
+        told.decisions.append(row)
+        self.tell()
+        return Answer(said, heard_s, row)
+
+    async def _carry_out(self, turn: Turn, answer: Answer) -> None:
+        turn.sent = True
+        kind, test_id = answer.said["kind"], self.plan.test_id
+        if kind == "misfit":
+            self.give_up(answer.said["words"])
+            return
+        chosen = [SegmentPlan(**segment) for segment in answer.said["segments"]]
+        ended = {"enough": "known-enough", "spent": self._spent()}.get(kind, "")
+        request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.laid, segments=chosen)
+        if ended:
+            request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
+        self._added += (widths := [segment.settings["pulse_width_us"] for segment in chosen])
+        try:
+            await self.rig.ask(request)
+        except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, and then it is asked again
+            if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
+                raise
+            del self._added[len(self._added) - len(widths) :]
+            answer.row["refused"] = error.detail
+            log.info("not laid: %s", error.detail, extra={"test_id": test_id})
+            return
+        answer.row["sample_to_plan_ms"] = round(1e3 * (self.clock.monotonic_s() - answer.heard_s), 1)
+        if ended:
+            self.told.state, self.told.ended = "ending", self.told.ended or ended
+        self.tell()
+
+    def _spent(self) -> str:
+        """Which bound leaves no room for another piece."""
+        assert self._newest is not None and self.plan.adaptive is not None
+        left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
+        return "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"
+
+    def _laid(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
+        """Width of each pulse that is laid, and the segments."""
+        rate_hz = self.plan.pulse_rate_hz
+        sources = {"plan": iter(self._fixed), "extension": iter(self._added), "end": iter(())}
+        widths: list[float] = []
+        segments = []
+        for segment in event.laid_segments:
+            count = round(segment.end_s * rate_hz) - len(widths)
+            own = next(sources[segment.by], [])
+            segments.append((segment.name, len(widths), len(widths) + count))
+            widths += [*own, *[0.0] * count][:count]
+        return widths, segments

@@ -1,0 +1,312 @@
+"""Kinds of tests: how each is planned, watched while it plays, and told after it. One lifecycle serves them all."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.models.registry import Versions
+from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.rig_client import RigClient, samples_of
+from stimrig.api.store.tables import Test
+from stimrig.rig.messages import AnglePlan, FinishedEvent, LiveEvent, TestPlan
+
+SERVICE = "stimrig"
+"""Who says enough where the service does."""
+AT_STOPPING_TORQUE_S = 12.0
+"""The largest torque-time, where nobody says: so many seconds at the torque that stops the test."""
+Tell = Callable[[dict[str, Any]], None]
+
+
+class Tasks:
+    """Work in the background; an error in it is logged."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._running: set[asyncio.Task[None]] = set()
+
+    def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Do it beside what waits."""
+        task = asyncio.create_task(work)
+        self._running.add(task)
+        task.add_done_callback(self._ended)
+        return task
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._running.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log = self._log
+            log.error("what went on in the background has failed", exc_info=error)
+
+    async def close(self) -> None:
+        """End all of it."""
+        running = list(self._running)
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan, and what else is known of it before it is played.
+
+    Parameters
+    ----------
+    kept : dict
+        What is kept beside the plan; nothing of a plain test.
+    how : dict or None
+        Of an adaptive test: what the adviser is asked with.
+    """
+
+    plan: TestPlan
+    kept: dict[str, Any] = field(default_factory=dict)
+    how: dict[str, Any] | None = None
+
+
+class Kind:
+    """A plain test: it plays its plan, and gives a model. Other kinds are what differs from that."""
+
+    names: tuple[str, ...] = ()
+    """As requests call them."""
+    part = ""
+    """What a test's document, its summary and the live messages call what is told of this kind alone."""
+    fitted = True
+    """Whether a test gives a model by itself."""
+
+    def __init__(self, rig: RigClient) -> None:
+        self.rig = rig
+
+    async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:  # noqa: ARG002
+        """The plan to play; with an angle, one that the joint's angle may stop, too.
+
+        Raises
+        ------
+        ApiError
+            409: the rig has no angle sensor; 422: the participant has no range of angles; what the kind or rig refuses.
+        """
+        if body.angle is not None:
+            watched = AnglePlan(range_rad=self.range_of(plan), still_s=body.angle.still_s)
+            plan = plan.model_copy(update={"angle": watched})
+        return Planned(plan)
+
+    def range_of(self, plan: TestPlan) -> tuple[float, float]:
+        """The participant's range of angles, where the rig can watch it."""
+        status = self.rig.status
+        if status is not None and not status.angle.present:
+            raise no_sensor()
+        range_rad = plan.profile.angle_range_rad
+        if range_rad is None:
+            detail = f"Set the angles that are comfortable for {plan.participant}: angle_range_rad of its profile."
+            raise ApiError(422, "no-angle-range", "The participant has no range of angles", detail)
+        return range_rad
+
+    def kept(self, body: TestIn, pulses: int) -> dict[str, Any]:  # noqa: ARG002
+        """What more is kept of a test with so many pulses. Raises ApiError (422) where both do not go together."""
+        return {}
+
+    def begin(self, planned: Planned) -> str:  # noqa: ARG002
+        """Watch a test that is about to start; the key with which it is started: empty where there is nothing to."""
+        return ""
+
+    def said_enough(self, test_id: str) -> None:
+        """A person has ended it well."""
+
+    def leave(self) -> None:
+        """Watch no test any more."""
+
+    async def close(self) -> None:
+        """Let everything go."""
+
+    def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:  # noqa: ARG002
+        """What is kept of a test that has ended, by the name it has in the summary."""
+        return {}
+
+    def fit_options(self, row: Test) -> dict[str, Any]:  # noqa: ARG002
+        """How the recording is fitted."""
+        return {}
+
+    def document(self, row: Test) -> dict[str, Any] | None:  # noqa: ARG002
+        """How a test of this kind stands or what became of it."""
+        return None
+
+
+class Kinds:
+    """All of them, by the name of a test's kind."""
+
+    def __init__(self, plain: Kind, *others: Kind) -> None:
+        self.all = (plain, *others)
+        self._by_name = {name: kind for kind in others for name in kind.names}
+        self.parts = [kind.part for kind in others if kind.part]
+
+    def __getitem__(self, name: str) -> Kind:
+        return self._by_name.get(name, self.all[0])
+
+    def documents(self, row: Test) -> dict[str, Any]:
+        """What is told of each kind alone; null for the kinds that a test is none of."""
+        kind = self[row.kind]
+        return dict.fromkeys(self.parts) | ({kind.part: kind.document(row)} if kind.part else {})
+
+
+class Watcher:
+    """A test from its first sample to its end. Whatever goes wrong in watching leaves it to its plan, told.
+
+    Parameters
+    ----------
+    plan : TestPlan
+        As the rig plays it.
+    told : object
+        What is known of the test, for pages and its document; has `state`, `problem` and `ended`.
+    tell : callable
+        Called whenever there is something new for pages.
+    """
+
+    watches, left = "watching", "alone"
+    """States: while all goes well, and after it did not."""
+    log = logging.getLogger("stimrig.sessions")
+
+    def __init__(self, plan: TestPlan, told: Any, rig: RigClient, clock: Clock, tell: Callable[[], None]) -> None:
+        self.plan, self.told, self.rig, self.clock, self.tell = plan, told, rig, clock, tell
+        self._tasks = Tasks(self.log)
+
+    async def run(self, path: Path | None) -> None:
+        """Watch it to its end."""
+        try:
+            await self._guarded(self._listen(path))
+        finally:
+            await self._tasks.close()
+
+    async def _listen(self, path: Path | None) -> None:
+        async with contextlib.aclosing(samples_of(path, self.plan.test_id)) as events:
+            async for event in events:
+                self.hear(event)
+
+    def hear(self, event: LiveEvent) -> None:
+        """Take the samples since the last event."""
+        raise NotImplementedError
+
+    def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Do it beside the samples, of which none may be missed."""
+        return self._tasks.begin(self._guarded(work))
+
+    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await work
+        except ApiError as error:
+            self.give_up(f"{error.title}. {error.detail}")
+        except Exception as error:
+            log = self.log
+            log.exception("a test is not watched any more")
+            self.give_up(f"{type(error).__name__}.")
+
+    def give_up(self, why: str) -> None:
+        """Watch no more."""
+        if self.told.state == self.watches:
+            self.told.state, self.told.problem = self.left, self.problem(why)
+            self.log.warning("%s", self.told.problem, extra={"test_id": self.plan.test_id})
+            self.tell()
+
+    def problem(self, why: str) -> str:
+        """What is told where it is watched no more."""
+        raise NotImplementedError
+
+    def document(self) -> dict[str, Any]:
+        """As clients see it."""
+        raise NotImplementedError
+
+
+class Watched(Kind):
+    """A kind whose running test this service watches, sample by sample; at most one runs.
+
+    Parameters
+    ----------
+    tell : callable
+        Called with a message for the live channel.
+    """
+
+    ends: ClassVar[Mapping[str, str]] = {}
+    """Why a test ended, by the rig's reason, where it is told by another name."""
+
+    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, tell: Tell) -> None:
+        super().__init__(rig)
+        self.clock, self.versions, self.tell = clock, versions, tell
+        self.watcher: Watcher | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def watch(self, watcher: Watcher) -> None:
+        """Watch this test from now on."""
+        self.leave()
+        self.watcher, self._task = watcher, asyncio.create_task(watcher.run(self.rig.path))
+
+    @property
+    def watching(self) -> bool:
+        """Whether a test is being watched."""
+        return self._task is not None and not self._task.done()
+
+    def tell_now(self) -> None:
+        """Tell pages how it stands."""
+        if self.watcher is not None:
+            self.tell({"type": self.part, "test_id": self.watcher.plan.test_id, **self.watcher.document()})
+
+    def _watcher_of(self, test_id: str) -> Watcher | None:
+        return self.watcher if self.watcher is not None and self.watcher.plan.test_id == test_id else None
+
+    def said_enough(self, test_id: str) -> None:
+        """As `Kind`."""
+        if (watcher := self._watcher_of(test_id)) is not None:
+            watcher.told.state, watcher.told.ended = "ending", watcher.told.ended or "enough"
+            self.tell_now()
+
+    def leave(self) -> None:
+        """As `Kind`."""
+        if self._task is not None:
+            self._task.cancel()
+        self._task, self.watcher = None, None
+
+    async def close(self) -> None:
+        """As `Kind`."""
+        task = self._task
+        self.leave()
+        if task is not None:
+            await asyncio.gather(task, return_exceptions=True)
+
+    def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
+        """As `Kind`."""
+        rigs, told = str(event.summary.get("ended_by") or event.outcome), self._told(row)
+        ended = told["ended"] if rigs == "enough" and told["ended"] else self.ends.get(rigs, rigs)
+        ended = self.end_of(row, event, rigs, told) or ended
+        measured = event.summary.get("torque_time_nms", told["torque_time_nm_s"])
+        return {self.part: {**told, "torque_time_nm_s": measured, "state": "ended", "ended": ended}}
+
+    def end_of(self, row: Test, event: FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
+        """Why it ended, where more than the rig's reason says it."""
+        return ""
+
+    def document(self, row: Test) -> dict[str, Any] | None:
+        """As `Kind`."""
+        return row.summary.get(self.part) or self._told(row)
+
+    def _told(self, row: Test) -> dict[str, Any]:
+        watcher = self._watcher_of(row.id)
+        return watcher.document() if watcher is not None else self.unwatched(row)
+
+    def unwatched(self, row: Test) -> dict[str, Any]:
+        """Of a test that this service does not watch: it never began, or the service was restarted meanwhile."""
+        raise NotImplementedError
+
+
+def begun(row: Test) -> bool:
+    """Whether a test was ever played."""
+    return row.state not in ("requested", "refused")
+
+
+def no_sensor() -> ApiError:
+    """409: the rig sees no angle."""
+    detail = "This rig has no angle sensor. The rig file names one under [angle_sensor]."
+    return ApiError(409, "no-angle-sensor", "There is no angle sensor", detail)

@@ -1,0 +1,192 @@
+"""The one test that this service has the rig play: who answers for it, and whether it may still be played."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.people import names
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.sessions.trials import SEQUENCE
+from stimrig.api.store import Store, seen
+from stimrig.api.store.tables import AuditEntry, Participant, Token
+from stimrig.rig.messages import StopRequest, WithdrawRequest
+
+log = logging.getLogger("stimrig.trials")
+ENDING_S = 2.0
+"""So long a start waits for a test whose end has been heard."""
+LOOK_AGAIN_S = 0.25
+"""How often it is looked whether a test may still be played: another service's changes are seen so late at most."""
+
+
+@dataclass
+class Current:
+    """The test the rig is busy with, or that is being identified."""
+
+    test_id: str
+    participant: str
+    by: str
+    kind: str = ""
+    """Of the test."""
+    started: bool = False
+    """The rig has said that it plays."""
+    ending: bool = False
+    """Its end has been heard."""
+    tokens: list[str] = field(default_factory=list)
+    """Hashes of the tokens by whose right it is played."""
+    until_utc: str | None = None
+    """When that right ends by itself: a controller's key with its day, or with its maker's token."""
+    since: seen.Seen | None = None
+    """The trail's place at its intent, or at the last change that was found; None: not written yet."""
+    over: bool = False
+    """That end was told to the rig."""
+    overtaken: list[AuditEntry] = field(default_factory=list)
+    """Changes that have withdrawn it."""
+    looking: asyncio.Lock = field(default_factory=asyncio.Lock)
+    missed: int = 0
+    """How often in a row the rig, asked for its state, did not name it."""
+    let_go: asyncio.Event = field(default_factory=asyncio.Event)
+    """The rig is free of it."""
+
+    @property
+    def rests_on(self) -> tuple[seen.About, ...]:
+        """Entries of the audit trail, since its intent, with which it would not have been begun."""
+        return (*rests_of(self.participant, self.kind), seen.revoked(*self.tokens))
+
+    @property
+    def holder(self) -> dict[str, str]:
+        """Who holds the rig, as problems and the rig's document tell it."""
+        return {"test_id": self.test_id, "participant": self.participant, "by": self.by}
+
+
+class Playing:
+    """That test, if there is one."""
+
+    def __init__(self, store: Store, clock: Clock, rig: RigClient) -> None:
+        self.store, self.clock, self.rig = store, clock, rig
+        self.current: Current | None = None
+
+    def plays(self, test_id: str | None) -> bool:
+        """Whether the rig plays this test now."""
+        current = self.current
+        return current is not None and current.test_id == test_id and current.started and not current.ending
+
+    def refuse_second(self) -> None:
+        """409 while a test runs, its holder named."""
+        if self.current is not None:
+            raise busy(self.current)
+
+    async def let_end(self) -> None:
+        """A test is seen to be done a moment before the rig is let go: who starts the next one then is not refused."""
+        if self.current is not None and self.current.ending:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self.current.let_go.wait(), ENDING_S)
+
+    def overtaking(self, current: Current) -> list[AuditEntry]:
+        """What was changed since its intent was written, with which it would not have been begun."""
+        with self.store.read() as session:
+            if current.since is None and current.started:  # it plays although this service was restarted
+                current.since = seen.newest(session, "", seen.of(current.test_id, "start test"))
+                current.until_utc = self.until_utc(current.tokens)
+            return [] if current.since is None else seen.since(session, current.since, *current.rests_on)
+
+    async def look_again(self) -> None:
+        """Withdraw the test if what it rests on was changed: called before each change is answered.
+
+        A test that has not begun plays no pulse; a controller's trial whose right has ended ends at once. Where the rig
+        does not take that, it is stopped, and asked again.
+        """
+        current = self.current
+        if current is None:
+            return
+        async with current.looking:
+            over = self.is_over(current) and not current.over  # known here, also where the store cannot be read
+            changed = [] if over else await asyncio.to_thread(self.overtaking, current)
+            if not changed and not over:
+                return
+            current.overtaken = changed or current.overtaken
+            begun = over or (current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed))
+            what = changed[-1].action if changed else "its right ended"
+            reason = f"{what}, after this test was asked for"
+            try:
+                await self.rig.ask(WithdrawRequest(test_id=current.test_id, reason=reason, begun=begun))
+            except ApiError as error:
+                log.error("%s could not be withdrawn: %s", current.test_id, error)
+                await self.stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
+            else:
+                current.since = seen.at(changed[-1], "") if changed else current.since
+                current.over |= over
+
+    async def look_again_and_again(self, current: Current) -> None:
+        """Other services change things, too."""
+        while self.current is current and not current.ending:
+            await asyncio.sleep(LOOK_AGAIN_S)
+            try:
+                await self.look_again()
+            except Exception:
+                log.exception("whether %s may still be played could not be seen", current.test_id)
+
+    async def stop_quietly(self, reason: str) -> None:
+        """Stop the rig; whether it could is only noted."""
+        try:
+            await self.rig.request(StopRequest(reason=reason, by="service"))
+        except ApiError as error:
+            log.warning("stop after a failed start: %s", error)
+
+    def is_over(self, current: Current) -> bool:
+        """Whether the right to it has ended by itself."""
+        return current.until_utc is not None and current.until_utc <= self.clock.utc()
+
+    def until_utc(self, tokens: list[str]) -> str | None:
+        """When the key ends by whose right a test is played, with its maker's; a person's may end before the test."""
+        rows = [row for token in tokens if (row := self.store.get(Token, token)) is not None]
+        by_key = any(row.participant for row in rows)
+        return min((row.expires_utc for row in rows if by_key and row.expires_utc), default=None)
+
+    def tokens_of(self, holder: str) -> list[str]:
+        """Hashes of the tokens by whose right a test is played: the asker's, and that of who made a key."""
+        row: Token | None = self.store.get(Token, holder) if holder else None
+        return [token for token in (holder, row.made_by if row else None) if token]
+
+
+def rests_of(participant: str, kind: str) -> tuple[seen.About, ...]:
+    """What must have been seen of a test: the participant, and of a controller's trial the decisions on models."""
+    models = (seen.decisions(participant),) if kind == SEQUENCE else ()
+    return (seen.participant(participant), *models)
+
+
+def other_than(asker: str, ran_by: str | None) -> str | None:
+    """Who ran a test, where that was not who asked for it."""
+    return ran_by if ran_by and names.folded(ran_by) != names.folded(asker) else None
+
+
+def refuse_archived(participant: Participant) -> None:
+    """409: nothing is begun with a participant in the archive."""
+    if participant.archived_utc is not None:
+        detail = (
+            f"{participant.code} is in the archive. Take it out first: on its page, or by "
+            f"POST /v1/participants/{participant.code}/unarchive. Nothing was started."
+        )
+        raise ApiError(409, "archived", "This participant is archived", detail)
+
+
+def right_ended() -> ApiError:
+    """409: by whose right it was asked for may do so no more."""
+    detail = (
+        "A controller's key ends with its day or its maker's token, and a right when it is revoked. Nothing was sent."
+    )
+    return ApiError(409, "changed-meanwhile", "The right to this test has ended", detail)
+
+
+def busy(current: Current) -> ApiError:
+    """409, naming the holder."""
+    who = current.by
+    detail = (
+        f"{current.test_id} for participant {current.participant}, started by {who}, uses the rig. "
+        "Wait for its end, or stop it."
+    )
+    return ApiError(409, "rig-busy", "Another test is running", detail, holder=current.holder)
