@@ -10,7 +10,6 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api import decisions
 from stimrig.api.client.errors import Conflict
 from stimrig.api.client.rest import Client
 from stimrig.api.clock import Clock
@@ -18,6 +17,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import Scope
 from stimrig.api.store import audit
 from stimrig.api.store.tables import Token
+from stimrig.api.web import guards
 from stimrig.rig import messages as m
 from stimrig.rig.messages import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
@@ -401,7 +401,7 @@ def test_what_was_seen_before_midnight_is_not_decided_after_it(
         asked.append(given)
         return tag.split(".")[2] if len(asked) == 1 else "2999-01-01"
 
-    monkeypatch.setattr(decisions, "local_day", ends)
+    monkeypatch.setattr(guards, "local_day", ends)
     refused = client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": tag})
     assert refused.status_code == 409 and "Approvals and calibrations end" in refused.json()["detail"]
     assert len(asked) > 1
