@@ -159,7 +159,7 @@ def served(emulate: str = "", tree: str = "") -> Iterator[str]:
         command = [
             sys.executable,
             "-m",
-            "stimrig.api.cli",
+            "stimrig",
             "serve",
             "--port",
             "0",

@@ -295,7 +295,7 @@ def speed() -> list[str]:
             writer = csv.writer(file)
             writer.writerow(["time_s", "pulse_width_us", "torque_nm", "segment"])
             writer.writerows(list(zip(*columns, strict=True))[:70_000])
-        command = [sys.executable, "-c", "from api.cli.main import main; main()", "fit", str(path), "--json"]
+        command = [sys.executable, "-c", "from stimrig.api.cli.main import main; main()", "fit", str(path), "--json"]
         times = []
         for _ in range(5):
             begin = time.perf_counter()

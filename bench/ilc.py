@@ -104,7 +104,7 @@ def ramp_deconvolution(service: ilc.Service, test: dict[str, Any]) -> dict[str, 
         command = [
             sys.executable,
             "-m",
-            "stimrig.api.cli",
+            "stimrig",
             "fit",
             str(data),
             "--method",

@@ -8,7 +8,7 @@ early. This fit cannot see the shortest delay of the transport itself, which sta
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,40 @@ def counted_rate_hz(samples: NDArray[Any]) -> float:
     return round(counted / max(float(last["host_time_s"] - first["host_time_s"]), 1e-9), 3)
 
 
+class Fit(NamedTuple):
+    """The line from the cell's clock to the test's, the points that it leads through, and the line below all of them.
+
+    `sure` says whether the edges certainly belong to their pulses.
+    """
+
+    line: Line
+    cell_s: Array
+    host_s: Array
+    envelope: Line
+    method: Method
+    sure: bool
+
+
+def fit(
+    cell_s: Array,
+    host_s: Array,
+    sync: NDArray[np.uint8],
+    written_s: Array,
+    sample_rate_hz: float,
+    until_s: float = np.inf,
+) -> Fit:
+    """See `align`; of edges and pulses only those before `until_s` are compared."""
+    points = earliest(cell_s, host_s)
+    envelope = line_below(*points)
+    edge_s = rising_edges(cell_s, sync, sample_rate_hz)
+    if until_s < np.inf:
+        edge_s, written_s = edge_s[envelope.at(edge_s) < until_s], written_s[written_s < until_s]
+    pairs = paired(edge_s, written_s, envelope)
+    if pairs is None or len(pairs[0]) < MIN_EDGES:
+        return Fit(envelope, *points, envelope, "regression", True)
+    return Fit(robust_line(*pairs[:2]), *pairs[:2], envelope, "sync", pairs[2])
+
+
 def align(
     cell_s: Array, host_s: Array, sync: NDArray[np.uint8], written_s: Array, sample_rate_hz: float
 ) -> tuple[Array, Alignment]:
@@ -103,24 +137,19 @@ def align(
     """
     if len(cell_s) < 2:
         return host_s.copy(), Alignment("regression", float("nan"), 0.0, 0.0)
-    envelope = lower_envelope(cell_s, host_s)
-    pairs = paired(rising_edges(cell_s, sync, sample_rate_hz), written_s, envelope)
-    if pairs is not None and len(pairs[0]) >= MIN_EDGES:
-        *pairs, sure = pairs
-        line, method = robust_line(*pairs), "sync"
-        misfit_s = misfit(line, *pairs)
-        coarse_s = 0.0 if sure else misfit(envelope, *earliest(cell_s, host_s))
+    found = fit(cell_s, host_s, sync, written_s, sample_rate_hz)
+    line, error_s = found.line, found.line.error_s
+    misfit_s = misfit(line, found.cell_s, found.host_s)
+    if found.method == "sync":
+        coarse_s = 0.0 if found.sure else misfit(found.envelope, *earliest(cell_s, host_s))
         if coarse_s > COARSE_MISFIT_S:  # then edges may have been matched to the wrong pulses
             misfit_s = max(misfit_s, coarse_s)
         # Pulses are often synchronous with the samples, so a pulse's position in its sample does not average out.
-        error_s = float(np.hypot(line.error_s, 1 / sample_rate_hz / np.sqrt(12)))
-        error_s = float(np.hypot(error_s, misfit_s))
-    else:
-        line, method = envelope, "regression"
-        error_s = float(np.hypot(envelope.error_s, misfit(envelope, *earliest(cell_s, host_s))))
+        error_s = float(np.hypot(error_s, 1 / sample_rate_hz / np.sqrt(12)))
+    error_s = float(np.hypot(error_s, misfit_s))
     time_s = line.at(cell_s)
     delay_ms = float(np.median(host_s - time_s)) * 1e3
-    return time_s, Alignment(method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
+    return time_s, Alignment(found.method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
 
 
 def robust_line(cell_s: Array, host_s: Array) -> Line:
@@ -162,11 +191,6 @@ def misfit(line: Line, cell_s: Array, host_s: Array) -> float:
     scatter_s = 1.4826 * float(np.median([np.median(np.abs(part - np.median(part))) for part in parts]))
     by_chance_s = 3.0 * MEDIAN_EFFICIENCY * scatter_s / np.sqrt(min(len(part) for part in parts))
     return max(0.0, worst_s - by_chance_s)
-
-
-def lower_envelope(cell_s: Array, host_s: Array) -> Line:
-    """A line under the receive times: through the earliest sample of each of many windows."""
-    return line_below(*earliest(cell_s, host_s))
 
 
 def line_below(cell_s: Array, host_s: Array) -> Line:

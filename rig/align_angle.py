@@ -149,8 +149,9 @@ def _fitted(sensor_s: Array, time_s: Array, period_s: float) -> Line:
 
 def _by_arrival(host_s: Array, sensor_s: Array) -> tuple[Line, float, Method]:
     """Below the times of arrival, as `stimrig.rig.align` does without a sync line."""
-    line = align.lower_envelope(sensor_s, host_s)
-    error_s = align.misfit(line, *align.earliest(sensor_s, host_s))
+    points = align.earliest(sensor_s, host_s)
+    line = align.line_below(*points)
+    error_s = align.misfit(line, *points)
     return line, float(np.hypot(line.error_s, error_s)), "regression"
 
 

@@ -22,7 +22,7 @@ PR_SET_PDEATHSIG = 1
 def main() -> int:
     """Answer requests until standard input ends."""
     _modest()
-    from stimrig.rig.control.building import serve  # after the limits are set: importing numpy takes time
+    from stimrig.rig.control.replies import serve  # after the limits are set: importing numpy takes time
 
     serve(sys.stdin.buffer, sys.stdout.buffer)
     return 0

@@ -214,24 +214,32 @@ def parse(path: Path, data: bytes) -> JournalContents:
     RecordingError
         Not a journal.
     """
-    blocks: list[tuple[Kind, bytes]] = []
-    at, missing, expected = len(MAGIC), 0, 0
-    damaged = sum(a != b for a, b in zip(data[:at], MAGIC, strict=False)) if len(data) > at else 0
-    while at < len(data):
-        block = block_at(data, at)
-        if block is None:
-            found = data.find(MARK, at + 1)
-            following = found if found >= 0 else len(data)
-            damaged += following - at
-            at = following
-            continue
-        kind, number, payload, at = block
+    start = len(MAGIC)
+    damaged = sum(a != b for a, b in zip(data[:start], MAGIC, strict=False)) if len(data) > start else 0
+    found, end, between = whole_blocks(data, start)
+    if not found and not data.startswith(MAGIC):
+        raise RecordingError(f"journal {path}: is not a journal, or its start was overwritten")
+    missing, expected = 0, 0
+    for _, number, _ in found:
         missing += (number - expected) & 0xFFFF
         expected = number + 1
-        blocks.append((kind, payload))
-    if not blocks and not data.startswith(MAGIC):
-        raise RecordingError(f"journal {path}: is not a journal, or its start was overwritten")
-    return JournalContents(path, blocks, damaged, missing)
+    damaged += between + max(0, len(data) - end)
+    return JournalContents(path, [(kind, payload) for kind, _, payload in found], damaged, missing)
+
+
+def whole_blocks(data: bytes, at: int) -> tuple[list[tuple[Kind, int, bytes]], int, int]:
+    """The whole blocks from a place on: kind, number and payload of each; the end of the last; bytes between them."""
+    found, end, damaged = [], at, 0
+    while 0 <= at < len(data):
+        block = block_at(data, at)
+        if block is None:
+            at = data.find(MARK, at + 1)
+            continue
+        *content, after = block
+        found.append(tuple(content))
+        damaged += at - end
+        at = end = after
+    return found, end, damaged
 
 
 def block_at(data: bytes, at: int) -> tuple[Kind, int, bytes, int] | None:

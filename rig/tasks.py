@@ -2,7 +2,7 @@
 
 Everything that the rig decides happens in such tasks, one step after the other. So a step is never interrupted, and
 needs no lock. Who owns the tasks calls `run` after each thing that came (bytes, a command, a finished piece of work)
-and at the time that `run` returned: `rig.adapters.driver` in the real rig, a simulator on a virtual clock in tests.
+and at the time that `run` returned: `rig.adapters.machine` in the real rig, a simulator on a virtual clock in tests.
 
 What takes long (a disk, building a plan) is handed to the owner with `work`, which runs it elsewhere.
 """

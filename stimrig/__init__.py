@@ -18,7 +18,7 @@ from stimrig import errors
 from stimrig.identify.shown import register_plotter
 
 if TYPE_CHECKING:
-    from stimrig.api.charts.figures import plot
+    from stimrig.api.charts.plot import plot
     from stimrig.api.client.rest import Client
     from stimrig.identify import Model, Record, compare, next_experiment, predict, read
     from stimrig.identify.effects import library as effects
@@ -36,7 +36,7 @@ _PLACES = {
     "improve": ("stimrig.with_progress", "improve"),
     "next_experiment": ("stimrig.identify.diagnosis.experiment", "next_experiment"),
     "effects": ("stimrig.identify.effects", "library"),
-    "plot": ("stimrig.api.charts.figures", "plot"),
+    "plot": ("stimrig.api.charts.plot", "plot"),
     "Client": ("stimrig.api.client.rest", "Client"),
 }
 
@@ -71,7 +71,7 @@ def __dir__() -> list[str]:
 
 def _draw(result: Any, record: Any) -> Any:
     """What `model.plot(record)` calls; the plotting library is loaded by the first figure."""
-    return import_module("stimrig.api.charts.figures").plot(result, record)
+    return import_module("stimrig.api.charts.plot").plot(result, record)
 
 
 register_plotter(_draw)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from stimrig.rig.adapters.driver import PRIORITY
+from stimrig.rig.adapters.machine import PRIORITY
 from tests.harness.paced_time import CLOCK, conductor
 from tests.harness.paced_time.conductor import AHEAD_S, LATE_S, Conductor, states_of
 from tests.harness.paced_time.paced_clock import (

@@ -4,103 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from stimrig.api.charts import hover
-from stimrig.api.charts.config import said
-from stimrig.api.charts.model_charts import (
-    INK,
-    MEASURED,
-    MODEL,
-    NOISE,
-    TOOLBAR_PX,
-    axis,
-    box,
-    layout,
-    line,
-    segment_marks,
-    segment_name,
-)
-from stimrig.api.charts.palette import role
+from stimrig.api.charts import figure as fig
+from stimrig.api.charts.figure import INK, MEASURED, MODEL, TOOLBAR_PX, axis, box, line, role
+from stimrig.api.charts.model_charts import segment_marks
 from stimrig.api.language import _, localised
+from stimrig.api.models import explanation
 
 MARK, MARK_LINE, FLOOR = role("worst-band"), role("worst"), role("limit")
-
-
-def residual(
-    comparison: dict[str, Any], segments: list[dict[str, Any]], places: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """Measurement minus model over time, the noise band, the worst places marked with their numbers."""
-    series = comparison["series"]
-    time_s, band = series["time_s"], series.get("noise_band_nm") or 0.0
-    shapes, labels = segment_marks(segments)
-    shapes.append(box(time_s[0], time_s[-1], NOISE, -band, band, yref="y"))
-    for place in places:
-        shapes.append(box(place["start_s"], place["end_s"], MARK))
-        labels.append({
-            "xref": "x", "yref": "paper", "x": (place["start_s"] + place["end_s"]) / 2, "y": 0.985, "yanchor": "top",
-            "text": f"<b>{place['number']}</b>", "showarrow": False, "font": {"size": 12, "color": role("on-worst")},
-            "bgcolor": MARK_LINE, "borderpad": 3, "name": "place",
-        })  # fmt: skip
-    words = _("measured − model")
-    names = hover.segments_at(time_s, segments, segment_name)
-    data = [line(time_s, series["residual_nm"], words, INK, 0.9,
-                 **hover.says(words, hover.RESIDUAL + hover.BESIDE, names))]  # fmt: skip
-    return {
-        "data": data,
-        "layout": layout(
-            height=320, shapes=shapes, annotations=labels, showlegend=False,
-            margin={"l": 64, "r": TOOLBAR_PX, "t": 30, "b": 48},
-            xaxis=axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **hover.AT_TIME),
-            yaxis=axis(_("Measured − model (N·m)")),
-        ),
-    }  # fmt: skip
-
-
-def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, Any]:
-    """What is left without an effect, and what adding it explains of that."""
-    data = [
-        line(time_s, found["seen_nm"], _("seen: left without it"), MEASURED, 1.8,
-             **hover.says(_("seen"), hover.RESIDUAL)),
-        line(time_s, found["expected_nm"], _("expected: what it explains"), MODEL, 1.8,
-             **hover.says(_("expected"), hover.RESIDUAL)),
-    ]  # fmt: skip
-    x = axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **hover.AT_TIME)
-    margin = {"l": 56, "r": TOOLBAR_PX, "t": 30, "b": 42}
-    return {"data": data, "layout": layout(height=250, xaxis=x, yaxis=axis(_("Torque (N·m)")), margin=margin)}
-
-
 NAMED_LETTERS = 60
 """Letters of the versions' names up to which they stand below their chart on a tablet."""
-
-
-def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Error over the versions, with the noise as the line to fall to."""
-    names = [f"{number}. {said(row['label'])}" for number, row in enumerate(rows, start=1)]
-    sizes = [13 if row["current"] else 8 for row in rows]
-    noise = next((row["noise_sd_nm"] for row in reversed(rows) if row.get("noise_sd_nm")), None)
-    held = [row["held_out_rms_nm"] for row in rows]
-    data = [_fall(names, [row["rms_nm"] for row in rows], _("rows used to fit"), MEASURED, sizes, "circle")]
-    if any(value is not None for value in held):
-        data.append(_fall(names, held, _("rows not used to fit"), MODEL, sizes, "diamond"))
-    shapes, labels = [], []
-    if noise:
-        shapes.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": noise, "y1": noise,
-                       "line": {"color": FLOOR, "width": 1.6, "dash": "dash"}})  # fmt: skip
-        words = _("noise %(size)s N·m", size=localised(f"{noise:.3f}"))
-        labels.append({"xref": "paper", "x": 0, "y": noise, "text": words, "showarrow": False,
-                       "yanchor": "bottom", "xanchor": "left", "name": "noise", "font": {"color": FLOOR}})  # fmt: skip
-    x = axis("", type="category", range=[-0.4, len(rows) - 0.6])
-    if sum(map(len, names)) > NAMED_LETTERS:  # they would be cut off; the table below names each number
-        x |= {"tickvals": names, "ticktext": [f"{number}." for number in range(1, len(rows) + 1)]}
-    y = axis(_("Error, rms (N·m)"), rangemode="tozero")
-    return {"data": data, "layout": layout(height=320, shapes=shapes, annotations=labels, xaxis=x, yaxis=y)}
-
-
-def _fall(
-    names: list[str], values: list[float | None], words: str, colour: str, sizes: list[int], symbol: str
-) -> dict[str, Any]:
-    marker = {"size": sizes, "symbol": symbol, "color": colour}
-    return line(names, values, words, colour, 2.2, mode="lines+markers", marker=marker,
-                **hover.says(words, "%{y:.3f} N·m"))  # fmt: skip
 
 
 def of_why(
@@ -122,6 +34,69 @@ def of_why(
 
 def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """The worst places before a diagnosis is there."""
-    from stimrig.api.models.explanation import place
+    return [explanation.place(entry, number) for number, entry in enumerate(comparison.get("where") or [], start=1)]
 
-    return [place(entry, number) for number, entry in enumerate(comparison.get("where") or [], start=1)]
+
+def residual(
+    comparison: dict[str, Any], segments: list[dict[str, Any]], places: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Measurement minus model over time, the noise band, the worst places marked with their numbers."""
+    series = comparison["series"]
+    time_s, noise_nm = series["time_s"], series.get("noise_band_nm") or 0.0
+    shapes, labels = segment_marks(segments)
+    shapes.append(box(time_s[0], time_s[-1], fig.NOISE, -noise_nm, noise_nm, yref="y"))
+    for place in places:
+        shapes.append(box(place["start_s"], place["end_s"], MARK))
+        labels.append({
+            "xref": "x", "yref": "paper", "x": (place["start_s"] + place["end_s"]) / 2, "y": 0.985, "yanchor": "top",
+            "text": f"<b>{place['number']}</b>", "showarrow": False, "font": {"size": 12, "color": role("on-worst")},
+            "bgcolor": MARK_LINE, "borderpad": 3, "name": "place",
+        })  # fmt: skip
+    words = _("measured − model")
+    said = fig.hover(words, fig.RESIDUAL + fig.BESIDE, fig.name_segments(time_s, segments))
+    return fig.figure(
+        [line(time_s, series["residual_nm"], words, INK, 0.9, **said)],
+        height=320, shapes=shapes, annotations=labels, showlegend=False,
+        margin={"l": 64, "r": TOOLBAR_PX, "t": 30, "b": 48},
+        xaxis=axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **fig.AT_TIME),
+        yaxis=axis(_("Measured − model (N·m)")),
+    )  # fmt: skip
+
+
+def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, Any]:
+    """What is left without an effect, and what adding it explains of that."""
+    seen, expected = (fig.hover(words, fig.RESIDUAL) for words in (_("seen"), _("expected")))
+    data = [
+        line(time_s, found["seen_nm"], _("seen: left without it"), MEASURED, 1.8, **seen),
+        line(time_s, found["expected_nm"], _("expected: what it explains"), MODEL, 1.8, **expected),
+    ]
+    x = axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **fig.AT_TIME)
+    margin = {"l": 56, "r": TOOLBAR_PX, "t": 30, "b": 42}
+    return fig.figure(data, height=250, xaxis=x, yaxis=axis(_("Torque (N·m)")), margin=margin)
+
+
+def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Error over the versions, with the noise as the line to fall to."""
+    names = [f"{number}. {fig.unlinked(row['label'])}" for number, row in enumerate(rows, start=1)]
+    sizes = [13 if row["current"] else 8 for row in rows]
+    data = []
+    for key, words, colour, symbol in (
+        ("rms_nm", _("rows used to fit"), MEASURED, "circle"),
+        ("held_out_rms_nm", _("rows not used to fit"), MODEL, "diamond"),
+    ):
+        values, marker = [row[key] for row in rows], {"size": sizes, "symbol": symbol, "color": colour}
+        if key == "rms_nm" or any(value is not None for value in values):
+            said = fig.hover(words, "%{y:.3f} N·m")
+            data.append(line(names, values, words, colour, 2.2, mode="lines+markers", marker=marker, **said))
+    shapes, labels = [], []
+    if noise := next((row["noise_sd_nm"] for row in reversed(rows) if row.get("noise_sd_nm")), None):
+        shapes.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": noise, "y1": noise,
+                       "line": {"color": FLOOR, "width": 1.6, "dash": "dash"}})  # fmt: skip
+        words = _("noise %(size)s N·m", size=localised(f"{noise:.3f}"))
+        labels.append({"xref": "paper", "x": 0, "y": noise, "text": words, "showarrow": False,
+                       "yanchor": "bottom", "xanchor": "left", "name": "noise", "font": {"color": FLOOR}})  # fmt: skip
+    x = axis("", type="category", range=[-0.4, len(rows) - 0.6])
+    if sum(map(len, names)) > NAMED_LETTERS:  # they would be cut off; the table below names each number
+        x |= {"tickvals": names, "ticktext": [f"{number}." for number in range(1, len(rows) + 1)]}
+    y = axis(_("Error, rms (N·m)"), rangemode="tozero")
+    return fig.figure(data, height=320, shapes=shapes, annotations=labels, xaxis=x, yaxis=y)

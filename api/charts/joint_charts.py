@@ -11,17 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from stimrig.api.charts import hover
-from stimrig.api.charts.model_charts import axis, filled, layout, line
-from stimrig.api.charts.palette import role
+from stimrig.api.charts import figure as fig
+from stimrig.api.charts.figure import axis, filled, line, role
 from stimrig.api.language import _
 
 STILL_RAD_S, FAST_RAD_S = 0.15, 0.7
-"""The ways to move, as the coverage of the guided tests divides them (`stimrig.api.sessions.coverage`)."""
+"""The ways to move, as the coverage of the guided tests divides them (`api.sessions.coverage`)."""
 NEAR_RAD = math.radians(3) + 1e-9
 """An angle counts as seen if the joint was this near to it: the table is finer than any movement."""
-BAND = role("series-band")
-HEIGHT_PX = 430
 
 
 @dataclass(frozen=True)
@@ -34,10 +31,6 @@ class Way:
     colour: str
     width: float
 
-    def has(self, velocity_rad_s: float) -> bool:
-        """Whether a velocity is one of it."""
-        return self.low <= velocity_rad_s < self.high
-
 
 WAYS = (
     Way("still", -STILL_RAD_S, STILL_RAD_S, role("series-6"), 1.8),
@@ -48,108 +41,75 @@ WAYS = (
 )
 
 
-@dataclass(frozen=True)
-class Curve:
-    """One column of a table.
-
-    Parameters
-    ----------
-    way : Way
-        What it is a column of.
-    column : int
-        Its number.
-    seen : list of bool, one for each angle
-        Whether the joint was near the angle while it moved this way.
-    """
-
-    way: Way
-    column: int
-    seen: list[bool]
-
-    def kept(self, table: Sequence[Sequence[float]]) -> list[float]:
-        """The column of a table."""
-        return [row[self.column] for row in table]
-
-    def runs(self) -> list[tuple[int, int]]:
-        """First and last row of each stretch that was seen, of two rows at least."""
-        edges = [row for row in range(len(self.seen) + 1)
-                 if (row < len(self.seen) and self.seen[row]) != (row > 0 and self.seen[row - 1])]  # fmt: skip
-        return [(first, end - 1) for first, end in zip(edges[::2], edges[1::2], strict=True) if end - first > 1]
-
-
 def of_joint(document: dict[str, Any]) -> dict[str, Any]:
     """Both figures of a model with a moving joint; none of another one, nor where it is not known what was seen."""
     joint = document.get("joint") or {}
     if not (joint.get("seen_h") and joint.get("seen_g")):
         return {}
     return {
-        "joint_g": _figure(joint, "g", "", hover.FACTOR, _("Share of the torque (1)")),
-        "joint_h": _figure(joint, "h", "_nm", hover.TORQUE, _("Passive torque (N·m)")),
+        "joint_g": _figure(joint, "g", "", fig.FACTOR, _("Share of the torque (1)")),
+        "joint_h": _figure(joint, "h", "_nm", fig.TORQUE, _("Passive torque (N·m)")),
     }
 
 
-def curves(joint: dict[str, Any], table: str) -> list[Curve]:
-    """The columns that are drawn of `g` or `h`: for each way to move the velocity that was seen most.
+def columns(joint: dict[str, Any], table: str) -> list[tuple[Way, int, list[bool]]]:
+    """The columns that are drawn of `g` or `h`, and at which angles the joint was seen to move so.
 
-    Both tables show the same velocities. A way that was seen at no angle is left out.
+    For each way to move the velocity that was seen most: both tables show the same velocities. A way that was seen at
+    no angle is left out.
     """
-    velocity = joint["velocity_rad_s"]
+    velocity, angle_rad = joint["velocity_rad_s"], joint["angle_rad"]
     often = [sum(row[k] for name in ("seen_g", "seen_h") for row in joint[name]) for k in range(len(velocity))]
     found = []
     for way in WAYS:
-        inside = [k for k, value in enumerate(velocity) if way.has(value)]
-        if not inside:
+        inside = [k for k, value in enumerate(velocity) if way.low <= value < way.high]
+        there = [
+            angle for angle, row in zip(angle_rad, joint[f"seen_{table}"], strict=True) if sum(row[k] for k in inside)
+        ]
+        if not there:
             continue
-        column = (
-            min(inside, key=lambda k: abs(velocity[k])) if way.name == "still" else max(inside, key=often.__getitem__)
-        )
-        seen = _near(joint["angle_rad"], [sum(row[k] for k in inside) for row in joint[f"seen_{table}"]])
-        if any(seen):
-            found.append(Curve(way, column, seen))
+        still = way.name == "still"
+        column = min(inside, key=lambda k: abs(velocity[k])) if still else max(inside, key=often.__getitem__)
+        found.append((way, column, [any(abs(angle - other) <= NEAR_RAD for other in there) for angle in angle_rad]))
     return found
-
-
-def _near(angle_rad: Sequence[float], times: Sequence[int]) -> list[bool]:
-    there = [angle for angle, count in zip(angle_rad, times, strict=True) if count > 0]
-    return [any(abs(angle - other) <= NEAR_RAD for other in there) for angle in angle_rad]
 
 
 def _figure(joint: dict[str, Any], name: str, unit: str, value: str, title: str) -> dict[str, Any]:
     angle_deg = [round(math.degrees(angle), 3) for angle in joint["angle_rad"]]
-    shown = curves(joint, name)
     bands: list[dict[str, Any]] = []
     dotted: list[dict[str, Any]] = []
     lines: list[dict[str, Any]] = []
-    for curve in shown:
-        y = curve.kept(joint[name + unit])
+    for way, column, seen in columns(joint, name):
+        y = [row[column] for row in joint[name + unit]]
         halves: list[float] = []
         if f"{name}_lower{unit}" in joint:
-            lower, upper = (curve.kept(joint[f"{name}_{edge}{unit}"]) for edge in ("lower", "upper"))
-            bands += _banded(angle_deg, curve, lower, upper, first=not bands)
-            halves = [(high - low) / 2 for low, high in zip(lower, upper, strict=True)]
-        if not all(curve.seen):
-            dotted.append(line(angle_deg, y, "", curve.way.colour, 1.2, line={"dash": "dot"}, showlegend=False,
-                               **hover.QUIET))  # fmt: skip
-        words = _words(curve.way, joint["velocity_rad_s"][curve.column])
-        lines.append(line(angle_deg, [at if seen else None for at, seen in zip(y, curve.seen, strict=True)], words,
-                          curve.way.colour, curve.way.width, **hover.with_halves(words, value, halves)))  # fmt: skip
+            lower, upper = ([row[column] for row in joint[f"{name}_{edge}{unit}"]] for edge in ("lower", "upper"))
+            bands += _bands(angle_deg, seen, lower, upper, first=not bands)
+            halves = fig.halves_of(lower, upper)
+        if not all(seen):
+            dots: dict[str, Any] = {"line": {"dash": "dot"}, "showlegend": False, **fig.QUIET}
+            dotted.append(line(angle_deg, y, "", way.colour, 1.2, **dots))
+        words = _words(way, joint["velocity_rad_s"][column])
+        solid = [at if there else None for at, there in zip(y, seen, strict=True)]
+        lines.append(line(angle_deg, solid, words, way.colour, way.width, **fig.hover_halves(words, value, halves)))
     if dotted:  # an entry of the legend, without a line
-        told = line(
-            angle_deg[:1], [None], _("dotted: not seen"), role("mark"), 1.2, line={"dash": "dot"}, **hover.QUIET
-        )
-        lines.append(told)
-    x = axis(_("Joint angle (°)"), range=[angle_deg[0], angle_deg[-1]], **hover.AT_ANGLE)
-    return {"data": [*bands, *dotted, *lines], "layout": layout(height=HEIGHT_PX, xaxis=x, yaxis=axis(title))}
+        dots = {"line": {"dash": "dot"}, **fig.QUIET}
+        lines.append(line(angle_deg[:1], [None], _("dotted: not seen"), role("mark"), 1.2, **dots))
+    x = axis(_("Joint angle (°)"), range=[angle_deg[0], angle_deg[-1]], **fig.AT_ANGLE)
+    return fig.figure([*bands, *dotted, *lines], height=430, xaxis=x, yaxis=axis(title))
 
 
-def _banded(
-    angle_deg: Sequence[float], curve: Curve, lower: Sequence[float], upper: Sequence[float], first: bool
+def _bands(
+    angle_deg: Sequence[float], seen: Sequence[bool], lower: Sequence[float], upper: Sequence[float], first: bool
 ) -> list[dict[str, Any]]:
-    """The band of each stretch that was seen; the first of all is the legend's."""
+    """The band of each stretch of two angles or more that was seen; the first of all is the legend's."""
     data: list[dict[str, Any]] = []
-    for begin, last in curve.runs():
-        part = slice(begin, last + 1)
-        pair = filled(angle_deg[part], lower[part], upper[part], _("95 %% band"), BAND)
+    edges = [row for row, (one, other) in enumerate(zip([*seen, False], [False, *seen], strict=True)) if one != other]
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        if end - begin < 2:
+            continue
+        part = slice(begin, end)
+        pair = filled(angle_deg[part], lower[part], upper[part], _("95 %% band"), role("series-band"))
         if data or not first:
             pair[1] |= {"name": "", "showlegend": False}
         data += pair

@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from stimrig.api.charts.palette import painted_light, role
+from stimrig.api.charts.figure import paint_light, role
 from stimrig.api.language import localised
 
 LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 40.0, 42.0
@@ -44,7 +44,7 @@ def svg(
         f'aria-label="{escape(label)}" font-family="{FONT}" font-size="11.5">'
     )
     drawn = head + "".join(parts) + "</svg>"
-    return Markup(painted_light(drawn) if on_paper else drawn)
+    return Markup(paint_light(drawn) if on_paper else drawn)
 
 
 class Plane:

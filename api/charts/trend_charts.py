@@ -1,11 +1,11 @@
-"""Small pictures of a participant's figures over the sessions, one above another on the same time axis.
+"""Small pictures, one above another: a participant's figures over the sessions, and what a model's trials said.
 
 They are SVG in the page's own colours: a dozen of them are there at once, and they follow the dark mode by themselves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -14,9 +14,10 @@ from markupsafe import Markup, escape
 from stimrig.api import language
 from stimrig.api.charts.svg import plain, ticks
 from stimrig.api.clock import unix_of, utc_label
-from stimrig.api.language import _
+from stimrig.api.language import _, lazy
 from stimrig.api.models import trend_words
 from stimrig.api.models.changes import BEYOND
+from stimrig.api.models.tracking import Bounds
 from stimrig.api.models.trend_words import UNBROKEN, Name
 
 WIDE, TALL = 400.0, 128.0
@@ -218,3 +219,110 @@ def span(points: Sequence[Point]) -> tuple[float, float]:
     top = min(max((up for _down, up in halves), default=high), high + room)
     short = max(room - (max(top, high) - min(foot, low)), 0.0)
     return min(foot, low) - short / 2 - 0.06 * room, max(top, high) + short / 2 + 0.06 * room
+
+
+# ---- the trials of an approved model --------------------------------------------------------------------------------
+
+FOOT = 16.0
+"""For the name of the axis below its numbers."""
+MOST_LABELS = 12
+TRIAL_FIGURES: dict[str, tuple[Any, str, float]] = {
+    "gain": (lazy("Gain"), "%", 100.0),
+    "threshold_shift_us": (lazy("Threshold shift"), "µs", 1.0),
+    "time_scale": (lazy("Time scale"), "%", 100.0),
+    "error_percent": (lazy("Error against the reference"), "%", 1.0),
+}
+"""Name, unit that is shown, and the factor to it."""
+
+
+def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[dict[str, Any]]:
+    """The pictures: each `title`, `unit`, `latest` (in words), `svg`.
+
+    Parameters
+    ----------
+    trials : sequence of mapping
+        As `api.models.tracked.told` gives them, the oldest first.
+    bounds : Bounds
+        What a person allowed, drawn as lines.
+    """
+    referred = any(trial["error_percent"] is not None for trial in trials)
+    return [_trial_panel(trials, name, bounds) for name in TRIAL_FIGURES if referred or name != "error_percent"]
+
+
+def _trial_panel(trials: Sequence[Mapping[str, Any]], name: str, bounds: Bounds) -> dict[str, Any]:
+    title, unit, factor = TRIAL_FIGURES[name]
+    points = [_trial_point(trial, name) for trial in trials]
+    known = [point for point in points if point["value"] is not None]
+    lines = [factor * end for end in bounds.get(name, ())]
+    drawn = TrialPlane(points, lines, unit).svg(f"{title}, {unit}") if known else Markup("")
+    return {"title": str(title), "unit": unit, "latest": known[-1]["words"] if known else "–", "svg": drawn}
+
+
+def _trial_point(trial: Mapping[str, Any], name: str) -> Point:
+    value, half = trial_figure(trial, name)
+    words = trial_words(trial, name)
+    return {
+        "at_s": float(trial["number"]), "value": value, "half": half, "current_ma": None,
+        "approved": trial["outcome"] in ("followed", "little"), "noted": bool(trial["ask"]), "words": words,
+        "tip": "\n".join((_("Trial %(number)s", number=trial["number"]), language.clock(trial["at_utc"]), words)),
+    }  # fmt: skip
+
+
+def trial_figure(trial: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:
+    """A trial's value in the unit that is shown, and half its band; None where it is not known."""
+    if name == "error_percent":
+        return trial[name], None
+    level, factor = (trial["now"] or {}).get(name), TRIAL_FIGURES[name][2]
+    return (factor * level["value"], factor * (level["high"] - level["low"]) / 2.0) if level else (None, None)
+
+
+def trial_words(trial: Mapping[str, Any], name: str) -> str:
+    """A trial's value with its band: 92.4 ± 0.8 %."""
+    value, half = trial_figure(trial, name)
+    if value is None:
+        return "–"
+    text = f"{value:.1f}" + ("" if half is None else f" ± {half:.1f}")
+    return language.localised(text.replace("-", "−")) + UNBROKEN + TRIAL_FIGURES[name][1]
+
+
+class TrialPlane(Plane):
+    """One quantity over the numbers of the trials, with the limits that a person allowed."""
+
+    tall = TALL + FOOT
+
+    def __init__(self, points: list[Point], lines: list[float], unit: str) -> None:
+        super().__init__(points, breaks=False)
+        self.lines_at, self.unit = lines, unit
+
+    def frame(self) -> list[str]:
+        """Grid and values, the unit above them, and the limits."""
+        return [*super().frame(), f'<text class="x" x="1" y="{TOP - 2:g}">{self.unit}</text>', *self.limits()]
+
+    def limits(self) -> list[str]:
+        """The limits that lie within the picture."""
+        return [
+            f'<path class="limit" d="M{LEFT:g} {self.y(value):.1f}H{WIDE - RIGHT:g}"/>'
+            for value in self.lines_at
+            if self.low <= value <= self.high
+        ]
+
+    def dates(self) -> list[str]:
+        """The numbers of the trials."""
+        every = -(-len(self.points) // MOST_LABELS)
+        at = f'y="{TALL - 5:g}" text-anchor="middle"'
+        marks = [
+            f'<text class="x" x="{self.x(one["at_s"]):.1f}" {at}>{one["at_s"]:.0f}</text>'
+            for one in self.points[::every]
+        ]
+        middle = (LEFT + WIDE - RIGHT) / 2
+        name = escape(_("Number of the trial"))
+        return [*marks, f'<text class="x" x="{middle:g}" y="{TALL + 11:g}" text-anchor="middle">{name}</text>']
+
+    def columns(self) -> list[str]:
+        """What the pointer meets, told by the browser itself: the card is renewed while somebody points at it."""
+        half = (WIDE - LEFT - RIGHT) / (2 * max(len(self.points), 1))
+        return [
+            f'<rect class="column" x="{self.x(one["at_s"]) - half:.1f}" y="0" '
+            f'width="{2 * half:.1f}" height="{TALL - BOTTOM:g}"><title>{escape(one["tip"])}</title></rect>'
+            for one in self.points
+        ]

@@ -34,7 +34,7 @@ class EmulatedRig:
     def __init__(self, folder: Path, name: str, patient: str, code: str, centre_url: str, key: str) -> None:
         self.name, self.code, self.token = name, code, secrets.token_urlsafe(24)
         self.port = free_port()
-        command = [sys.executable, "-m", "stimrig.api.cli", "serve", "--data", str(folder), "--port", str(self.port)]
+        command = [sys.executable, "-m", "stimrig", "serve", "--data", str(folder), "--port", str(self.port)]
         log = owner_only.folder(folder) / "service.log"
         self.child = Child(name, [*command, "--emulate", f"--patient {patient}"], log, {
             "STIMRIG_CENTRE_URL": centre_url, "STIMRIG_CENTRE_KEY": key, "STIMRIG_ADMIN_TOKEN": self.token,

@@ -72,7 +72,7 @@ def check_rig_file(settings: Settings) -> Iterator[Finding]:
     if settings.rig_file is None:
         yield Finding("rig file", "ok", "none given: the emulated rig will be used")
         return
-    code = "import sys, pathlib; from rig import config; config.load(pathlib.Path(sys.argv[1]))"
+    code = "import sys, pathlib; from stimrig.rig import config; config.load(pathlib.Path(sys.argv[1]))"
     command = [sys.executable, "-c", code, str(settings.rig_file)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     if done.returncode == 0:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import pkgutil
@@ -34,6 +35,38 @@ def build(verb: str = "") -> typer.Typer:
 
     No verb waits until the libraries of all others are loaded.
     """
+    app = _empty()
+    for name in [verb] if verb in VERBS else VERBS:
+        module = importlib.import_module(f"{commands.__name__}.{name}")
+        if hasattr(module, "register"):
+            module.register(app)
+        else:
+            app.command(name)(getattr(module, name))
+    return app
+
+
+def _overview() -> typer.Typer:
+    """The command line as its help lists it: what each verb does, read from its file and not loaded."""
+    app, groups = _empty(), {}
+    for name in VERBS:
+        tree = ast.parse((Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8"))
+        does = {node.name: ast.get_docstring(node) for node in tree.body if isinstance(node, ast.FunctionDef)}
+        if name in does:
+            app.command(name, help=does[name])(_nothing)
+        else:
+            calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+            made = next(call for call in calls if ast.unparse(call.func) == "typer.Typer")
+            groups[name] = next(ast.literal_eval(word.value) for word in made.keywords if word.arg == "help")
+    for name, words in groups.items():  # verbs with verbs of their own stand behind the others
+        app.command(name, help=words)(_nothing)
+    return app
+
+
+def _nothing() -> None:
+    """Stands for a verb that is only listed."""
+
+
+def _empty() -> typer.Typer:
     app = typer.Typer(
         name="stimrig",
         help="Identify electrically stimulated muscle, see where the model fails, learn what is missing.",
@@ -44,12 +77,6 @@ def build(verb: str = "") -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_options)  # one verb alone stays a verb
-    for name in [verb] if verb in VERBS else VERBS:
-        module = importlib.import_module(f"{commands.__name__}.{name}")
-        if hasattr(module, "register"):
-            module.register(app)
-        else:
-            app.command(name)(getattr(module, name))
     return app
 
 
@@ -76,7 +103,7 @@ def run(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     verb = next((word for word in (arguments if arguments is not None else sys.argv[1:]) if word[:1] != "-"), "")
     try:
-        code = build(verb)(arguments, standalone_mode=False)
+        code = (build(verb) if verb in VERBS else _overview())(arguments, standalone_mode=False)
         sys.stdout.flush()
         return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):

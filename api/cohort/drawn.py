@@ -6,9 +6,7 @@ import math
 from datetime import UTC, datetime
 from typing import Any
 
-from stimrig.api.charts.config import said
-from stimrig.api.charts.model_charts import axis, layout
-from stimrig.api.charts.palette import role
+from stimrig.api.charts.figure import axis, layout, role, unlinked
 from stimrig.api.cohort.gathered import Gathered, wilson
 
 LEAST_CASES = 5
@@ -65,7 +63,7 @@ def errors(found: Gathered) -> Figure | None:
         "type": "bar",
         "orientation": "h",
         "x": [count for _, count in counts],
-        "y": [said(kind) for kind, _ in counts],
+        "y": [unlinked(kind) for kind, _ in counts],
         "marker": {"color": role("worst")},
         "hovertemplate": "%{y}: %{x} records<extra></extra>",
     }
@@ -93,7 +91,7 @@ def over_sessions(found: Gathered, key: tuple[str, str]) -> Figure | None:
         traces.append({
             "type": "scatter",
             "mode": "lines+markers",
-            "name": said(found.people[who]),
+            "name": unlinked(found.people[who]),
             "x": [datetime.fromtimestamp(at_s, UTC).isoformat() for at_s, _, _ in points],
             "y": [value for _, value, _ in points],
             "error_y": {"type": "data", "array": sds, "color": colour, "thickness": 1},
@@ -125,7 +123,7 @@ def title_of(key: tuple[str, str]) -> str:
 
 
 def _plain(name: str) -> str:
-    return said(name.replace("_", " "))
+    return unlinked(name.replace("_", " "))
 
 
 def _figure(data: list[dict[str, Any]], height: int, **axes: Any) -> Figure:

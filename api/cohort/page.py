@@ -7,8 +7,8 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from stimrig.api.charts.local_figure import LocalFigure
-from stimrig.api.charts.palette import in_light
+from stimrig.api.charts.figure import in_light
+from stimrig.api.charts.plot import LocalFigure
 from stimrig.api.cohort import drawn
 from stimrig.api.cohort.gathered import PROBABLE, Gathered, wilson
 

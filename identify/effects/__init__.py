@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from stimrig.identify.effects import own_file
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, form
 from stimrig.identify.effects.own_file import BadEffect
 from stimrig.identify.errors import BadRequest
 
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"
-_NOT_EFFECTS = {"base", "kernels", "own_file"}
+_NOT_EFFECTS = {"base", "own_file"}
 
 
 def _own() -> list[Effect]:
@@ -48,7 +48,8 @@ def _from_packages() -> Iterator[tuple[str, Effect]]:
     for point in entry_points(group=GROUP):
         place = f"entry point {point.name} = {point.value}"
         try:
-            effect = point.load()
+            with own_file.old_names():
+                effect = point.load()
         except Exception as error:
             raise BadEffect(own_file.in_one_line(error), place=place, fix=own_file.FIX) from error
         yield place, own_file.checked(effect, place)
@@ -89,49 +90,7 @@ def get(effect_id: str) -> Effect:
 
 def library() -> list[dict[str, Any]]:
     """The library as dicts, for `stimrig effects` and the page."""
-    return [_describe(effect) for effect in registry().values()]
+    return [effect.to_dict() for effect in registry().values()]
 
 
-def _describe(effect: Effect) -> dict[str, Any]:
-    first = effect.forms[0]
-    return {
-        "id": effect.id,
-        "name": effect.name,
-        "stage": effect.stage,
-        "part": effect.part,
-        "equation": first.equation,
-        "parameters": [_parameter(p) for p in first.parameters],
-        "forms": [
-            {
-                "name": form.name,
-                "stage": form.stage,
-                "equation": form.equation,
-                "parameters": [_parameter(p) for p in form.parameters],
-                "source": form.source or effect.source,
-            }
-            for form in effect.forms
-            if len(form.parameters) < 40
-        ],
-        "source": effect.source,
-        "signature": effect.signature,
-        "confused_with": list(effect.resembles),
-        "separated_by": effect.separated_by,
-        "plain": effect.plain,
-        "needs": list(effect.needs),
-        "predictable": effect.predictable,
-    }
-
-
-def _parameter(p: Parameter) -> dict[str, Any]:
-    return {
-        "name": p.name,
-        "unit": p.unit,
-        "range": [p.lower, p.upper],
-        "relative_to": p.relative or None,
-        "neutral": None if p.neutral in (float("inf"), float("-inf")) else p.neutral,
-        "start": list(p.start),
-        "about": p.about,
-    }
-
-
-__all__ = ["BadEffect", "Effect", "Form", "Parameter", "Scene", "get", "library", "registry"]
+__all__ = ["BadEffect", "Effect", "Form", "Parameter", "Scene", "form", "get", "library", "registry"]

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.polynomial.chebyshev import chebvander
 
 from stimrig.identify.dynamics.variable_speed import SpeedLaw
@@ -70,6 +71,18 @@ class Parameter:
             start=tuple(zero + value * unit for value in self.start),
             relative="",
         )
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the library tells it."""
+        return {
+            "name": self.name,
+            "unit": self.unit,
+            "range": [self.lower, self.upper],
+            "relative_to": self.relative or None,
+            "neutral": self.neutral if np.isfinite(self.neutral) else None,
+            "start": list(self.start),
+            "about": self.about,
+        }
 
 
 @dataclass(frozen=True)
@@ -175,7 +188,9 @@ class Scene:
         return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
 
 
-Apply = Callable[[Any, dict[str, Any], Scene], Any]
+Values = dict[str, Any]
+"""Parameters by name, each of shape (M, 1), or a number where a form is called row by row."""
+Apply = Callable[[Any, Values, Scene], Any]
 
 
 @dataclass(frozen=True)
@@ -251,6 +266,16 @@ class Form:
     fine: bool = False
     source: str = ""
     state: Callable[[np.ndarray, dict[str, Any], Scene], np.ndarray] | None = None
+
+    def to_dict(self, source: str) -> dict[str, Any]:
+        """As the library tells it; `source` is that of the effect."""
+        return {
+            "name": self.name,
+            "stage": self.stage,
+            "equation": self.equation,
+            "parameters": [p.to_dict() for p in self.parameters],
+            "source": self.source or source,
+        }
 
     def starts(self, scene: Scene) -> list[dict[str, float]]:
         """Starting values, one dict per run."""
@@ -350,3 +375,127 @@ class Effect:
             if form.name == name or not name:
                 return form
         raise KeyError(name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the library tells it; without forms of a great many parameters."""
+        first = self.forms[0]
+        return {
+            "id": self.id,
+            "name": self.name,
+            "stage": self.stage,
+            "part": self.part,
+            "equation": first.equation,
+            "parameters": [p.to_dict() for p in first.parameters],
+            "forms": [form.to_dict(self.source) for form in self.forms if len(form.parameters) < 40],
+            "source": self.source,
+            "signature": self.signature,
+            "confused_with": list(self.resembles),
+            "separated_by": self.separated_by,
+            "plain": self.plain,
+            "needs": list(self.needs),
+            "predictable": self.predictable,
+        }
+
+
+def form(stage: str, equation: str, *parameters: Parameter, name: str = "", **more: Any) -> Callable[[Apply], Form]:
+    """Decorator that makes a function of all rows at once (`batched`) a form, which is called as the function is."""
+    return lambda apply: Form(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
+
+
+def slow_gain(
+    effect: str,
+    name: str,
+    equation: str,
+    parameters: tuple[Parameter, ...],
+    factor: Callable[[Values, np.ndarray], np.ndarray],
+    *,
+    by_pulses: bool = False,
+    constant: bool = False,
+    source: str = "",
+) -> Form:
+    """A gain with a slow state (`adapt`) that fills with torque, or by pulses of any width.
+
+    Its second parameter is the time constant of filling, its third that of recovery, `recovery_s`. `factor(p, x)` is
+    the gain at a state.
+    """
+
+    def used(drive: np.ndarray, p: Values, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
+        a = np.broadcast_to(scene.on, drive.shape) if by_pulses else level
+        onset_s, recovery_s, begin = p[parameters[1].name][:, 0], p["recovery_s"][:, 0], scene.states.get(effect, 0.0)
+        return adapt(a, onset_s, recovery_s, constant, scene.step_s, scene.rest_s, begin)
+
+    return Form(
+        name,
+        "gain",
+        equation,
+        parameters,
+        lambda drive, p, scene: drive * factor(p, used(drive, p, scene)[0]),
+        batched=True,
+        source=source,
+        state=lambda drive, p, scene: used(drive, p, scene)[1],
+    )
+
+
+@njit(cache=True, nogil=True)
+def adapt(
+    drive: np.ndarray,
+    onset_s: np.ndarray,
+    recovery_s: np.ndarray,
+    constant: bool,
+    step_s: float,
+    rest_s: np.ndarray,
+    begin: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery; exact for a held drive a.
+
+    With `constant`, recovery also continues under stimulation: x' = a (1 - x)/onset - x/recovery.
+
+    `drive` is a in [0, 1], shape (M, K), `rest_s`, shape (K,), additional rest before each interval, `begin` x before
+    the first. Returns the mean of x at the start and the end of each interval, shape (M, K), and x after the last.
+    """
+    rows, size = drive.shape
+    out, last = np.empty((rows, size)), np.empty(rows)
+    for m in range(rows):
+        x = begin
+        for k in range(size):
+            if rest_s[k] > 0.0:
+                x *= np.exp(-rest_s[k] / recovery_s[m])
+            a = min(max(drive[m, k], 0.0), 1.0)
+            up = a / onset_s[m]
+            down = 1.0 / recovery_s[m] if constant else (1.0 - a) / recovery_s[m]
+            rate = up + down
+            end = x
+            if rate > 0.0:
+                goal = up / rate
+                end = goal + (x - goal) * np.exp(-rate * step_s)
+            out[m, k] = 0.5 * (x + end)
+            x = end
+        last[m] = x
+    return out, last
+
+
+@njit(cache=True, nogil=True)
+def activate(
+    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float
+) -> np.ndarray:  # pragma: no cover
+    """First-order activation with time constants for rise and fall; mean over each interval, from 0.
+
+    a' = (w - a)/τ, τ = rise if the drive is above the activation, else fall. With τ = 0, a follows w at once.
+    Shapes (M, K), (M,).
+    """
+    rows, size = drive.shape
+    out = np.empty((rows, size))
+    for m in range(rows):
+        a = 0.0
+        for k in range(size):
+            w = drive[m, k]
+            tau = rise_s[m] if w > a else fall_s[m]
+            if tau <= 0.0:
+                a = w
+                out[m, k] = w
+            else:
+                decay = np.exp(-step_s / tau)
+                out[m, k] = w + (a - w) * (1.0 - decay) * tau / step_s
+                a = w + (a - w) * decay
+    return out

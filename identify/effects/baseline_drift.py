@@ -2,41 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
-
-
-def _linear(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return p["slope_nm_per_s"] * scene.time_s
-
-
-def _warming(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return p["shift_nm"] * -np.expm1(-scene.time_s / p["time_constant_s"])
-
-
-def _bent(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    s = scene.time_s / 60.0
-    return 60.0 * p["slope_nm_per_s"] * s + p["bend_nm"] * s * s
-
-
-def _breathing(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    turn = 2 * np.pi * scene.time_s / p["period_s"]
-    return p["cos_nm"] * (np.cos(turn) - 1.0) + p["sin_nm"] * np.sin(turn)
-
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 KNOTS = 6
-
-
-def _wander(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """A natural cubic spline through evenly spaced knots, zero at the start."""
-    knots = np.linspace(0.0, 1.0, KNOTS + 1)
-    values = np.concatenate([np.zeros_like(p["knot_1_nm"]), *(p[f"knot_{i}_nm"] for i in range(1, KNOTS + 1))], axis=1)
-    place = np.clip((scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9), 0.0, 1.0)
-    return CubicSpline(knots, np.eye(KNOTS + 1), bc_type="natural")(place).dot(values.T).T
 
 
 def _shift(name: str, reach: float, about: str = "", start: float = 0.0, unit: str = "N·m") -> Parameter:
@@ -46,53 +17,57 @@ def _shift(name: str, reach: float, about: str = "", start: float = 0.0, unit: s
 
 _SLOPE = _shift("slope_nm_per_s", 0.04, "drift per second", unit="N·m/s")
 
+
+@form("additive", "y + slope·t", _SLOPE)
+def linear(_: None, p: Values, scene: Scene) -> np.ndarray:
+    return p["slope_nm_per_s"] * scene.time_s
+
+
+@form(
+    "additive",
+    "y + shift (1 - exp(-t/time_constant))",
+    _shift("shift_nm", 0.6, "final shift"),
+    Parameter("time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="time constant of the shift"),
+)
+def warming(_: None, p: Values, scene: Scene) -> np.ndarray:
+    return p["shift_nm"] * -np.expm1(-scene.time_s / p["time_constant_s"])
+
+
+@form("additive", "y + slope·t + bend (t/60)²", _SLOPE, _shift("bend_nm", 1.8, "curvature over one minute"))
+def bent(_: None, p: Values, scene: Scene) -> np.ndarray:
+    s = scene.time_s / 60.0
+    return 60.0 * p["slope_nm_per_s"] * s + p["bend_nm"] * s * s
+
+
+@form(
+    "additive",
+    "y + cos·(cos(2πt/period) - 1) + sin·sin(2πt/period)",
+    Parameter("period_s", "s", 9.0, 90.0, 30.0, (12.0, 25.0, 50.0), "log", about="period of a slow wave"),
+    _shift("cos_nm", 0.22, start=0.003),
+    _shift("sin_nm", 0.22, start=0.003),
+)
+def wave(_: None, p: Values, scene: Scene) -> np.ndarray:
+    turn = 2 * np.pi * scene.time_s / p["period_s"]
+    return p["cos_nm"] * (np.cos(turn) - 1.0) + p["sin_nm"] * np.sin(turn)
+
+
+@form(
+    "additive",
+    "y + s(t), s: a natural cubic spline with six knots over the record",
+    *(_shift(f"knot_{i}_nm", 0.3, f"shift at {i}/6 of the record") for i in range(1, KNOTS + 1)),
+)
+def wander(_: None, p: Values, scene: Scene) -> np.ndarray:
+    """Evenly spaced knots, zero at the start."""
+    knots = np.linspace(0.0, 1.0, KNOTS + 1)
+    values = np.concatenate([np.zeros_like(p["knot_1_nm"]), *(p[f"knot_{i}_nm"] for i in range(1, KNOTS + 1))], axis=1)
+    place = np.clip((scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9), 0.0, 1.0)
+    return CubicSpline(knots, np.eye(KNOTS + 1), bc_type="natural")(place).dot(values.T).T
+
+
 EFFECT = Effect(
     id="baseline_drift",
     name="Drift of the baseline",
-    forms=(
-        Form("linear", "additive", "y + slope·t", (_SLOPE,), _linear, True),
-        Form(
-            "warming",
-            "additive",
-            "y + shift (1 - exp(-t/time_constant))",
-            (
-                _shift("shift_nm", 0.6, "final shift"),
-                Parameter(
-                    "time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="time constant of the shift"
-                ),
-            ),
-            _warming,
-            True,
-        ),
-        Form(
-            "bent",
-            "additive",
-            "y + slope·t + bend (t/60)²",
-            (_SLOPE, _shift("bend_nm", 1.8, "curvature over one minute")),
-            _bent,
-            True,
-        ),
-        Form(
-            "wave",
-            "additive",
-            "y + cos·(cos(2πt/period) - 1) + sin·sin(2πt/period)",
-            (
-                Parameter("period_s", "s", 9.0, 90.0, 30.0, (12.0, 25.0, 50.0), "log", about="period of a slow wave"),
-                _shift("cos_nm", 0.22, start=0.003),
-                _shift("sin_nm", 0.22, start=0.003),
-            ),
-            _breathing,
-            True,
-        ),
-        Form(
-            "wander",
-            "additive",
-            "y + s(t), s: a natural cubic spline with six knots over the record",
-            tuple(_shift(f"knot_{i}_nm", 0.3, f"shift at {i}/6 of the record") for i in range(1, KNOTS + 1)),
-            _wander,
-            True,
-        ),
-    ),
+    forms=(linear, warming, bent, wave, wander),
     signature="The rests do not return to the same torque; the error does not depend on the stimulation.",
     resembles=("voluntary_effort", "fatigue", "mixed_fibres", "passive_torque"),
     separated_by="Rests at zero pulse width before and after each part.",

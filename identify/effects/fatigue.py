@@ -4,33 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
-from stimrig.identify.effects.kernels import adapt
+from stimrig.identify.effects.base import Effect, Form, Parameter, slow_gain
 
 _DEPTH = Parameter("depth", "1", 0.0, 0.95, 0.0, (0.3, 0.6), about="largest share of torque that is lost")
 _ONSET = Parameter("onset_s", "s", 3.0, 250.0, 30.0, (15.0, 50.0), "log", about="time constant under full stimulation")
 _RECOVERY = Parameter("recovery_s", "s", 4.0, 400.0, 50.0, (40.0, 90.0), "log", about="time constant at rest")
 
 
-def _form(name: str, equation: str, source: str = "") -> Form:
-    def used(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-        level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
-        a = np.broadcast_to(scene.on, drive.shape) if name == "by_pulses" else level
-        onset_s, recovery_s, begin = p["onset_s"][:, 0], p["recovery_s"][:, 0], scene.states.get("fatigue", 0.0)
-        return adapt(a, onset_s, recovery_s, name == "compartments", scene.step_s, scene.rest_s, begin)
-
-    return Form(
-        name,
-        "gain",
-        equation,
-        (_DEPTH, _ONSET, _RECOVERY),
-        lambda drive, p, scene: drive * (1.0 - p["depth"] * used(drive, p, scene)[0]),
-        batched=True,
-        source=source,
-        state=lambda drive, p, scene: used(drive, p, scene)[1],
-    )
+def _form(name: str, equation: str, **more: Any) -> Form:
+    parameters = (_DEPTH, _ONSET, _RECOVERY)
+    return slow_gain("fatigue", name, equation, parameters, lambda p, x: 1.0 - p["depth"] * x, **more)
 
 
 EFFECT = Effect(
@@ -40,17 +23,19 @@ EFFECT = Effect(
         _form(
             "fitness",
             "w = μ f(u); μ = 1 - depth·x; x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max",
-            "Riener, Quintern, Schmidt 1996, muscle fitness",
+            source="Riener, Quintern, Schmidt 1996, muscle fitness",
         ),
         _form(
             "compartments",
             "w = (1 - depth·x) f(u); x' = a(1 - x)/onset - x/recovery",
-            "Ding et al. 2003 (A falls with force, recovers with one time constant); Xia, Frey-Law 2008",
+            constant=True,
+            source="Ding et al. 2003 (A falls with force, recovers with one time constant); Xia, Frey-Law 2008",
         ),
         _form(
             "by_pulses",
             "w = μ f(u); μ = 1 - depth·x; x' = a(1 - x)/onset - (1 - a) x/recovery; a = 1 under pulses of any width, "
             "else 0",
+            by_pulses=True,
         ),
     ),
     signature="Torque above the model early in the stimulation and below it late; after a rest it is higher again.",

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ SCALES = ("linear", "log")
 RELATIVE = ("", "torque", "width", "span", "level")
 ROWS = 80
 """Pulse intervals on which a form is tried."""
+OLD_NAMES = ("identify", "identify.effects", "identify.effects.base")
+"""From which files of earlier versions import what is in `stimrig.effects` now."""
 
 
 class BadEffect(IdentifyError):
@@ -37,12 +42,27 @@ def effect_of(path: Path) -> Effect:
         raise BadEffect("not a Python file", place=str(path), fix=FIX)
     module = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
+        with old_names():
+            spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise BadEffect(in_one_line(error), place=_place(path, error), fix=FIX) from error
     if not hasattr(module, "EFFECT"):
         raise BadEffect("no EFFECT in it", place=str(path), fix="End the file with EFFECT = Effect(...).")
     return checked(module.EFFECT, str(path), path)
+
+
+@contextmanager
+def old_names() -> Iterator[None]:
+    """Within it, `OLD_NAMES` can be imported, unless they are somebody else's."""
+    spec, own = importlib.util.find_spec("identify"), sys.modules["stimrig.identify"].__file__
+    free = spec is None or (spec.origin and own and Path(spec.origin).samefile(own))  # in a checkout it is our folder
+    old = {name: sys.modules[f"stimrig.{name}"] for name in OLD_NAMES if free and name not in sys.modules}
+    sys.modules.update(old)
+    try:
+        yield
+    finally:
+        for name in old:
+            del sys.modules[name]
 
 
 def in_one_line(error: BaseException) -> str:

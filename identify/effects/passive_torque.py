@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from numba import njit
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
-from stimrig.identify.effects.kernels import relaxed
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
-SURFACE = "surface"
+SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
+"""Of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
 
 
 def _part(name: str, unit: str, reach: float, about: str, start: tuple[float, ...] = (0.0,)) -> Parameter:
@@ -18,6 +18,7 @@ def _part(name: str, unit: str, reach: float, about: str, start: tuple[float, ..
     return Parameter(name, unit, -reach, reach, 0.0, start, relative="torque", about=about)
 
 
+_STIFF = _part("stiffness_nm_per_rad", "N·m/rad", 3.0, "elastic part, at the reference angle", (0.0, 0.15))
 _VISCOUS = _part("viscosity_nm_s_per_rad", "N·m·s/rad", 0.6, "viscous part")
 
 
@@ -25,40 +26,117 @@ def _speed(scene: Scene) -> np.ndarray:
     return np.zeros_like(scene.time_s) if scene.velocity_rad_s is None else scene.velocity_rad_s
 
 
-def _linear(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    away = scene.away_rad
-    return p["stiffness_nm_per_rad"] * away + p["viscosity_nm_s_per_rad"] * _speed(scene)
+@form("additive", "y + stiffness·Δ + viscosity·velocity, Δ = angle - reference angle", _STIFF, _VISCOUS)
+def linear(_: None, p: Values, scene: Scene) -> np.ndarray:
+    return p["stiffness_nm_per_rad"] * scene.away_rad + p["viscosity_nm_s_per_rad"] * _speed(scene)
 
 
-def _exponential(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    away = scene.away_rad
+@form(
+    "additive",
+    "y + stiffness (exp(k·Δ) - 1)/k + viscosity·velocity",
+    _STIFF,
+    Parameter("steepness_per_rad", "1/rad", 0.3, 10.0, 2.0, (2.0,), "log", about="k"),
+    _VISCOUS,
+    source="(exp(4(l - 1)/0.6) - 1)/(e⁴ - 1), De Groote et al. 2016, and viscous",
+)
+def exponential(_: None, p: Values, scene: Scene) -> np.ndarray:
     k = p["steepness_per_rad"]
-    elastic = p["stiffness_nm_per_rad"] * np.expm1(np.clip(k * away, -30.0, 8.0)) / k
+    elastic = p["stiffness_nm_per_rad"] * np.expm1(np.clip(k * scene.away_rad, -30.0, 8.0)) / k
     return elastic + p["viscosity_nm_s_per_rad"] * _speed(scene)
 
 
-def _two_sided(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+@form(
+    "additive",
+    "y + stiffness·Δ + bend·Δ² + hardening·Δ³ + viscosity·velocity",
+    _STIFF,
+    _part("bend_nm_per_rad2", "N·m/rad²", 3.0, "one-sided part"),
+    _part("hardening_nm_per_rad3", "N·m/rad³", 4.5, "stiffening at both ends"),
+    _VISCOUS,
+)
+def two_sided(_: None, p: Values, scene: Scene) -> np.ndarray:
     away = scene.away_rad
     elastic = p["stiffness_nm_per_rad"] * away + p["bend_nm_per_rad2"] * away**2 + p["hardening_nm_per_rad3"] * away**3
     return elastic + p["viscosity_nm_s_per_rad"] * _speed(scene)
 
 
-SHAPES = 12
-"""Polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
-SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
+_FREE = (
+    *(_part(f"elastic_{i}_nm", "N·m", size, f"polynomial {i}") for i, size in enumerate(SIZES, start=1)),
+    _VISCOUS,
+    replace(_VISCOUS, name="tilt_nm_s_per_rad", about="viscosity's slope over the range"),
+    replace(_VISCOUS, name="bow_nm_s_per_rad", about="viscosity's curvature over the range"),
+    _part("dry_nm", "N·m", 0.5, "dry friction"),
+    Parameter("dry_below_rad_s", "rad/s", 0.01, 0.5, 0.07, (0.07,), "log", about="where it is less than that"),
+    Parameter("inertia_nm_s2_per_rad", "N·m·s²/rad", -0.5, 0.5, 0.0, (0.0,), about="of what the cell moves"),
+)
 
 
-def _surface(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _surface(_: None, p: Values, scene: Scene) -> np.ndarray:
     velocity, place = _speed(scene), scene.place
-    elastic = sum(p[f"elastic_{i}_nm"] * bend for i, bend in enumerate(scene.bends(SHAPES), start=1))
+    elastic = sum(p[f"elastic_{i}_nm"] * bend for i, bend in enumerate(scene.bends(len(SIZES)), start=1))
     viscous = p["viscosity_nm_s_per_rad"] + p["tilt_nm_s_per_rad"] * place + p["bow_nm_s_per_rad"] * place**2
     acceleration = 0.0 if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
     dry = p["dry_nm"] * np.tanh(velocity / p["dry_below_rad_s"])
     return elastic + viscous * velocity + dry + p["inertia_nm_s2_per_rad"] * acceleration
 
 
-def _relaxing(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """As `_surface`, and a spring behind a dashpot."""
+surface = form(
+    "additive",
+    "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
+    "inertia·acceleration, x: place in the fitted range, -1 to 1",
+    *_FREE,
+    name="surface",
+    fine=True,
+    source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
+)(_surface)
+
+
+@njit(cache=True, nogil=True)
+def relaxed(
+    value: np.ndarray, time_s: np.ndarray, begins: np.ndarray, relaxation_s: np.ndarray
+) -> np.ndarray:  # pragma: no cover
+    """What follows a value by a first-order lag, exact for a value that goes straight from point to point.
+
+    Parameters
+    ----------
+    value, time_s : ndarray, shape (K,)
+        What is followed, and when, s.
+    begins : ndarray of bool, shape (K,)
+        Where it has already arrived: at the begin of each recording.
+    relaxation_s : ndarray, shape (M,)
+        Time constants, s.
+
+    Returns
+    -------
+    ndarray, shape (M, K)
+    """
+    rows, size = relaxation_s.size, value.size
+    out = np.empty((rows, size))
+    for m in range(rows):
+        z = value[0]
+        out[m, 0] = z
+        for k in range(1, size):
+            step_s = time_s[k] - time_s[k - 1]
+            if begins[k] or not step_s > 0.0:
+                z = value[k]
+            else:
+                lag_s = relaxation_s[m]
+                slope = (value[k] - value[k - 1]) / step_s
+                z = value[k] - slope * lag_s + (z - value[k - 1] + slope * lag_s) * np.exp(-step_s / lag_s)
+            out[m, k] = z
+    return out
+
+
+@form(
+    "additive",
+    "surface + relaxing·(Δ - z), z' = (Δ - z)/relaxation",
+    *_FREE,
+    replace(_STIFF, name="relaxing_nm_per_rad", start=(0.0,), about="stiffness that gives way"),
+    Parameter("relaxation_s", "s", 0.3, 10.0, 1.0, (1.0,), "log", about="time in which it does"),
+    fine=True,
+    source="standard linear solid, Fung 1981",
+)
+def relaxing(_: None, p: Values, scene: Scene) -> np.ndarray:
+    """As `surface`, and a spring behind a dashpot."""
     away = scene.away_rad
     begins = np.zeros(away.size, bool) if scene.begins is None else scene.begins
     time_constants, row = np.unique(p["relaxation_s"], return_inverse=True)
@@ -66,76 +144,10 @@ def _relaxing(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return _surface(None, p, scene) + p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
 
 
-_STIFF = _part("stiffness_nm_per_rad", "N·m/rad", 3.0, "elastic part, at the reference angle", (0.0, 0.15))
-
-_FREE = Form(
-    SURFACE,
-    "additive",
-    "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
-    "inertia·acceleration, x: place in the fitted range, -1 to 1",
-    (
-        *(_part(f"elastic_{i}_nm", "N·m", size, f"polynomial {i}") for i, size in enumerate(SIZES, start=1)),
-        _VISCOUS,
-        replace(_VISCOUS, name="tilt_nm_s_per_rad", about="viscosity's slope over the range"),
-        replace(_VISCOUS, name="bow_nm_s_per_rad", about="viscosity's curvature over the range"),
-        _part("dry_nm", "N·m", 0.5, "dry friction"),
-        Parameter("dry_below_rad_s", "rad/s", 0.01, 0.5, 0.07, (0.07,), "log", about="where it is less than that"),
-        Parameter("inertia_nm_s2_per_rad", "N·m·s²/rad", -0.5, 0.5, 0.0, (0.0,), about="of what the cell moves"),
-    ),
-    _surface,
-    True,
-    fine=True,
-    source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
-)
-
 EFFECT = Effect(
     id="passive_torque",
     name="Passive torque of the joint",
-    forms=(
-        Form(
-            "linear",
-            "additive",
-            "y + stiffness·Δ + viscosity·velocity, Δ = angle - reference angle",
-            (_STIFF, _VISCOUS),
-            _linear,
-            True,
-        ),
-        Form(
-            "exponential",
-            "additive",
-            "y + stiffness (exp(k·Δ) - 1)/k + viscosity·velocity",
-            (_STIFF, Parameter("steepness_per_rad", "1/rad", 0.3, 10.0, 2.0, (2.0,), "log", about="k"), _VISCOUS),
-            _exponential,
-            True,
-            source="(exp(4(l - 1)/0.6) - 1)/(e⁴ - 1), De Groote et al. 2016, and viscous",
-        ),
-        Form(
-            "two_sided",
-            "additive",
-            "y + stiffness·Δ + bend·Δ² + hardening·Δ³ + viscosity·velocity",
-            (
-                _STIFF,
-                _part("bend_nm_per_rad2", "N·m/rad²", 3.0, "one-sided part"),
-                _part("hardening_nm_per_rad3", "N·m/rad³", 4.5, "stiffening at both ends"),
-                _VISCOUS,
-            ),
-            _two_sided,
-            True,
-        ),
-        _FREE,
-        replace(
-            _FREE,
-            name="relaxing",
-            equation=f"{SURFACE} + relaxing·(Δ - z), z' = (Δ - z)/relaxation",
-            parameters=(
-                *_FREE.parameters,
-                replace(_STIFF, name="relaxing_nm_per_rad", start=(0.0,), about="stiffness that gives way"),
-                Parameter("relaxation_s", "s", 0.3, 10.0, 1.0, (1.0,), "log", about="time in which it does"),
-            ),
-            apply=_relaxing,
-            source="standard linear solid, Fung 1981",
-        ),
-    ),
+    forms=(linear, exponential, two_sided, surface, relaxing),
     signature="Torque that follows the movement, also without stimulation.",
     resembles=("baseline_drift", "torque_velocity"),
     separated_by="Passive movement without stimulation.",

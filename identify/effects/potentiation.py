@@ -4,44 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
-from stimrig.identify.effects.kernels import adapt
+from stimrig.identify.effects.base import Effect, Form, Parameter, slow_gain
 
 _GAIN = Parameter("gain", "1", 0.0, 2.0, 0.0, (0.2, 0.5), about="largest share of torque that is gained")
 _ONSET = Parameter("onset_s", "s", 1.2, 80.0, 5.0, (4.0, 15.0), "log", about="time constant under full stimulation")
 _RECOVERY = Parameter("recovery_s", "s", 2.0, 400.0, 60.0, (20.0, 80.0), "log", about="time constant at rest")
 
 
-def _form(name: str, equation: str) -> Form:
-    def used(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-        level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
-        a = np.broadcast_to(scene.on, drive.shape) if name == "by_pulses" else level
-        onset_s, recovery_s, begin = p["onset_s"][:, 0], p["recovery_s"][:, 0], scene.states.get("potentiation", 0.0)
-        return adapt(a, onset_s, recovery_s, name == "steady_decay", scene.step_s, scene.rest_s, begin)
-
-    return Form(
-        name,
-        "gain",
-        equation,
-        (_GAIN, _ONSET, _RECOVERY),
-        lambda drive, p, scene: drive * (1.0 + p["gain"] * used(drive, p, scene)[0]),
-        batched=True,
-        state=lambda drive, p, scene: used(drive, p, scene)[1],
-    )
+def _form(name: str, equation: str, **more: Any) -> Form:
+    parameters = (_GAIN, _ONSET, _RECOVERY)
+    return slow_gain("potentiation", name, equation, parameters, lambda p, x: 1.0 + p["gain"] * x, **more)
 
 
 EFFECT = Effect(
     id="potentiation",
     name="Potentiation",
-    forms=tuple(
-        _form(name, equation)
-        for name, equation in (
-            ("by_level", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max"),
-            ("steady_decay", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - x/recovery; a = |f|/f_max"),
-            ("by_pulses", "as by_level, with a = 1 under pulses of any width, else 0"),
-        )
+    forms=(
+        _form("by_level", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max"),
+        _form("steady_decay", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - x/recovery; a = |f|/f_max", constant=True),
+        _form("by_pulses", "as by_level, with a = 1 under pulses of any width, else 0", by_pulses=True),
     ),
     signature="Torque below the model early in the stimulation and above it late: the opposite of fatigue.",
     resembles=("threshold_drift", "fatigue", "baseline_drift"),

@@ -7,12 +7,19 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+
+_CEILING = Parameter(
+    "ceiling_nm", "N·m", -1.5, 1.5, np.inf, (0.9,), "linear", "level", "largest torque that the sensor shows"
+)
+_FLOOR = Parameter(
+    "floor_nm", "N·m", -1.5, 1.5, -np.inf, (-0.5,), "linear", "level", "smallest torque that the sensor shows"
+)
 
 
-def _clipped(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _clipped(y: np.ndarray, ceiling: np.ndarray, scene: Scene) -> np.ndarray:
     """Mean of min(y + noise, ceiling): near the ceiling only positive noise is cut off."""
-    ceiling, sd = p["ceiling_nm"], max(scene.noise_sd_nm, 1e-6)
+    sd = max(scene.noise_sd_nm, 1e-6)
     with np.errstate(invalid="ignore"):
         over = (y - ceiling) / sd
         bell = np.exp(-0.5 * np.minimum(over * over, 700.0)) / np.sqrt(2 * np.pi)
@@ -20,12 +27,19 @@ def _clipped(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     return np.where(np.isinf(ceiling), y, cut)
 
 
-def _floored(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return -_clipped(-y, {"ceiling_nm": -p["floor_nm"]}, scene)
+@form("sensor", "min(y + noise, ceiling)", _CEILING)
+def ceiling(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    return _clipped(y, p["ceiling_nm"], scene)
 
 
-def _both(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return _floored(_clipped(y, p, scene), p, scene)
+@form("sensor", "max(y + noise, floor)", _FLOOR)
+def floor(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    return -_clipped(-y, -p["floor_nm"], scene)
+
+
+@form("sensor", "min(max(y + noise, floor), ceiling)", _CEILING, _FLOOR)
+def both(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    return -_clipped(-_clipped(y, p["ceiling_nm"], scene), -p["floor_nm"], scene)
 
 
 def _detect(raw: Any) -> tuple[str, dict[str, float]] | None:
@@ -36,21 +50,10 @@ def _detect(raw: Any) -> tuple[str, dict[str, float]] | None:
     return "both" if len(found) == 2 else next(iter(found)), {f"{name}_nm": value for name, value in found.items()}
 
 
-_CEILING = Parameter(
-    "ceiling_nm", "N·m", -1.5, 1.5, np.inf, (0.9,), "linear", "level", "largest torque that the sensor shows"
-)
-_FLOOR = Parameter(
-    "floor_nm", "N·m", -1.5, 1.5, -np.inf, (-0.5,), "linear", "level", "smallest torque that the sensor shows"
-)
-
 EFFECT = Effect(
     id="sensor_clipping",
     name="Clipping of the sensor",
-    forms=(
-        Form("ceiling", "sensor", "min(y + noise, ceiling)", (_CEILING,), _clipped, True),
-        Form("floor", "sensor", "max(y + noise, floor)", (_FLOOR,), _floored, True),
-        Form("both", "sensor", "min(max(y + noise, floor), ceiling)", (_CEILING, _FLOOR), _both, True),
-    ),
+    forms=(ceiling, floor, both),
     signature="Flat peaks: many samples have exactly the same largest (or smallest) value.",
     resembles=("output_saturation",),
     separated_by="The same test with a lower amplifier gain: clipping then disappears, saturation of the muscle "

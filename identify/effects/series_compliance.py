@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from numba import njit
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
-from stimrig.identify.effects.kernels import exponential, follow, follow_curved
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
+Motion = tuple[np.ndarray, np.ndarray]
+"""Torque and its rate."""
 _RESTARTS = tuple(
     {"resonance_hz": hz, "damping": 0.15, "share": 0.4, "base.time_constant_s": t, "base.damping": 1.0}
     for hz, t in ((1.6, 0.1), (3.0, 0.15))
@@ -22,6 +22,61 @@ _RESONANCE = (
 _STIFFENING = Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque")
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _moved(phi, gamma, z, v, a, b, c, d):  # pragma: no cover
+    return phi[0] * z + phi[1] * v + gamma[0] * a + gamma[1] * b + gamma[2] * c + gamma[3] * d
+
+
+@njit(cache=True, nogil=True)
+def _follow(
+    torque: np.ndarray, slope: np.ndarray, phi: np.ndarray, gamma: np.ndarray, step_s: float
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """Response of a second-order system to the cubic through boundary states; (M, K + 1) to (M, K + 1).
+
+    `slope` is the rate times the step; `phi` (M, 2, 2) and `gamma` (M, 2, 4) act on (z, z'·step), (x0, x0', x1, x1').
+    """
+    rows, size = torque.shape
+    out = np.zeros((rows, size))
+    rate = np.zeros((rows, size))
+    for m in range(rows):
+        z, v = torque[m, 0], 0.0
+        out[m, 0] = z
+        for k in range(size - 1):
+            a, b, c, d = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
+            z, v = (
+                _moved(phi[m, 0], gamma[m, 0], z, v, a, b, c, d),
+                _moved(phi[m, 1], gamma[m, 1], z, v, a, b, c, d),
+            )
+            out[m, k + 1] = z
+            rate[m, k + 1] = v / step_s
+    return out, rate
+
+
+@njit(cache=True, nogil=True)
+def _exponential(matrix: np.ndarray) -> np.ndarray:  # pragma: no cover
+    """Matrix exponential of a small matrix of norm up to about 20, by scaled Taylor series."""
+    size = matrix.shape[0]
+    scaled = matrix / 64.0
+    term, total = np.eye(size), np.eye(size)
+    for n in range(1, 13):
+        term = _product(term, scaled) / n
+        total += term
+    for _ in range(6):
+        total = _product(total, total)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:  # pragma: no cover
+    size = a.shape[0]
+    out = np.zeros((size, size))
+    for i in range(size):
+        for k in range(size):
+            for j in range(size):
+                out[i, j] += a[i, k] * b[k, j]
+    return out
+
+
 def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Exact transition of z'' = ω²(x - z) - 2ζω z', where x is the cubic between the states (x, x') at both ends."""
     omega = 2 * np.pi * frequency_hz * step_s
@@ -29,13 +84,13 @@ def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarr
     system[0, 1] = 1.0
     system[1, :3] = [-(omega**2), -2 * damping * omega, omega**2]
     system[2, 3] = system[3, 4] = system[4, 5] = 1.0
-    phi = exponential(system)
+    phi = _exponential(system)
     # Time in steps: the cubic's derivatives at the start, from x0, x0', x1, x1'.
     cubic = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [-6, -4, 6, -2], [12, 6, -12, 6]], float)
     return phi[:2, :2], phi[:2, 2:] @ cubic
 
 
-def _series(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _series(x: Motion, p: Values, scene: Scene) -> Motion:
     torque, rate = x
     frequency, damping = p["resonance_hz"][:, 0], p["damping"][:, 0]
     if np.all(np.isinf(frequency)):
@@ -43,16 +98,34 @@ def _series(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -
     pairs = list(zip(frequency.tolist(), damping.tolist(), strict=True))
     known = {pair: _steps(*pair, scene.step_s) for pair in set(pairs)}
     phi, gamma = (np.stack(matrices) for matrices in zip(*(known[pair] for pair in pairs), strict=True))
-    return follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)
+    return _follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)
 
 
-def _partly(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+series = form("filter", "z'' + 2 ζ ω z' + ω² z = ω² y", *_RESONANCE, name="series", restarts=_RESTARTS)(_series)
+
+
+@form(
+    "filter",
+    "y + share (z - y), z as in series",
+    *_RESONANCE,
+    Parameter("share", "1", 0.0, 1.0, 0.0, (0.5,), about="share of torque through the spring"),
+    grows=True,
+    restarts=_RESTARTS,
+)
+def partly(x: Motion, p: Values, scene: Scene) -> Motion:
     torque, rate = _series(x, p, scene)
     share = p["share"]
     return x[0] + share * (torque - x[0]), x[1] + share * (rate - x[1])
 
 
-def _inertia(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+@form(
+    "filter",
+    "y - share·z''/ω², z as in series: the load cell also carries the mass",
+    *_RESONANCE,
+    Parameter("share", "1", 0.0, 1.5, 0.0, (0.5,), about="share of the mass that the load cell carries"),
+    grows=True,
+)
+def inertia(x: Motion, p: Values, scene: Scene) -> Motion:
     """The load cell also carries the mass: the torque that accelerates it is missing from the reading."""
     (y, y_rate), share = x, p["share"]
     z, z_rate = _series(x, p, scene)
@@ -64,64 +137,89 @@ def _inertia(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) 
     return y - share * taken, y_rate - share * (y_rate - z_rate - 2 * damping * speeding / omega)
 
 
-def _curved(toe: bool) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    def apply(x: tuple[np.ndarray, np.ndarray], p: dict[str, Any], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-        frequency = p["resonance_hz"][:, 0]
-        if np.all(np.isinf(frequency)):
-            return x
-        beta = p["stiffening"][:, 0] / scene.scale_nm ** (2 if toe else 1)
-        damping = p["damping"][:, 0]
-        return follow_curved(x[0], x[1] * scene.step_s, 2 * np.pi * frequency, damping, beta, toe, scene.step_s)
+SPRING_PARTS = 12
+"""Leapfrog steps per interval: at 16 Hz and 40 pulses/s a step is a fifth of a radian."""
 
-    return apply
+
+@njit(cache=True, nogil=True)
+def _follow_curved(
+    torque: np.ndarray,
+    slope: np.ndarray,
+    omega: np.ndarray,
+    damping: np.ndarray,
+    curved: np.ndarray,
+    toe: bool,
+    step_s: float,
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+    """A mass on a nonlinear spring, driven by the cubic x through boundary states.
+
+    With a toe q'' = ω² (x - z) - 2 ζ ω q', z = q (1 + β q²) the spring's torque; else z'' = ω² (1 + β |z|)(x - z) -
+    2 ζ ω z'. Shapes (M, K) and (M,); β in 1/(N·m)² or 1/(N·m).
+    """
+    rows, size = torque.shape
+    h = step_s / SPRING_PARTS
+    out, rate = np.zeros((size, rows)), np.zeros((size, rows))
+    x0, v0 = np.ascontiguousarray(torque.T), np.ascontiguousarray(slope.T)
+    q, v = x0[0].copy(), np.zeros(rows)
+    out[0] = q
+    w2 = h * omega * omega
+    c = damping * omega * h
+    keep, give = (1.0 - c) / (1.0 + c), w2 / (1.0 + c)
+    for k in range(size - 1):
+        for i in range(SPRING_PARTS):
+            s = (i + 0.5) / SPRING_PARTS
+            a, b = (1 + 2 * s) * (1 - s) * (1 - s), s * (1 - s) * (1 - s)
+            d, e = s * s * (3 - 2 * s), s * s * (s - 1)
+            for m in range(rows):
+                x = a * x0[k, m] + b * v0[k, m] + d * x0[k + 1, m] + e * v0[k + 1, m]
+                z = q[m] + 0.5 * h * v[m]
+                force = x - z * (1.0 + curved[m] * z * z) if toe else (1.0 + curved[m] * abs(z)) * (x - z)
+                v[m] = keep[m] * v[m] + give[m] * force
+                q[m] = z + 0.5 * h * v[m]
+        for m in range(rows):
+            if not abs(q[m]) < 1e6:
+                q[m], v[m] = 0.0, 0.0
+            bent = curved[m] * q[m] * q[m] if toe else 0.0
+            out[k + 1, m] = q[m] * (1.0 + bent)
+            rate[k + 1, m] = v[m] * (1.0 + 3.0 * bent)
+    return np.ascontiguousarray(out.T), np.ascontiguousarray(rate.T)
+
+
+def _curved(x: Motion, p: Values, scene: Scene, toe: bool) -> Motion:
+    frequency = p["resonance_hz"][:, 0]
+    if np.all(np.isinf(frequency)):
+        return x
+    beta = p["stiffening"][:, 0] / scene.scale_nm ** (2 if toe else 1)
+    damping = p["damping"][:, 0]
+    return _follow_curved(x[0], x[1] * scene.step_s, 2 * np.pi * frequency, damping, beta, toe, scene.step_s)
+
+
+@form(
+    "filter",
+    "q'' + 2 ζ ω q' + ω² (z - y) = 0, z = q (1 + stiffening·q²/y_max²)",
+    *_RESONANCE,
+    _STIFFENING,
+    source="toe region of a tendon: Zajac 1989; Duffing's spring",
+)
+def toe(x: Motion, p: Values, scene: Scene) -> Motion:
+    return _curved(x, p, scene, True)
+
+
+@form(
+    "filter",
+    "z'' + 2 ζ ω z' + ω² (1 + stiffening·|z|/y_max) (z - y) = 0",
+    *_RESONANCE,
+    replace(_STIFFENING, lower=-0.6),
+    grows=True,
+)
+def stiffening(x: Motion, p: Values, scene: Scene) -> Motion:
+    return _curved(x, p, scene, False)
 
 
 EFFECT = Effect(
     id="series_compliance",
     name="Compliance in series",
-    forms=(
-        Form("series", "filter", "z'' + 2 ζ ω z' + ω² z = ω² y", _RESONANCE, _series, True, restarts=_RESTARTS),
-        Form(
-            "partly",
-            "filter",
-            "y + share (z - y), z as in series",
-            (*_RESONANCE, Parameter("share", "1", 0.0, 1.0, 0.0, (0.5,), about="share of torque through the spring")),
-            _partly,
-            True,
-            grows=True,
-            restarts=_RESTARTS,
-        ),
-        Form(
-            "inertia",
-            "filter",
-            "y - share·z''/ω², z as in series: the load cell also carries the mass",
-            (
-                *_RESONANCE,
-                Parameter("share", "1", 0.0, 1.5, 0.0, (0.5,), about="share of the mass that the load cell carries"),
-            ),
-            _inertia,
-            True,
-            grows=True,
-        ),
-        Form(
-            "toe",
-            "filter",
-            "q'' + 2 ζ ω q' + ω² (z - y) = 0, z = q (1 + stiffening·q²/y_max²)",
-            (*_RESONANCE, _STIFFENING),
-            _curved(toe=True),
-            True,
-            source="toe region of a tendon: Zajac 1989; Duffing's spring",
-        ),
-        Form(
-            "stiffening",
-            "filter",
-            "z'' + 2 ζ ω z' + ω² (1 + stiffening·|z|/y_max) (z - y) = 0",
-            (*_RESONANCE, replace(_STIFFENING, lower=-0.6)),
-            _curved(toe=False),
-            True,
-            grows=True,
-        ),
-    ),
+    forms=(series, partly, inertia, toe, stiffening),
     signature="The torque oscillates after every step.",
     resembles=("electromechanical_delay",),
     separated_by="Steps, at a high sampling rate.",

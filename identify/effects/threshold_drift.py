@@ -3,97 +3,69 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+
+_TIME = Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="time constant of the shift")
+_SLOPE = Parameter("slope_us_per_s", "µs/s", -4.0, 4.0, 0.0, (0.5, -0.5), about="shift of the threshold per second")
+_SHIFT = Parameter("shift_us", "µs", -80.0, 80.0, 0.0, (15.0, -15.0), about="final shift")
+_SCALE = Parameter("slope_per_s", "1/s", -0.02, 0.02, 0.0, (0.003, -0.003), about="share of the width lost per second")
+_SHARE = Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share of the width lost in the end")
 
 
 def _moved(width: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return np.where(width > 0, width - shift, width)
 
 
-def _linear(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return _moved(width, p["slope_us_per_s"] * scene.time_s)
-
-
-def _exponential(p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _settled(p: Values, scene: Scene) -> np.ndarray:
     """1 - exp(-t/time_constant), minus its value at the reference time, at which the recruitment curve holds."""
     tau = p["time_constant_s"]
     return np.exp(-scene.reference_s / tau) - np.exp(-scene.time_s / tau)
 
 
-def _settling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return _moved(width, p["shift_us"] * _exponential(p, scene))
+@form("pulse_width", "w = f(u - slope·t) where u > 0", _SLOPE)
+def linear(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    return _moved(width, p["slope_us_per_s"] * scene.time_s)
 
 
-def _scaling(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+@form(
+    "pulse_width",
+    "w = f(u - shift (exp(-t_ref/time_constant) - exp(-t/time_constant))) where u > 0; t_ref: middle of the ramp",
+    _SHIFT,
+    _TIME,
+)
+def settling(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    return _moved(width, p["shift_us"] * _settled(p, scene))
+
+
+@form("pulse_width", "w = f(u (1 - slope·t))", _SCALE)
+def scaling(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     return width * (1.0 - p["slope_per_s"] * scene.time_s)
 
 
-def _fading(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    return width * (1.0 - p["share"] * _exponential(p, scene))
+@form(
+    "pulse_width",
+    "w = f(u (1 - share (exp(-t_ref/time_constant) - exp(-t/time_constant))))",
+    _SHARE,
+    replace(_TIME, start=(12.0,)),
+    source="Lapicque: widths at threshold scale as the current falls",
+)
+def fading(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    return width * (1.0 - p["share"] * _settled(p, scene))
 
 
-def _charge(width: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+@form("pulse_width", "w = f(u - slope·∫u dt/u_max) where u > 0", _SLOPE)
+def by_charge(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     used = np.cumsum(scene.pulse_width_us) * scene.step_s / scene.largest_us
     return _moved(width, p["slope_us_per_s"] * used)
 
 
-_TIME = Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="time constant of the shift")
-_SLOPE = Parameter("slope_us_per_s", "µs/s", -4.0, 4.0, 0.0, (0.5, -0.5), about="shift of the threshold per second")
-
 EFFECT = Effect(
     id="threshold_drift",
     name="Drift of the recruitment threshold",
-    forms=(
-        Form("linear", "pulse_width", "w = f(u - slope·t) where u > 0", (_SLOPE,), _linear, True),
-        Form(
-            "settling",
-            "pulse_width",
-            "w = f(u - shift (exp(-t_ref/time_constant) - exp(-t/time_constant))) where u > 0; t_ref: middle of the "
-            "ramp",
-            (
-                Parameter("shift_us", "µs", -80.0, 80.0, 0.0, (15.0, -15.0), about="final shift"),
-                _TIME,
-            ),
-            _settling,
-            True,
-        ),
-        Form(
-            "scaling",
-            "pulse_width",
-            "w = f(u (1 - slope·t))",
-            (
-                Parameter(
-                    "slope_per_s", "1/s", -0.02, 0.02, 0.0, (0.003, -0.003), about="share of the width lost per second"
-                ),
-            ),
-            _scaling,
-            True,
-        ),
-        Form(
-            "fading",
-            "pulse_width",
-            "w = f(u (1 - share (exp(-t_ref/time_constant) - exp(-t/time_constant))))",
-            (
-                Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share of the width lost in the end"),
-                replace(_TIME, start=(12.0,)),
-            ),
-            _fading,
-            True,
-            source="Lapicque: widths at threshold scale as the current falls",
-        ),
-        Form(
-            "by_charge",
-            "pulse_width",
-            "w = f(u - slope·∫u dt/u_max) where u > 0",
-            (_SLOPE,),
-            _charge,
-            True,
-        ),
-    ),
+    forms=(linear, settling, scaling, fading, by_charge),
     signature="The recruitment curve moves along the pulse width: the error is large where it is steep, and grows "
     "with time.",
     resembles=("fatigue", "potentiation", "voluntary_effort", "recruitment_hysteresis"),

@@ -2,38 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 _SIDE = Parameter("slope_s_per_rad", "s/rad", -2.0, 2.0, 0.0, (0.1, -0.1), about="share of torque lost per rad/s")
-
 _SHAPE = Parameter("shape", "1", 0.1, 2.0, 0.25, (0.25,), "log", about="Hill's a/F0")
 _TOP = Parameter("top", "1", 1.05, 1.9, 1.4, (1.4,), about="largest torque when lengthening, divided by isometric")
-SURFACE = "surface"
 
 
-def _linear(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+@form("output", "y (1 - slope·velocity)", _SIDE)
+def linear(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     assert scene.velocity_rad_s is not None
     return y * np.maximum(1.0 - p["slope_s_per_rad"] * scene.velocity_rad_s, 0.0)
 
 
-def _hill(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+def _hyperbola(y: np.ndarray, p: Values, v: np.ndarray) -> np.ndarray:
     """Hill's hyperbola for shortening, continued to a plateau for lengthening."""
-    assert scene.velocity_rad_s is not None
-    return _hyperbola(y, p, p["slope_s_per_rad"] * scene.velocity_rad_s)
-
-
-def _bent(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """As `_hill`, its slope another one at each angle: moment arm and fibre length change with it."""
-    assert scene.velocity_rad_s is not None
-    slope = p["slope_s_per_rad"] + p["tilt_s_per_rad"] * scene.place + p["bow_s_per_rad"] * scene.place**2
-    return _hyperbola(y, p, slope * scene.velocity_rad_s)
-
-
-def _hyperbola(y: np.ndarray, p: dict[str, Any], v: np.ndarray) -> np.ndarray:
     shape = p["shape"]
     shortening = np.maximum(1.0 - v, 0.0) / (1.0 + np.maximum(v, 0.0) / shape)
     top = p["top"]
@@ -41,7 +26,44 @@ def _hyperbola(y: np.ndarray, p: dict[str, Any], v: np.ndarray) -> np.ndarray:
     return y * np.where(v >= 0, shortening, lengthening)
 
 
-def _marion(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+@form(
+    "output",
+    "y (1 - v)/(1 + v/shape) for shortening, up to `top`·y for lengthening; v = slope·velocity",
+    _SIDE,
+    _SHAPE,
+    _TOP,
+    source="Hill 1938; Thelen 2003",
+)
+def hill(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    assert scene.velocity_rad_s is not None
+    return _hyperbola(y, p, p["slope_s_per_rad"] * scene.velocity_rad_s)
+
+
+@form(
+    "output",
+    "as hill, v = (slope + tilt·x + bow·x²)·velocity, x: place in the fitted range, -1 to 1",
+    _SIDE,
+    Parameter("tilt_s_per_rad", "s/rad", -1.0, 1.0, 0.0, (0.0,), about="slope's slope over the range"),
+    Parameter("bow_s_per_rad", "s/rad", -1.0, 1.0, 0.0, (0.0,), about="slope's curvature over the range"),
+    _SHAPE,
+    _TOP,
+    source="Hill 1938; Thelen 2003; Marion et al. 2010 for the dependence on the angle",
+)
+def surface(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    """As `hill`, its slope another one at each angle: moment arm and fibre length change with it."""
+    assert scene.velocity_rad_s is not None
+    slope = p["slope_s_per_rad"] + p["tilt_s_per_rad"] * scene.place + p["bow_s_per_rad"] * scene.place**2
+    return _hyperbola(y, p, slope * scene.velocity_rad_s)
+
+
+@form(
+    "output",
+    "y + gain·θ exp(-decay·θ) θ' under stimulation",
+    Parameter("gain_nm_s_per_rad2", "N·m·s/rad²", -0.9, 0.9, 0.0, (0.03, -0.03), "linear", "torque", "V1"),
+    Parameter("decay_per_rad", "1/rad", 0.0, 4.0, 1.3, (1.0,), about="V2"),
+    source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ'",
+)
+def marion(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     assert scene.angle_rad is not None and scene.velocity_rad_s is not None
     angle = np.abs(scene.angle_rad)
     return y + p["gain_nm_s_per_rad2"] * angle * np.exp(
@@ -49,8 +71,15 @@ def _marion(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
     ) * scene.velocity_rad_s * np.minimum(np.abs(y) / (0.2 * scene.scale_nm), 1.0)
 
 
-def _bell(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """As `_marion`, but as a share of the torque; the slope is the largest one over all angles."""
+@form(
+    "output",
+    "y (1 - slope·x exp(1 - x)·θ'), x = decay·θ",
+    _SIDE,
+    Parameter("decay_per_rad", "1/rad", 0.3, 4.0, 1.3, (1.3,), "log", about="V2"),
+    source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ', as a share of the torque",
+)
+def bell(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+    """As `marion`, but as a share of the torque; the slope is the largest one over all angles."""
     assert scene.angle_rad is not None and scene.velocity_rad_s is not None
     place = p["decay_per_rad"] * np.abs(scene.angle_rad)
     share = p["slope_s_per_rad"] * place * np.exp(1.0 - place) * scene.velocity_rad_s
@@ -60,58 +89,7 @@ def _bell(y: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
 EFFECT = Effect(
     id="torque_velocity",
     name="Torque depends on velocity",
-    forms=(
-        Form("linear", "output", "y (1 - slope·velocity)", (_SIDE,), _linear, True),
-        Form(
-            "hill",
-            "output",
-            "y (1 - v)/(1 + v/shape) for shortening, up to `top`·y for lengthening; v = slope·velocity",
-            (
-                _SIDE,
-                _SHAPE,
-                _TOP,
-            ),
-            _hill,
-            True,
-            source="Hill 1938; Thelen 2003",
-        ),
-        Form(
-            SURFACE,
-            "output",
-            "as hill, v = (slope + tilt·x + bow·x²)·velocity, x: place in the fitted range, -1 to 1",
-            (
-                _SIDE,
-                Parameter("tilt_s_per_rad", "s/rad", -1.0, 1.0, 0.0, (0.0,), about="slope's slope over the range"),
-                Parameter("bow_s_per_rad", "s/rad", -1.0, 1.0, 0.0, (0.0,), about="slope's curvature over the range"),
-                _SHAPE,
-                _TOP,
-            ),
-            _bent,
-            True,
-            source="Hill 1938; Thelen 2003; Marion et al. 2010 for the dependence on the angle",
-        ),
-        Form(
-            "marion",
-            "output",
-            "y + gain·θ exp(-decay·θ) θ' under stimulation",
-            (
-                Parameter("gain_nm_s_per_rad2", "N·m·s/rad²", -0.9, 0.9, 0.0, (0.03, -0.03), "linear", "torque", "V1"),
-                Parameter("decay_per_rad", "1/rad", 0.0, 4.0, 1.3, (1.0,), about="V2"),
-            ),
-            _marion,
-            True,
-            source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ'",
-        ),
-        Form(
-            "bell",
-            "output",
-            "y (1 - slope·x exp(1 - x)·θ'), x = decay·θ",
-            (_SIDE, Parameter("decay_per_rad", "1/rad", 0.3, 4.0, 1.3, (1.3,), "log", about="V2")),
-            _bell,
-            True,
-            source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ', as a share of the torque",
-        ),
-    ),
+    forms=(linear, hill, surface, marion, bell),
     signature="The error follows the measured velocity, but only under stimulation.",
     resembles=("torque_angle", "passive_torque"),
     separated_by="The same movement with stimulation and without.",

@@ -2,45 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values
 
-LOWEST_HZ, HIGHEST_HZ = 2.6, 14.0
 KNOTS = (1, 8, 20, 45, 90, 180)
 """Number of times between which the amplitudes are linear, for each form."""
+_FREQUENCY = Parameter("frequency_hz", "Hz", 2.6, 14.0, 5.0, (5.0,), "log", about="tremor frequency")
 
 
-def _wave(knots: int) -> Callable[..., np.ndarray]:
-    def apply(_: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-        turn = 2 * np.pi * p["frequency_hz"] * scene.time_s
-        cos, sin = np.cos(turn), np.sin(turn)
-        if knots == 1:
-            return p["cos_0_nm"] * cos + p["sin_0_nm"] * sin
-        place = np.clip((scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9), 0.0, 1.0) * (knots - 1)
-        total = np.zeros(turn.shape)
-        for i in range(knots):
-            hat = np.maximum(1.0 - np.abs(place - i), 0.0)
-            near = hat > 0
-            total[..., near] += hat[near] * (p[f"cos_{i}_nm"] * cos[..., near] + p[f"sin_{i}_nm"] * sin[..., near])
-        return total
-
-    return apply
+def _wave(p: Values, scene: Scene, knots: int) -> np.ndarray:
+    turn = 2 * np.pi * p["frequency_hz"] * scene.time_s
+    cos, sin = np.cos(turn), np.sin(turn)
+    if knots == 1:
+        return p["cos_0_nm"] * cos + p["sin_0_nm"] * sin
+    place = np.clip((scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9), 0.0, 1.0) * (knots - 1)
+    total = np.zeros(turn.shape)
+    for i in range(knots):
+        hat = np.maximum(1.0 - np.abs(place - i), 0.0)
+        near = hat > 0
+        total[..., near] += hat[near] * (p[f"cos_{i}_nm"] * cos[..., near] + p[f"sin_{i}_nm"] * sin[..., near])
+    return total
 
 
 def _form(knots: int) -> Form:
     amplitude = (-0.4, 0.4, 0.0, (0.0,), "linear", "torque")
-    parts = [Parameter(f"{part}_{i}_nm", "N·m", *amplitude) for i in range(knots) for part in ("cos", "sin")]
-    frequency = Parameter("frequency_hz", "Hz", LOWEST_HZ, HIGHEST_HZ, 5.0, (5.0,), "log", about="tremor frequency")
+    parts = (Parameter(f"{part}_{i}_nm", "N·m", *amplitude) for i in range(knots) for part in ("cos", "sin"))
     return Form(
         "steady" if knots == 1 else f"waxing_{knots}",
         "additive",
         "y + A(t) cos(2πft) + B(t) sin(2πft)" + ("" if knots == 1 else f", A and B linear between {knots} times"),
-        (frequency, *parts),
-        _wave(knots),
+        (_FREQUENCY, *parts),
+        lambda _, p, scene: _wave(p, scene, knots),
         batched=True,
     )
 

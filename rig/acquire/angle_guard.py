@@ -1,55 +1,75 @@
-"""What a test asks of the joint's angle while it runs, and what it hears of a sensor that it does not need."""
+"""What a test asks of the joint's angle while it runs, and what it hears of a sensor that it does not need.
+
+It detects an angle that a test may not have: outside its range, away from its target, still, or not to be believed. A
+sensor that slipped by less than the limit on a jump cannot be detected here, nor one that is stuck in a held test.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stimrig.rig.acquire.angle_check import AngleCheck, degrees, outside
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.acquire.health import Watch
+from stimrig.rig.acquire.plausibility import RateCheck
+from stimrig.rig.acquire.stream import steps_from
 from stimrig.rig.clock import Clock
 from stimrig.rig.errors import DeviceError, JournalError, RefusedError
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.limits import Limit, check
-from stimrig.rig.messages import TestPlan
-from stimrig.rig.signals import Recorded
+from stimrig.rig.messages import HELD, TestPlan
+from stimrig.rig.signals import TRUSTED, Recorded
 from stimrig.rig.tasks import Tasks
 
 AROUND_S = 0.1
 """Real seconds over which the median tells where the joint is before a test."""
 PATIENCE_S = 2.0
 """Real seconds to wait for a sensor that was just plugged in, or a rig that was just started."""
+FASTEST_RAD_S = 20.0
+"""The fastest voluntary flexion of an elbow: while samples are missing it may turn so far."""
+MOVED_RAD = 0.01
+"""Less is no movement: noise of the sensor, or of an arm that is held."""
+LEAVING = 2.0
+"""Tolerances by which a joint may leave its target before the test stops."""
 
 
 class AngleGuard:
-    """The angle sensor during one test.
+    """The angle sensor during one test. Of a plan that asks nothing only whether the sensor can be believed is noted.
 
     Parameters
     ----------
     receiver
         None: the rig has no angle sensor.
+    table
+        The tightest of rig file, profile and plan.
     """
 
     def __init__(
         self, receiver: AngleReceiver | None, plan: TestPlan, table: dict[str, Limit], clock: Clock, watch: Watch
     ) -> None:
         self._receiver, self._clock, self._watch = receiver, clock, watch
+        self._wanted, self._is_held = plan.angle, plan.kind == HELD
+        self._range, self._jump_rad = table["angle_rad"], table["angle_jump_rad"].hi
         self.needed = plan.angle is not None
         """Whether a fault of the angle ends the test."""
         self._journal: Journal | None = None
         self._noted = False
-        self._check: AngleCheck | None = None
-        if receiver is not None:
-            self._check = AngleCheck(plan, table, receiver.nominal_rate_hz, clock.speed)
+        self._rate_hz = 1.0 if receiver is None else receiver.nominal_rate_hz
+        self._rate = RateCheck("angle sensor", self._rate_hz, clock.speed)
+        self._last: tuple[float, int, float] | None = None
+        self._still: tuple[float, float] | None = None
+        self._moving = False
 
     def record(self, journal: Journal, on_fault: Callable[[str], None]) -> None:
         """Write every sample from now on; `on_fault` gets what must end the test."""
         self._journal = journal
-        if self._receiver is not None and self._check is not None:
-            self._receiver.record(journal, self._check, on_fault if self.needed else self._note, on_fault)
+        if self._receiver is not None:
+            self._receiver.write_to(journal, self._wrong, on_fault if self.needed else self._note, on_fault)
 
     def release(self) -> Recorded | None:
         """Stop recording; returns the counts, None without a sensor."""
@@ -61,13 +81,11 @@ class AngleGuard:
 
     def begin(self) -> None:
         """What waited in buffers has been read."""
-        if self._check is not None:
-            self._check.rate.begin()
+        self._rate.begin()
 
     def started(self) -> None:
-        """The test's clock runs."""
-        if self._check is not None:
-            self._check.started()
+        """The test's clock runs: from now on the joint may not stand still for long. From any thread."""
+        self._moving = True
 
     def fault(self) -> str | None:
         """What must end the test; asked before each pulse, rests included. None: nothing."""
@@ -75,7 +93,7 @@ class AngleGuard:
 
     def fault_at_end(self) -> str | None:
         """What only the whole test shows, and must make it a fault."""
-        return self._ending(None if self._check is None else self._check.rate.fault_at_end())
+        return self._ending(self._rate.fault_at_end())
 
     def _ending(self, found: str | None) -> str | None:
         """What was found, if this test needs the sensor; else it is noted."""
@@ -101,11 +119,94 @@ class AngleGuard:
             with contextlib.suppress(JournalError):  # whoever writes a pulse or a sample next reports it
                 self._journal.append_json(Kind.EVENT, event)
 
+    def _wrong(self, samples: NDArray[Any]) -> str | None:
+        """What is wrong with this block; None: nothing."""
+        angle_rad, now_s = samples["angle_rad"], float(samples["host_time_s"][-1])
+        found = (
+            _unreliable(samples)
+            or self._jumped(samples)
+            or self._outside(angle_rad)
+            or self._away(angle_rad)
+            or self._stands(angle_rad, now_s)
+            or self._rate.fault(len(samples), int(samples["counter"][-1]), now_s)
+        )
+        self._last = float(angle_rad[-1]), int(samples["counter"][-1]), now_s
+        return found
+
+    def _jumped(self, samples: NDArray[Any]) -> str | None:
+        """More than the limit between two samples; what could have happened while samples were missing is allowed."""
+        angle_rad, counter = samples["angle_rad"], samples["counter"]
+        before = self._last or (float(angle_rad[0]), int(counter[0]) - 1, float(samples["host_time_s"][0]))
+        steps_rad = np.abs(steps_from(before[0], angle_rad))
+        if counter[0] >= 0:
+            missing_s = (steps_from(before[1], counter) - 1) / self._rate_hz
+        else:
+            missing_s = np.maximum(0.0, steps_from(before[2], samples["host_time_s"]) - 0.02)
+        worst_rad = float(np.max(steps_rad - FASTEST_RAD_S * missing_s))
+        if worst_rad <= self._jump_rad:
+            return None
+        return (
+            f"angle sensor: it jumped by {degrees(worst_rad)} from one sample to the next, at most "
+            f"{degrees(self._jump_rad)} can be true; a loose cable, a slipped or a reversed sensor"
+        )
+
+    def _outside(self, angle_rad: NDArray[np.float64]) -> str | None:
+        if self._wanted is None:
+            return None
+        bound = self._range
+        within = (angle_rad >= bound.lo) & (angle_rad <= bound.hi)
+        return None if np.all(within) else f"angle sensor: {outside(float(angle_rad[np.argmin(within)]), bound)}"
+
+    def _away(self, angle_rad: NDArray[np.float64]) -> str | None:
+        if self._wanted is None or self._wanted.target_rad is None:
+            return None
+        target_rad, most_rad = self._wanted.target_rad, LEAVING * self._wanted.tolerance_rad
+        near = np.abs(angle_rad - target_rad) <= most_rad
+        if np.all(near):
+            return None
+        return (
+            f"angle sensor: the joint is at {degrees(float(angle_rad[np.argmin(near)]))}, it must be held at "
+            f"{degrees(target_rad)} ± {degrees(most_rad)}"
+        )
+
+    def _stands(self, angle_rad: NDArray[np.float64], now_s: float) -> str | None:
+        still_s = None if self._wanted is None or self._is_held else self._wanted.still_s
+        if still_s is None or not self._moving:
+            return None
+        if self._still is None or np.any(np.abs(angle_rad - self._still[1]) >= MOVED_RAD):
+            self._still = now_s, float(angle_rad[-1])
+        if now_s - self._still[0] <= still_s:
+            return None
+        return (
+            f"angle sensor: no movement for {still_s:g} s, at {degrees(self._still[1])}; the sensor is stuck, or the "
+            "joint is not moved"
+        )
+
+
+def _unreliable(samples: NDArray[Any]) -> str | None:
+    if not np.all(np.isin(samples["fault"], TRUSTED)):
+        return "angle sensor: it reports a fault of its own; check the sensor and its mounting"
+    if not np.all(np.isfinite(samples["angle_rad"])):
+        return "angle sensor: sent an angle that is not a number (NaN); check its cable"
+    return None
+
 
 def _worded(receiver: AngleReceiver) -> str:
     """Why a sensor gives nothing."""
     found = receiver.problem or "angle sensor: no angle arrives; check its cable and supply"
     return found if found.startswith("angle sensor") else f"angle sensor: {found}"
+
+
+def outside(angle_rad: float, bound: Limit) -> str:
+    """An angle outside a range, in words; one that is beyond it by a hair is not told as the end itself."""
+    beyond_rad = max(bound.lo - angle_rad, angle_rad - bound.hi)
+    digits = 1 if beyond_rad >= math.radians(0.1) else 3
+    return f"{degrees(angle_rad, digits)} is outside {degrees(bound.lo)} … {degrees(bound.hi)} ({bound.owner})"
+
+
+def degrees(angle_rad: float, digits: int = 1) -> str:
+    """An angle for people."""
+    return f"{math.degrees(angle_rad):.{digits}f}°"
 
 
 async def await_angle(receiver: AngleReceiver, tasks: Tasks) -> None:

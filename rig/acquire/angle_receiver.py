@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig.acquire.angle_check import AngleCheck
 from stimrig.rig.acquire.stream import Stream
 from stimrig.rig.align import RATE_TOLERANCE
 from stimrig.rig.angle_velocity import LiveSlope
 from stimrig.rig.devices import AngleSensor
 from stimrig.rig.errors import DeviceError
-from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.journal import Kind
 from stimrig.rig.signals import ANGLE_SAMPLE, AngleScale
 from stimrig.rig.tasks import Tasks
 
@@ -68,20 +66,6 @@ class AngleReceiver(Stream):
         self.scale = scale
         self._slope.forget()
         self._recent = deque(self._scaled(samples) for samples in self._recent)
-
-    def record(
-        self, journal: Journal, check: AngleCheck, on_fault: Callable[[str], None], on_broken: Callable[[str], None]
-    ) -> None:
-        """From now on write every sample and check it.
-
-        Parameters
-        ----------
-        on_fault
-            Called with what is wrong with the angle.
-        on_broken
-            Called if the journal cannot be written.
-        """
-        self._record(journal, on_fault, on_broken, check.fault)
 
     def data_age_s(self, now_s: float) -> float:
         """How old the newest angle is: since its arrival, and what it came late."""

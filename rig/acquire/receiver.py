@@ -13,11 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig.acquire.stream import Stream
-from stimrig.rig.acquire.torque_time import TorqueTime
 from stimrig.rig.devices import LoadCell
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.signals import Recorded
 from stimrig.rig.tasks import Tasks
+
+
+class TorqueTime:
+    """Sums up from block to block. The time between two blocks counts with the later one, lost samples included."""
+
+    def __init__(self) -> None:
+        self.nms = 0.0
+        """N·m·s since `begin`; of either sign of the torque, so noise makes it larger, never smaller."""
+        self._rest_nm: float | None = None
+        self._last_s = 0.0
+
+    def begin(self, rest_nm: float, time_s: float) -> None:
+        """Count from now on: torque above `rest_nm`, rig time."""
+        self.nms, self._rest_nm, self._last_s = 0.0, rest_nm, time_s
+
+    def add(self, time_s: float, mean_nm: float) -> None:
+        """A block's last sample and its mean torque."""
+        if self._rest_nm is None:
+            return
+        self.nms += abs(mean_nm - self._rest_nm) * max(0.0, time_s - self._last_s)
+        self._last_s = time_s
+
 
 LIVE_BLOCKS = 4000
 RANGE_MEAN_S = 0.01
@@ -54,7 +75,7 @@ class Receiver(Stream):
         wrong: Callable[[NDArray[Any]], str | None] = lambda _: None,
     ) -> None:
         """From now on write every sample to the journal and check it; faults are reported at once."""
-        self._record(journal, on_fault, on_fault, wrong)
+        self.write_to(journal, wrong, on_fault, on_fault)
         self._limits_nm, self.torque_time, self.peak_nm = limits_nm, TorqueTime(), 0.0
         self.begin_range()
 

@@ -10,17 +10,17 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from stimrig.rig.acquire.angle_guard import AngleGuard
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.acquire.evidence import AROUND_S, stop_device, watch_decay
-from stimrig.rig.acquire.halt import Cause, Halt
 from stimrig.rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
 from stimrig.rig.acquire.plausibility import PlausibilityCheck
 from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.clock import Clock
 from stimrig.rig.errors import DeviceError, JournalError
 from stimrig.rig.gate import Gate
 from stimrig.rig.journal import Journal, Kind
@@ -31,6 +31,37 @@ from stimrig.rig.plan import PlannedTest
 from stimrig.rig.score import Score
 from stimrig.rig.signals import Pulse, PulseStatus, Recorded
 from stimrig.rig.tasks import Signal
+
+Cause = Literal["stopped", "fault", "withdrawn"]
+"""`withdrawn`: nothing is wrong, so nothing latches. A stop or a fault that comes later outranks it."""
+
+
+class Halt:
+    """Set once, or once more after a withdrawal; `signal` wakes all who wait."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.signal = Signal()
+        self.cause: Cause | None = None
+        self.reason = ""
+        self.time_s = 0.0
+        self._clock = clock
+        self._heard: list[Callable[[], None]] = []
+
+    def on_set(self, action: Callable[[], None]) -> None:
+        """Call `action` when halted, before anything else goes on."""
+        self._heard.append(action)
+
+    def set(self, cause: Cause, reason: str) -> bool:
+        """End the test; False if it was already ending."""
+        if self.cause not in (None, "withdrawn") or cause == self.cause:
+            return False
+        self.time_s = self._clock.now_s() if self.cause is None else self.time_s
+        self.cause, self.reason = cause, reason
+        self.signal.set()
+        for action in self._heard:
+            action()
+        return True
+
 
 log = logging.getLogger("rig.run")
 

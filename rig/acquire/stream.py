@@ -198,15 +198,25 @@ class Stream:
         """Record and check samples that have their place."""
         raise NotImplementedError
 
-    def _record(
+    def write_to(
         self,
         journal: Journal,
+        wrong: Callable[[NDArray[Any]], str | None],
         on_fault: Callable[[str], None],
         on_broken: Callable[[str], None],
-        wrong: Callable[[NDArray[Any]], str | None],
     ) -> None:
-        """From now on write and check every sample; `wrong` says of a block what is wrong with it, None: nothing."""
-        self._journal, self._on_fault, self._on_broken, self._wrong = journal, on_fault, on_broken, wrong
+        """From now on write and check every sample.
+
+        Parameters
+        ----------
+        wrong
+            Says of a block what is wrong with it, None: nothing.
+        on_fault
+            Called with that, at once.
+        on_broken
+            Called if the journal cannot be written.
+        """
+        self._journal, self._wrong, self._on_fault, self._on_broken = journal, wrong, on_fault, on_broken
         self.counts = Recorded()
 
     def release(self) -> Recorded:

@@ -16,9 +16,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stimrig.rig.adapters.connections import Connections
 from stimrig.rig.adapters.previews import Previews
-from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
+from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connections, StopServer
 from stimrig.rig.control import desk
 from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from stimrig.rig.control.rig import Rig
@@ -176,12 +175,12 @@ class Server:
         """Previews are built in order of request; none for a client that has disconnected."""
         if self._previews is None or writer.transport.is_closing():
             return b""
-        return await self._previews.reply(line, self.rig.angle_set_at_utc)
+        return await self._previews.reply(line, self.rig.joint.set_at_utc)
 
     def _refuse_long(self, line: bytes, kind: str) -> None:
         if len(line) > LONG_LINE_BYTES and kind == "":
             raise PlanError(f"request: if over {LONG_LINE_BYTES // 1000} kB, it must begin with its kind and its id")
-        if len(line) > LONG_LINE_BYTES and self.rig.busy:
+        if len(line) > LONG_LINE_BYTES and self.rig.state.trial.busy:
             raise BusyError("a test is in progress; wait or stop it")
 
     async def _obey(self, request: Any, writer: asyncio.StreamWriter) -> None:

@@ -1,6 +1,6 @@
-"""Calibration of the angle sensor by two poses: what a goniometer shows, and what the sensor gives there.
+"""The joint's angle, and the calibration of its sensor by two poses: what a goniometer shows, and what it gives there.
 
-It is kept in the data folder, for the sensor that it was made with. Another sensor in the rig file has none.
+The calibration is kept in the data folder, for the sensor that it was made with. Another one in the rig file has none.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig.acquire.angle_check import degrees
+from stimrig.rig.acquire.angle_guard import await_angle, check_start, degrees
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.clock import utc_text
-from stimrig.rig.control.small_file import SmallFile
+from stimrig.rig.config import RigConfig
+from stimrig.rig.control.live import finite
+from stimrig.rig.control.memory import SmallFile
+from stimrig.rig.control.pair import Pair
 from stimrig.rig.devices import DeviceSettings
-from stimrig.rig.errors import DeviceError, RefusedError
+from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError
 from stimrig.rig.limits import Limit, refuse
 from stimrig.rig.machine import Machine
-from stimrig.rig.messages import AngleCalibration, AnglePose
+from stimrig.rig.messages import AngleCalibration, AnglePose, AnglePoseRequest, AngleStatus, TestPlan
 from stimrig.rig.signals import TRUSTED, AngleScale
+from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
 
@@ -201,3 +205,107 @@ def _moved(samples: NDArray[Any], part_s: float) -> float:
     part = np.floor((samples["host_time_s"] - samples["host_time_s"][0]) / part_s).astype(int)
     means = [float(np.mean(samples["raw"][part == each])) for each in np.unique(part)]
     return max(means) - min(means)
+
+
+class Joint:
+    """The joint's angle as the rig's sensor gives it.
+
+    Parameters
+    ----------
+    bound
+        The angles that this rig allows.
+    """
+
+    def __init__(self, config: RigConfig, machine: Machine, pair: Pair, bound: Limit) -> None:
+        self.poses = AngleCalibrating(config.data_dir, config.angle_sensor, machine)
+        self._present, self._needs_calibration = config.angle_sensor is not None, config.require_calibration
+        self._pair, self._bound, self._tasks = pair, bound, machine.tasks
+
+    async def recall(self) -> None:
+        """Read the calibration that was stored."""
+        await self.poses.recall()
+        self._pair.rescale(self.poses.scale)
+
+    @property
+    def set_at_utc(self) -> str | None:
+        """When the sensor was calibrated; None: it was not. May be called from another thread."""
+        found = self.poses.calibration
+        return None if found is None else found.set_at_utc
+
+    def status(self) -> AngleStatus:
+        """For clients."""
+        if not self._present:
+            return AngleStatus()
+        angle, poses = self._pair.angle, self.poses
+        now: dict[str, Any] = {}
+        if angle is not None:
+            age_s = angle.age_s(self._tasks.clock.now_s())
+            found = {"angle_rad": angle.angle_rad, "velocity_rad_s": angle.velocity_rad_s, "age_s": age_s}
+            now = {"problem": angle.problem, **{name: finite(value) for name, value in found.items()}}
+        return AngleStatus(
+            present=True,
+            calibrated=poses.calibration is not None,
+            range_rad=(self._bound.lo, self._bound.hi),
+            pose=poses.first,
+            calibration=poses.calibration,
+            **now,
+        )
+
+    def described(self) -> dict[str, Any] | None:
+        """What a journal's header says of the sensor; None: there is none."""
+        if self._pair.angle is None:
+            return None
+        sensor = self._pair.angle.sensor
+        return {
+            "sample_rate_hz": sensor.sample_rate_hz,
+            "of_the_cell": sensor.of_the_cell,
+            "one_bus": sensor.on_the_cells_bus,
+            "calibration": self.poses.described(sensor.scale),
+        }
+
+    async def await_angle(self, plan: TestPlan) -> None:
+        """Wait a moment for the first angle, if a test asks for it. Raises DeviceError: the rig is disconnected."""
+        if plan.angle is not None and self._present:
+            await await_angle(self._receiver(), self._tasks)
+
+    def check(self, plan: TestPlan, table: dict[str, Limit]) -> None:
+        """Refuse a test that asks for an angle that this rig cannot give, or where the joint is elsewhere.
+
+        Raises PlanError, RefusedError, DeviceError.
+        """
+        if plan.angle is None:
+            return
+        self._refuse_absent("plan.angle")
+        if self._needs_calibration and self.poses.calibration is None:
+            raise RefusedError(
+                "plan.angle: the angle sensor is not calibrated; take two poses with a goniometer, "
+                f"{degrees(APART_RAD)} or more apart"
+            )
+        check_start(self._receiver(), plan, table, self._tasks.clock)
+
+    async def pose(self, request: AnglePoseRequest, trial: Trial) -> None:
+        """The goniometer's angle of a joint that is held still; the second one completes a calibration.
+
+        Raises
+        ------
+        PlanError
+            This rig has no angle sensor.
+        BusyError
+            A test is in progress.
+        DeviceError, RefusedError, RigError
+            See `AngleCalibrating.pose`.
+        """
+        self._refuse_absent("angle_pose")
+        if trial.busy:
+            raise BusyError(f"test {trial.test_id} is {trial.state}; take the pose afterwards")
+        await self.poses.pose(request.angle_rad, request.by, self._receiver(), self._bound, request.first)
+        self._pair.rescale(self.poses.scale)
+
+    def _refuse_absent(self, place: str) -> None:
+        if not self._present:
+            raise PlanError(f"{place}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)")
+
+    def _receiver(self) -> AngleReceiver:
+        if self._pair.angle is None:
+            raise DeviceError("angle sensor: the rig is disconnected; re-arm it first")
+        return self._pair.angle

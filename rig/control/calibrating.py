@@ -1,30 +1,56 @@
-"""Requests of a guided calibration; `stimrig.rig.control.calibration` decides what is allowed, `Playing` plays it."""
+"""Requests of a guided calibration; `rig.control.calibration` decides what is allowed, the player plays it."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from typing import Any
 
 from stimrig.rig import plan
 from stimrig.rig.control.calibration import Calibration
-from stimrig.rig.control.playing import Playing, check_names
+from stimrig.rig.control.memory import Rest, Result
+from stimrig.rig.control.pair import Pair
+from stimrig.rig.control.playing import Player, check_names
+from stimrig.rig.control.sealing import RecordingStore
+from stimrig.rig.control.state import State
 from stimrig.rig.errors import BusyError, PlanError
+from stimrig.rig.limits import Limit
+from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
     Calibrated,
     CalibrateFinishRequest,
+    CalibrateMarkRequest,
     CalibrateStartRequest,
+    CalibrateStepRequest,
     CalibrationResult,
-    StateEvent,
-    Status,
-    Threshold,
 )
 
 log = logging.getLogger("rig")
 
 
-class Calibrating(Playing):
-    """Opens, plays step by step, marks and closes a calibration."""
+class Calibrations:
+    """Opens, plays step by step, marks and closes a calibration. Every answer but that of `finish` is the status.
 
-    async def calibrate(self, request: CalibrateStartRequest) -> Status:
+    Parameters
+    ----------
+    table
+        The rig's limits.
+    angle
+        What a journal says of the angle sensor.
+    publish
+        Tells the status to everybody.
+    """
+
+    def __init__(
+        self, state: State, pair: Pair, player: Player, rest: Rest, store: RecordingStore, result: Result,
+        machine: Machine, table: dict[str, Limit], angle: Callable[[], dict[str, Any] | None],
+        publish: Callable[[], None],
+    ) -> None:  # fmt: skip
+        self._state, self._pair, self._player, self._rest = state, pair, player, rest
+        self._store, self._result, self._tasks = store, result, machine.tasks
+        self._table, self._angle, self._publish = table, angle, publish
+
+    async def start(self, request: CalibrateStartRequest) -> None:
         """Open a guided calibration; nothing is sent yet.
 
         Raises
@@ -34,20 +60,19 @@ class Calibrating(Playing):
         PlanError, RefusedError
             Wrong name or id; step, train, current or rate outside the limits, or too small to stimulate.
         """
-        latch = self.latch
-        async with self._in_turn():
-            following = self._trial.calibrate(request.participant)
-            self._refuse_unseen(latch)
+        state, latch = self._state, self._state.latch
+        async with state.in_turn():
+            following = state.trial.calibrate(request.participant)
+            state.refuse_unseen(latch)
             self._result.refuse_waiting()
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
-            calibration = Calibration(request, self._table, self._clock.unix_s(), self._pair.steps)
+            calibration = Calibration(request, self._table, self._tasks.clock.unix_s(), self._pair.steps)
             await self._tasks.work(self._store.check_room, f"{request.calibration_id}.001")
-            self._trial.may_start()  # a stop may have come meanwhile
-            self._calibration = calibration
-            self._change(following)
-        return self.status()
+            state.trial.may_start()  # a stop may have come meanwhile
+            state.calibration = calibration
+            state.change(following)
 
-    async def calibrate_step(self, direction: str, shown_us: float | None = None) -> Status:
+    async def step(self, request: CalibrateStepRequest) -> None:
         """Play one train: a step up, a step down, or the same again; returns when it has started.
 
         Raises
@@ -56,70 +81,69 @@ class Calibrating(Playing):
             No calibration is open, or another width was shown; a train is playing; above a limit or the marked comfort
             maximum; its day is over.
         """
-        async with self._in_turn():
-            calibration = self._open_calibration()
-            calibration.check_day(self._clock.unix_s())
-            width_us = calibration.next_width_us(direction)
-            calibration.check_shown(width_us, shown_us)
-            request = calibration.train(width_us)
-            test = plan.build(request, calibration.table)
+        async with self._state.in_turn():
+            calibration = self._open(today=True)
+            width_us = calibration.next_width_us(request.direction)
+            calibration.check_shown(width_us, request.shown_us)
+            train = calibration.train(width_us)
+            test = plan.build(train, calibration.table)
             self._rest.check(test, calibration.rest)
-            await self._tasks.work(self._store.check_room, request.test_id)
-            self._open_calibration()  # a stop may have come meanwhile
-            await self._launch(test, calibration.table, self._trial.train(request.test_id))
-        return self.status()
+            await self._tasks.work(self._store.check_room, train.test_id)
+            self._open()  # a stop may have come meanwhile
+            following = self._state.trial.train(train.test_id)
+            await self._player.launch(test, calibration.table, following, self._angle())
 
-    async def calibrate_mark(self, threshold: Threshold) -> Status:
+    async def mark(self, request: CalibrateMarkRequest) -> None:
         """Mark the last train's width as a threshold. Raises PlanError, BusyError, RefusedError (its day is over)."""
-        async with self._in_turn():
-            calibration = self._open_calibration()
-            calibration.check_day(self._clock.unix_s())
-            calibration.mark(threshold)
-            self._publish(StateEvent(status=self.status()))
-        return self.status()
+        async with self._state.in_turn():
+            self._open(today=True).mark(request.threshold)
+            self._publish()
 
-    async def calibrate_finish(self, request: CalibrateFinishRequest) -> CalibrationResult:
+    async def finish(self, request: CalibrateFinishRequest) -> CalibrationResult:
         """Close the calibration and give its profile; of one that is closed, what was kept of it.
 
         Raises PlanError (a threshold is missing, none or another is open), BusyError, RefusedError (its day is over),
         RigError (the result could not be written: it stays open).
         """
-        async with self._in_turn():
-            if self._calibration is None and (kept := self._result.of(request.calibration_id)) is not None:
+        async with self._state.in_turn():
+            if self._state.calibration is None and (kept := self._result.of(request.calibration_id)) is not None:
                 result = kept.result
                 if request.discard:
                     await self._result.let_go(kept.calibration_id)
                     result = result.model_copy(update={"profile": None})
             else:
-                result = await self._close_calibration(self._open_calibration(request.calibration_id), request.discard)
+                result = await self._close(self._open(request.calibration_id), request.discard)
             log.info("calibration %s by %s", "discarded" if request.discard else "done", request.by)
-            self._publish(StateEvent(status=self.status()))
+            self._publish()
         return result
 
-    async def _close_calibration(self, calibration: Calibration, discard: bool) -> CalibrationResult:
+    async def stored(self, calibration_id: str) -> None:
+        """A client has stored that result. Raises RigError: the file could not be removed, so it waits still."""
+        async with self._state.in_turn():
+            await self._result.let_go(calibration_id)
+            self._publish()
+
+    async def _close(self, calibration: Calibration, discard: bool) -> CalibrationResult:
         of = calibration.request
-        profile = None if discard else calibration.profile(self._clock.unix_s())
+        profile = None if discard else calibration.profile(self._tasks.clock.unix_s())
         result = CalibrationResult(profile=profile, recordings=calibration.recordings)
         if not discard:
             found = {"calibration_id": of.calibration_id, "participant": of.participant, "by": of.by, "result": result}
             await self._result.keep(Calibrated.model_validate(found))
-        if self._trial.state == "calibrating":  # a stop may have come meanwhile: it takes no result back
-            self._change(self._trial.calibrated())
+        if self._state.trial.state == "calibrating":  # a stop may have come meanwhile: it takes no result back
+            self._state.change(self._state.trial.calibrated())
         return result
 
-    async def calibrate_stored(self, calibration_id: str) -> Status:
-        """A client has stored that result. Raises RigError: the file could not be removed, so it waits still."""
-        async with self._in_turn():
-            await self._result.let_go(calibration_id)
-            self._publish(StateEvent(status=self.status()))
-        return self.status()
-
-    def _open_calibration(self, calibration_id: str = "") -> Calibration:
-        if self._calibration is None:
+    def _open(self, calibration_id: str = "", today: bool = False) -> Calibration:
+        """The open calibration between two trains; `today`: if its day is not over."""
+        calibration, trial = self._state.calibration, self._state.trial
+        if calibration is None:
             raise PlanError("calibration: none is open (a stop or a fault closes it); start a new one")
-        open_id = self._calibration.request.calibration_id
+        open_id = calibration.request.calibration_id
         if calibration_id not in ("", open_id):
             raise PlanError(f"calibration: {calibration_id!r} is not open; {open_id} is")
-        if self._trial.state != "calibrating":
-            raise BusyError(f"calibration: train {self._trial.test_id} is {self._trial.state}; wait or stop it")
-        return self._calibration
+        if trial.state != "calibrating":
+            raise BusyError(f"calibration: train {trial.test_id} is {trial.state}; wait or stop it")
+        if today:
+            calibration.check_day(self._tasks.clock.unix_s())
+        return calibration

@@ -17,22 +17,22 @@ log = logging.getLogger("rig.desk")
 
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
-_DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel]]] = {
+_DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
     "start": lambda rig, asked: rig.start(asked.plan, asked.key),
     "stop": lambda rig, asked: rig.stop(asked.reason, asked.by),
-    "withdraw": Rig.withdraw,
-    "extend": Rig.extend,
-    "enough": Rig.enough,
+    "withdraw": lambda rig, asked: rig.player.withdraw(asked),
+    "extend": lambda rig, asked: rig.player.extend(asked),
+    "enough": lambda rig, asked: rig.player.enough(asked),
     "sequences": lambda rig, _: rig.library(),
     "rearm": lambda rig, asked: rig.rearm(asked.by, asked.latch),
-    "calibrate-start": Rig.calibrate,
-    "calibrate-step": lambda rig, asked: rig.calibrate_step(asked.direction, asked.shown_us),
-    "calibrate-mark": lambda rig, asked: rig.calibrate_mark(asked.threshold),
-    "calibrate-finish": Rig.calibrate_finish,
-    "calibrate-stored": lambda rig, asked: rig.calibrate_stored(asked.calibration_id),
+    "calibrate-start": lambda rig, asked: rig.calibrations.start(asked),
+    "calibrate-step": lambda rig, asked: rig.calibrations.step(asked),
+    "calibrate-mark": lambda rig, asked: rig.calibrations.mark(asked),
+    "calibrate-finish": lambda rig, asked: rig.calibrations.finish(asked),
+    "calibrate-stored": lambda rig, asked: rig.calibrations.stored(asked.calibration_id),
     "angle_pose": Rig.angle_pose,
 }
-"""All others are answered by the status."""
+"""What has no answer of its own, and all others, are answered by the status."""
 
 
 def read(line: bytes) -> Any:
@@ -44,7 +44,8 @@ async def obey(rig: Rig, request: Any) -> Reply:
     """Obey a request; errors become part of the reply."""
     try:
         do = _DO.get(request.kind)
-        body = (rig.status() if do is None else await do(rig, request)).model_dump(mode="json")
+        answer = None if do is None else await do(rig, request)
+        body = (rig.status() if answer is None else answer).model_dump(mode="json")
     except RigError as error:
         return refusal(request.id, error)
     except Exception as error:

@@ -1,6 +1,6 @@
 """Plays one test, or one train of a calibration: from the first block of its journal to its sealed recording.
 
-An adaptive test is extended meanwhile, and ended well; `stimrig.rig.score` decides what is laid.
+An adaptive test is extended meanwhile, and ended well; `rig.score` decides what is laid.
 """
 
 from __future__ import annotations
@@ -10,14 +10,21 @@ import hmac
 import logging
 import math
 import re
+from collections.abc import Callable
+from typing import Any
 
 from stimrig.rig import limits, plan
-from stimrig.rig.acquire.halt import Halt
-from stimrig.rig.acquire.run import RunResult, TestRun
-from stimrig.rig.control.core import Core
-from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError
+from stimrig.rig.acquire.health import Watch
+from stimrig.rig.acquire.run import Cause, Halt, RunResult, TestRun
+from stimrig.rig.control.memory import Rest
+from stimrig.rig.control.pair import Pair
+from stimrig.rig.control.sealing import RecordingStore
+from stimrig.rig.control.state import State
+from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError, WithdrawnError
+from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
     EnoughRequest,
+    Event,
     Extended,
     ExtendRequest,
     FinishedEvent,
@@ -25,6 +32,7 @@ from stimrig.rig.messages import (
     Withdrawn,
     WithdrawRequest,
 )
+from stimrig.rig.tasks import Signal, Task
 from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
@@ -36,124 +44,106 @@ MOST_WITHDRAWN = 1000
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
 
 
-class Playing(Core):
-    """Plays planned and admitted tests. What is asked while one plays waits for no start and no re-arm."""
+class Player:
+    """Plays planned and admitted tests, one at a time. What is asked while one plays waits for no start and no re-arm.
 
-    _key = ""
+    Parameters
+    ----------
+    publish
+        Gets the event of each test that has finished.
+    """
 
-    async def _launch(self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Trial) -> None:
+    def __init__(
+        self, state: State, pair: Pair, rest: Rest, store: RecordingStore, machine: Machine, watch: Watch,
+        publish: Callable[[Event], None],
+    ) -> None:  # fmt: skip
+        self._state, self._pair, self._rest, self._store = state, pair, rest, store
+        self._machine, self._tasks, self._clock, self._watch = machine, machine.tasks, machine.tasks.clock, watch
+        self._publish = publish
+        self.run: TestRun | None = None
+        self.playing: Task[None] | None = None
+        self.finished: FinishedEvent | None = None
+        self.evidence: StopEvidence | None = None
+        self.evidence_ready = Signal()
+        self.withdrawals: dict[str, str] = {}
+        """Tests that must not begin any more, and why: the newest ones."""
+        self._halt: Halt | None = None
+        self._key = ""
+
+    def refuse_withdrawn(self, test_id: str) -> None:
+        """Raise WithdrawnError if that test was withdrawn meanwhile."""
+        if (withdrawn := self.withdrawals.get(test_id)) is not None:
+            raise WithdrawnError(f"test {test_id}: {withdrawn}; ask for a new test")
+
+    async def launch(
+        self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Trial, angle: dict[str, Any] | None,
+        key: str = "",
+    ) -> None:  # fmt: skip
         """Create latch file and journal, then play: for every test and every train of a calibration.
 
         From here on a stop ends this test, also while its files are being made. Raises RigError: it does not begin.
+
+        Parameters
+        ----------
+        following
+            The state from now on.
+        angle
+            What the journal says of the angle sensor; None: there is none.
+        key
+            What extensions of an adaptive test must know.
         """
-        before, halt = self._trial, Halt(self._clock)
+        state, before, halt = self._state, self._state.trial, Halt(self._clock)
         halt.on_set(lambda: self._ending(halt))
-        self._halt, self._evidence = halt, None
-        self._evidence_ready.clear()
-        self._change(following)
+        self._halt, self.evidence, self._key = halt, None, key
+        self.evidence_ready.clear()
+        state.change(following)
         try:
-            await self._latch.write("running", f"test {following.test_id} of participant {following.participant}")
-            journal = await self._tasks.work(self._store.begin, test, self._pair.identity, self._of_angle())
-            gate, receiver, angle = self._pair.gate, self._pair.receiver, self._pair.angle
+            await state.file.write("running", f"test {following.test_id} of participant {following.participant}")
+            journal = await self._tasks.work(self._store.begin, test, self._pair.identity, angle)
+            gate, receiver, sensor = self._pair.gate, self._pair.receiver, self._pair.angle
             if gate is None or receiver is None:
                 raise DeviceError("the devices were disconnected before the test began")
         except Exception:
             await self._not_begun(before)
             raise
-        self._run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, angle)
-        self._run.on_evidence = self._take_evidence
-        self._playing = self._tasks.spawn(self._execute(self._run), "test")
+        self.run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, sensor)
+        self.run.on_evidence = self._take_evidence
+        self.playing = self._tasks.spawn(self._execute(self.run), "test")
 
-    def _ending(self, halt: Halt) -> None:
-        if halt.cause == "withdrawn":
-            self._change(self._trial.withdrawn())
-        else:
-            self._halted(halt.reason)
+    def end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
+        """End the running test, or latch; True if a test runs."""
+        self._state.count_stop()
+        runs = self._state.trial.busy and self._halt is not None
+        if not runs or self._halt is None:
+            if latch_idle:
+                self._state.halted(reason)
+        elif not self._halt.set(cause, reason) and latch_idle:
+            self._state.halted(reason)  # it was ending: both reasons are told
+        return runs
+
+    def trouble(self) -> str | None:
+        """That the task of the test has died; None: it has not."""
+        trial = self._state.trial
+        if trial.busy and self.run is not None and (self.playing is None or self.playing.done.is_set()):
+            return f"the task of test {trial.test_id} ended, but its test did not"
+        return None
 
     async def withdraw(self, request: WithdrawRequest) -> Withdrawn:
         """See `WithdrawRequest`. Like a stop it waits for no turn, and for nothing else. Raises PlanError (its id)."""
         test_id, reason = request.test_id, f"withdrawn: {request.reason:.{LONGEST_WORDS}}"
         check_names("withdraw", test_id=test_id)
-        present, run = self._trial.test_id == test_id, self._run
-        ending = present and self._trial.state not in ("arming", "running")
+        present, run = self._state.trial.test_id == test_id, self.run
+        ending = present and self._state.trial.state not in ("arming", "running")
         begun = present and run is not None and run.begun
         over = self.finished is not None and self.finished.test_id == test_id
         if ending or over or (begun and not request.begun):
             return Withdrawn(withdrawn=False)
-        self._withdrawn[test_id] = reason
-        if len(self._withdrawn) > MOST_WITHDRAWN:
-            del self._withdrawn[next(iter(self._withdrawn))]
+        self.withdrawals[test_id] = reason
+        if len(self.withdrawals) > MOST_WITHDRAWN:
+            del self.withdrawals[next(iter(self.withdrawals))]
         if present and self._halt is not None:
             self._halt.set("withdrawn", reason)
         return Withdrawn(withdrawn=True)
-
-    async def _not_begun(self, before: Trial) -> None:
-        """No pulse was sent. A stop that came meanwhile counts as one of an idle rig."""
-        halted = self._trial
-        self._change(before)
-        if halted.lost:
-            self._change(before.disconnected(halted.lost))
-        if halted.latch:
-            self._halted(halted.reason)
-        else:
-            with contextlib.suppress(RigError):
-                await self._latch.clear()
-        self._evidence_ready.set()
-
-    def _take_evidence(self, evidence: StopEvidence) -> None:
-        self._evidence = evidence
-        self._evidence_ready.set()
-
-    async def _execute(self, run: TestRun) -> None:
-        self._tasks.spawn(self._announce(run), "announce")
-        try:
-            result = await run.execute()
-            if result.last_pulse_s is not None:  # stored before another test may start; an unconfirmed end is one now
-                confirmed = result.evidence.confirmed
-                await self._rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
-            self._change(self._trial.ended())
-            finished = await self._tasks.work(self._store.finish, run.journal.path, run.plan.test_id, result)
-            await self._finish(run, result, finished)
-        except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
-            log.exception("the test could not be ended properly")
-            await self._broken(f"internal: {type(error).__name__}: {error}")
-
-    async def _finish(self, run: TestRun, result: RunResult, finished: FinishedEvent) -> None:
-        train = self._trial.calibrating
-        if finished.recording_path is None and run.t0_s is not None:  # only a journal: needs a person
-            self._change(self._trial.halted(finished.reason))
-        await self._settle_latch()
-        self._run = None
-        if train and self._calibration is not None:
-            self._calibration.played(run.plan.profile.max_pulse_width_us, result.rise_nm, finished)
-        if not train:
-            self.finished = finished
-        self._change(self._trial.sealed())
-        if not train:
-            self._publish(finished)
-
-    async def _settle_latch(self) -> None:
-        """Store what the rig will be after this test; once more if it is stopped meanwhile."""
-        stored = None
-        while stored is not self._trial:
-            stored = self._trial
-            following = stored.sealed()
-            if following.state == "latched":
-                await self._remember(following)
-            else:
-                await self._latch.clear()
-
-    async def _broken(self, reason: str) -> None:
-        self._evidence_ready.set()
-        self._run = None
-        self._change(Trial("latched", reason, lost=reason))
-        await self._remember(Trial("uncertain", reason))
-        await self._rest.pulse_at(self._clock.now_s(), ended=False)
-
-    async def _announce(self, run: TestRun) -> None:
-        await self._tasks.wait(math.inf, run.started, run.halt.signal)
-        if run.started.is_set() and self._trial.state == "arming":
-            self._change(self._trial.armed())
 
     async def extend(self, request: ExtendRequest) -> Extended:
         """Lay segments behind everything that is laid.
@@ -186,12 +176,75 @@ class Playing(Core):
 
     def _running(self, test_id: str) -> TestRun:
         """The adaptive test of that id, if it is the one that plays."""
-        run = self._run
+        run = self.run
         if run is None or run.plan.test_id != test_id:
             raise TooLateError(f"test {test_id!r} is not running")
         if run.plan.adaptive is None:
             raise PlanError(f"test {test_id} has a fixed plan; it can only be stopped")
         return run
+
+    def _ending(self, halt: Halt) -> None:
+        if halt.cause == "withdrawn":
+            self._state.change(self._state.trial.withdrawn())
+        else:
+            self._state.halted(halt.reason)
+
+    async def _not_begun(self, before: Trial) -> None:
+        """No pulse was sent. A stop that came meanwhile counts as one of an idle rig."""
+        state, halted = self._state, self._state.trial
+        state.change(before)
+        if halted.lost:
+            state.change(before.disconnected(halted.lost))
+        if halted.latch:
+            state.halted(halted.reason)
+        else:
+            with contextlib.suppress(RigError):
+                await state.file.clear()
+        self.evidence_ready.set()
+
+    def _take_evidence(self, evidence: StopEvidence) -> None:
+        self.evidence = evidence
+        self.evidence_ready.set()
+
+    async def _execute(self, run: TestRun) -> None:
+        self._tasks.spawn(self._announce(run), "announce")
+        try:
+            result = await run.execute()
+            if result.last_pulse_s is not None:  # stored before another test may start; an unconfirmed end is one now
+                confirmed = result.evidence.confirmed
+                await self._rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
+            self._state.change(self._state.trial.ended())
+            finished = await self._tasks.work(self._store.finish, run.journal.path, run.plan.test_id, result)
+            await self._finish(run, result, finished)
+        except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
+            log.exception("the test could not be ended properly")
+            await self._broken(f"internal: {type(error).__name__}: {error}")
+
+    async def _announce(self, run: TestRun) -> None:
+        await self._tasks.wait(math.inf, run.started, run.halt.signal)
+        if run.started.is_set() and self._state.trial.state == "arming":
+            self._state.change(self._state.trial.armed())
+
+    async def _finish(self, run: TestRun, result: RunResult, finished: FinishedEvent) -> None:
+        state, train = self._state, self._state.trial.calibrating
+        if finished.recording_path is None and run.t0_s is not None:  # only a journal: needs a person
+            state.change(state.trial.halted(finished.reason))
+        await state.settle()
+        self.run = None
+        if train and state.calibration is not None:
+            state.calibration.played(run.plan.profile.max_pulse_width_us, result.rise_nm, finished)
+        if not train:
+            self.finished = finished
+        state.change(state.trial.sealed())
+        if not train:
+            self._publish(finished)
+
+    async def _broken(self, reason: str) -> None:
+        self.evidence_ready.set()
+        self.run = None
+        self._state.change(Trial("latched", reason, lost=reason))
+        await self._state.remember(Trial("uncertain", reason))
+        await self._rest.pulse_at(self._clock.now_s(), ended=False)
 
 
 def check_names(place: str, **names: str) -> None:

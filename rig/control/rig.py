@@ -1,35 +1,41 @@
-"""The rig: both devices, one test at a time, its status and events. Independent of the sockets."""
+"""The rig: its devices, one test at a time, its status and events. Independent of the sockets."""
 
 from __future__ import annotations
 
 import logging
-import math
+from collections.abc import Callable
 from dataclasses import replace
 
 from stimrig.rig import limits, plan
-from stimrig.rig.acquire.angle_check import degrees
-from stimrig.rig.acquire.angle_guard import await_angle, check_start
-from stimrig.rig.control.angle_calibration import APART_RAD
-from stimrig.rig.control.calibrating import Calibrating
+from stimrig.rig.config import RigConfig
+from stimrig.rig.control.angle_calibration import Joint
+from stimrig.rig.control.calibrating import Calibrations
 from stimrig.rig.control.calibration import check_profile, check_range
-from stimrig.rig.control.playing import LONGEST_WORDS, check_names
-from stimrig.rig.errors import (
-    BusyError,
-    ConfigError,
-    DeviceError,
-    LatchChangedError,
-    PlanError,
-    RefusedError,
-    WithdrawnError,
+from stimrig.rig.control.live import finite, live_event
+from stimrig.rig.control.memory import Latch, Rest, Result
+from stimrig.rig.control.pair import Pair
+from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
+from stimrig.rig.control.sealing import RecordingStore
+from stimrig.rig.control.state import State
+from stimrig.rig.errors import ConfigError, DeviceError, LatchChangedError, PlanError
+from stimrig.rig.machine import Machine
+from stimrig.rig.messages import (
+    PASSIVE,
+    AnglePoseRequest,
+    Event,
+    FinishedEvent,
+    LiveEvent,
+    Sequences,
+    StateEvent,
+    Status,
+    StopEvidence,
+    TestPlan,
 )
-from stimrig.rig.limits import Limit
-from stimrig.rig.messages import PASSIVE, AnglePoseRequest, Sequences, StateEvent, Status, StopEvidence, TestPlan
 from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
 
 MIN_KEY = 16
-NO_SENSOR = "{}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)"
 STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
 STORED_S = 7.0
@@ -38,14 +44,95 @@ SEALED_WITHIN_S = 30.0
 """Real seconds within which a test that was stopped is sealed."""
 
 
-class Rig(Calibrating):
-    """Owns the devices. All but `status`, `trouble` and `live` are tasks of the machine.
+class Rig:
+    """Its parts, and what needs several of them. All but `status`, `trouble` and `live` are tasks of the machine.
 
     Parameters
     ----------
     publish
         Receives all events except live ones; must not block.
     """
+
+    def __init__(self, config: RigConfig, machine: Machine, publish: Callable[[Event], None]) -> None:
+        self._data_dir, self._require_calibration = config.data_dir, config.require_calibration
+        self._machine, self._tasks, self._clock = machine, machine.tasks, machine.tasks.clock
+        self._publish, self.speed = publish, machine.tasks.clock.speed
+        self.table = config.limits.table()
+        """Hard limits, narrowed by the rig file."""
+        self._born_s = self._clock.now_s()
+        self.state = State(Latch(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._tell)
+        self.pair = Pair(config, machine, self.fault, self._lost)
+        self.joint = Joint(config, machine, self.pair, self.table["angle_rad"])
+        self.rest = Rest(config.data_dir, machine)
+        self.store = RecordingStore(config, machine)
+        self._result = Result(config.data_dir, machine)
+        self.player = Player(self.state, self.pair, self.rest, self.store, machine, config.watch, publish)
+        self.calibrations = Calibrations(
+            self.state, self.pair, self.player, self.rest, self.store, self._result, machine, self.table,
+            self.joint.described, self._tell,
+        )  # fmt: skip
+
+    @property
+    def latch(self) -> str:
+        """See `State.latch`."""
+        return self.state.latch
+
+    @property
+    def finished(self) -> FinishedEvent | None:
+        """The newest test that has finished, recovered ones included."""
+        return self.player.finished
+
+    def status(self) -> Status:
+        """State, devices and limits now."""
+        trial, run, receiver = self.state.trial, self.player.run, self.pair.receiver
+        calibration = self.state.calibration
+        cell = dict(self.pair.identity["load_cell"])
+        if receiver and (measured_hz := receiver.measured_rate_hz()) is not None:
+            cell["measured_rate_hz"] = round(measured_hz, 2)
+        seen = receiver is not None and receiver.last_s is not None
+        return Status(
+            state=trial.state,
+            reason=trial.told,
+            latch=self.state.latch,
+            test_id=trial.test_id,
+            participant=trial.participant,
+            segment=run.segment() if run else None,
+            elapsed_s=run.elapsed_s() if run else 0.0,
+            duration_s=run.score.longest_s if run else 0.0,
+            stimulator=self.pair.identity["stimulator"],
+            load_cell=cell,
+            torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
+            torque_nm=finite(receiver.last_torque_nm) if receiver else None,
+            angle=self.joint.status(),
+            calibration=calibration.status() if calibration else None,
+            calibrated=self._result.waiting,
+            limits=limits.bounds(self.table),
+            require_calibration=self._require_calibration,
+            finished=self.finished,
+        )
+
+    def trouble(self) -> str | None:
+        """Which task or request of this process hangs or has died; None: none. For the process's watchdog."""
+        trial, receiver = self.state.trial, self.pair.receiver
+        if (found := self.state.trouble() or self.player.trouble()) is not None:
+            return found
+        if receiver is not None and not receiver.living and trial.state != "disconnected" and not trial.lost:
+            return "the torque receiver has ended"
+        return None
+
+    def live(self, samples: bool = False) -> LiveEvent | None:
+        """Torque and pulses since the last call, every sample if asked for; None if there is no new torque.
+
+        It only reads, and takes what waits to be shown: it may be called from another thread than the tasks'.
+        """
+        run, receiver, now_s = self.player.run, self.pair.receiver, self._clock.now_s()
+        if receiver is None:
+            return None
+        origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
+        event = live_event(receiver, run, origin_s, now_s, samples, self.pair.angle)
+        if event is not None and run is not None:
+            run.told_pulses += len(event.pulse_time_s)
+        return event
 
     async def open(self) -> None:
         """Seal what a crash left, then connect; a missing device is reported in the status, not raised.
@@ -57,44 +144,41 @@ class Rig(Calibrating):
         """
         work = self._tasks.work
         try:
-            await work(self._store.make_folders)
+            await work(self.store.make_folders)
             self._folder_lock = await work(self._machine.disk.lock, self._data_dir)
         except OSError as error:
             raise ConfigError(f"data_dir: {error.filename or self._data_dir}: {error.strerror}") from None
-        await self._poses.recall()
+        await self.joint.recall()
         await self._result.recall()
-        self._pair.rescale(self._poses.scale)
-        remembered, reason = await self._latch.read()
-        for event in await work(self._store.recover, "the rig process died during the test"):
+        remembered, reason = await self.state.file.read()
+        if await self._recover("the rig process died during the test"):
             remembered = "running"
-            self.finished = event
-            self._publish(event)
         before = None
-        await self._rest.recall(in_doubt=remembered == "running")  # after a crash the last pulse's time is unknown
+        await self.rest.recall(in_doubt=remembered == "running")  # after a crash the last pulse's time is unknown
         if remembered == "running":
             before, reason = "uncertain", f"the rig died during a test ({reason or 'its journal was left'})"
         elif remembered == "latched":
             before = "latched"
         trial = Trial().connected(before, reason)
         try:
-            await self._pair.connect()
+            await self.pair.connect()
         except DeviceError as error:
             log.error("%s", error)
             trial = trial.disconnected(str(error))  # a latch stays although a device is missing
         else:
             if before == "uncertain":
-                trial = replace(trial, reason=f"{reason}; the stimulator, asked now: {self._pair.found_state}")
-        self._change(trial)
+                trial = replace(trial, reason=f"{reason}; the stimulator, asked now: {self.pair.found_state}")
+        self.state.change(trial)
 
     async def close(self) -> None:
         """Stop a running test, wait until it is sealed, disconnect. A start that is under way does not begin."""
-        self._closing = True
-        self._change(self._trial.disconnected("the rig is shutting down"))
+        self.state.closing = True
+        self.state.change(self.state.trial.disconnected("the rig is shutting down"))
         await self.stop("the rig is shutting down", "rig", latch_idle=False)
-        if self._playing is not None:
-            await self._tasks.sleep(SEALED_WITHIN_S, self._playing.done)
-        await self._pair.disconnect()
-        await self._latch_written()  # of a stop that came meanwhile
+        if self.player.playing is not None:
+            await self._tasks.sleep(SEALED_WITHIN_S, self.player.playing.done)
+        await self.pair.disconnect()
+        await self.state.written()  # of a stop that came meanwhile
         self._folder_lock.__exit__(None, None, None)
 
     async def start(self, request: TestPlan, key: str = "") -> Status:
@@ -111,78 +195,40 @@ class Rig(Calibrating):
         JournalError, RigError
             The journal or the latch file cannot be written.
         """
-        self._trial.may_start()  # before its turn: a start that was asked for while stopped must not run later
-        latch = self.latch
-        if request.angle is not None and self._has_angle:
-            await await_angle(self._angle_receiver(), self._tasks)
-        async with self._in_turn():
-            self._trial.may_start()
-            self._refuse_unseen(latch)
+        state = self.state
+        state.trial.may_start()  # before its turn: a start that was asked for while stopped must not run later
+        latch = state.latch
+        await self.joint.await_angle(request)
+        async with state.in_turn():
+            state.trial.may_start()
+            state.refuse_unseen(latch)
             check_names("plan", test_id=request.test_id, participant=request.participant)
             if request.adaptive is not None and len(key) < MIN_KEY:  # only who started it extends it
                 raise PlanError(
                     f"start.key: an adaptive test needs one of at least {MIN_KEY} characters; make a random one"
                 )
-            table = limits.for_plan(self._table, request)
+            table = limits.for_plan(self.table, request)
             test = await self._tasks.work(plan.build, request, table)
-            await self._tasks.work(self._store.check_room, request.test_id)
-            following = self._trial.start(request.test_id, request.participant)  # a stop may have come meanwhile
+            await self._tasks.work(self.store.check_room, request.test_id)
+            following = state.trial.start(request.test_id, request.participant)  # a stop may have come meanwhile
             now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
             needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
             check_profile(request.profile, now_s, needs_widths, longest_s)
-            check_range(request, self.angle_set_at_utc)
-            plan.check_steps(test, self._pair.steps)
-            self._rest.check(test, table["rest_between_tests_s"])
-            self._check_angle(request, table)
-            self._key = key
-            if (withdrawn := self._withdrawn.get(request.test_id)) is not None:
-                raise WithdrawnError(f"test {request.test_id}: {withdrawn}; ask for a new test")
+            check_range(request, self.joint.set_at_utc)
+            plan.check_steps(test, self.pair.steps)
+            self.rest.check(test, table["rest_between_tests_s"])
+            self.joint.check(request, table)
+            self.player.refuse_withdrawn(request.test_id)
             # nothing is waited for from here until it can be halted
-            await self._launch(test, table, following)
+            await self.player.launch(test, table, following, self.joint.described(), key)
         return self.status()
-
-    @property
-    def angle_set_at_utc(self) -> str | None:
-        """When the angle sensor was calibrated; None: it was not. May be called from another thread."""
-        found = self._poses.calibration
-        return None if found is None else found.set_at_utc
 
     async def angle_pose(self, request: AnglePoseRequest) -> Status:
-        """The goniometer's angle of a joint that is held still; the second one completes a calibration.
-
-        Raises
-        ------
-        PlanError
-            This rig has no angle sensor.
-        BusyError
-            A test is in progress.
-        DeviceError, RefusedError, RigError
-            See `AngleCalibrating.pose`.
-        """
-        async with self._in_turn():
-            if not self._has_angle:
-                raise PlanError(NO_SENSOR.format("angle_pose"))
-            if self._trial.busy:
-                raise BusyError(f"test {self._trial.test_id} is {self._trial.state}; take the pose afterwards")
-            await self._poses.pose(
-                request.angle_rad, request.by, self._angle_receiver(), self._table["angle_rad"], request.first
-            )
-            self._pair.rescale(self._poses.scale)
-            self._publish(StateEvent(status=self.status()))
+        """A pose of the angle sensor's calibration; raises as `Joint.pose`."""
+        async with self.state.in_turn():
+            await self.joint.pose(request, self.state.trial)
+            self._tell()
         return self.status()
-
-    def _check_angle(self, plan: TestPlan, table: dict[str, Limit]) -> None:
-        """Refuse a test that asks for an angle that this rig cannot give, or where the joint is elsewhere."""
-        if plan.angle is None:
-            return
-        if not self._has_angle:
-            raise PlanError(NO_SENSOR.format("plan.angle"))
-        if self._require_calibration and self._poses.calibration is None:
-            raise RefusedError(
-                "plan.angle: the angle sensor is not calibrated; take two poses with a goniometer, "
-                f"{degrees(APART_RAD)} or more apart"
-            )
-        check_start(self._angle_receiver(), plan, table, self._clock)
 
     async def library(self) -> Sequences:
         """All sequences and protocols that a plan may name."""
@@ -192,24 +238,22 @@ class Rig(Calibrating):
         """Stop stimulation now, latch, and return what device and torque showed afterwards."""
         words = f"{reason:.{LONGEST_WORDS}} (by {by:.{LONGEST_WORDS}})" if by else f"{reason:.{LONGEST_WORDS}}"
         until_s = self._clock.now_s() + STORED_S * self._clock.speed
-        if self._end("stopped", words, latch_idle):
-            await self._tasks.sleep(STOP_TIMEOUT_S, self._evidence_ready)
-            if self._trial.state == "sealing":
-                await self._latch_written(until_s)
-            if self._evidence is not None or self._trial.busy:
-                return self._evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
+        player, state = self.player, self.state
+        if player.end("stopped", words, latch_idle):
+            await self._tasks.sleep(STOP_TIMEOUT_S, player.evidence_ready)
+            if state.trial.state == "sealing":
+                await state.written(until_s)
+            if player.evidence is not None or state.trial.busy:
+                return player.evidence or self._unconfirmed(
+                    "no more pulses are sent; the device did not answer in time"
+                )
         evidence = await self._stop_idle()
-        await self._latch_written(until_s)
+        await state.written(until_s)
         return evidence
-
-    async def _latch_written(self, until_s: float = math.inf) -> None:
-        """Wait until what the next process has to know of the last stop is stored, or the disk refused it, or hangs."""
-        if self._latching is not None:
-            await self._tasks.wait(until_s, self._latching.done)
 
     async def _stop_idle(self) -> StopEvidence:
         """Ask the device although no test runs."""
-        gate = self._pair.gate
+        gate = self.pair.gate
         if gate is None:
             return self._unconfirmed("the stimulator is not connected; no pulse can be sent")
         try:
@@ -217,12 +261,12 @@ class Rig(Calibrating):
             safe, state = await gate.state()
         except DeviceError as error:
             return self._unconfirmed(str(error))
-        await self._rest.settle()
+        await self.rest.settle()
         return StopEvidence(confirmed=safe, detail=f"no test was running; device: {state}", device_state=state)
 
     def _unconfirmed(self, detail: str) -> StopEvidence:
         """Evidence if the device did not answer: a pulse that was sent before may still be felt."""
-        possible = self._pair.gate.still_possible() if self._pair.gate else self._rest.doubt()
+        possible = self.pair.gate.still_possible() if self.pair.gate else self.rest.doubt()
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
@@ -238,27 +282,48 @@ class Rig(Calibrating):
         DeviceError
             A device does not answer: the rig stays stopped.
         """
-        async with self._in_turn():
-            self._refuse_unseen(latch)
-            stopped = self._trial
+        state = self.state
+        async with state.in_turn():
+            state.refuse_unseen(latch)
+            stopped = state.trial
             following = stopped.rearm()
-            if stopped.lost or not await self._pair.both_answer():
+            if stopped.lost or not await self.pair.both_answer():
                 try:
-                    await self._pair.reconnect()
+                    await self.pair.reconnect()
                 except DeviceError as error:
-                    self._change(self._trial.disconnected(str(error)))
+                    state.change(state.trial.disconnected(str(error)))
                     raise
-            for event in await self._tasks.work(self._store.recover, "its recording could not be sealed at its end"):
-                self.finished = event
-                self._publish(event)
-            await self._rest.settle()
-            self._refuse_unseen(latch)
-            await self._latch.clear()
+            await self._recover("its recording could not be sealed at its end")
+            await self.rest.settle()
+            state.refuse_unseen(latch)
+            await state.file.clear()
             try:
-                self._refuse_unseen(latch)
+                state.refuse_unseen(latch)
             except LatchChangedError:
-                await self._remember(self._trial)
+                await state.remember(state.trial)
                 raise
             log.info("re-armed by %s after: %s", by, stopped.reason)
-            self._change(following)
+            state.change(following)
         return self.status()
+
+    async def _recover(self, reason: str) -> bool:
+        """Seal the journals that were left; whether there were any."""
+        found = await self._tasks.work(self.store.recover, reason)
+        for event in found:
+            self.player.finished = event
+            self._publish(event)
+        return bool(found)
+
+    def fault(self, reason: str) -> None:
+        """A device reports a fault."""
+        log.error("%s", reason)
+        self.player.end("fault", reason)
+
+    def _lost(self, reason: str) -> None:
+        """A device is gone."""
+        log.error("%s", reason)
+        self.player.end("fault", reason, latch_idle=False)
+        self.state.change(self.state.trial.disconnected(reason))
+
+    def _tell(self) -> None:
+        self._publish(StateEvent(status=self.status()))

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from stimrig.rig import archive, assembly, journal
 from stimrig.rig.acquire.health import SYNC_PERIOD_S
 from stimrig.rig.acquire.run import RunResult
 from stimrig.rig.config import RigConfig
-from stimrig.rig.control import dose
-from stimrig.rig.control.live import finite
+from stimrig.rig.control.summary import recovered_dose, summary_of
 from stimrig.rig.errors import JournalError, PlanError, RecordingError
 from stimrig.rig.journal import Journal
 from stimrig.rig.machine import Log, Machine
@@ -27,12 +23,6 @@ log = logging.getLogger("rig.sealing")
 
 MIN_FREE_BYTES = 64 * 2**20
 """A test of the longest duration makes 25 MB of journal and as much of recording at 1600 samples/s."""
-
-DOUBTFUL_ALIGNMENT_MS = 5.0
-DOUBTFUL_RATE = 0.02
-"""Beyond these a recording's times are uncertain, and its finished event says so. A larger rate error is a fault."""
-ROUNDED_US = 1.0
-"""A width that is lower than planned by more was not only rounded to the device's step."""
 
 
 class RecordingStore:
@@ -154,7 +144,7 @@ class RecordingStore:
             contents = journal.parse(path, self._disk.read(path))
             recording = assembly.assemble(contents, outcome, reason)
             if summary.get("recovered"):
-                summary |= dose.of_recording(recording, contents, self._unseen_s(contents))
+                summary |= recovered_dose(recording, contents, self._unseen_s(contents))
             sealed = archive.seal(recording, self.recordings, self._disk)
             if contents.damaged:  # the readable part is sealed; the file is kept for inspection
                 self._disk.rename(path, path.with_suffix(".damaged"))
@@ -167,99 +157,9 @@ class RecordingStore:
         if sealed is not None:
             event = {name: sealed.recording.attributes[name] for name in ("outcome", "reason", "recording_id")}
             event |= {"recording_path": str(sealed.path), "file_sha256": sealed.file_sha256}
-            event["summary"] = summary | _of_recording(sealed.recording, summary)
+            event["summary"] = summary | summary_of(sealed.recording, summary)
         event |= {"test_id": test_id, "last_sample_unix_s": unix_s}
         return FinishedEvent.model_validate(event)
-
-
-def _of_recording(recording: assembly.Recording, counted: dict[str, Any]) -> dict[str, Any]:
-    alignment = recording.alignment
-    return {
-        **({"angle": counted.get("angle", {}) | _of_angle(recording)} if recording.angle else {}),
-        "samples": len(recording.columns["torque/time_s"]),
-        "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
-        "alignment": {**asdict(alignment), "error_ms": finite(alignment.error_ms)},
-        "warnings": [*warnings(recording), *dose.warnings(counted)],
-    }
-
-
-def _of_angle(recording: assembly.Recording) -> dict[str, Any]:
-    angle_rad, error_ms = recording.columns["angle/angle_rad"], recording.angle["error_ms"]
-    return {
-        "samples": len(angle_rad),
-        "range_rad": [float(angle_rad.min()), float(angle_rad.max())] if len(angle_rad) else None,
-        "method": recording.angle["method"],
-        "error_ms": finite(error_ms),
-    }
-
-
-def warnings(recording: assembly.Recording) -> list[str]:
-    """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
-    alignment, attributes = recording.alignment, recording.attributes
-    found = [*_disturbed_line(recording), *_of_sensor(recording)]
-    if attributes["journal_note"]:
-        found.append(f"journal: {attributes['journal_note']}")
-    nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
-    if not len(recording.columns["torque/time_s"]):
-        return found
-    torque_nm = recording.columns["torque/torque_nm"]
-    if np.all(torque_nm == torque_nm[0]):
-        found.append(
-            f"load cell: its value stayed at exactly {torque_nm[0]:.3f} N·m in the whole test; it may be stuck"
-        )
-    if not (alignment.error_ms <= DOUBTFUL_ALIGNMENT_MS):
-        error = "unknown" if alignment.error_ms != alignment.error_ms else f"{alignment.error_ms:.1f} ms"
-        found.append(
-            f"torque and pulses: the error of their alignment is {error} (usual: up to {DOUBTFUL_ALIGNMENT_MS:g} ms), "
-            "because the computer or the bus was blocked; delays in a model of this recording may be wrong"
-        )
-    if nominal_hz > 0 and not (abs(measured_hz / nominal_hz - 1) <= DOUBTFUL_RATE):
-        found.append(
-            f"load cell: {measured_hz:.0f} samples/s arrived, the rig file says {nominal_hz:g}: times in this "
-            "recording may be wrong"
-        )
-    return found
-
-
-def _of_sensor(recording: assembly.Recording) -> list[str]:
-    """Warnings about an angle sensor that failed in a test that did not need it, or whose times are uncertain."""
-    found = [
-        f"{event['reason']}; the angle in this recording may be wrong or missing"
-        for event in recording.events
-        if event.get("event") == "angle_trouble"
-    ]
-    if not recording.angle or not len(recording.columns["angle/time_s"]):
-        return found
-    error_ms = recording.angle["error_ms"]
-    if not (error_ms <= DOUBTFUL_ALIGNMENT_MS):
-        error = "unknown" if error_ms != error_ms else f"{error_ms:.1f} ms"
-        found.append(f"angle and torque: the error of their alignment is {error}; a model of a movement may be wrong")
-    return found
-
-
-def _disturbed_line(recording: assembly.Recording) -> list[str]:
-    """Warnings about late acknowledgements, acknowledgements of what was not sent, dropped pulses and what followed."""
-    named = [event.get("event") for event in recording.events]
-    late_s = [event["delay_s"] for event in recording.events if event.get("event") == "late_ack"]
-    found = []
-    if unasked := named.count("unasked_ack"):
-        found.append(
-            f"stimulator: it acknowledged {unasked} pulses that were not sent; they may have been felt and are not in "
-            "this recording"
-        )
-    if late_s:
-        found.append(
-            f"stimulator: {len(late_s)} acknowledgements came late, up to {max(late_s) * 1e3:.0f} ms after the pulse "
-            f"was sent; these pulses may have been felt that late; {named.count('dropped')} pulses that came due "
-            "meanwhile were dropped"
-        )
-    planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
-    if weaker := int(np.count_nonzero(planned_us - sent_us > ROUNDED_US)):
-        found.append(
-            f"stimulator: {weaker} pulses were narrower than planned, since after dropped pulses the width climbs back "
-            "no faster than its limit"
-        )
-    return found
 
 
 def software() -> str:

@@ -1,15 +1,18 @@
-"""A serial line with numbered packets: bytes in, packets out, and commands that wait for their acks."""
+"""What drivers of stimulators on a serial line share: numbered packets, and commands that wait for their acks."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from enum import IntEnum
+from typing import Any, ClassVar, Generic, TypeVar
 
+from stimrig.rig.devices import DeviceSettings
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.machine import Machine, Port
 from stimrig.rig.signals import Ack, LateError
 from stimrig.rig.tasks import Signal
-from stimrig.rig.wire.framing import FrameReader, Packet
+from stimrig.rig.wire.framing import FrameReader, Framing, Packet
 
 log = logging.getLogger("rig.line")
 
@@ -93,19 +96,9 @@ class PacketLine:
         return self._number
 
     async def ask(self, make: Callable[[int], bytes], name: str, answer: int, timeout_s: float) -> Packet:
-        """Write a command and wait for its ack.
+        """Write a command and wait so many real seconds for its ack, which has the command number `answer`.
 
-        Parameters
-        ----------
-        name, answer
-            Name of the command in messages, and the command number of its ack.
-        timeout_s
-            Real seconds.
-
-        Raises
-        ------
-        DeviceError
-            No ack in time, or an unexpected answer.
+        Raises DeviceError: no ack in time, or an unexpected answer.
         """
         answered, packets = Signal(), list[Packet]()
         number = self.tell(make)
@@ -135,18 +128,15 @@ class PacketLine:
 
     def _read(self, data: bytes, time_s: float) -> None:
         try:
-            self._take(data, time_s)
+            for packet in self._frames.feed(data):
+                self._on_packet(packet, time_s)
+                if packet.number in self._waiting:
+                    answered, packets = self._waiting.pop(packet.number)
+                    packets.append(packet)
+                    answered.set()
         except Exception as error:  # a bug in a driver: report it at once, not after a timeout
             log.exception("the reader of %s failed", self.port)
             self._lose(f"internal: {type(error).__name__}: {error}")
-
-    def _take(self, data: bytes, time_s: float) -> None:
-        for packet in self._frames.feed(data):
-            self._on_packet(packet, time_s)
-            if packet.number in self._waiting:
-                answered, packets = self._waiting.pop(packet.number)
-                packets.append(packet)
-                answered.set()
 
     def _lose(self, reason: str) -> None:
         if self._open:
@@ -160,3 +150,73 @@ class PacketLine:
         waiting, self._waiting = self._waiting, {}
         for answered, _ in waiting.values():
             answered.set()
+
+
+class LineSettings(DeviceSettings):
+    """What the settings of every driver on a serial line have."""
+
+    port: str
+    channel: int
+    reply_timeout_s: float
+
+
+S = TypeVar("S", bound=LineSettings)
+
+
+class LineStimulator(Generic[S]):
+    """Base of the drivers; see `rig.devices.Stimulator` for what the methods promise."""
+
+    framing: ClassVar[Framing]
+    numbers: ClassVar[int]
+    """Packet numbers before they repeat."""
+    serial: ClassVar[dict[str, Any]]
+    """Arguments of `serial.Serial`."""
+
+    def __init__(self, settings: S, machine: Machine) -> None:
+        self._settings = settings
+        port = machine.port(settings.port, **self.serial)
+        self._line = PacketLine(machine, port, settings.port, self.numbers, self.framing.reader, self._take)
+        self.listen = self._line.listen
+
+    async def open(self) -> dict[str, Any]:
+        await self._line.open()
+        try:
+            serial_number, firmware = await self._identity()
+            _, state = await self.state()
+        except DeviceError:
+            self.close()
+            raise
+        settings = self._settings
+        return {
+            "device": settings.device,
+            "id": serial_number,
+            "firmware": firmware,
+            "port": settings.port,
+            "channel": settings.channel,
+            "state": state,
+        }
+
+    async def state(self) -> tuple[bool, str]:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        self._line.close()
+
+    async def _identity(self) -> tuple[str, str]:
+        """Serial number and firmware."""
+        raise NotImplementedError
+
+    def _take(self, packet: Packet, time_s: float) -> None:
+        raise NotImplementedError
+
+    def _frame(self, command: IntEnum, data: bytes = b"") -> Callable[[int], bytes]:
+        return lambda number: self.framing.encode(Packet(number, command, data))
+
+    async def _ask(self, command: IntEnum, data: bytes = b"") -> Packet:
+        frame, timeout_s = self._frame(command, data), self._settings.reply_timeout_s
+        return await self._line.ask(frame, in_words(command), command + 1, timeout_s)
+
+
+def in_words(command: IntEnum) -> str:
+    """The name of a command for messages."""
+    return command.name.lower().replace("_", " ")

@@ -1,73 +1,160 @@
 """Hasomed RehaMove P24 in ScienceMode 4's low level: one command per pulse, so without commands nothing is sent.
 
 The driver takes only width and current and makes the symmetric biphasic pulse itself, so a pulse is always balanced.
+
+Frame: `F0`, length and CRC each as two bytes behind an escape, the stuffed payload, `0F`. The payload starts with
+packet number (6 bits) and command (10 bits). An ack is the command + 1.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import binascii
+import struct
+from enum import IntEnum
 
 from pydantic import Field
 
-from stimrig.rig.devices import DeviceSettings
-from stimrig.rig.devices._line import PacketLine
-from stimrig.rig.errors import DeviceError
+from stimrig.rig.devices._line import LineSettings, LineStimulator, in_words
+from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
-from stimrig.rig.machine import Machine
 from stimrig.rig.signals import Ack
-from stimrig.rig.wire import sciencemode4 as wire
-from stimrig.rig.wire.framing import Packet
-from stimrig.rig.wire.sciencemode4 import Command
+from stimrig.rig.wire.framing import Framing, Packet
 
 KIND = "stimulator"
 
-BAUD_RATE = 3_000_000
+OVERHEAD_BYTES = 10
+MAX_FRAME_BYTES = 128
+"""Longer than any answer of the low level. Part of a damaged frame may look like the start of a longer frame, and the
+reader would then wait for that length and lose the frames in between."""
+INTERPHASE_US = 100
+
+
+class Command(IntEnum):
+    """Commands used here."""
+
+    LL_INIT = 0
+    LL_CHANNEL_CONFIG = 2
+    LL_STOP = 4
+    DEVICE_ID = 52
+    STIM_STATUS = 62
+    GENERAL_ERROR = 66
+    UNKNOWN_COMMAND = 67
+    EXTENDED_VERSION = 68
+
+
+RESULTS = {
+    0: "ok",
+    1: "transfer error",
+    2: "parameter error",
+    7: "not initialised",
+    8: "high voltage error",
+    10: "electrode error",
+    11: "invalid command",
+    16: "pulse timeout",
+    28: "current too low",
+}
+"""Result byte of an ack -> words."""
 NOT_INITIALISED = 7
+LEVELS = {0: "not initialised", 1: "low level initialised", 2: "mid level initialised", 3: "mid level running"}
+"""Stimulation status byte -> words."""
 
 
-class Settings(DeviceSettings):
+def result_text(result: int) -> str:
+    """Words for a result byte, with the number if it is unknown."""
+    return RESULTS.get(result, f"error {result}")
+
+
+def _unpack(payload: bytes) -> Packet:
+    head = int.from_bytes(payload[:2], "big")
+    return Packet(head >> 10, head & 0x3FF, payload[2:])
+
+
+FRAMING = Framing(
+    header_fields=4,
+    header=lambda body: struct.pack(">HH", len(body) + OVERHEAD_BYTES, binascii.crc_hqx(body, 0)),
+    frame_length=lambda header: int.from_bytes(header[:2], "big"),
+    max_frame_bytes=MAX_FRAME_BYTES,
+    pack=lambda packet: struct.pack(">H", packet.number << 10 | packet.command) + packet.data,
+    unpack=_unpack,
+)
+
+
+def ll_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float, connector: int = 0) -> bytes:
+    """Frame of one symmetric biphasic pulse: (w, +I), (100 µs, 0), (w, −I).
+
+    Parameters
+    ----------
+    number
+        Packet number, 0 … 63.
+    channel, connector
+        Counted from 0.
+    pulse_width_us
+        Width of each phase, whole µs, 1 … 4095.
+    current_ma
+        0 … 130 mA in steps of 0.5.
+
+    Raises
+    ------
+    WireError
+        A value that the frame cannot carry: no pulse is better than another pulse.
+    """
+    half_ma = 2 * current_ma
+    if not (isinstance(pulse_width_us, int) and 1 <= pulse_width_us <= 4095):
+        raise WireError(f"pulse width {pulse_width_us} µs is not a whole number from 1 to 4095")
+    if not (0 <= half_ma <= 260 and half_ma == int(half_ma)):
+        raise WireError(f"current {current_ma} mA is not 0 to 130 in steps of 0.5")
+    if not (0 <= channel <= 3 and 0 <= connector <= 1):
+        raise WireError(f"channel {channel} on connector {connector}: 0 to 3 on 0 or 1")
+    points = ((pulse_width_us, int(half_ma)), (INTERPHASE_US, 0), (pulse_width_us, -int(half_ma)))
+    head = 0x80 | channel << 5 | connector << 4 | len(points) - 1
+    body = b"".join(struct.pack(">I", width << 20 | half + 300 << 10) for width, half in points)
+    return FRAMING.encode(Packet(number, Command.LL_CHANNEL_CONFIG, bytes((head,)) + body))
+
+
+def parse_status(data: bytes) -> tuple[int, int, int]:
+    """(result, level, high voltage code) of a status ack. Raises WireError: too short."""
+    if len(data) < 3:
+        raise WireError(f"status ack of {len(data)} bytes, expected 3")
+    return data[0], data[1], data[2]
+
+
+def parse_device_id(data: bytes) -> str:
+    """Serial number of a device id ack: ten characters after the result."""
+    return data[1:11].decode("ascii", "replace").strip("\0 ")
+
+
+def parse_version(data: bytes) -> str:
+    """`firmware (ScienceMode version)` of an extended version ack, '' where it is too short to tell."""
+    if len(data) < 7:
+        return ""
+    return f"{data[1]}.{data[2]}.{data[3]} (ScienceMode {data[4]}.{data[5]}.{data[6]})"
+
+
+class Settings(LineSettings):
     port: str = Field(description="serial port, e.g. /dev/serial/by-id/usb-HASOMED_P24-if00")
     channel: int = Field(1, ge=1, le=4, description="1 red, 2 blue, 3 black, 4 white")
     connector: int = Field(1, ge=1, le=2, description="1 yellow, 2 green")
     reply_timeout_s: float = Field(0.5, gt=0, le=5, description="for commands other than pulses, real seconds")
 
 
-class P24:
-    """Driver of one P24 on one serial port; see `stimrig.rig.devices.Stimulator` for what the methods promise."""
+class P24(LineStimulator[Settings]):
+    """Driver of one P24 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
 
     steps = Steps(pulse_width_us=1.0, current_ma=0.5, shortest_us=1.0)
+    framing, numbers = FRAMING, 64
+    serial = {"baudrate": 3_000_000, "stopbits": 2, "rtscts": True}  # noqa: RUF012
 
-    def __init__(self, settings: Settings, machine: Machine) -> None:
-        self._settings = settings
-        port = machine.port(settings.port, baudrate=BAUD_RATE, stopbits=2, rtscts=True)
-        self._line = PacketLine(machine, port, settings.port, wire.NUMBERS, wire.FRAMING.reader, self._take)
-        self.listen, self.close = self._line.listen, self._line.close
-
-    async def open(self) -> dict[str, Any]:
-        await self._line.open()
-        try:
-            serial_number = wire.parse_device_id((await self._ask(Command.DEVICE_ID)).data)
-            firmware = wire.parse_version((await self._ask(Command.EXTENDED_VERSION)).data)
-            _, state = await self.state()
-        except DeviceError:
-            self.close()
-            raise
-        return {
-            "device": "p24",
-            "id": serial_number,
-            "firmware": firmware,
-            "port": self._settings.port,
-            "channel": self._settings.channel,
-            "state": state,
-        }
+    async def _identity(self) -> tuple[str, str]:
+        serial_number = parse_device_id((await self._ask(Command.DEVICE_ID)).data)
+        return serial_number, parse_version((await self._ask(Command.EXTENDED_VERSION)).data)
 
     async def arm(self) -> None:
-        await self._ask(Command.LL_INIT)
+        await self._ask(Command.LL_INIT, bytes((0,)))
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
         channel, connector = self._settings.channel - 1, self._settings.connector - 1
         return self._line.tell(
-            lambda number: wire.ll_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma, connector), latest_s
+            lambda number: ll_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma, connector), latest_s
         )
 
     def feed(self) -> None:
@@ -75,37 +162,29 @@ class P24:
 
     async def stop(self) -> None:
         self._line.discard()
-        await self._ask(
-            Command.LL_STOP, fine=(0, NOT_INITIALISED)
-        )  # a device that is not initialised has already stopped
+        # a device that is not initialised has already stopped
+        await self._ask(Command.LL_STOP, fine=(0, NOT_INITIALISED))
 
     async def state(self) -> tuple[bool, str]:
-        result, level, _ = wire.parse_status((await self._ask(Command.STIM_STATUS)).data)
+        result, level, _ = parse_status((await self._ask(Command.STIM_STATUS)).data)
         if result != 0:
-            raise DeviceError(f"stimulator {self._settings.port} answered its state with {wire.result_text(result)}")
-        return level == 0, wire.LEVELS.get(level, f"level {level}")
+            raise DeviceError(f"stimulator {self._settings.port} answered its state with {result_text(result)}")
+        return level == 0, LEVELS.get(level, f"level {level}")
 
-    async def _ask(self, command: Command, fine: tuple[int, ...] = (0,)) -> Packet:
-        data = bytes((0,)) if command == Command.LL_INIT else b""
-        name = command.name.lower().replace("_", " ")
-        packet = await self._line.ask(
-            lambda number: wire.FRAMING.encode(Packet(number, command, data)),
-            name,
-            command + 1,
-            self._settings.reply_timeout_s,
-        )
+    async def _ask(self, command: IntEnum, data: bytes = b"", fine: tuple[int, ...] = (0,)) -> Packet:
+        packet = await super()._ask(command, data)
         result = packet.data[0] if packet.data else 1  # an answer without a result is none
         if result not in fine:
-            raise DeviceError(f"stimulator {self._settings.port}: {name}: {wire.result_text(result)}")
+            raise DeviceError(f"stimulator {self._settings.port}: {in_words(command)}: {result_text(result)}")
         return packet
 
     def _take(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.LL_CHANNEL_CONFIG + 1:
             result = packet.data[0] if packet.data else 1
-            self._line.on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
+            self._line.on_ack(Ack(packet.number, time_s, result_text(result) if result else None))
         elif packet.command in (Command.GENERAL_ERROR, Command.UNKNOWN_COMMAND):
             result = packet.data[0] if packet.data else 0
-            words = wire.result_text(result) if result else "unknown command"
+            words = result_text(result) if result else "unknown command"
             self._line.on_ack(Ack(packet.number, time_s, words))
 
 

@@ -3,73 +3,170 @@
 The channel list is never used, since the device would continue to play it for up to 1200 ms after the host's last
 command. The device's own watchdog is still active: after 1200 ms without a command it closes the connection and offers
 a new one. Only `feed` keeps it alive, which the rig calls after a health check: there is no keep-alive thread.
+
+Frame: `F0`, CRC-8 and length each as one byte behind an escape, the stuffed body, `0F`. The body is packet number,
+command, data; numbers of several bytes come most significant first. CRC and length are those of the stuffed body.
+An ack is the command + 1 with the same number; its first byte is a signed result.
 """
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Any
 
 from pydantic import Field
 
-from stimrig.rig.devices import DeviceSettings
-from stimrig.rig.devices._line import PacketLine
-from stimrig.rig.errors import DeviceError
+from stimrig.rig.devices._line import LineSettings, LineStimulator
+from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
 from stimrig.rig.machine import Machine
 from stimrig.rig.signals import Ack
 from stimrig.rig.tasks import Signal
-from stimrig.rig.wire import sciencemode2 as wire
-from stimrig.rig.wire.framing import Packet
-from stimrig.rig.wire.sciencemode2 import Command
+from stimrig.rig.wire.framing import Framing, Packet
 
 KIND = "stimulator"
 
-BAUD_RATE = 460_800
 FEED_S = 0.3
 """Rig seconds after the last command at which a keep-alive goes out, a quarter of the device's watchdog."""
 OFFER_S = 1.5
 """Real seconds to wait for the device to offer a connection; it does so every 500 ms."""
+OVERHEAD_BYTES = 6
+MAX_BODY_BYTES = 0xFF
+VERSION = 1
+
+
+class Command(IntEnum):
+    """Commands used here; the device sends INIT, UNKNOWN and STIMULATION_ERROR without being asked."""
+
+    INIT = 1
+    INIT_ACK = 2
+    UNKNOWN = 3
+    WATCHDOG = 4
+    GET_MODE = 10
+    STOP = 34
+    SINGLE_PULSE = 36
+    STIMULATION_ERROR = 38
+
+
+RESULTS = {
+    0: "ok",
+    -1: "transfer error",
+    -2: "parameter error",
+    -3: "wrong mode",
+    -5: "protocol version refused",
+    -8: "busy",
+}
+"""Result of an ack -> words."""
+
+ERRORS = {-1: "emergency switch pressed", -2: "electrode error", -3: "stimulation module error"}
+"""What a StimulationError says -> words."""
+
 START_MODE = 0
+MODES = {0: "start mode, pulses on command only", 1: "channel list initialised", 2: "channel list running"}
 
 
-class Settings(DeviceSettings):
+def result_of(data: bytes) -> int:
+    """Signed result at the head of an ack or error; a missing one counts as a transfer error."""
+    return int.from_bytes(data[:1], "big", signed=True) if data else -1
+
+
+def result_text(result: int) -> str:
+    """Words for a result, with the number if it is unknown."""
+    return RESULTS.get(result, f"error {result}")
+
+
+def _crc_table() -> bytes:
+    table = bytearray()
+    for byte in range(256):
+        for _ in range(8):
+            byte = (byte << 1 ^ 0x07 if byte & 0x80 else byte << 1) & 0xFF
+        table.append(byte)
+    return bytes(table)
+
+
+_CRC = _crc_table()
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8, polynomial 07, from 0, not reflected."""
+    crc = 0
+    for byte in data:
+        crc = _CRC[crc ^ byte]
+    return crc
+
+
+def _header(body: bytes) -> bytes:
+    if len(body) > MAX_BODY_BYTES:
+        raise WireError(f"body of {len(body)} bytes, at most {MAX_BODY_BYTES}")
+    return bytes((crc8(body), len(body)))
+
+
+FRAMING = Framing(
+    header_fields=2,
+    header=_header,
+    frame_length=lambda header: header[1] + OVERHEAD_BYTES,
+    max_frame_bytes=MAX_BODY_BYTES + OVERHEAD_BYTES,
+    pack=lambda packet: bytes((packet.number, packet.command)) + packet.data,
+    unpack=lambda payload: Packet(payload[0], payload[1], payload[2:]),
+)
+
+
+def single_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float) -> bytes:
+    """Frame of one symmetric biphasic pulse, drawn by the device.
+
+    Parameters
+    ----------
+    number
+        Packet number, 0 … 255.
+    channel
+        0 … 7.
+    pulse_width_us
+        Width of each phase, whole µs, 20 … 500.
+    current_ma
+        0 … 126 mA in steps of 2.
+
+    Raises
+    ------
+    WireError
+        A value that the frame cannot carry: no pulse is better than another pulse.
+    """
+    if not (isinstance(pulse_width_us, int) and 20 <= pulse_width_us <= 500):
+        raise WireError(f"pulse width {pulse_width_us} µs is not a whole number from 20 to 500")
+    if not (0 <= current_ma <= 126 and current_ma % 2 == 0):
+        raise WireError(f"current {current_ma} mA is not 0 to 126 in steps of 2")
+    if not (0 <= channel <= 7):
+        raise WireError(f"channel {channel}: 0 to 7")
+    data = bytes((channel,)) + pulse_width_us.to_bytes(2, "big") + bytes((int(current_ma),))
+    return FRAMING.encode(Packet(number, Command.SINGLE_PULSE, data))
+
+
+class Settings(LineSettings):
     port: str = Field(description="serial port, e.g. /dev/serial/by-id/usb-FTDI_RehaStim2-if00-port0")
     channel: int = Field(1, ge=1, le=8, description="1 to 4 on side A, 5 to 8 on side B")
     reply_timeout_s: float = Field(0.3, gt=0, le=5, description="for commands other than pulses, real seconds")
 
 
-class RehaStim2:
+class RehaStim2(LineStimulator[Settings]):
     """Driver of one RehaStim 2 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
 
     steps = Steps(pulse_width_us=1.0, current_ma=2.0, shortest_us=20.0)
+    framing, numbers = FRAMING, 256
+    serial = {"baudrate": 460_800, "parity": "E"}  # noqa: RUF012
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
-        self._settings = settings
+        super().__init__(settings, machine)
         self._tasks, self._clock = machine.tasks, machine.tasks.clock
-        port = machine.port(settings.port, baudrate=BAUD_RATE, parity="E")
-        self._line = PacketLine(machine, port, settings.port, wire.NUMBERS, wire.FRAMING.reader, self._take)
         self._armed = False
         self._offered = Signal()
         self._offer: Packet | None = None
-        self.listen = self._line.listen
 
     async def open(self) -> dict[str, Any]:
         self._offer = None
         self._offered.clear()
-        await self._line.open()
-        try:
-            _, state = await self.state()
-        except DeviceError:
-            self.close()
-            raise
-        return {
-            "device": "rehastim2",
-            "id": "",
-            "firmware": f"ScienceMode 2, protocol {wire.VERSION}",
-            "port": self._settings.port,
-            "channel": self._settings.channel,
-            "state": state,
-        }
+        return await super().open()
+
+    async def _identity(self) -> tuple[str, str]:
+        return "", f"ScienceMode 2, protocol {VERSION}"
 
     async def arm(self) -> None:
         await self.stop()  # back to the start mode, whatever the mode was
@@ -81,45 +178,39 @@ class RehaStim2:
     def send(self, pulse: Admitted, latest_s: float) -> int:
         channel = self._settings.channel - 1
         return self._line.tell(
-            lambda number: wire.single_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma), latest_s
+            lambda number: single_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma), latest_s
         )
 
     def feed(self) -> None:
         if self._armed and self._clock.now_s() - self._line.last_written_s >= FEED_S:
-            self._line.tell(lambda number: wire.FRAMING.encode(Packet(number, Command.WATCHDOG)))
+            self._line.tell(self._frame(Command.WATCHDOG))
 
     async def stop(self) -> None:
         self._armed = False
         self._line.discard()
-        result = wire.result_of((await self._ask(Command.STOP)).data)
+        result = result_of((await self._ask(Command.STOP)).data)
         if result != 0:
-            raise DeviceError(f"stimulator {self._settings.port}: stop: {wire.result_text(result)}")
+            raise DeviceError(f"stimulator {self._settings.port}: stop: {result_text(result)}")
 
     async def state(self) -> tuple[bool, str]:
         data = (await self._ask(Command.GET_MODE)).data
-        result = wire.result_of(data)
+        result = result_of(data)
         if result != 0 or len(data) < 2:
-            raise DeviceError(f"stimulator {self._settings.port} answered its mode with {wire.result_text(result)}")
-        return data[1] == START_MODE, wire.MODES.get(data[1], f"mode {data[1]}")
+            raise DeviceError(f"stimulator {self._settings.port} answered its mode with {result_text(result)}")
+        return data[1] == START_MODE, MODES.get(data[1], f"mode {data[1]}")
 
     def close(self) -> None:
         self._armed = False
-        self._line.close()
+        super().close()
 
-    async def _ask(self, command: Command) -> Packet:
+    async def _ask(self, command: IntEnum, data: bytes = b"") -> Packet:
         """Ask; if the device has closed the connection, accept its next offer and ask once more."""
         try:
-            return await self._ask_once(command)
+            return await super()._ask(command, data)
         except DeviceError:
             if not await self._take_offer():
                 raise
-        return await self._ask_once(command)
-
-    async def _ask_once(self, command: Command) -> Packet:
-        name = command.name.lower().replace("_", " ")
-        timeout_s = self._settings.reply_timeout_s
-        make = lambda number: wire.FRAMING.encode(Packet(number, command))  # noqa: E731
-        return await self._line.ask(make, name, command + 1, timeout_s)
+        return await super()._ask(command, data)
 
     async def _take_offer(self) -> bool:
         """Accept a connection that the device offers; False if it offers none."""
@@ -128,30 +219,27 @@ class RehaStim2:
         self._offered.clear()
         if offer is None:
             return False
-        accepted = offer.data[:1] == bytes((wire.VERSION,))
+        accepted = offer.data[:1] == bytes((VERSION,))
         result = 0 if accepted else -5
-        self._line.tell(lambda _: wire.FRAMING.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
+        self._line.tell(lambda _: FRAMING.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
         if not accepted:
             raise DeviceError(f"stimulator {self._settings.port}: it uses protocol {offer.data.hex()}, this driver 1")
         return True
 
     def _take(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.SINGLE_PULSE + 1:
-            result = wire.result_of(packet.data)
-            self._line.on_ack(Ack(packet.number, time_s, wire.result_text(result) if result else None))
+            result = result_of(packet.data)
+            self._line.on_ack(Ack(packet.number, time_s, result_text(result) if result else None))
         elif packet.command == Command.STIMULATION_ERROR:
-            error = wire.result_of(packet.data)
-            self._line.on_ack(Ack(-1, time_s, wire.ERRORS.get(error, f"stimulation error {error}")))
+            error = result_of(packet.data)
+            self._line.on_ack(Ack(-1, time_s, ERRORS.get(error, f"stimulation error {error}")))
         elif packet.command == Command.UNKNOWN:
             self._line.on_ack(Ack(packet.number, time_s, "unknown command"))
         elif packet.command == Command.INIT:
-            self._take_init(packet, time_s)
-
-    def _take_init(self, packet: Packet, time_s: float) -> None:
-        self._offer = packet
-        self._offered.set()
-        if self._armed:
-            self._line.on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
+            self._offer = packet
+            self._offered.set()
+            if self._armed:
+                self._line.on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
 
 
 create = RehaStim2

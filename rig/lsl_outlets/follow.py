@@ -9,7 +9,7 @@ from pathlib import Path
 
 from stimrig.rig import journal
 from stimrig.rig.errors import RecordingError
-from stimrig.rig.journal import MAGIC, MARK, Kind
+from stimrig.rig.journal import MAGIC, Kind
 
 AT_ONCE_BYTES = 1 << 18
 FREE_TO_READ = {0xEF53: "ext2 to ext4", 0x9123683E: "btrfs", 0x01021994: "tmpfs", 0x794C7630: "overlay"}
@@ -60,21 +60,10 @@ class Tail:
         if not piece:
             return []
         self._buffer += piece
-        found: list[tuple[Kind, bytes]] = []
-        at = 0
-        while at < len(self._buffer):
-            block = journal.block_at(self._buffer, at)
-            if block is None:
-                following = self._next_whole(at)
-                if following is None:  # the rest of it has not come yet
-                    break
-                self.damaged_bytes += following - at
-                at = following
-                continue
-            kind, _, payload, at = block
-            found.append((kind, payload))
-        self._buffer = self._buffer[at:]
-        return found
+        found, end, damaged = journal.whole_blocks(self._buffer, 0)  # of what follows some may not have come yet
+        self.damaged_bytes += damaged
+        self._buffer = self._buffer[end:]
+        return [(kind, payload) for kind, _, payload in found]
 
     def left(self) -> bool:
         """Whether the rig has sealed it, or moved it aside."""
@@ -87,12 +76,6 @@ class Tail:
     def close(self) -> None:
         """Let it go."""
         os.close(self._fd)
-
-    def _next_whole(self, at: int) -> int | None:
-        while (at := self._buffer.find(MARK, at + 1)) >= 0:
-            if journal.block_at(self._buffer, at) is not None:
-                return at
-        return None
 
 
 class Journals:

@@ -1,4 +1,8 @@
-"""One test, from the blocks of its growing journal: what can be sent by now, with times of LSL's clock."""
+"""One test, from the blocks of its growing journal: what can be sent by now, with times of LSL's clock.
+
+The alignment is that of `rig.align`, of all samples so far. The sealed recording's uses the whole test. A line through
+its first second errs most far away from it, so the first samples are held back until the line is known well enough.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig import journal
+from stimrig.rig import align, journal
+from stimrig.rig.align import Array, Fit
 from stimrig.rig.journal import Kind
-from stimrig.rig.lsl_outlets.alignment import LiveAlignment
 from stimrig.rig.signals import SAMPLE
-
-Array = NDArray[np.float64]
 
 DELAY_S = 0.5
 """Real seconds for which each sample waits: longer than an ack may take, and than the rest that is measured after a
 test's end."""
+IN_TRANSIT_S = 0.1
+"""Real seconds: edges and pulses newer than this are not compared, one of a pair may still be on its way."""
+NO_SYNC = 255
 GOOD_S, GOOD_SHARE = 0.0003, 0.1
 """Standard error of the alignment from which on samples are sent: s, or this share of a sample if that is longer."""
 HOLD_S = 10.0
@@ -47,6 +52,68 @@ class _Pulse:
     current_ma: float
     written_s: float = np.nan
     acked_s: float = np.nan
+
+
+class LiveAlignment:
+    """Grows with the test.
+
+    Parameters
+    ----------
+    sample_rate_hz
+        Nominal rate of the cell.
+    speed
+        Rig seconds per real second.
+    """
+
+    def __init__(self, sample_rate_hz: float, speed: float = 1.0) -> None:
+        self._rate_hz, self._speed = sample_rate_hz, speed
+        self._kind, self._counted, self._first_stamp_s = "", 0, 0.0
+        self._taken: list[tuple[Array, NDArray[Any]]] = []
+        self.written_s: list[float] = []
+        """When each pulse was written, by the rig's clock."""
+        self.fit: Fit | None = None
+        self._synced = False
+
+    def take(self, samples: NDArray[Any]) -> Array:
+        """Take the next samples (`rig.signals.SAMPLE`); their times on the cell's clock, s."""
+        cell_s = self._cell_s(samples)
+        self._taken.append((cell_s, samples))
+        return cell_s
+
+    def update(self) -> None:
+        """Fit the line anew."""
+        cell_s, samples = (np.concatenate(parts) for parts in zip(*self._taken, strict=True))
+        self._taken = [(cell_s, samples)]
+        host_s, sync = samples["host_time_s"], samples["sync"]
+        self._synced = bool(np.any(sync != NO_SYNC))
+        until_s = float(host_s.max()) - IN_TRANSIT_S * self._speed
+        self.fit = align.fit(cell_s, host_s, sync, np.array(self.written_s), self._rate_hz, until_s)
+
+    def error_s(self, cell_s: float) -> float:
+        """Standard error of the line at a time of the cell's clock, s; infinite where too little is known."""
+        fit = self.fit
+        span_s = 0.0 if fit is None else float(np.ptp(fit.cell_s))
+        if fit is None or span_s <= 0 or (self._synced and fit.method != "sync"):
+            return np.inf
+        # the scatter of few points may be nothing by chance; a sample's length scatters at least
+        least_s = 1 / self._rate_hz / np.sqrt(12 * len(fit.cell_s))
+        lever = np.sqrt(12) * (cell_s - fit.line.centre_s) / span_s
+        error_s = max(fit.line.error_s, least_s) * np.hypot(1, lever)
+        return float(error_s) if np.isfinite(error_s) else np.inf
+
+    def _cell_s(self, samples: NDArray[Any]) -> Array:
+        """`rig.align.cell_time`, block by block: what the first block has tells what is counted by."""
+        counter, stamp_s = samples["counter"], samples["stamp_s"]
+        if not self._kind:
+            self._kind = "counter" if np.all(counter >= 0) else "stamp" if np.all(np.isfinite(stamp_s)) else "count"
+            self._first_stamp_s = float(stamp_s[0])
+        if self._kind == "counter":
+            return align.cell_time(counter.astype(np.int64), stamp_s, self._rate_hz)
+        if self._kind == "stamp":
+            return stamp_s - self._first_stamp_s
+        cell_s = (self._counted + np.arange(len(samples))) / self._rate_hz
+        self._counted += len(samples)
+        return cell_s
 
 
 class LiveTest:
@@ -119,7 +186,7 @@ class LiveTest:
             return
         if self._alignment is None:
             self._alignment = LiveAlignment(self._rate_hz, self._speed)
-        self._held.append((self._alignment.samples(samples), samples))
+        self._held.append((self._alignment.take(samples), samples))
         self._newest_s = max(self._newest_s, float(samples["host_time_s"][-1]))
 
     def _pulse(self, kind: Kind, payload: bytes) -> None:
@@ -176,7 +243,7 @@ class LiveTest:
                 continue
             written_s = min(pulse.written_s, pulse.acked_s) if np.isfinite(pulse.acked_s) else pulse.written_s
             if self._alignment is not None:
-                self._alignment.pulse(written_s)
+                self._alignment.written_s.append(written_s)
             if written_s >= self._since_s:
                 batch.pulse_s.append(self._lsl_s(written_s))
                 batch.pulses.append((pulse.width_us, pulse.current_ma, index))
@@ -197,7 +264,7 @@ class LiveTest:
         self._good = self._good or error_s < enough_s or waited_s > HOLD_S * self._speed
 
     def _pass_torque(self, batch: Batch, finish: bool) -> None:
-        if self._alignment is None or self._alignment.line is None:
+        if self._alignment is None or self._alignment.fit is None:
             return
         until_s = np.inf if finish else self._newest_s - DELAY_S * self._speed
         passing = 0
@@ -208,7 +275,7 @@ class LiveTest:
         cell_s = np.concatenate([held[0] for held in self._held[:passing]])
         samples = np.concatenate([held[1] for held in self._held[:passing]])
         del self._held[:passing]
-        time_s = self._alignment.line.at(cell_s)
+        time_s = self._alignment.fit.line.at(cell_s)
         keep = self._inside(time_s) & (samples["host_time_s"] >= self._since_s)
         time_s = np.maximum.accumulate(np.maximum(time_s[keep], self._last_s))
         if len(time_s):

@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
-from stimrig.api.charts import compare_charts, diagnosis_charts, hover, model_charts, palette
+from stimrig.api.charts import diagnosis_charts, model_charts
+from stimrig.api.charts import figure as fig
+from stimrig.api.charts.figure import LIGHT, in_light
 from stimrig.api.charts.svg import svg
 from stimrig.api.language import using
 from tests.api.test_export import measured
@@ -90,17 +92,17 @@ def test_every_line_that_is_seen_says_its_unit(figures: dict[str, Any]) -> None:
 def test_a_curves_band_is_said_at_the_curves_own_points() -> None:
     band = {"at": [0.0, 10.0], "whole_lower": [1.0, 2.0], "whole_upper": [1.2, 2.6]}
     with using("en"):
-        found = hover.with_band("model", hover.TORQUE, [0.0, 5.0, 10.0, 12.0], band, "at")
+        found = fig.hover_band("model", fig.TORQUE, [0.0, 5.0, 10.0, 12.0], band, "at")
     assert found["customdata"] == ["0.10", "0.20", "0.30", "0.30"]
     with using("de"):
-        assert hover.with_band("model", hover.TORQUE, [0.0], band, "at")["customdata"] == ["0,10"]
-    assert "±" not in hover.with_band("model", hover.TORQUE, [0.0], {}, "at")["hovertemplate"]
+        assert fig.hover_band("model", fig.TORQUE, [0.0], band, "at")["customdata"] == ["0,10"]
+    assert "±" not in fig.hover_band("model", fig.TORQUE, [0.0], {}, "at")["hovertemplate"]
 
 
 def test_each_time_has_the_segment_it_lies_in() -> None:
     segments = [{"name": name, "start_s": start} for name, start in (("a", 0.0), ("b", 1.0), ("c", 2.0))]
-    assert hover.segments_at([0.0, 0.9, 1.0, 1.5, 2.0, 9.0], segments, str.upper) == ["A", "A", "B", "B", "C", "C"]
-    assert hover.segments_at([0.0], [], str.upper) == [""]
+    assert fig.name_segments([0.0, 0.9, 1.0, 1.5, 2.0, 9.0], segments, str.upper) == ["A", "A", "B", "B", "C", "C"]
+    assert fig.name_segments([0.0], [], str.upper) == [""]
 
 
 def test_figures_hold_roles_and_no_colours(figures: dict[str, Any]) -> None:
@@ -108,17 +110,17 @@ def test_figures_hold_roles_and_no_colours(figures: dict[str, Any]) -> None:
     for name, figure in figures.items():
         kept = json.dumps({**figure, "data": [{**line, "x": [], "y": []} for line in figure["data"]]})
         assert re.findall(r'"#[0-9a-fA-F]{3,8}"|"rgba?\((?!0,0,0,0)[^"]*"', kept) == [], name
-        light = json.dumps(palette.in_light(figure))
-        assert "var(" not in light and palette.LIGHT["ink"] in light
+        light = json.dumps(in_light(figure))
+        assert "var(" not in light and LIGHT["ink"] in light
 
 
 def test_a_still_on_paper_has_its_colours_and_its_words(figures: dict[str, Any]) -> None:
     figure = {**figures["falling"], "data": [{**figures["falling"]["data"][0], "name": 'fill="var(--ink)"'}] * 2}
     on_page, on_paper = str(svg(figure)), str(svg(figure, on_paper=True))
     assert 'stroke="var(--measured)"' in on_page
-    assert f'stroke="{palette.LIGHT["measured"]}"' in on_paper and on_paper.count("var(--") == 2, "words are words"
+    assert f'stroke="{LIGHT["measured"]}"' in on_paper and on_paper.count("var(--") == 2, "words are words"
 
 
 def test_compared_models_differ_in_colour_and_in_dash() -> None:
-    looks = [compare_charts.style(number) for number in range(compare_charts.MOST)]
+    looks = [model_charts.style(number) for number in range(model_charts.MOST)]
     assert len({look["colour"] for look in looks}) == len({look["dash"] for look in looks}) == len(looks) == 6

@@ -252,27 +252,23 @@ def test_unforeseen_error_is_one_line_and_a_log(
 
 
 def test_every_verb_of_the_contract_is_there_and_helps() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "stimrig.api.cli", "--help"], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-m", "stimrig", "--help"], capture_output=True, text=True, check=True)
     for verb in ("serve", "emulate", "test", "fit", "predict", "compare", "diagnose", "improve", "effects", "table1"):
         assert f"\n  {verb}" in done.stdout
 
 
 def test_bad_input_as_a_process() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "stimrig.api.cli", "fit", "nowhere.csv"], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-m", "stimrig", "fit", "nowhere.csv"], capture_output=True, text=True)
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
 
 
 def test_emulate_hands_everything_on() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "stimrig.api.cli", "emulate", "--patient", "nobody"], capture_output=True, text=True
+        [sys.executable, "-m", "stimrig", "emulate", "--patient", "nobody"], capture_output=True, text=True
     )
     assert done.returncode == 2 and "nobody" in done.stderr and done.stderr.count("\n") == 1
     helped = subprocess.run(
-        [sys.executable, "-m", "stimrig.api.cli", "emulate", "--help"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "stimrig", "emulate", "--help"], capture_output=True, text=True, check=True
     )
     assert "--hidden SEED" in helped.stdout
 
@@ -285,6 +281,6 @@ def test_without_a_verb_the_help_is_told_line_by_line(given, capsys):
 
 
 def test_a_verb_does_not_wait_for_the_libraries_of_others():
-    code = "import sys; from api.cli.main import build; build('diagnose'); print('sqlalchemy' in sys.modules)"
+    code = "import sys; from stimrig.api.cli.main import build; build('diagnose'); print('sqlalchemy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

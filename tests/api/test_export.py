@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.api.charts import model_charts, ramp_directions
-from stimrig.api.charts.hover import on
+from stimrig.api.charts import model_charts
+from stimrig.api.charts.figure import interpolate
 from stimrig.api.charts.svg import svg, ticks
 from stimrig.api.workers.pool import WORKER
 from stimrig.api.workers.verbs import curves
@@ -91,10 +91,10 @@ def distance(found: dict[str, Any]) -> float:
 
 def test_both_directions_of_the_ramp_lie_on_the_curve_of_a_muscle_without_hysteresis() -> None:
     document, drawn = measured()
-    found = ramp_directions.seen(document, drawn)
+    found = model_charts.ramp_points(document, drawn)
     known = document["recruitment"]
     for points in found.values():
-        curve = [on(width, known["pulse_width_us"], known["torque_nm"]) for width in points["pulse_width_us"]]
+        curve = [interpolate(width, known["pulse_width_us"], known["torque_nm"]) for width in points["pulse_width_us"]]
         assert np.abs(np.array(points["torque_nm"]) - curve).max() < 0.12
     assert abs(distance(found)) < 0.06
 
@@ -108,7 +108,7 @@ def test_a_muscle_with_hysteresis_shows_two_curves() -> None:
         return np.where(ramp & (falls > 0), 0.8, 0.0)
 
     document, drawn = measured(lag)
-    found = ramp_directions.seen(document, drawn)
+    found = model_charts.ramp_points(document, drawn)
     assert distance(found) > 0.2, "less than the 0.8 N·m put in: the fitted lag takes a part of it upon itself"
     figure = model_charts.recruitment(document, drawn)
     assert {"ramp up", "ramp down"} <= {trace["name"] for trace in figure["data"]}
@@ -117,8 +117,8 @@ def test_a_muscle_with_hysteresis_shows_two_curves() -> None:
 def test_a_recording_without_a_ramp_has_no_directions() -> None:
     document, drawn = measured()
     still = {**drawn, "pulse_width_us": [0.0, 200.0] * (len(drawn["time_s"]) // 2), "time_s": drawn["time_s"]}
-    assert ramp_directions.seen(document, still) == {}
-    assert ramp_directions.seen(document, {**drawn, "time_s": [0.0]}) == {}
+    assert model_charts.ramp_points(document, still) == {}
+    assert model_charts.ramp_points(document, {**drawn, "time_s": [0.0]}) == {}
 
 
 def test_still_pictures_are_whole_svg_with_the_values_in_their_place() -> None:

@@ -101,7 +101,7 @@ def test_killed_service_comes_back_at_the_same_place_with_everything(tmp_path: P
 
 def test_everything_dies_with_the_launcher(tmp_path: Path) -> None:
     environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN}
-    command = [sys.executable, "-m", "stimrig.api.cli", "serve", "--port", "0", "--data", str(tmp_path)]
+    command = [sys.executable, "-m", "stimrig", "serve", "--port", "0", "--data", str(tmp_path)]
     launcher = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
     assert launcher.stdout is not None and "stimrig serves http://127.0.0.1:" in launcher.stdout.readline()
     launcher.stdout.readline()
@@ -148,7 +148,7 @@ def test_rig_file_that_does_not_hold_is_one_line(tmp_path: Path, device: str, si
     path.write_text(RIG_FILE.format(device=device, port="/dev/ttyUSB77", signal=signal_name))
     for verb in (["serve", "--port", "0"], ["test"]):
         done = subprocess.run(
-            [sys.executable, "-m", "stimrig.api.cli", *verb, "--rig", str(path), "--data", str(tmp_path)],
+            [sys.executable, "-m", "stimrig", *verb, "--rig", str(path), "--data", str(tmp_path)],
             capture_output=True, text=True, timeout=60,
         )  # fmt: skip
         assert done.returncode == 2, done
@@ -159,7 +159,7 @@ def test_rig_file_that_does_not_hold_is_one_line(tmp_path: Path, device: str, si
 def test_port_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(RIG_FILE.format(device="p24", port="/dev/ttyUSB77", signal="Torque_Nm"))
-    command = [sys.executable, "-m", "stimrig.api.cli", "test", "--rig", str(path), "--data", str(tmp_path)]
+    command = [sys.executable, "-m", "stimrig", "test", "--rig", str(path), "--data", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2, done
     assert "/dev/ttyUSB77" in done.stderr and done.stderr.count("\n") == 1

@@ -12,7 +12,7 @@ import pytest
 
 import stimrig
 from stimrig import identify
-from stimrig.api.charts.config import CHART_CONFIG
+from stimrig.api.charts.figure import CHART_CONFIG
 from stimrig.api.web.pages.report_file import comparison_html, improvement_html
 from stimrig.api.workers.verbs import curves, thinned
 from tests.api.browser import open_tab

@@ -173,7 +173,7 @@ def test_nothing_is_left_whenever_it_is_told_to_end(tmp_path: Path) -> None:
 
 def test_a_running_test_is_sealed_although_the_launcher_is_killed(tmp_path: Path) -> None:
     """It says nothing to the rig any more: the kernel does."""
-    served = Started(tmp_path, "served", "-m", "stimrig.api.cli", *SERVE, "--data", str(tmp_path / "served"))
+    served = Started(tmp_path, "served", "-m", "stimrig", *SERVE, "--data", str(tmp_path / "served"))
     with httpx.Client(base_url=served.url(), auth=LooksFirst(TOKEN), timeout=LIMIT_S) as http:
         http.post("/v1/participants", json={"code": "P1"})
         http.post("/v1/tests", json={"participant": "P1"})

@@ -58,7 +58,7 @@ def test_commands_do_what_they_are_said_to(tmp_path: Path, monkeypatch: pytest.M
                 hidden = words[words.index("--emulate") + 1] if "--emulate" in words else ""
                 words += ["--protocol", "short", "--emulate", f"{hidden} --speed 3"]
             if words[0] in ("test", "emulate"):  # they do not come back into this process
-                subprocess.run([sys.executable, "-m", "stimrig.api.cli", *words], check=True, timeout=300)
+                subprocess.run([sys.executable, "-m", "stimrig", *words], check=True, timeout=300)
                 continue
             out = io.StringIO()
             with contextlib.redirect_stdout(out):

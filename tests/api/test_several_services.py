@@ -160,7 +160,7 @@ def test_what_a_living_service_follows_is_left_to_it(tmp_path: Path, short_dir: 
 @pytest.mark.slow
 def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, address: str) -> None:
     taking = (
-        "import asyncio, sys\nfrom api.store import Store, holds\n"
+        "import asyncio, sys\nfrom stimrig.api.store import Store, holds\n"
         "async def main():\n"
         "    async with holds.of(Store(sys.argv[1])).turn('limits'):\n"
         "        print('had', flush=True)\n        await asyncio.sleep(600)\n"

@@ -44,7 +44,8 @@ def kernel_shuts() -> set[str]:
 def shut_in(code: str, *folders: Path, writes: tuple[Path, ...] = ()) -> subprocess.CompletedProcess[str]:
     """A process that shuts itself in, does what `code` says and tells `left` and what `code` put into `found`."""
     program = (
-        "import json, os, sys\nfrom pathlib import Path\nfrom api.workers.confinement import confine, limit_time\n"
+        "import json, os, sys\nfrom pathlib import Path\n"
+        "from stimrig.api.workers.confinement import confine, limit_time\n"
         f"reads, writes = {[str(each) for each in folders]!r}, {[str(each) for each in writes]!r}\n"
         "left, found = confine(map(Path, reads), map(Path, writes)), {}\n"
         "def attempt(name, work):\n"

@@ -237,7 +237,7 @@ def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
     command = [
         sys.executable,
         "-m",
-        "stimrig.api.cli",
+        "stimrig",
         "serve",
         "--rig-socket",
         str(socket),

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
+from stimrig.api.charts import figure as fig
 from stimrig.api.charts import model_charts
 from stimrig.api.workers.recorded_signals import recorded
 from tests.api.browser import expected, participant, start
@@ -103,6 +104,6 @@ def test_what_was_not_played_begins_where_the_pulses_end(tmp_path: Path, sent_us
     plan_us = [100.0] * 400
     figure = model_charts.recorded(found, plan_us, 40.0, "stopped")
     (faint,) = [trace for trace in figure["data"] if trace["name"] == "planned, not played"]
-    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == model_charts.FAINT
+    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == fig.FAINT
     whole = model_charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
     assert not [trace for trace in whole["data"] if trace["name"] == "planned, not played"]

@@ -13,6 +13,7 @@ import pytest
 from stimrig import identify
 from stimrig.api.models.tracking import Limits
 from stimrig.api.workers import tracking_verbs
+from stimrig.identify import tracking
 from stimrig.rig import messages as m
 from tests.api.fake_rig import PATIENT, write_recording
 from tests.harness.sessions import Planned, record
@@ -138,15 +139,13 @@ def test_a_person_who_tired_in_earlier_sessions_is_expected_to(model_json: str, 
 
 
 def test_warming_follows_a_trial_of_its_own(model_json: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    import identify.tracking
-
     followed: list[float] = []
-    own = identify.tracking.follow
+    own = tracking.follow
 
     def noted(model: Any, state: Any, record: identify.Record) -> Any:
         followed.append(float(np.ptp(record.torque_nm)))
         return own(model, state, record)
 
-    monkeypatch.setattr(identify.tracking, "follow", noted)
+    monkeypatch.setattr(tracking, "follow", noted)
     assert tracking_verbs.warm(silent, model_json) == {}
     assert len(followed) == 1 and followed[0] > 1.0

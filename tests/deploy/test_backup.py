@@ -90,7 +90,7 @@ def test_there_and_back(machine: Machine, tmp_path: Path) -> None:
 
 
 def test_the_rig_reads_the_latch_of_restored_data(machine: Machine, tmp_path: Path) -> None:
-    from stimrig.rig.control.latch import Latch
+    from stimrig.rig.control.memory import Latch
     from tests.simulator.virtual_time import VirtualMachine
 
     def read(folder: Path) -> tuple[str | None, str]:

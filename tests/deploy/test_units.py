@@ -12,7 +12,7 @@ import pytest
 
 from stimrig.api.cli.launcher import SEAL_S
 from stimrig.rig.__main__ import BEAT_PERIOD_S, PROCESS_PRIORITY
-from stimrig.rig.adapters.driver import PRIORITY
+from stimrig.rig.adapters.machine import PRIORITY
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"

@@ -18,26 +18,11 @@ from stimrig.identify.simulation.problem import Problem
 from tests.identify import hidden_muscles
 
 CONTRACT = {
-    "fatigue",
-    "potentiation",
-    "recruitment_hysteresis",
-    "asymmetric_relaxation",
-    "electromechanical_delay",
-    "mixed_fibres",
-    "threshold_drift",
-    "baseline_drift",
-    "voluntary_effort",
-    "tremor",
-    "mains_hum",
-    "output_saturation",
-    "sensor_clipping",
-    "series_compliance",
-    "torque_angle",
-    "torque_velocity",
-    "passive_torque",
-    "activation_dependent_speed",
-    "catch_like",
-}
+    "fatigue", "potentiation", "recruitment_hysteresis", "asymmetric_relaxation", "electromechanical_delay",
+    "mixed_fibres", "threshold_drift", "baseline_drift", "voluntary_effort", "tremor", "mains_hum",
+    "output_saturation", "sensor_clipping", "series_compliance", "torque_angle", "torque_velocity", "passive_torque",
+    "activation_dependent_speed", "catch_like",
+}  # fmt: skip
 FORMS = [(effect.id, form.name) for effect in registry().values() for form in effect.forms]
 
 

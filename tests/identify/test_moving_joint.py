@@ -17,7 +17,7 @@ from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import changed, record
 from stimrig.identify.dynamics.make_grid import make_grid
 from stimrig.identify.effects import get
-from stimrig.identify.effects.kernels import relaxed
+from stimrig.identify.effects.passive_torque import relaxed
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.estimation.quality import quality, range_warnings
 from stimrig.identify.fitting import MOVING_JOINT

@@ -180,8 +180,8 @@ def test_chi_square_tail_against_scipy():
 
 def test_starting_is_cheap():
     code = (
-        "import sys, identify; assert 'numpy' not in sys.modules;"
-        "import identify.records.read, identify.records.csv, identify.model;"
+        "import sys, stimrig.identify; assert 'numpy' not in sys.modules;"
+        "import stimrig.identify.records.read, stimrig.identify.records.csv, stimrig.identify.model;"
         "slow = [m for m in ('scipy.signal', 'scipy.optimize', 'scipy.stats', 'scipy.interpolate', 'numba', 'h5py')"
         " if m in sys.modules]; assert not slow, slow"
     )

@@ -11,10 +11,9 @@ import numpy as np
 
 from stimrig.rig import archive, assembly, journal, limits, plan
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
-from stimrig.rig.acquire.halt import Halt
 from stimrig.rig.acquire.health import DEFAULT_WATCH, Watch
 from stimrig.rig.acquire.receiver import Receiver
-from stimrig.rig.acquire.run import RunResult, TestRun
+from stimrig.rig.acquire.run import Halt, RunResult, TestRun
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.gate import Gate

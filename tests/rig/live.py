@@ -15,7 +15,17 @@ from stimrig.rig.control import pair
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Disk
-from stimrig.rig.messages import Event, Profile, Status, StopEvidence, TestPlan
+from stimrig.rig.messages import (
+    CalibrateMarkRequest,
+    CalibrateStepRequest,
+    Direction,
+    Event,
+    Profile,
+    Status,
+    StopEvidence,
+    TestPlan,
+    Threshold,
+)
 from stimrig.rig.signals import Block
 from stimrig.rig.tasks import Outcome, Task, Tasks
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, hold, rest
@@ -179,6 +189,16 @@ class LiveRig:
 
     def rearm(self, by: str = "nurse") -> Status:
         return self.ask(self.rig.rearm(by, self.rig.latch))
+
+    def step(self, direction: Direction = "up") -> None:
+        self.ask(self.rig.calibrations.step(CalibrateStepRequest(direction=direction)))
+
+    def mark(self, threshold: Threshold) -> None:
+        self.ask(self.rig.calibrations.mark(CalibrateMarkRequest(threshold=threshold)))
+
+    def stored(self, calibration_id: str) -> Status:
+        self.ask(self.rig.calibrations.stored(calibration_id))
+        return self.rig.status()
 
     def close(self) -> None:
         self.ask(self.rig.close())

@@ -16,8 +16,7 @@ import pytest
 import serial
 
 from stimrig.rig.adapters import can_bus
-from stimrig.rig.adapters.can_bus import CanBus
-from stimrig.rig.adapters.read_ahead import ReadAhead
+from stimrig.rig.adapters.can_bus import CanBus, ReadAhead
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.devices import can_angle_sensor, can_load_cell
 from stimrig.rig.devices.can_angle_sensor import CanAngleSensor

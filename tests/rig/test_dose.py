@@ -34,8 +34,8 @@ def died(
         data = bytes(file.data)
         places = [i for i in range(len(data)) if (block := journal.block_at(data, i)) is not None and block[0] == cut]
         del file.data[places[-1] :]
-    assert live.rig._run is not None
-    live.rig._run.journal._failure = "dead"  # nothing of that process is written any more
+    assert live.rig.player.run is not None
+    live.rig.player.run.journal._failure = "dead"  # nothing of that process is written any more
     disk.process_ended()
     again = make(disk=disk, clock=live.clock)
     assert again.rig.status().state == "uncertain" and again.rig.finished is not None

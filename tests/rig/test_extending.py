@@ -13,8 +13,8 @@ import pytest
 
 from stimrig.rig import journal as jn
 from stimrig.rig.clock import utc_text
-from stimrig.rig.control.building import previewed
 from stimrig.rig.control.calibration import end_of_day_s
+from stimrig.rig.control.replies import previewed
 from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from stimrig.rig.messages import (
     AdaptivePlan,
@@ -49,7 +49,7 @@ def request(after: int = 20, test_id: str = "one", key: str = KEY) -> ExtendRequ
 
 
 def extend(live: LiveRig, *which: Any, **key: str) -> Extended:
-    return live.ask(live.rig.extend(request(*which, **key)))
+    return live.ask(live.rig.player.extend(request(*which, **key)))
 
 
 def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: Make):
@@ -63,7 +63,10 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     for wrong in ("", KEY[::-1], KEY[:-1], KEY + "0", "0123456789abcdeF", "\ud800" * 16):
         with pytest.raises(PlanError, match="not the key"):
             extend(live, 20, key=wrong)
-    for ask in (lambda: extend(live, 20, "two"), lambda: live.ask(live.rig.enough(EnoughRequest(test_id="two")))):
+    for ask in (
+        lambda: extend(live, 20, "two"),
+        lambda: live.ask(live.rig.player.enough(EnoughRequest(test_id="two"))),
+    ):
         with pytest.raises(TooLateError, match="test 'two' is not running"):
             ask()
     first = extend(live, 20)
@@ -72,7 +75,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     live.wait("running")
     live.wait_pulses(5)
     assert extend(live, 44).laid == 68
-    run = live.rig._run
+    run = live.rig.player.run
     assert run is not None
     run.gate.late, run.gate.not_sent = [(3, 0.004)], [4]
     event = live.rig.live(samples=True)
@@ -89,7 +92,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     assert plain is not None
     assert (plain.late, plain.samples) == ([], None), "only who chooses pieces needs them"
     assert live.rig.status().duration_s == 60.0
-    ending = live.ask(live.rig.enough(EnoughRequest(test_id="one", by="nurse")))
+    ending = live.ask(live.rig.player.enough(EnoughRequest(test_id="one", by="nurse")))
     assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))
     live.wait("ready")
     finished = live.rig.finished
@@ -114,7 +117,7 @@ def test_neither_before_nor_after_a_test_nor_when_it_is_stopped(make: Make):
     live = make()
 
     def refused(words: str) -> None:
-        for ask in (lambda: extend(live, 20), lambda: live.ask(live.rig.enough(EnoughRequest(test_id="one")))):
+        for ask in (lambda: extend(live, 20), lambda: live.ask(live.rig.player.enough(EnoughRequest(test_id="one")))):
             with pytest.raises(TooLateError, match=words):
                 ask()
 
@@ -136,7 +139,7 @@ def test_neither_before_nor_after_a_test_nor_when_it_is_stopped(make: Make):
 def test_a_fixed_test_and_a_calibration_are_not_extended(make: Make):
     live = make()
     live.start(live.plan("one", hold_s=20.0), KEY)
-    for ask in (lambda: extend(live, 840), lambda: live.ask(live.rig.enough(EnoughRequest(test_id="one")))):
+    for ask in (lambda: extend(live, 840), lambda: live.ask(live.rig.player.enough(EnoughRequest(test_id="one")))):
         with pytest.raises(PlanError, match="fixed plan"):
             ask()
 

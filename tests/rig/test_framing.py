@@ -14,8 +14,8 @@ from stimrig.hardware_sim.stimulators import framing
 from stimrig.hardware_sim.stimulators import sciencemode2 as emulated2
 from stimrig.hardware_sim.stimulators import sciencemode4 as emulated4
 from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.rig.devices import p24, rehastim2
 from stimrig.rig.errors import WireError
-from stimrig.rig.wire import sciencemode2, sciencemode4
 from stimrig.rig.wire.framing import Packet as RigsPacket
 
 FRAMES_2 = {
@@ -82,8 +82,8 @@ def of_rig(version: int, module: Any) -> Codec:
 
 
 CODECS = {
-    "rig 2": of_rig(2, sciencemode2),
-    "rig 4": of_rig(4, sciencemode4),
+    "rig 2": of_rig(2, rehastim2),
+    "rig 4": of_rig(4, p24),
     "emulator 2": Codec(2, emulated2.encode, emulated2.Decoder, 0, "corrupt_frames"),
     "emulator 4": Codec(4, emulated4.encode, emulated4.Decoder, 0, "corrupt_frames"),
 }
@@ -190,7 +190,7 @@ def test_stuffing_is_reversible_and_hides_borders(data: bytes):
 )
 def test_what_is_no_frame_is_told(text: str):
     with pytest.raises(WireError):
-        sciencemode2.FRAMING.decode(bytes.fromhex(text))
+        rehastim2.FRAMING.decode(bytes.fromhex(text))
 
 
 def test_a_body_longer_than_its_length_field_is_refused():

@@ -9,7 +9,7 @@ import pytest
 
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.clock import MonotonicClock, utc_text
-from stimrig.rig.control.latch import Latch
+from stimrig.rig.control.memory import Latch
 from stimrig.rig.errors import BusyError
 from tests.rig.fakes import slow_work
 from tests.simulator.virtual_time import VirtualMachine

@@ -13,7 +13,7 @@ import pytest
 
 from stimrig.rig.control.replies import refusal
 from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, LatchedError, PlanError, RigError
-from stimrig.rig.messages import CalibrateStartRequest
+from stimrig.rig.messages import CalibrateStartRequest, CalibrateStepRequest
 from stimrig.rig.tasks import Task
 from tests.rig.live import LiveRig
 from tests.simulator.disk import SimulatedDisk
@@ -77,8 +77,8 @@ def begin_test(live: LiveRig) -> Coroutine[Any, Any, Any]:
 
 
 async def begin_train(live: LiveRig) -> None:
-    await live.rig.calibrate(CALIBRATION)
-    await live.rig.calibrate_step("up")
+    await live.rig.calibrations.start(CALIBRATION)
+    await live.rig.calibrations.step(CalibrateStepRequest())
 
 
 def rearm_and_start(live: LiveRig) -> Coroutine[Any, Any, Any]:
@@ -218,7 +218,7 @@ def lose_the_cell(live: LiveRig) -> object:
 AGAIN = {
     "a stop": lambda live: live.stop("it hurts", "colleague"),
     "the same stop": lambda live: live.stop("first"),
-    "a fault": lambda live: live.rig._fault("stimulator: electrode error"),
+    "a fault": lambda live: live.rig.fault("stimulator: electrode error"),
     "a lost device": lose_the_cell,
 }
 """What may come while it is latched, and be seen by nobody yet."""
@@ -305,7 +305,7 @@ def test_a_bug_while_a_tests_files_are_made_leaves_a_rig_that_can_be_stopped(mak
     def fail(*_: object) -> None:
         raise ValueError("a mistake in this program")
 
-    monkeypatch.setattr(live.rig._store, "begin", fail)
+    monkeypatch.setattr(live.rig.store, "begin", fail)
     with pytest.raises(ValueError, match="mistake"):
         live.start(live.plan("one"))
     assert live.rig.status().state == "ready"

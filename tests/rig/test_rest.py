@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stimrig.rig.adapters.files import Files
-from stimrig.rig.control.rest import Rest
+from stimrig.rig.control.memory import Rest
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 PULSE_S = 900.0

@@ -19,12 +19,12 @@ MARKS: tuple[Threshold, ...] = ("sensory", "motor", "comfort")
 
 def open_one(live: LiveRig, calibration_id: str) -> None:
     request = CalibrateStartRequest(calibration_id=calibration_id, participant="P", by="nurse", train_s=0.2)
-    live.ask(live.rig.calibrate(request))
+    live.ask(live.rig.calibrations.start(request))
 
 
 def finish(live: LiveRig, calibration_id: str = "c1", discard: bool = False) -> CalibrationResult:
     request = CalibrateFinishRequest(by="nurse", calibration_id=calibration_id, discard=discard)
-    return live.ask(live.rig.calibrate_finish(request))
+    return live.ask(live.rig.calibrations.finish(request))
 
 
 def marked(make: Make) -> LiveRig:
@@ -32,10 +32,10 @@ def marked(make: Make) -> LiveRig:
     live = make(disk=SimulatedDisk(World(0)))
     open_one(live, "c1")
     for threshold in MARKS:
-        live.ask(live.rig.calibrate_step("up"))
+        live.step("up")
         live.wait("calibrating")
         live.machine.wait(4.0)
-        live.ask(live.rig.calibrate_mark(threshold))
+        live.mark(threshold)
     return live
 
 
@@ -59,9 +59,9 @@ def test_the_result_waits_in_the_status_and_is_given_again_also_by_the_next_proc
             open_one(again, "c2")
         with pytest.raises(PlanError, match="none is open"):
             finish(again, "c2")
-    assert again.ask(again.rig.calibrate_stored("c2")).calibrated is not None, "another one lets nothing go"
-    assert again.ask(again.rig.calibrate_stored("c1")).calibrated is None
-    assert again.ask(again.rig.calibrate_stored("c1")).calibrated is None
+    assert again.stored("c2").calibrated is not None, "another one lets nothing go"
+    assert again.stored("c1").calibrated is None
+    assert again.stored("c1").calibrated is None
     open_one(again, "c2")
     assert restarted(make, again).rig.status().calibrated is None
 
@@ -105,7 +105,7 @@ def test_a_result_that_waits_can_be_discarded_and_ends_with_its_day(make: Make):
 def test_a_stop_while_the_result_is_written_takes_it_back_from_nobody(make: Make):
     live = marked(make)
     request = CalibrateFinishRequest(by="nurse")
-    task = live.begin(live.rig.calibrate_finish(request))
+    task = live.begin(live.rig.calibrations.finish(request))
     live.machine.wait(0.001)
     live.stop("now")
     live.until(task.done.is_set)

@@ -9,11 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
-from stimrig.rig import limits
-from stimrig.rig.control import core
-from stimrig.rig.control.building import previewed
+from stimrig.rig.config import LimitSettings
+from stimrig.rig.control import state
 from stimrig.rig.control.calibration import end_of_day_s
-from stimrig.rig.control.replies import refusal
+from stimrig.rig.control.replies import previewed, refusal
 from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError, RestError, UncertainError
 from stimrig.rig.messages import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
 from tests.rig.live import SPEED, WORK_S, LiveRig
@@ -74,13 +73,12 @@ def test_the_rest_outlives_a_clean_restart_and_a_wall_clock_set_ahead(make: Make
 
 
 def test_a_calibration_does_not_shorten_the_rest_after_a_test(make: Make):
-    live = make()
-    live.rig._table = limits.at_least(live.rig._table, "rest_between_tests_s", 60.0, "rig file")
+    live = make(limits=LimitSettings(rest_between_tests_s=60.0))
     live.start(live.plan("one", hold_s=0.5))
     live.wait("ready")
-    live.ask(live.rig.calibrate(CalibrateStartRequest(calibration_id="c", participant="P", by="t")))
+    live.ask(live.rig.calibrations.start(CalibrateStartRequest(calibration_id="c", participant="P", by="t")))
     with pytest.raises(RefusedError, match=r"rest_between_tests_s .*wait 5\d"):
-        live.ask(live.rig.calibrate_step("up"))
+        live.step("up")
 
 
 def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
@@ -88,23 +86,25 @@ def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
     midnight_s = end_of_day_s(live.clock.unix_s())
     live.clock.set_unix_ahead(midnight_s - 10.0 - live.clock.unix_s())
     with pytest.raises(PlanError, match="none is open"):
-        live.ask(live.rig.calibrate_step("up"))
-    live.ask(live.rig.calibrate(CalibrateStartRequest(calibration_id="c", participant="P", by="t", train_s=2.0)))
+        live.step("up")
+    live.ask(
+        live.rig.calibrations.start(CalibrateStartRequest(calibration_id="c", participant="P", by="t", train_s=2.0))
+    )
     with pytest.raises(BusyError, match="calibration"):
         live.start(live.plan("one"))
-    live.ask(live.rig.calibrate_step("up"))
+    live.step("up")
     live.wait_pulses(5)
     with pytest.raises(BusyError):
-        live.ask(live.rig.calibrate_step("up"))
+        live.step("up")
     live.clock.set_unix_ahead(midnight_s + 1.0 - live.clock.unix_s())
     live.wait("calibrating")
     assert len(live.stimulator.sent) == 80  # the train that had begun was played to its end
-    for late in (lambda: live.ask(live.rig.calibrate_step("up")), lambda: live.ask(live.rig.calibrate_mark("sensory"))):
+    for late in (lambda: live.step("up"), lambda: live.mark("sensory")):
         with pytest.raises(RefusedError, match="began on an earlier day"):
             late()
     with pytest.raises(RefusedError, match="began on an earlier day"):
-        live.ask(live.rig.calibrate_finish(CalibrateFinishRequest(by="t")))
-    discarded = live.ask(live.rig.calibrate_finish(CalibrateFinishRequest(by="t", discard=True)))
+        live.ask(live.rig.calibrations.finish(CalibrateFinishRequest(by="t")))
+    discarded = live.ask(live.rig.calibrations.finish(CalibrateFinishRequest(by="t", discard=True)))
     assert discarded.profile is None
     assert live.rig.finished is None, "a train is no test"
     assert live.rig.status().state == "ready"
@@ -213,7 +213,7 @@ def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make):
 
 
 def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(core, "MAX_REQUEST_S", 3.0)
+    monkeypatch.setattr(state, "MAX_REQUEST_S", 3.0)
     live = make()
     rig = live.rig
     assert rig.trouble() is None
@@ -228,11 +228,11 @@ def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPat
     assert rig.trouble() is None
     live.wait_pulses(5)
     assert rig.trouble() is None
-    playing, rig._playing = rig._playing, live.begin(rig._rest.settle())
-    live.until(rig._playing.done.is_set)
+    playing, rig.player.playing = rig.player.playing, live.begin(rig.rest.settle())
+    live.until(rig.player.playing.done.is_set)
     assert rig.trouble() == "the task of test one ended, but its test did not"
-    rig._playing = playing
-    receiver = rig._pair.receiver
+    rig.player.playing = playing
+    receiver = rig.pair.receiver
     assert receiver is not None
     receiver._closing.set()
     live.machine.wait(0.1)

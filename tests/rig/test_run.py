@@ -16,7 +16,7 @@ from stimrig.hardware_sim.settings import Settings
 from stimrig.rig import archive
 from stimrig.rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
 from stimrig.rig.adapters.files import Files
-from stimrig.rig.control.sealing import warnings
+from stimrig.rig.control.summary import warnings
 from stimrig.rig.devices import p24, rehastim2
 from stimrig.rig.errors import WireError
 from stimrig.rig.limits import Steps

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from stimrig.rig.devices import rehastim2 as wire
 from stimrig.rig.errors import WireError
-from stimrig.rig.wire import sciencemode2 as wire
 from stimrig.rig.wire.framing import Packet
 
 

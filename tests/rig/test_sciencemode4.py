@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig.rig.devices import p24
+from stimrig.rig.devices import p24 as wire
 from stimrig.rig.errors import DeviceError, WireError
-from stimrig.rig.wire import sciencemode4 as wire
 from stimrig.rig.wire.framing import Packet
 from tests.rig.test_framing import FRAMES_4
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine

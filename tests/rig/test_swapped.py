@@ -10,7 +10,6 @@ import pytest
 from stimrig.rig.devices import p24, rehastim2
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Told
-from stimrig.rig.wire import sciencemode2, sciencemode4
 from tests.simulator.virtual_time import VirtualMachine
 
 REHASTIM_OFFER = bytes.fromhex("f0814781560001010f")
@@ -56,23 +55,20 @@ ANSWERS: dict[str, tuple[Callable[[bytes], bytes], bytes]] = {
 }
 
 
-ASKING_P24 = {
-    sciencemode4.Command.DEVICE_ID, sciencemode4.Command.EXTENDED_VERSION, sciencemode4.Command.STIM_STATUS,
-}  # fmt: skip
-DRIVERS: dict[str, tuple[Any, Any, set[Any]]] = {
-    "a P24": (p24, sciencemode4, ASKING_P24),
-    "a RehaStim 2": (rehastim2, sciencemode2, {sciencemode2.Command.GET_MODE}),
+DRIVERS: dict[str, tuple[Any, set[Any]]] = {
+    "a P24": (p24, {p24.Command.DEVICE_ID, p24.Command.EXTENDED_VERSION, p24.Command.STIM_STATUS}),
+    "a RehaStim 2": (rehastim2, {rehastim2.Command.GET_MODE}),
 }
 
 
 @pytest.mark.parametrize(("of", "what"), [(of, what) for of in DRIVERS for what in ANSWERS if what != of])
 def test_a_stimulator_that_is_another_is_only_asked_who_it_is(of: str, what: str):
-    line, (driver, wire, asking) = Other(*ANSWERS[what]), DRIVERS[of]
+    line, (driver, asking) = Other(*ANSWERS[what]), DRIVERS[of]
     device = driver.create(driver.Settings(device=driver.__name__.rpartition(".")[2], port=PORT), line)
     device.listen(lambda _: None, lambda _: None)
     with pytest.raises(DeviceError, match=PORT):
         line.run(device.open())
-    commands = {packet.command for packet in wire.FRAMING.reader().feed(line.heard)}
+    commands = {packet.command for packet in driver.FRAMING.reader().feed(line.heard)}
     assert commands
     assert commands <= asking
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from stimrig.rig.adapters.driver import Driver
+from stimrig.rig.adapters.machine import Driver
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.tasks import Signal, Turn
 from tests.rig.fakes import slow_work

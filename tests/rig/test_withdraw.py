@@ -25,7 +25,7 @@ WHY = "withdrawn: signed out"
 
 def withdraw(live: LiveRig, test_id: str = "one", begun: bool = False) -> bool:
     request = WithdrawRequest(test_id=test_id, reason="signed out", begun=begun)
-    return live.ask(live.rig.withdraw(request)).withdrawn
+    return live.ask(live.rig.player.withdraw(request)).withdrawn
 
 
 def one_pulse(live: LiveRig) -> bool:
@@ -85,8 +85,8 @@ def test_it_holds_for_a_test_that_the_rig_has_not_heard_of_yet(make: Make):
     assert live.states == ["ready"] and WithdrawnError.code == "withdrawn"
     for number in range(MOST_WITHDRAWN):
         assert withdraw(live, f"other-{number}")
-    assert len(live.rig._withdrawn) == MOST_WITHDRAWN
-    assert list(live.rig._withdrawn)[-1] == f"other-{MOST_WITHDRAWN - 1}", "the oldest is forgotten"
+    assert len(live.rig.player.withdrawals) == MOST_WITHDRAWN
+    assert list(live.rig.player.withdrawals)[-1] == f"other-{MOST_WITHDRAWN - 1}", "the oldest is forgotten"
     with pytest.raises(PlanError, match="letters, digits"):
         withdraw(live, "../one")
 

@@ -170,7 +170,7 @@ class People:
 
     def _extend(self) -> None:
         rig = self.clinic.rig
-        run = None if rig is None else rig._run
+        run = None if rig is None else rig.player.run
         if run is None:
             return
         if self.chance.random() < 0.3:

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from stimrig.rig.acquire.halt import Halt
+from stimrig.rig.acquire.run import Halt
 from stimrig.rig.gate import Gate
 from tests.simulator.__main__ import live, shrink
 from tests.simulator.life import Life

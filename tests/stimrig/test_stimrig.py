@@ -39,6 +39,17 @@ def test_importing_it_loads_no_library() -> None:
     assert not HEAVY & set(loaded)
 
 
+@pytest.mark.slow
+def test_it_works_in_a_folder_with_packages_of_our_folders_names(tmp_path: Path) -> None:
+    """Whatever a project of one's own calls its packages: all of ours are parts of `stimrig`."""
+    for name in ("api", "rig", "identify", "hardware_sim", "tests"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise ImportError('this is not stimrig')\n")
+    code = "import stimrig; print(stimrig.fit, stimrig.Client, stimrig.effects()[0])"
+    for command in (["-c", code], ["-m", "stimrig", "--version"], ["-m", "stimrig.rig", "--help"]):
+        subprocess.run([sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, check=True)
+
+
 def test_names_are_those_of_the_contract() -> None:
     assert set(stimrig.__all__) == NAMES | {"carry", "errors"}
     assert all(callable(getattr(stimrig, name)) for name in NAMES)

@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 
 from stimrig.api import clinical_words, effect_words, language
-from stimrig.api.charts.config import PAGE_CONFIG
+from stimrig.api.charts.figure import PAGE_CONFIG
 from stimrig.api.language import words
 from stimrig.api.models.summary import followed
 

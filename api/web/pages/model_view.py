@@ -10,7 +10,6 @@ from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api import language
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
-from stimrig.api.charts.overview import LARGE, overview
 from stimrig.api.errors import ApiError
 from stimrig.api.models import advice, carried_structure, explanation, headline, next_step, stored, summary
 from stimrig.api.people.auth import Scope
@@ -75,7 +74,7 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
 def drawn(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
     """The model's own figures; the first one low enough for the first screen."""
     figures = model_charts.of_model(document, measured["curves"], measured["comparison"])
-    first = {"overview": overview(figures[LARGE])} if LARGE in figures else {}
+    first = {"overview": model_charts.overview(figures[model_charts.LARGE])} if model_charts.LARGE in figures else {}
     return figures | first | joint_charts.of_joint(document)
 
 

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
 from stimrig.api import language
-from stimrig.api.charts import compare_charts, trend_charts
-from stimrig.api.charts.compare_charts import MOST
+from stimrig.api.charts import model_charts, trend_charts
+from stimrig.api.charts.model_charts import MOST
 from stimrig.api.errors import ApiError
 from stimrig.api.models import changes, stored, trend_words
 from stimrig.api.models.trend import Session
@@ -56,8 +56,8 @@ async def compare(
             if number != at
         ],
         figures={
-            "recruitment": compare_charts.recruitment(documents, names),
-            "step": compare_charts.step([one["curves"] for one in sides], names),
+            "recruitment": model_charts.compared_recruitment(documents, names),
+            "step": model_charts.compared_step([one["curves"] for one in sides], names),
         },
     )
 
@@ -80,7 +80,7 @@ async def side(context: Context, rows: Sequence[Model], number: int) -> dict[str
     row = rows[number]
     found: dict[str, Any] = {
         "model": await asyncio.to_thread(context.versions.document, row),
-        "style": compare_charts.style(number),
+        "style": model_charts.style(number),
         "curves": None,
         "elsewhere": None,
         "problem": None,

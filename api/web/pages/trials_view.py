@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse, Response
 
-from stimrig.api.charts import tracking_charts
+from stimrig.api.charts import trend_charts
 from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, clock, ngettext
@@ -23,7 +23,6 @@ from stimrig.api.web.pages.render import signed
 from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
-TABLE = ("gain", "threshold_shift_us", "time_scale")
 
 
 @router.get("/trials")
@@ -59,7 +58,7 @@ def card(context: Context, code: str) -> dict[str, Any] | None:
     bounds = Limits(**(approval.tracking or {})).bounds(told["threshold_us"])
     return {
         **told,
-        "panels": tracking_charts.panels(told["trials"], bounds) if told["trials"] else [],
+        "panels": trend_charts.trial_panels(told["trials"], bounds) if told["trials"] else [],
         "sentences": sentences(told["trials"], recording.created_utc),
         "age": age(context, told),
         "rows": [row(trial) for trial in reversed(told["trials"])],
@@ -82,13 +81,5 @@ def age(context: Context, told: dict[str, Any]) -> str:
 
 def row(trial: dict[str, Any]) -> dict[str, Any]:
     """A trial in the table."""
-    factors = (100.0, 1.0, 100.0)
-    units = ("%", "µs", "%")
-    cells = []
-    for name, factor, unit in zip(TABLE, factors, units, strict=True):
-        level = (trial["now"] or {}).get(name)
-        half = factor * (level["high"] - level["low"]) / 2.0 if level else None
-        cells.append(tracking_charts.said(factor * level["value"], half, unit) if level else "–")
-    error = trial["error_percent"]
-    cells.append("–" if error is None else tracking_charts.said(error, None, "%"))
+    cells = [trend_charts.trial_words(trial, name) for name in trend_charts.TRIAL_FIGURES]
     return {**trial, "cells": cells, "words": str(OUTCOMES[trial["outcome"]])}

@@ -33,7 +33,7 @@ def no_settings(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[str, str]]:
     """`stimrig centre` as a process: its address, and the token that it printed."""
-    command = [sys.executable, "-m", "stimrig.api.cli", "centre", "--port", "0", "--data", str(tmp_path / "data")]
+    command = [sys.executable, "-m", "stimrig", "centre", "--port", "0", "--data", str(tmp_path / "data")]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env=environment)
     assert process.stdout is not None

@@ -57,7 +57,7 @@ def test_without_the_extra_it_says_what_to_install(
 
 def test_the_verb_loads_without_the_extra() -> None:
     code = (
-        "import sys; from api.cli.main import build; build('cohort'); "
+        "import sys; from stimrig.api.cli.main import build; build('cohort'); "
         "print([name for name in ('dask', 'distributed', 'pyarrow', 'fsspec') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -125,7 +125,7 @@ def unmet(document: dict[str, Any]) -> list[str]:
 
 
 def test_the_docs_list_the_fields_that_there_are() -> None:
-    lines = (Path(main.__file__).parents[2] / "docs" / "cohorts.md").read_text("utf-8").splitlines()
+    lines = (Path(__file__).parents[3] / "docs" / "cohorts.md").read_text("utf-8").splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
     written = {row[0].strip("`"): row[1:] for row in rows if len(row) == 3}
     assert written == {name: [field.type, field.says] for name, field in FIELDS.items()}

@@ -4,15 +4,51 @@ from __future__ import annotations
 
 from typing import Any
 
+import plotly.graph_objects as go
+
 from stimrig.api.charts import diagnosis_charts, model_charts
-from stimrig.api.charts.local_figure import LocalFigure
-from stimrig.api.charts.palette import in_light
+from stimrig.api.charts.figure import CHART_CONFIG, in_light
 from stimrig.api.models import explanation
 from stimrig.api.workers.verbs import curves, runs, thinned
 from stimrig.identify import BadRequest, Comparison, Improvement, Model, Record, compare
 
 BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]
 """Widths of the measurement and of the recruitment curve beside it."""
+
+
+def _with(config: dict[str, Any] | None) -> dict[str, Any]:
+    return {**(config or {}), **CHART_CONFIG}  # a copy: plotly takes entries out of what it is given
+
+
+class LocalFigure(go.Figure):
+    """A figure that has no button to upload it, and whose HTML loads nothing from elsewhere."""
+
+    def show(self, *args: Any, config: dict[str, Any] | None = None, **kwargs: Any) -> None:
+        """Show it."""
+        super().show(*args, config=_with(config), **kwargs)
+
+    def to_html(self, *args: Any, config: dict[str, Any] | None = None, **kwargs: Any) -> str:
+        """As HTML."""
+        return super().to_html(*args, config=_with(config), **kwargs)
+
+    def write_html(self, *args: Any, config: dict[str, Any] | None = None, **kwargs: Any) -> None:
+        """Into an HTML file."""
+        super().write_html(*args, config=_with(config), **kwargs)
+
+    def _repr_html_(self) -> str:
+        bundle = self._repr_mimebundle_()
+        return bundle.get("text/html") or self.to_html(full_html=False, include_plotlyjs=True)
+
+    def _repr_mimebundle_(self, *args: Any, **kwargs: Any) -> Any:
+        return super()._repr_mimebundle_(*args, config=_with(None), **kwargs)
+
+    def _ipython_display_(self) -> None:
+        import plotly.io as pio
+
+        if pio.renderers.render_on_display and pio.renderers.default:
+            self.show()
+        else:
+            print(repr(self))
 
 
 def plot(what: Any, record: Record | None = None) -> LocalFigure:
@@ -38,10 +74,13 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
     if isinstance(what, Model) and record is not None:
         return LocalFigure(in_light(_model(what, record)))
     if isinstance(what, Comparison):
-        return LocalFigure(in_light(_residual(what.to_dict())))
+        found = what.to_dict()
+        segments = runs(found["series"]["segment"], found["series"]["time_s"])
+        residual = diagnosis_charts.residual(thinned(found), segments, diagnosis_charts.places_of(found))
+        return LocalFigure(in_light(residual))
     if isinstance(what, Improvement):
-        found = {**what.to_dict(), "models": []}
-        return LocalFigure(in_light(diagnosis_charts.falling(explanation.of_steps(found))))
+        rows = explanation.of_steps({**what.to_dict(), "models": []})
+        return LocalFigure(in_light(diagnosis_charts.falling(rows)))
     message = "plot takes a model and its record, a comparison, or what improve found: plot(model, record)"
     raise BadRequest(message, place="plot")
 
@@ -57,8 +96,3 @@ def _model(model: Model, record: Record) -> dict[str, Any]:
     figure["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": ALONE, "anchor": "y4"}
     figure["layout"]["yaxis4"] = {**curve["layout"]["yaxis"], "anchor": "x2"}
     return figure
-
-
-def _residual(found: dict[str, Any]) -> dict[str, Any]:
-    segments = runs(found["series"]["segment"], found["series"]["time_s"])
-    return diagnosis_charts.residual(thinned(found), segments, diagnosis_charts.places_of(found))

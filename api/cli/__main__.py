@@ -1,5 +1,0 @@
-"""`python -m stimrig.api.cli`: what the console script `stimrig` runs."""
-
-from stimrig.api.cli.main import main
-
-main()

@@ -1,0 +1,214 @@
+"""What the rig must remember across a crash: that a test was running, or that it is latched and why."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from stimrig.rig import limits
+from stimrig.rig.acquire.run import LEAD_S
+from stimrig.rig.clock import utc_text
+from stimrig.rig.errors import BusyError, RestError, RigError
+from stimrig.rig.machine import Machine
+from stimrig.rig.messages import Calibrated
+from stimrig.rig.plan import PlannedTest
+from stimrig.rig.tasks import Turn
+
+
+class SmallFile:
+    """What is asked for first is written first. `place` begins the words of an error."""
+
+    def __init__(self, path: Path, place: str, machine: Machine) -> None:
+        self.path, self._place = path, place
+        self._disk, self._work, self._turn = machine.disk, machine.tasks.work, Turn(machine.tasks)
+        self._stored: bytes | None = None
+
+    async def read(self) -> dict[str, Any] | None:
+        """Its content; None: there is no file. Raises OSError, ValueError: it cannot be read."""
+        try:
+            content = json.loads(await self._work(self._disk.read, self.path))
+        except FileNotFoundError:
+            return None
+        except RecursionError as error:
+            raise ValueError(str(error)) from None
+        if not isinstance(content, dict):
+            raise ValueError("it is no JSON object")
+        return content
+
+    async def write(self, content: dict[str, Any]) -> None:
+        """Replace the file, unless it holds that already. Raises RigError."""
+        await self._put(json.dumps(content).encode())
+
+    async def remove(self) -> None:
+        """Also where there is none. Raises RigError."""
+        await self._put(None)
+
+    async def _put(self, data: bytes | None) -> None:
+        async with self._turn:
+            if data is not None and data == self._stored:
+                return
+            self._stored = None
+            try:
+                if data is None:
+                    await self._work(self._disk.remove, self.path)
+                else:
+                    await self._work(self._disk.replace, self.path, data)
+            except OSError as error:
+                raise RigError(f"{self._place}: {self.path}: {error.strerror}; free some disk space") from None
+            self._stored = data
+
+
+Remembered = Literal["running", "latched"]
+
+
+class Latch:
+    """Stored before the event that it describes."""
+
+    def __init__(self, folder: Path, machine: Machine) -> None:
+        self._file = SmallFile(folder / "latch.json", "latch file", machine)
+        self.clear = self._file.remove
+        """Remove the state: a person has re-armed, or a test has ended well. Raises RigError."""
+
+    async def read(self) -> tuple[Remembered | None, str]:
+        """The stored state and its reason; an unreadable file counts as a running test."""
+        try:
+            content = await self._file.read()
+            if content is None:
+                return None, ""
+            return ("latched" if content["state"] == "latched" else "running"), str(content["reason"])
+        except (OSError, ValueError, KeyError):
+            return "running", "the latch file could not be read"
+
+    async def write(self, state: Remembered, reason: str) -> None:
+        """Store a state. Raises RigError if the disk fails: then nothing may start."""
+        await self._file.write({"state": state, "reason": reason})
+
+
+log = logging.getLogger("rig.rest")
+
+
+class Rest:
+    """Time of the last pulse on the rig's clock; None: there was none with this data folder."""
+
+    def __init__(self, folder: Path, machine: Machine) -> None:
+        self._folder, self._machine, self._clock = folder, machine, machine.tasks.clock
+        self._file = SmallFile(folder / "last-pulse.json", "the last pulse's time could not be written", machine)
+        self.last_pulse_s: float | None = None
+        self._ended = True
+
+    async def recall(self, in_doubt: bool) -> None:
+        """Read what the last process stored. `in_doubt`: it crashed, so the time of its last pulse is unknown."""
+        remembered_s, used = await self._read()
+        if remembered_s is not None and not in_doubt:
+            self.last_pulse_s = remembered_s
+        elif in_doubt or used:
+            await self.pulse_at(self._clock.now_s(), ended=False)
+
+    async def pulse_at(self, time_s: float, ended: bool = True) -> None:
+        """Store the time of the last pulse; if the disk fails, the next process is in doubt.
+
+        `ended` is False if the end of stimulation is not confirmed: a stalled line may still hold a pulse.
+        """
+        self.last_pulse_s, self._ended = time_s, ended
+        content = {
+            "ended": ended,
+            "boot_id": self._machine.boot_id,
+            "monotonic_s": time_s / self._clock.speed,
+            "written_utc": utc_text(self._clock.unix_s()),
+        }
+        try:
+            await self._file.write(content)
+        except RigError as error:
+            log.error("%s", error)
+            with contextlib.suppress(RigError):  # the disk is read-only now: the latch file still says that a test ran
+                await self._file.remove()
+
+    def doubt(self) -> str:
+        """A sentence if the line may still hold a pulse that was sent before; empty if not."""
+        return "" if self._ended else "a pulse that was sent before may still be felt"
+
+    async def settle(self) -> None:
+        """The stimulator has answered, so the line is empty; a held pulse may have been felt just now."""
+        if not self._ended:
+            await self.pulse_at(self._clock.now_s())
+
+    def check(self, test: PlannedTest, limit: limits.Limit) -> None:
+        """Raise RestError if the earliest pulse follows the last one too soon."""
+        first = test.first_pulse
+        if self.last_pulse_s is None or first is None:
+            return
+        first_s = first / test.plan.pulse_rate_hz + LEAD_S * self._clock.speed
+        rest_s = self._clock.now_s() + first_s - self.last_pulse_s
+        refusal = limits.check(limit, rest_s)
+        if refusal is not None:
+            raise RestError(f"plan: {refusal}; wait {limit.lo - rest_s:.1f} s")
+
+    async def _read(self) -> tuple[float | None, bool]:
+        """The stored time, if it certainly belongs to this boot; whether any test was ever played with this folder.
+
+        Older versions stored no time of the last pulse.
+        """
+        work, names, boot_id = self._machine.tasks.work, self._machine.disk.names, self._machine.boot_id
+        try:
+            content = await self._file.read()
+            if content is None:
+                return None, any([await work(names, self._folder / name) for name in ("recordings", "journals")])
+            time_s = float(content["monotonic_s"]) * self._clock.speed
+            certain = bool(boot_id) and content["boot_id"] == boot_id and content["ended"] is True
+        except (OSError, ValueError, KeyError, TypeError):
+            return None, True
+        return (time_s if certain and 0 <= time_s <= self._clock.now_s() else None), True
+
+
+log = logging.getLogger("rig")
+
+
+class Result:
+    """Written before the result is told."""
+
+    def __init__(self, folder: Path, machine: Machine) -> None:
+        self._file, self._clock = SmallFile(folder / "calibrated.json", "calibration", machine), machine.tasks.clock
+        self._kept: Calibrated | None = None
+
+    @property
+    def waiting(self) -> Calibrated | None:
+        """What nobody has stored yet; None also once its day has ended: then it is no profile any more."""
+        profile = self._kept and self._kept.result.profile
+        if not profile or not profile.expires_at_utc:
+            return None
+        return self._kept if self._clock.unix_s() < datetime.fromisoformat(profile.expires_at_utc).timestamp() else None
+
+    def of(self, calibration_id: str) -> Calibrated | None:
+        """The result of that calibration, if it waits."""
+        return self.waiting if self.waiting and self.waiting.calibration_id == calibration_id else None
+
+    def refuse_waiting(self) -> None:
+        """Raise BusyError if one waits: a new calibration would replace it."""
+        if (kept := self.waiting) is not None:
+            raise BusyError(
+                f"the result of calibration {kept.calibration_id} of participant {kept.participant} waits to be "
+                "stored; finish that one again, or discard it"
+            )
+
+    async def recall(self) -> None:
+        """Read what the process before kept."""
+        try:
+            content = await self._file.read()
+            self._kept = None if content is None else Calibrated.model_validate(content)
+        except (OSError, ValueError) as error:
+            log.error("%s: not readable (%s); calibrate again", self._file.path, " ".join(str(error).split()))
+
+    async def keep(self, found: Calibrated) -> None:
+        """Raises RigError: it could not be written, so it must not be told yet."""
+        await self._file.write(found.model_dump(mode="json"))
+        self._kept = found
+
+    async def let_go(self, calibration_id: str) -> None:
+        """It is stored, or discarded; nothing if another one waits. Raises RigError: it waits still."""
+        if self.of(calibration_id) is not None:
+            await self._file.remove()
+            self._kept = None

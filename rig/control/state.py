@@ -1,0 +1,142 @@
+"""Which state the rig is in and why, who may change it, and what the next process has to know of it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+from collections.abc import AsyncIterator, Callable
+
+from stimrig.rig.control.calibration import Calibration
+from stimrig.rig.control.memory import Latch
+from stimrig.rig.errors import BusyError, LatchChangedError, RigError
+from stimrig.rig.tasks import Task, Tasks, Turn
+from stimrig.rig.trial import STOPPED, Trial
+
+log = logging.getLogger("rig")
+
+MAX_REQUEST_S = 60.0
+"""Real seconds that a request may take: re-arming reopens both devices and seals journals that were left."""
+RETRY_S = 1.0
+"""Real seconds between two attempts to write a latch that the disk refused."""
+
+
+class State:
+    """The trial, its latch and the turn of requests.
+
+    Requests that begin something take their turn, one after the other. A stop never waits for it: it changes the state
+    at once, and what was begun finds that out before it goes on.
+
+    Parameters
+    ----------
+    instance
+        Of this process, another one for each.
+    publish
+        Called after each change.
+    """
+
+    def __init__(self, file: Latch, tasks: Tasks, instance: str, publish: Callable[[], None]) -> None:
+        self.trial = Trial()
+        self.file = file
+        self.calibration: Calibration | None = None
+        """The one that is open: a stop, a fault or a lost device closes it."""
+        self.closing = False
+        """Whether the rig shuts down: from now on nothing begins."""
+        self._tasks, self._clock, self._publish = tasks, tasks.clock, publish
+        self._turn = Turn(tasks)
+        self._turn_since_s: float | None = None
+        self._instance, self._stops = instance, 0
+        """How often it was stopped, a fault was reported, or why it is stopped became another reason."""
+        self._published = ""
+        """The latch that was told last."""
+        self._latching: Task[None] | None = None
+        """Writes the latch of the last stop."""
+
+    @property
+    def latch(self) -> str:
+        """What a person must have seen who re-arms: another one after each stop, and in each process."""
+        return f"{self._instance}-{self._stops}"
+
+    @contextlib.asynccontextmanager
+    async def in_turn(self) -> AsyncIterator[None]:
+        """For requests that begin something: one after the other. Raises BusyError once the rig shuts down."""
+        async with self._turn:
+            if self.closing:
+                raise BusyError("the rig is shutting down")
+            self._turn_since_s = self._clock.now_s()
+            try:
+                yield
+            finally:
+                self._turn_since_s = None
+
+    def trouble(self) -> str | None:
+        """That a request hangs; None: none does."""
+        running_s = 0.0 if self._turn_since_s is None else (self._clock.now_s() - self._turn_since_s)
+        if running_s > MAX_REQUEST_S * self._clock.speed:
+            return f"a request has been running for {running_s / self._clock.speed:.0f} s"
+        return None
+
+    def refuse_unseen(self, latch: str) -> None:
+        """Raise LatchChangedError if the rig was stopped since `latch` was told: who asks has not seen it."""
+        if latch == self.latch:
+            return
+        if self.trial.told:
+            raise LatchChangedError(f"now: {self.trial.told}; look at the participant and the rig, then re-arm")
+        raise LatchChangedError("the rig was stopped while this waited; look at the participant, then ask again")
+
+    def change(self, trial: Trial) -> None:
+        """From now on this is the state."""
+        if trial.told not in ("", self.trial.told):
+            self._stops += 1
+        changed = trial != self.trial or self._published != self.latch
+        self.trial, self._published = trial, self.latch
+        if not trial.calibrating:
+            self.calibration = None
+        if changed:
+            log.info("state %s %s", trial.state, trial.reason, extra={"test_id": trial.test_id})
+            self._publish()
+
+    def count_stop(self) -> None:
+        """Somebody or something asked for a stop: whoever re-arms must have seen it."""
+        self._stops += 1
+
+    def halted(self, reason: str) -> None:
+        """A stop or a fault: the state that follows, and its latch for the next process."""
+        following = self.trial.halted(reason)
+        if following.state in STOPPED or following.state == "sealing":
+            # behind whatever is being written: a clear that was under way does not come last
+            self._latching = self._tasks.spawn(self.remember(following), "latch file")
+        self.change(following)
+
+    async def remember(self, trial: Trial) -> None:
+        """Write the latch file. If the disk fails, the rig stays stopped; a latch is written once the disk takes it.
+
+        Until then the file holds "running" if a test had begun, so that the next process starts as uncertain.
+        """
+        try:
+            await self.file.write("running" if trial.state == "uncertain" else "latched", trial.reason)
+        except RigError as error:
+            log.error("%s", error)
+            self._tasks.spawn(self._remember_later(), "latch file")
+
+    async def _remember_later(self) -> None:
+        await self._tasks.sleep(RETRY_S)
+        async with self._turn:  # not while somebody re-arms
+            if self.trial.state in STOPPED:
+                await self.remember(self.trial)
+
+    async def settle(self) -> None:
+        """Store what the rig will be after this test; once more if it is stopped meanwhile."""
+        stored = None
+        while stored is not self.trial:
+            stored = self.trial
+            following = stored.sealed()
+            if following.state == "latched":
+                await self.remember(following)
+            else:
+                await self.file.clear()
+
+    async def written(self, until_s: float = math.inf) -> None:
+        """Wait until what the next process has to know of the last stop is stored, or the disk refused it, or hangs."""
+        if self._latching is not None:
+            await self._tasks.wait(until_s, self._latching.done)
