@@ -44,7 +44,7 @@ def measure(seeds: range, steep: bool, noise_sd_nm: float) -> list[dict[str, Any
         unseen = make_design("full", rng_of(seed, "unseen"), largest_us, validate_s=UNSEEN_S, with_validate=True)
         held = unseen.held_out
         truth = _record(scenario, Design(unseen.width_us[held], unseen.segment[held]), None)
-        for protocol in protocols.library():
+        for protocol in protocols.LIBRARY:
             design = _design(protocol, largest_us)
             rng = rng_of(seed, "noise", protocol)
             record = _record(scenario, design, rng, noise_sd_nm)
@@ -66,7 +66,7 @@ def name_hidden(seeds: range, strengths: list[str], noise_sd_nm: float) -> list[
         effect = names[number % len(names)] if seed % 4 else ""
         strength = strengths[number // len(names) % len(strengths)]
         scenario = draw_scenario((effect,) if effect else (), strength, seed, noise_sd_nm=noise_sd_nm)
-        for protocol in protocols.library():
+        for protocol in protocols.LIBRARY:
             design = _design(protocol, float(np.floor(scenario.base.largest_width_us)))
             found = diagnose(_record(scenario, design, rng_of(seed, "noise", protocol), noise_sd_nm))
             rows.append({
@@ -83,7 +83,7 @@ def _told_of_hidden(rows: list[dict[str, Any]]) -> None:
         "| protocol | named first | and 'effect missing' | or in its group | nothing named | nothing hidden, said so |"
     )
     print("|---" * 6 + "|")
-    for protocol in protocols.library():
+    for protocol in protocols.LIBRARY:
         of = [row for row in rows if row["protocol"] == protocol and row["effect"]]
         first = sum(row["named"][:1] == [row["effect"]] for row in of)
         sure = sum(row["named"][:1] == [row["effect"]] and row["verdict"] == "effect_missing" for row in of)
@@ -139,7 +139,7 @@ def main() -> None:
         return
     print("| protocol | time s | dose of the paper's | unseen fit %, median | lowest |\n|---|---|---|---|---|")
     paper_nms = np.array([row["torque_time_nms"] for row in rows if row["protocol"] == protocols.DEFAULT])
-    for protocol in protocols.library():
+    for protocol in protocols.LIBRARY:
         of = [row for row in rows if row["protocol"] == protocol]
         dose = float(np.median([row["torque_time_nms"] for row in of] / paper_nms))
         fits = [row["unseen_fit"] for row in of]

@@ -10,17 +10,18 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig import align, angle_columns, intended, journal
+from stimrig.rig import align, align_angle, journal
 from stimrig.rig.align_angle import Reference
 from stimrig.rig.clock import utc_text
 from stimrig.rig.errors import RecordingError
-from stimrig.rig.journal import JournalContents, Kind
+from stimrig.rig.journal import JournalContents, Kind, LaidBlock, Segment
 from stimrig.rig.signals import SAMPLE, PulseStatus
 
 FORMAT = "stimrig-recording"
@@ -71,7 +72,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     _refuse_empty(contents)
     notes = _damage(contents)
     header = contents.first_json(Kind.HEADER) or _header_of_blocks(contents, notes)
-    planned, segments = intended.planned(contents, header, notes)
+    planned, segments = planned_pulses(contents, header, notes)
     rate_hz = float(header["plan"]["pulse_rate_hz"])
     begun, t0_s, unix_s = _start(contents, header, rate_hz)
     end = contents.first_json(Kind.END) or {"outcome": outcome, "reason": reason, "time_s": _last_time(contents)}
@@ -84,7 +85,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     pulse_times = np.sort(written_s[np.isfinite(written_s)])
     reference, alignment, measured_hz = _aligned(contents, t0_s, pulse_times, float(header["sample_rate_hz"]))
     columns.update(_torque(reference, end_s))
-    of_angle, angle = angle_columns.of_journal(contents, header, reference, end_s)
+    of_angle, angle = align_angle.of_journal(contents, header, reference, end_s)
     columns.update(of_angle)
     segments = [s for s in segments if s.start / rate_hz < played_s]
     columns["segments/start_s"] = np.array([s.start / rate_hz for s in segments])
@@ -120,7 +121,7 @@ def _ending(contents: JournalContents, header: dict[str, Any], end: dict[str, An
     return {
         "adaptive": int(bool(header["plan"].get("adaptive"))),
         "ended_by": end.get("ended_by", "plan") if completed else end["outcome"],
-        "laid": json.dumps([block.described() for block in intended.laid_blocks(contents)]),
+        "laid": json.dumps([block.described() for block in laid_blocks(contents)]),
     }
 
 
@@ -148,7 +149,7 @@ def _damage(contents: JournalContents) -> list[str]:
 
 def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, Any]:
     """A header inferred from the blocks, if both copies are damaged."""
-    intents = intended.intents(contents)
+    intents = read_intents(contents)
     rate_hz = LIKELY_RATE_HZ
     if len(intents) > 1 and intents[-1][0] > intents[0][0]:
         rate_hz = round((intents[-1][0] - intents[0][0]) / (intents[-1][2] - intents[0][2]), 6)
@@ -181,7 +182,7 @@ def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) ->
     started = contents.first_json(Kind.START)
     if started is not None:
         return True, float(started["t0_s"]), float(started["unix_s"])
-    intents = intended.intents(contents)
+    intents = read_intents(contents)
     t0_s = float(header["time_s"])
     if intents:
         t0_s = float(np.median([due_s - index / rate_hz for index, _, due_s, _, _ in intents]))
@@ -195,7 +196,7 @@ def _sample_rate(contents: JournalContents) -> float:
 
 
 def _first_time(contents: JournalContents) -> float:
-    times = [intent[1] for intent in intended.intents(contents)[:1]]
+    times = [intent[1] for intent in read_intents(contents)[:1]]
     times += [float(np.frombuffer(p, SAMPLE)["host_time_s"][0]) for k, p in contents.blocks if k == Kind.TORQUE][:1]
     return min(times, default=0.0)
 
@@ -330,3 +331,72 @@ def _torque(of: Reference, end_s: float) -> dict[str, NDArray[Any]]:
         "torque/sync": of.samples["sync"][inside],
         "torque/gaps": gaps.astype(np.int64).reshape(-1, 2),
     }
+
+
+Floats = NDArray[np.float64]
+Intent = tuple[int, float, float, float, float]
+
+
+def read_intents(contents: JournalContents) -> list[Intent]:
+    """Index, time, due time, width and current of each pulse that was to be sent."""
+    return [journal.INTENT.unpack(payload) for kind, payload in contents.blocks if kind == Kind.INTENT]
+
+
+def laid_blocks(contents: JournalContents) -> list[LaidBlock]:
+    """Segments that were laid after the start, in order."""
+    return [LaidBlock.of_bytes(payload) for kind, payload in contents.blocks if kind == Kind.LAID]
+
+
+def planned_pulses(contents: JournalContents, header: dict[str, Any], notes: list[str]) -> tuple[Floats, list[Segment]]:
+    """Planned width of each pulse, µs, shape (n,), and the segments; notes say what was inferred."""
+    plan = next((np.frombuffer(p, "<f8") for k, p in contents.blocks if k == Kind.PLAN), None)
+    if plan is None:
+        notes.append("both copies of the plan are lost: the widths that were sent are used as planned widths")
+    widths_us = np.empty(0) if plan is None else plan
+    segments = [Segment(s["name"], s["start"], s["end"], s.get("by", "plan")) for s in header["segments"]]
+    sent_us = _sent(contents) if plan is None or header["plan"].get("adaptive") else np.empty(0)
+    for cut, block in _growth(contents):
+        widths_us = _filled(widths_us, sent_us, cut, notes, plan is None)
+        segments = [s._replace(end=min(s.end, cut)) for s in segments if s.start < cut]
+        if block is not None and block.segment.end > cut:
+            widths_us = np.concatenate([widths_us, block.pulse_width_us])
+            segments.append(block.segment)
+    return _filled(widths_us, sent_us, max(len(widths_us), len(sent_us)), notes, plan is None), segments
+
+
+def _growth(contents: JournalContents) -> Iterator[tuple[int, LaidBlock | None]]:
+    """Pulses up to which all stayed as it was, and what was laid after them; None: only the end was written."""
+    for kind, payload in contents.blocks:
+        if kind == Kind.LAID:
+            block = LaidBlock.of_bytes(payload)
+            yield block.segment.start, block
+        elif kind == Kind.EVENT and (event := json.loads(payload))["event"] == "ended":
+            yield event["index"], None
+
+
+def _filled(widths_us: Floats, sent_us: Floats, end: int, notes: list[str], told: bool) -> Floats:
+    """The widths up to pulse `end`; what is missing is taken from what was sent, 0 where nothing was."""
+    missing = end - len(widths_us)
+    if missing <= 0:
+        return widths_us[:end]
+    found_us = np.zeros(missing)
+    known_us = sent_us[len(widths_us) : end]
+    found_us[: len(known_us)] = known_us
+    if not told:
+        notes.append(
+            f"which segments pulses {len(widths_us) + 1} to {end} belonged to is lost: the widths that were sent are "
+            "used as planned widths"
+        )
+    return np.concatenate([widths_us, found_us])
+
+
+def _sent(contents: JournalContents) -> Floats:
+    """Widths by the intents, up to the last pulse of which any block speaks, µs."""
+    known = [journal.SKIPPED.unpack(p)[0] for k, p in contents.blocks if k in (Kind.WRITTEN, Kind.SKIPPED)]
+    known += [journal.ACKED.unpack_from(p)[0] for k, p in contents.blocks if k == Kind.ACKED]
+    asked = read_intents(contents)
+    known += [intent[0] for intent in asked]
+    widths_us = np.zeros(max(known, default=-1) + 1)
+    for index, _, _, width_us, _ in asked:
+        widths_us[index] = width_us
+    return widths_us

@@ -1,40 +1,53 @@
-"""From a `TestPlan` to every pulse of the test. The whole test is built and checked before anything is sent."""
+"""From a `TestPlan` to every pulse of the test. The whole test is built and checked before anything is sent.
+
+A plan is one list of segments; each is built to a piece. A test that is extended while it plays gets more of them
+later. Every limit holds for the whole test: its duration and charge, the charge of each second, and the rise from one
+segment to the next.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig import pieces, protocols, sequences
-from stimrig.rig.errors import PlanError
-from stimrig.rig.limits import Limit, Steps, refuse
-from stimrig.rig.messages import HELD, MOVING, PASSIVE, Preview, ProtocolInfo, RecruitmentTable, Sequences, TestPlan
-from stimrig.rig.pieces import MAX_SEGMENTS, MAX_WIDTH_SETTING, Piece
+from stimrig.rig import protocols, sequences
+from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.limits import Limit, Refusal, Steps, admit, refuse
+from stimrig.rig.messages import (
+    HELD,
+    MOVING,
+    PASSIVE,
+    SAFE_END_S,
+    Preview,
+    ProtocolInfo,
+    RecruitmentTable,
+    SegmentPlan,
+    Sequences,
+    TestPlan,
+)
+from stimrig.rig.signals import Pulse
 
 USUAL_RATE_HZ = 40.0
+MAX_SEGMENTS = 200
+MAX_WIDTH_SETTING = "max_pulse_width_us"
+"""If the plan does not give this setting of a sequence, it is the comfort maximum, or the request's limit if lower."""
+NOTHING = np.empty(0)
 
 
-def library() -> Sequences:
-    """All sequences with their settings as a plan gives them, all protocols, and the default test."""
-    found = sequences.described()
-    for sequence in found:
-        width = sequence.settings["properties"].get(MAX_WIDTH_SETTING)
-        if width is not None:
-            del width["default"]
-            width["description"] += "; left out: the comfort maximum, or the test's own limit if that is lower"
-    default = protocols.segments(protocols.DEFAULT, 0.0)
-    told = [_protocol(name, words) for name, words in protocols.described().items()]
-    return Sequences(sequences=found, protocols=told, default=default)
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One segment, built: a width for each pulse, µs, shape (n,), n >= 1.
 
+    `jumps` says whether its sequence may rise to any allowed width within one pulse.
+    """
 
-def _protocol(protocol_id: str, words: str) -> ProtocolInfo:
-    chosen = protocols.segments(protocol_id, 0.0)
-    pulses = sum(sequences.pulse_count(segment.sequence, segment.settings, USUAL_RATE_HZ) for segment in chosen)
-    names = [segment.name for segment in chosen]
-    return ProtocolInfo(id=protocol_id, description=words, segments=names, duration_s=pulses / USUAL_RATE_HZ)
+    of: SegmentPlan
+    pulse_width_us: NDArray[np.float64]
+    jumps: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,16 +127,19 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
         raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
     if len(chosen) > MAX_SEGMENTS:
         raise PlanError(f"plan.segments: {len(chosen)} segments, at most {MAX_SEGMENTS}; combine some of them")
-    built = pieces.build(chosen, plan, table["duration_s"])
-    pieces.check_all(built, plan, table)
+    built = build_pieces(chosen, plan, table["duration_s"])
+    check_pieces(built, plan, table)
     widths_us = np.concatenate([piece.pulse_width_us for piece in built])
     longest_s = len(widths_us) / plan.pulse_rate_hz
     if plan.adaptive is not None:
         # it plays if nobody extends: it must fit into its bounds with its safe end
-        whole = len(widths_us) + pieces.safe_end(widths_us, plan.pulse_rate_hz)
+        whole = len(widths_us) + safe_end(widths_us, plan.pulse_rate_hz)
         refuse(table["duration_s"], whole / plan.pulse_rate_hz, "plan, with its safe end")
         longest_s = table["duration_s"].hi
-    return PlannedTest(plan, widths_us, laid_out(built), built, longest_s)
+    ends = np.cumsum([len(piece.pulse_width_us) for piece in built]).tolist()
+    places = zip(built, [0, *ends[:-1]], ends, strict=True)
+    segments = tuple(PlannedSegment(piece.of.name, start, end) for piece, start, end in places)
+    return PlannedTest(plan, widths_us, segments, built, longest_s)
 
 
 def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:
@@ -139,11 +155,105 @@ def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:
         refuse(table["angle_rad"], target_rad, "plan.angle.target_rad")
 
 
-def laid_out(built: Sequence[Piece]) -> tuple[PlannedSegment, ...]:
-    """Start and end of each piece."""
-    ends = np.cumsum([len(piece.pulse_width_us) for piece in built]).tolist()
-    starts = [0, *ends[:-1]]
-    return tuple(PlannedSegment(piece.of.name, *at) for piece, *at in zip(built, starts, ends, strict=True))
+def build_pieces(chosen: Sequence[SegmentPlan], plan: TestPlan, longest: Limit, before: int = 0) -> tuple[Piece, ...]:
+    """Build segments that follow `before` pulses; too long ones are refused before they are built.
+
+    Parameters
+    ----------
+    longest
+        Limit on the duration of all pulses, those before included.
+
+    Raises
+    ------
+    PlanError
+        Unknown sequence, wrong setting, or a segment without a pulse: names the segment.
+    RefusedError
+        Too long.
+    """
+    reached = before
+    for number, segment in enumerate(chosen, start=1):
+        with _named(number, segment):
+            count = sequences.pulse_count(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz)
+            if count < 1:
+                raise PlanError(f"too short for one pulse at {plan.pulse_rate_hz:g} pulses/s; lengthen it")
+        reached += count
+        refuse(longest, reached / plan.pulse_rate_hz, f"plan, up to segment {number}")
+    built = []
+    for number, segment in enumerate(chosen, start=1):
+        with _named(number, segment):
+            widths_us = sequences.build(segment.sequence, _settings(segment, plan), plan.pulse_rate_hz)
+            built.append(Piece(segment, widths_us, sequences.jumps(segment.sequence, segment.settings)))
+    return tuple(built)
+
+
+@contextlib.contextmanager
+def _named(number: int, segment: SegmentPlan) -> Iterator[None]:
+    """Add the segment's number and name to a PlanError."""
+    try:
+        yield
+    except PlanError as error:
+        raise PlanError(f"segment {number} ({segment.name}): {error}") from None
+
+
+def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
+    settings = dict(segment.settings)
+    if MAX_WIDTH_SETTING in sequences.find(segment.sequence).Settings.model_fields:
+        settings.setdefault(MAX_WIDTH_SETTING, plan.largest_us)
+    return settings
+
+
+def check_pieces(
+    pieces: Sequence[Piece], plan: TestPlan, table: dict[str, Limit], before_us: NDArray[np.float64] = NOTHING
+) -> None:
+    """Check pieces against the limits, as a part of the whole that they make with the pulses before them.
+
+    Parameters
+    ----------
+    before_us
+        Widths of all pulses before them, µs, shape (n,), already checked.
+
+    Raises
+    ------
+    RefusedError
+        Names the limit, the value and the excess.
+    """
+    current_ma, rate_hz = plan.profile.current_ma, plan.pulse_rate_hz
+    added_us = np.concatenate([piece.pulse_width_us for piece in pieces])
+    for width_us in np.unique(added_us):
+        verdict = admit(Pulse(float(width_us), current_ma), table)
+        if isinstance(verdict, Refusal):
+            raise RefusedError(f"{_place(pieces, width_us)}: {verdict}")
+    whole = len(before_us) + len(added_us)
+    window = min(max(1, round(rate_hz)), whole)
+    charge_uc = np.concatenate([before_us[max(0, len(before_us) - window + 1) :], added_us]) * current_ma * 1e-3
+    worst_uc = float(np.max(np.convolve(charge_uc, np.ones(window), "valid")))
+    refuse(table["charge_per_second_uc"], worst_uc, "plan")
+    whole_uc = sequences.dose_uc(before_us, current_ma) + sequences.dose_uc(added_us, current_ma)
+    refuse(table["charge_per_test_uc"], whole_uc, "plan")
+    refuse(table["duration_s"], whole / rate_hz, "plan")
+    last_us = float(before_us[-1]) if len(before_us) else 0.0
+    for piece in pieces:
+        if not piece.jumps:  # else the sequence jumps by design
+            rises_us = np.diff(piece.pulse_width_us, prepend=last_us)
+            first = int(np.argmax(rises_us))
+            refuse(table["width_rise_us"], float(rises_us[first]), f"segment {piece.of.name}, pulse {first + 1}")
+        last_us = float(piece.pulse_width_us[-1])
+
+
+def _place(pieces: Sequence[Piece], width_us: float) -> str:
+    """Segment and pulse at which a width stands first, NaN included."""
+    for piece in pieces:
+        same = (piece.pulse_width_us == width_us) | np.isnan(piece.pulse_width_us) & np.isnan(width_us)
+        if same.any():
+            return f"segment {piece.of.name}, pulse {int(np.argmax(same)) + 1}"
+    return "plan"
+
+
+def safe_end(widths_us: NDArray[np.float64], pulse_rate_hz: float) -> int:
+    """Pulses of width 0 that must still follow, so that the test ends with `SAFE_END_S` without stimulation."""
+    played = np.flatnonzero(widths_us)
+    resting = len(widths_us) - (int(played[-1]) + 1 if len(played) else 0)
+    return max(0, round(SAFE_END_S * pulse_rate_hz) - resting)
 
 
 def check_steps(test: PlannedTest, steps: Steps) -> None:
@@ -178,3 +288,22 @@ def preview(test: PlannedTest, recruitment: RecruitmentTable | None = None) -> P
         pulse_width_us=test.pulse_width_us.tolist(),
         segments=[{"name": s.name, "start_s": s.start / rate_hz, "end_s": s.end / rate_hz} for s in test.segments],
     )
+
+
+def library() -> Sequences:
+    """All sequences with their settings as a plan gives them, all protocols, and the default test."""
+    found = sequences.described()
+    for sequence in found:
+        width = sequence.settings["properties"].get(MAX_WIDTH_SETTING)
+        if width is not None:
+            del width["default"]
+            width["description"] += "; left out: the comfort maximum, or the test's own limit if that is lower"
+    described = [_protocol(name, words) for name, words in protocols.described().items()]
+    return Sequences(sequences=found, protocols=described, default=protocols.segments(protocols.DEFAULT, 0.0))
+
+
+def _protocol(protocol_id: str, words: str) -> ProtocolInfo:
+    chosen = protocols.segments(protocol_id, 0.0)
+    pulses = sum(sequences.pulse_count(segment.sequence, segment.settings, USUAL_RATE_HZ) for segment in chosen)
+    names = [segment.name for segment in chosen]
+    return ProtocolInfo(id=protocol_id, description=words, segments=names, duration_s=pulses / USUAL_RATE_HZ)

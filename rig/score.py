@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig import journal as jn
-from stimrig.rig import pieces
+from stimrig.rig import plan
 from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.limits import Limit, refuse, tightened
 from stimrig.rig.messages import AHEAD, Extended, LaidSegment, SegmentPlan
-from stimrig.rig.pieces import Piece
-from stimrig.rig.plan import PlannedTest
+from stimrig.rig.plan import Piece, PlannedTest
 from stimrig.rig.tasks import Tasks
 
 MAX_EXTENSION_SEGMENTS = 8
@@ -80,7 +79,7 @@ class Score:
         self._checking = False
         at_start = test.pieces[:1] if self.adaptive else test.pieces
         self._fixed = deque(test.pieces[len(at_start) :])
-        self.laid = Laid(pieces.NOTHING, np.empty(0, bool), ())
+        self.laid = Laid(plan.NOTHING, np.empty(0, bool), ())
         for piece in at_start:
             self.laid = self.laid.with_piece(piece, "plan")
         self._reached = -1
@@ -221,7 +220,7 @@ class Score:
     def _built_and_checked(self, laid: Laid, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
         """Behind what is laid; changes nothing, since it runs beside the sender."""
         before = len(laid)
-        most = min(MAX_EXTENSION_SEGMENTS, pieces.MAX_SEGMENTS - len(laid.segments) - len(self._fixed) - 1)
+        most = min(MAX_EXTENSION_SEGMENTS, plan.MAX_SEGMENTS - len(laid.segments) - len(self._fixed) - 1)
         if not (1 <= len(chosen) <= most):
             raise PlanError(f"extend.segments: {len(chosen)} segments; give 1 to {most}")
         for number, segment in enumerate(chosen, start=1):
@@ -229,17 +228,17 @@ class Score:
                 raise PlanError(f"extend.segments: name {number} must have 1 to {MAX_NAME} printable characters")
         longest_s = before / self.plan.pulse_rate_hz + MAX_EXTENSION_S
         table = tightened(self._table, "duration_s", longest_s, f"at most {MAX_EXTENSION_S:g} s an extension")
-        built = pieces.build(chosen, self.plan, table["duration_s"], before)
+        built = plan.build_pieces(chosen, self.plan, table["duration_s"], before)
         self._check(laid, built)
         return built
 
     def _check(self, laid: Laid, added: Sequence[Piece]) -> None:
         """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
         before_us = laid.pulse_width_us
-        pieces.check_all(added, self.plan, self._table, before_us)
+        plan.check_pieces(added, self.plan, self._table, before_us)
         whole_us = np.concatenate([before_us, *(piece.pulse_width_us for piece in added)])
         rate_hz = self.plan.pulse_rate_hz
-        whole_s = (len(whole_us) + pieces.safe_end(whole_us, rate_hz)) / rate_hz
+        whole_s = (len(whole_us) + plan.safe_end(whole_us, rate_hz)) / rate_hz
         refuse(self._table["duration_s"], whole_s, "plan, with its safe end")
 
     def _go_on(self) -> None:
@@ -262,7 +261,7 @@ class Score:
         event = {"event": "ended", "by": by, "reason": reason, "index": cut, "time_s": self._clock.now_s()}
         self._journal.append_json(Kind.EVENT, event)
         kept = self.laid.cut(cut)
-        missing = pieces.safe_end(kept.pulse_width_us, self.plan.pulse_rate_hz)
+        missing = plan.safe_end(kept.pulse_width_us, self.plan.pulse_rate_hz)
         if missing or len(kept) < len(self.laid):
             self._lay(Piece(SAFE_END, np.zeros(missing), jumps=False), "end", kept)
         self.ended_by, self._end_at = by, len(kept)

@@ -44,6 +44,7 @@ SCALES = 0.7, 1.4
 """How far the scale of two poses may be from the rig file's: beyond it a number was mistyped or the sensor slips."""
 SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
 """Settings that tell one sensor from another."""
+NO_SENSOR = "{}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)"
 ROUNDED = 1e-9
 """Share by which what a file says may differ from what its two poses make."""
 
@@ -303,7 +304,7 @@ class Joint:
 
     def _refuse_absent(self, place: str) -> None:
         if not self._present:
-            raise PlanError(f"{place}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)")
+            raise PlanError(NO_SENSOR.format(place))
 
     def _receiver(self) -> AngleReceiver:
         if self._pair.angle is None:

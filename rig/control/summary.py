@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig import intended
+from stimrig.rig import assembly
 from stimrig.rig.acquire.receiver import TorqueTime
 from stimrig.rig.assembly import Recording
 from stimrig.rig.control.live import finite
@@ -47,7 +47,7 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
     widths_us = np.where(widths_us > 0, widths_us, widest_us)  # of a pulse whose width is lost
     currents_ma = np.where(currents_ma > 0, currents_ma, highest_ma)
     header = contents.first_json(Kind.HEADER)  # None: it is lost
-    planned_us = np.empty(0) if header is None else intended.planned(contents, header, [])[0]
+    planned_us = np.empty(0) if header is None else assembly.planned_pulses(contents, header, [])[0]
     unseen_us = planned_us[n : n + int(np.ceil(lost_s * rate_hz))]
     doubtful = int(np.sum(status == PulseStatus.UNACKNOWLEDGED)) + int(np.sum(unseen_us > 0))
     played_s = max([n / rate_hz if felt.any() else 0.0, *columns["segments/end_s"].tolist()])

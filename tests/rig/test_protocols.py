@@ -18,7 +18,7 @@ def built(protocol: str, **more: float) -> plan.PlannedTest:
     return plan.build(request, limits.for_plan(limits.HARD_LIMITS, request))
 
 
-@pytest.mark.parametrize("protocol", protocols.library())
+@pytest.mark.parametrize("protocol", protocols.LIBRARY)
 @pytest.mark.parametrize("comfort_us", [1.0, 77.3, 280.0, 500.0])
 def test_every_protocol_fits_every_comfort_maximum(protocol: str, comfort_us: float):
     test = built(protocol, max_pulse_width_us=comfort_us)
