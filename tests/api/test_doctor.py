@@ -11,8 +11,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from stimrig.api.cli import doctor, main
-from stimrig.api.cli.doctor import Finding, examine
+from stimrig.api.cli import main
+from stimrig.api.cli.commands import doctor
+from stimrig.api.cli.commands.doctor import Finding, examine
 from stimrig.api.logs import JsonLines
 from stimrig.api.settings import Settings
 from tests.api.conftest import Service, run_test

@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 
-from stimrig.api.cli import streams as streams_module
+from stimrig.api.cli import launcher
 from stimrig.api.cli.child import LAST_BYTES, Child
-from stimrig.api.cli.launcher import Services
-from stimrig.api.cli.streams import Streams
+from stimrig.api.cli.launcher import Services, Streams
 from stimrig.api.settings import Settings
 from tests.harness.lsl_recorder import on_this_machine
 
@@ -49,7 +48,7 @@ class FakeChild:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     clock = SimpleNamespace(now_s=1000.0)
-    monkeypatch.setattr(streams_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    monkeypatch.setattr(launcher, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
     return clock
 
 

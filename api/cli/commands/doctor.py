@@ -2,14 +2,308 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from stimrig.api.cli import doctor as checks
 from stimrig.api.cli.terminal import Json, given, say, say_json
 from stimrig.api.settings import Settings
+
+Verdict = Literal["ok", "care", "fails"]
+LEAST_FREE_GB, GOOD_FREE_GB = 0.5, 5.0
+SENDER_PRIORITY = 50
+LATE_MS, SLOW_DISK_MS = 5.0, 200.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at.
+
+    Attributes
+    ----------
+    verdict : {'ok', 'care', 'fails'}
+        `fails`: a test would be refused or lost. `care`: it works, but not as it should.
+    """
+
+    check: str
+    verdict: Verdict
+    says: str
+    fix: str = ""
+
+
+def examine(settings: Settings) -> list[Finding]:
+    """All checks; one that breaks is a finding, too."""
+    found: list[Finding] = []
+    for name, check in checks().items():
+        try:
+            found += check(settings)
+        except Exception as error:
+            found.append(Finding(name, "care", f"could not be checked: {type(error).__name__}: {error}"))
+    return found
+
+
+def checks() -> dict[str, Callable[[Settings], Iterator[Finding]]]:
+    """The checks of this module, in the order they are written."""
+    return {name.removeprefix("check_"): check for name, check in globals().items() if name.startswith("check_")}
+
+
+def as_dict(found: list[Finding]) -> dict[str, Any]:
+    """The findings as one object."""
+    worst = max((finding.verdict for finding in found), key=get_args(Verdict).index, default="ok")
+    return {"verdict": worst, "findings": [asdict(finding) for finding in found]}
+
+
+def check_rig_file(settings: Settings) -> Iterator[Finding]:
+    """The rig file, read by the rig's own reader, in a process of its own."""
+    if settings.rig_file is None:
+        yield Finding("rig file", "ok", "none given: the emulated rig will be used")
+        return
+    code = "import sys, pathlib; from stimrig.rig import config; config.load(pathlib.Path(sys.argv[1]))"
+    command = [sys.executable, "-c", code, str(settings.rig_file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    if done.returncode == 0:
+        yield Finding("rig file", "ok", f"{settings.rig_file}: every key is valid")
+    else:
+        last = (done.stderr.strip().splitlines() or ["it cannot be read"])[-1].partition("Error: ")
+        yield Finding("rig file", "fails", last[2] or last[0], "docs/rig-file.md lists every key")
+
+
+def check_devices(settings: Settings) -> Iterator[Finding]:
+    """Are the stimulator's port and the load cell's bus there, and may this user use them?"""
+    if settings.rig_file is None or not settings.rig_file.is_file():
+        return
+    content = tomllib.loads(settings.rig_file.read_text("utf-8"))
+    port = (content.get("stimulator") or {}).get("port")
+    if port:
+        yield port_finding("stimulator", Path(port))
+    bus = (content.get("load_cell") or {}).get("bus") or {}
+    if bus:
+        yield bus_finding(bus)
+
+
+def port_finding(what: str, port: Path) -> Finding:
+    """A serial port: there, a device, and ours to use."""
+    if not port.exists():
+        fix = "plug it in and switch it on; `ls -l /dev/serial/by-id /dev/stimrig` shows what is there"
+        return Finding(what, "fails", f"{port} is not there", fix)
+    mode = port.stat().st_mode
+    if not stat.S_ISCHR(mode):
+        return Finding(what, "fails", f"{port} is no serial port", "give its name under /dev in the rig file")
+    if not os.access(port, os.R_OK | os.W_OK):
+        fix = "add this user to the port's group (dialout), or install deploy/udev/70-stimrig.rules; sign in again"
+        return Finding(what, "fails", f"{port} may not be read and written by this user", fix)
+    return Finding(what, "ok", f"{port} is there and may be used")
+
+
+def bus_finding(bus: dict[str, Any]) -> Finding:
+    """A CAN bus by its kind."""
+    kind, channel = str(bus.get("interface", "")), str(bus.get("channel", ""))
+    if kind == "slcan":
+        return port_finding("load cell", Path(channel.partition("@")[0]))
+    if kind == "socketcan":
+        link = Path("/sys/class/net") / channel
+        if not link.exists():
+            fix = f"plug the adapter in; systemctl start stimrig-can@{channel} brings it up"
+            return Finding("load cell", "fails", f"there is no interface {channel}", fix)
+        if not int((link / "flags").read_text(), 16) & 1:
+            fix = f"ip link set {channel} up type can bitrate …, or systemctl start stimrig-can@{channel}"
+            return Finding("load cell", "fails", f"{channel} is down", fix)
+        return Finding("load cell", "ok", f"{channel} is up")
+    if kind == "socketcand":
+        host, port = str(bus.get("host", "127.0.0.1")), int(bus.get("port", 29536))
+        try:
+            socket.create_connection((host, port), timeout=2).close()
+        except OSError as error:
+            says = f"socketcand at {host}:{port}: {error.strerror or error}"
+            return Finding("load cell", "fails", says, "start socketcand on that machine")
+        return Finding("load cell", "ok", f"socketcand answers at {host}:{port}")
+    return Finding("load cell", "care", f"a {kind} bus cannot be checked without opening it")
+
+
+def check_rig(settings: Settings) -> Iterator[Finding]:
+    """Does the rig's process answer, and does it stand still?"""
+    if settings.rig_socket is None:
+        return
+    try:
+        with socket.socket(socket.AF_UNIX) as line:
+            line.settimeout(3)
+            line.connect(str(settings.rig_socket))
+            line.sendall(b'{"kind": "status", "id": 1}\n')
+            body = json.loads(line.makefile().readline())["body"]
+    except (OSError, ValueError, KeyError) as error:
+        fix = "systemctl status stimrig-rig; its journal says why"
+        yield Finding("rig", "fails", f"{settings.rig_socket}: no answer ({error})", fix)
+        return
+    if body["state"] in ("latched", "uncertain", "disconnected"):
+        fix = "check the participant and the rig, then re-arm it on the page"
+        yield Finding("rig", "fails", f"{body['state']}: {body['reason']}", fix)
+    else:
+        yield Finding("rig", "ok", body["state"])
+
+
+def check_data(settings: Settings) -> Iterator[Finding]:
+    """The data folder: ours to write, closed to others, with room, on a disk that keeps pace."""
+    folder = settings.data_dir.absolute()
+    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        fix = f"chown it to this user, or set STIMRIG_DATA_DIR; deploy/install.sh makes {folder} as it should be"
+        yield Finding("data folder", "fails", f"{nearest} may not be written by this user", fix)
+        return
+    if folder.exists() and folder.stat().st_mode & stat.S_IROTH:
+        yield Finding("data folder", "care", f"{folder} may be read by every user", f"chmod o-rwx {folder}")
+    else:
+        yield Finding("data folder", "ok", f"{folder} may be written, by this user and its group")
+    free_gb = shutil.disk_usage(nearest).free / 1e9
+    says, fix = f"{free_gb:.1f} GB free; a test takes 5 MB", "make room, or move old recordings to the backup"
+    yield Finding("disk", "fails" if free_gb < LEAST_FREE_GB else "care" if free_gb < GOOD_FREE_GB else "ok", says, fix)
+    slowest_ms = max(synced_ms(nearest) for _ in range(5))
+    says = f"slowest of five writes to the disk: {slowest_ms:.0f} ms"
+    yield Finding(
+        "disk speed", "care" if slowest_ms > SLOW_DISK_MS else "ok", says, "use a local disk, not a network disk"
+    )
+
+
+def synced_ms(folder: Path) -> float:
+    """A journal's second of data, brought to the disk, ms."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        began = time.perf_counter()
+        file.write(b"\0" * 65536)
+        file.flush()
+        os.fsync(file.fileno())
+        return 1000 * (time.perf_counter() - began)
+
+
+def check_database(settings: Settings) -> Iterator[Finding]:
+    """Does the database open, and does its audit trail hold?"""
+    if settings.database_url is None and not (settings.data_dir / "stimrig.db").exists():
+        yield Finding("database", "ok", "not there yet; the first start makes it")
+        return
+    from stimrig.api.errors import ApiError
+    from stimrig.api.outbox import receipts
+    from stimrig.api.store import Store
+    from stimrig.api.store.tables import AuditEntry
+
+    try:
+        store = Store(settings.database)
+    except ApiError as error:
+        yield Finding("database", "fails", str(error), "restore it from the backup (docs/install.md)")
+        return
+    entries = store.all(AuditEntry, order=AuditEntry.seq)
+    broken = receipts.of_folder(entries, settings.data_dir).first_broken
+    store.close()
+    if broken is None:
+        yield Finding("database", "ok", f"opens; the chain of the audit trail's {len(entries)} entries is complete")
+    else:
+        fix = "compare with the backup: the database was changed outside the service"
+        yield Finding("database", "fails", f"the audit trail is broken at entry {broken}", fix)
+
+
+def check_centre(settings: Settings) -> Iterator[Finding]:
+    """Does a centre hear of this rig? Nothing where none is configured."""
+    from stimrig.api.clock import Clock
+    from stimrig.api.outbox import status
+
+    told = status.read(settings, Clock().unix_s())
+    if told is None:
+        return
+    says = f"{told.centre}: {status.WORDS[told.state]}"
+    if told.detail:
+        says += f" ({told.detail})"
+    says += f" {told.items_waiting} items and {told.files_waiting} files wait"
+    says += f"; last contact {told.last_contact_utc or 'never'}"
+    if told.damaged_count:
+        says += f"; {told.damaged_count} files are missing or damaged, the first: {told.damaged[0]}"
+    fix = status.FIXES.get(told.state, "see outbox.log in the folder of the logs")
+    yield Finding("centre", "ok" if told.state in status.GOOD else "care", says, fix)
+
+
+def check_clock(_settings: Settings) -> Iterator[Finding]:
+    """Is UTC a label to be trusted, and does this machine wake up in time?"""
+    tool = shutil.which("timedatectl")
+    answer = ""
+    if tool:
+        command = [tool, "show", "--property=NTPSynchronized", "--value"]
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10).stdout.strip()
+    if answer == "yes":
+        yield Finding("clock", "ok", "set by NTP")
+    else:
+        says = "not set by NTP" if answer == "no" else "it is not known whether NTP sets it"
+        fix = "timedatectl set-ntp true; without a network set it by hand: recordings and approvals carry its date"
+        yield Finding("clock", "care", says, fix)
+    late_ms = []
+    for _ in range(200):
+        began = time.perf_counter()
+        time.sleep(0.002)
+        late_ms.append(1000 * (time.perf_counter() - began) - 2)
+    worst_ms = sorted(late_ms)[-3]
+    fix = "end other programs on this machine; give the rig real-time priority"
+    says = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 10 ms)"
+    yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, fix)
+
+
+def check_priority(_settings: Settings) -> Iterator[Finding]:
+    """May the rig's sender run before everything else?"""
+    code = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({SENDER_PRIORITY}))"
+    allowed = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=30).returncode == 0
+    says = "real-time priority is granted" if allowed else "no real-time priority for this user"
+    fix = "LimitRTPRIO=60 as in deploy/systemd/stimrig-rig.service, or `rtprio 60` in /etc/security/limits.d"
+    yield Finding("priority", "ok" if allowed else "care", says, "" if allowed else fix)
+
+
+def check_compiled(_settings: Settings) -> Iterator[Finding]:
+    """Can what numba compiles be kept, so that the first fit is not a slow one?"""
+    from stimrig import identify
+
+    place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(str(identify.__file__)).parent)
+    nearest = next(folder for folder in (place, *place.parents) if folder.exists())
+    kept = os.access(nearest, os.W_OK | os.X_OK)
+    says = f"{place} {'may' if kept else 'may not'} be written"
+    fix = "set NUMBA_CACHE_DIR to a folder of this user; otherwise each start compiles again, for about ten seconds"
+    yield Finding("compiled code", "ok" if kept else "care", says, "" if kept else fix)
+
+
+def check_door(settings: Settings) -> Iterator[Finding]:
+    """Is the service closed to the network unless TLS stands in front?"""
+    from stimrig.api.web.server import refuse_open_door
+
+    try:
+        refuse_open_door(settings)
+    except OSError as error:
+        yield Finding("address", "fails", str(error))
+        return
+    with socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET) as line:
+        line.settimeout(1)
+        taken = line.connect_ex((settings.host, settings.port)) == 0
+    says = f"{settings.host}:{settings.port} {'is in use, by the service or another program' if taken else 'is free'}"
+    yield Finding("address", "ok", says)
+
+
+def check_workers(_settings: Settings) -> Iterator[Finding]:
+    """Can the processes that read other people's files be shut in?"""
+    command = [sys.executable, "-m", "stimrig.api.workers.confinement"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    left_open = json.loads(done.stdout)
+    if not left_open:
+        says = "isolated: no network, no files but recordings, limits on memory and time"
+        yield Finding("workers", "ok", says)
+    for what, why in left_open.items():
+        fix = "a kernel from 5.13 on with Landlock" if what == "files" else "Linux on x86_64 or aarch64 with seccomp"
+        says = f"{what}: workers that read uploads cannot be isolated from them here ({why})"
+        yield Finding("workers", "care", says, f"{fix}; until then upload only files from people you trust")
+
 
 MARKS = {"ok": "ok   ", "care": "care ", "fails": "FAILS"}
 
@@ -21,8 +315,8 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check devices, permissions, clock, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
-    found = checks.examine(Settings(**given(rig_file=rig, data_dir=data, rig_socket=socket)))
-    report = checks.as_dict(found)
+    found = examine(Settings(**given(rig_file=rig, data_dir=data, rig_socket=socket)))
+    report = as_dict(found)
     if as_json:
         say_json(report)
     else:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from stimrig.api.cli.cohort_report import changed_lines
+from stimrig.api.cli.commands.cohort import changed_lines
 from stimrig.api.cohort import changed
 from stimrig.api.cohort.changed import compared
 from stimrig.api.cohort.errors import CohortError

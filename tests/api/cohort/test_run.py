@@ -15,7 +15,7 @@ import pytest
 from distributed import Client, LocalCluster
 from distributed.scheduler import KilledWorker
 
-from stimrig.api.cli.cohort_report import duration, words
+from stimrig.api.cli.commands.cohort import duration, words
 from stimrig.api.cohort import flight, worker
 from stimrig.api.cohort.cluster import check_versions
 from stimrig.api.cohort.errors import CohortError, CutOffError

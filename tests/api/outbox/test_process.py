@@ -18,7 +18,7 @@ import httpx
 import pytest
 
 from stimrig.api.cli import launcher
-from stimrig.api.cli.doctor import check_centre
+from stimrig.api.cli.commands.doctor import check_centre
 from stimrig.api.cli.launcher import Services
 from stimrig.api.errors import SettingsError
 from stimrig.api.outbox import status
