@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from stimrig import identify
+from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.paper import muscle, table1
 
 FOLDER = Path(__file__).parent.parent / "docs" / "img"
 TRIALS = 20
@@ -34,7 +34,7 @@ def figure_4():
     """Input and output of a PRBS test and of a triangular ramp test, with the model's free run."""
     import matplotlib.pyplot as plt
 
-    record, _ = table1.simulate(0.05, 1, 1600.0)
+    record, _ = paper.simulate(0.05, 1, 1600.0)
     predicted = identify.predict(identify.fit(record), record)
     names = np.array(record.segment_names)[record.segment]
     figure, axes = plt.subplots(2, 2, figsize=(8, 4), sharex="col")
@@ -57,17 +57,17 @@ def figure_5():
     """The simulated muscle: recruitment curve and step response, with what is identified at 40 Hz and 0.10 N·m."""
     import matplotlib.pyplot as plt
 
-    record, _ = table1.simulate(0.10, 1)
+    record, _ = paper.simulate(0.10, 1)
     model = identify.fit(record)
     curve, step = model.bands["recruitment"], model.bands["step_response"]
     figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3))
     width = np.linspace(0, 300, 101)
     left.fill_between(curve["pulse_width_us"], curve["lower"], curve["upper"], color="#fdc", label="95 % band")
     left.plot(curve["pulse_width_us"], curve["value"], color="#b30", lw=1.2, label="identified")
-    left.plot(width, muscle.recruitment(width), "k--", lw=1, label="true")
+    left.plot(width, paper.recruitment(width), "k--", lw=1, label="true")
     left.set(xlabel="pulse width, µs", ylabel="f(u), N·m", title="recruitment curve")
     left.legend(frameon=False)
-    true = SecondOrder(muscle.TIME_CONSTANT_S, muscle.DAMPING).step_response(step["time_s"])
+    true = SecondOrder(paper.TIME_CONSTANT_S, paper.DAMPING).step_response(step["time_s"])
     right.fill_between(step["time_s"], step["lower"], step["upper"], color="#fdc")
     right.plot(step["time_s"], step["value"], color="#b30", lw=1.2)
     right.plot(step["time_s"], true, "k--", lw=1)
@@ -79,9 +79,9 @@ def figure_7():
     """Best fit against noise: the paper's and ours on the noisy ramp, the ceiling, and ours on unseen input."""
     import matplotlib.pyplot as plt
 
-    rows = table1.run(TRIALS)["rows"]
+    rows = paper.table1(TRIALS)["rows"]
     figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2), sharex=True)
-    noise = table1.NOISE_NM
+    noise = paper.NOISE_NM
     colours = {
         "two-stage": "#06c",
         "ramp-deconvolution": "#393",
@@ -92,8 +92,8 @@ def figure_7():
         mine = [row for row in rows if row["method"] == method]
         left.plot(noise, [row["ours"] for row in mine], color=colour, marker="o", ms=3, lw=1, label=method)
         right.plot(noise, [row["unseen"] for row in mine], color=colour, marker="o", ms=3, lw=1)
-        if method in table1.PAPER:
-            left.plot(noise, [value for value, _ in table1.PAPER[method]], color=colour, ls=":", lw=1)
+        if method in paper.PAPER:
+            left.plot(noise, [value for value, _ in paper.PAPER[method]], color=colour, ls=":", lw=1)
     ceiling = [row["ceiling"] for row in rows if row["method"] == "two-stage"]
     left.plot(noise, ceiling, "k", lw=0.6, label="ceiling")
     left.plot([], [], "k:", lw=1, label="the paper")

@@ -20,11 +20,11 @@ import numpy as np
 
 from bench.stamp import RESULTS, written_by
 from stimrig import identify
+from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.estimation.uncertainty import prediction_band
-from stimrig.identify.paper import muscle
-from stimrig.identify.paper.table1 import simulate
+from stimrig.identify.paper import simulate
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 
@@ -49,7 +49,7 @@ def record_of(patient: Patient, rng: np.random.Generator, rate_hz: float, noise_
     """A record of this patient in the paper's test, with a baseline, and its clean torque."""
     baseline_nm = float(rng.uniform(-1, 1))
     return make_record(
-        patient, rng, rate_hz=rate_hz, noise_nm=noise_nm, baseline_nm=baseline_nm, pulses=muscle.protocol()
+        patient, rng, rate_hz=rate_hz, noise_nm=noise_nm, baseline_nm=baseline_nm, pulses=paper.protocol()
     )
 
 

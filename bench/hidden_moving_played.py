@@ -11,7 +11,7 @@ from typing import Any
 from bench.hidden_played import agrees, reveal
 from stimrig.hardware_sim.hidden_records import patient_record, write_csv
 from stimrig.identify.diagnosis import diagnose
-from stimrig.identify.records.read import read
+from stimrig.identify.records import read
 from stimrig.identify.records.record import Record
 from tests.harness.processes import Bench, default_plan
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stimrig.identify.dynamics.boundary import step_matrix
+from stimrig.identify.dynamics.states import step_matrix
 
 COUNT, KEEP, SCALE = 3000, 0.98, 0.5
 LEVELS, HOLD = 13, 20

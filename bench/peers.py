@@ -10,8 +10,8 @@ import numpy as np
 
 from bench.contenders import CONTENDERS, Contender, Task
 from bench.stamp import RESULTS, written_by
+from stimrig.identify import paper
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
-from stimrig.identify.paper import muscle
 from stimrig.identify.records.record import Record
 
 NOISE_NM = (0.0, 0.02, 0.10)
@@ -22,8 +22,8 @@ TARGET = RESULTS / "bench.md"
 
 def make_task(rate_hz: float, noise_nm: float, seed: int) -> tuple[Task, np.ndarray]:
     """A record of the paper's muscle and its clean torque."""
-    widths, names = muscle.protocol()
-    clean = muscle.torque(widths, rate_hz)
+    widths, names = paper.protocol()
+    clean = paper.torque(widths, rate_hz)
     each = round(rate_hz / 40.0)
     labels = np.repeat(names, each)
     noise = np.random.default_rng(seed).standard_normal(clean.size) * noise_nm

@@ -25,7 +25,7 @@ from stimrig.hardware_sim import hidden_records
 from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.fitting import fit
-from stimrig.identify.records import parts_csv
+from stimrig.identify.records.join import write_joined
 from tests.api.browser import CHROMIUM
 
 IMAGES = Path(__file__).parents[1] / "docs" / "img"
@@ -52,7 +52,7 @@ def prepared_joint(url: str, folder: Path) -> str:
     isometric = record(arm, "isometric", ARM)
     guided = guided_tests(arm, fit(as_record(isometric)), isometric, ARM)
     path = folder / "joint.csv"
-    parts_csv.write(joined([isometric, *guided]), path)
+    write_joined(joined([isometric, *guided]), path)
     with client(url) as http:
         recording = taken(http, "P018", path)["recording_id"]
         return str(

@@ -6,9 +6,9 @@ import numpy as np
 
 from bench.stamp import RESULTS, written_by
 from stimrig import identify
+from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
-from stimrig.identify.paper import muscle, table1
 from stimrig.identify.records.record import Record
 
 TARGET = RESULTS / "table1.md"
@@ -37,7 +37,7 @@ def run() -> None:
 def fits(noise_nm: float, method: str, rate_hz: float = 40.0, trials: int = FEW, **options: object) -> dict[str, float]:
     """Mean scores over trials."""
     count = trials if noise_nm else 1
-    scores = [table1.score(*table1.simulate(noise_nm, SEED + t, rate_hz), method, **options) for t in range(count)]
+    scores = [paper.score(*paper.simulate(noise_nm, SEED + t, rate_hz), method, **options) for t in range(count)]
     return {key: float(np.median([s[key] for s in scores])) for key in scores[0]}
 
 
@@ -46,7 +46,7 @@ def shown(value: float) -> str:
 
 
 def main_table() -> list[str]:
-    found = table1.run(TRIALS)
+    found = paper.table1(TRIALS)
     lines = [
         "# Table I, ours beside the paper's",
         "",
@@ -62,10 +62,10 @@ def main_table() -> list[str]:
         "|---|---|---|---|---|---|---|",
     ]
     for row in found["rows"]:
-        paper = "–" if row["paper"] is None else f"{row['paper']:.2f} ± {row['paper_sd']:.2f}"
+        printed = "–" if row["paper"] is None else f"{row['paper']:.2f} ± {row['paper_sd']:.2f}"
         ours = f"{row['ours']:.2f} ± {row['ours_sd']:.2f}"
         lines.append(
-            f"| {row['noise_nm']:.2f} | {row['method']} | {paper} | {ours} | {row['ceiling']:.2f} "
+            f"| {row['noise_nm']:.2f} | {row['method']} | {printed} | {ours} | {row['ceiling']:.2f} "
             f"| {row['clean']:.2f} | {row['unseen']:.2f} |"
         )
     return [
@@ -79,8 +79,8 @@ def main_table() -> list[str]:
 
 
 def scored_rows() -> list[str]:
-    widths, labels = muscle.protocol()
-    clean, names = muscle.torque(widths, 40.0), np.array(labels)
+    widths, labels = paper.protocol()
+    clean, names = paper.torque(widths, 40.0), np.array(labels)
     ramp = np.flatnonzero(names == "ramp")
     place = np.arange(names.size)
     sets = {
@@ -89,12 +89,12 @@ def scored_rows() -> list[str]:
         "the PRBS": names == "prbs",
         "PRBS and ramp with their rests": place <= ramp[-1] + 120,
     }
-    record, _ = table1.simulate(0.0, SEED)
+    record, _ = paper.simulate(0.0, SEED)
     rivals = [
         identify.predict(identify.fit(record, method=method), record)
         for method in ("ramp-deconvolution", "separable-least-squares")
     ]
-    levels = table1.NOISE_NM[1:]
+    levels = paper.NOISE_NM[1:]
     lines = [
         "## Which rows are scored sets the ceiling",
         "",
@@ -111,7 +111,7 @@ def scored_rows() -> list[str]:
         cells = [f"{100 * (1 - level / spread):.2f}" for level in levels]
         cells += [f"{best_fit_percent(clean[rows], predicted[rows]):.2f}" for predicted in rivals]
         lines.append(f"| {name} | {spread:.2f} | {' | '.join(cells)} |")
-    printed = [value for value, _ in table1.PAPER["two-stage"][1:]]
+    printed = [value for value, _ in paper.PAPER["two-stage"][1:]]
     spread = float(np.mean([level / (1 - value / 100) for level, value in zip(levels, printed, strict=True)]))
     cells = [*(f"{value:.2f}" for value in printed), "91.24", "92.06"]
     return [*lines, f"| the paper's two-stage column | {spread:.2f} | {' | '.join(cells)} |"]
@@ -126,13 +126,13 @@ def poles_as_constants(block: Discrete) -> tuple[float, float]:
 
 
 def literal(noise_nm: float, seed: int, *, through_a: bool, rate_hz: float = 40.0) -> tuple[Record, np.ndarray]:
-    """As `table1.simulate`, or with the noise of equation (9), passed through 1/A(q)."""
-    record, clean = table1.simulate(noise_nm, seed, rate_hz)
+    """As `paper.simulate`, or with the noise of equation (9), passed through 1/A(q)."""
+    record, clean = paper.simulate(noise_nm, seed, rate_hz)
     if not through_a:
         return record, clean
     from scipy.signal import lfilter
 
-    a = SecondOrder(muscle.TIME_CONSTANT_S, muscle.DAMPING).discrete(rate_hz)[1]
+    a = SecondOrder(paper.TIME_CONSTANT_S, paper.DAMPING).discrete(rate_hz)[1]
     coloured = lfilter([1.0], a, record.torque_nm - clean)
     coloured *= np.std(record.torque_nm - clean) / np.std(coloured) if noise_nm else 1.0
     return record.with_torque(clean + coloured), clean
@@ -172,7 +172,7 @@ def where_noise_enters() -> list[str]:
 
 
 def inverting() -> list[str]:
-    b = np.array(SecondOrder(muscle.TIME_CONSTANT_S, muscle.DAMPING).discrete(40.0)[0])
+    b = np.array(SecondOrder(paper.TIME_CONSTANT_S, paper.DAMPING).discrete(40.0)[0])
     lines = [
         "## Inverting G: equations (26) to (28) as printed",
         "",
@@ -188,7 +188,7 @@ def inverting() -> list[str]:
         outside = 0
         count = FEW if noise else 1
         for trial in range(count):
-            record, _ = table1.simulate(noise, SEED + trial)
+            record, _ = paper.simulate(noise, SEED + trial)
             block = identify.fit(record, method="two-stage", order="2,1,1", linear="equation-error").linear
             assert isinstance(block, Discrete)
             outside += bool(np.any(np.abs(np.roots(block.b)) >= 1))
@@ -209,7 +209,7 @@ def sampling_rate() -> list[str]:
         "| method | 40 Hz | 400 Hz | 1600 Hz |",
         "|---|---|---|---|",
     ]
-    for method in table1.OURS:
+    for method in paper.OURS:
         cells = [fits(0.10, method, rate, trials=5) for rate in (40.0, 400.0, 1600.0)]
         lines.append(f"| {method} | " + " | ".join(f"{c['clean']:.2f} / {c['unseen']:.2f}" for c in cells) + " |")
     return lines
@@ -226,7 +226,7 @@ def taps() -> list[str]:
     ]
     for count in (41, 81, 121, 161):
         both = fits(0.0, "separable-least-squares", taps=count)
-        record, clean = table1.simulate(0.0, SEED)
+        record, clean = paper.simulate(0.0, SEED)
         model = identify.fit(record, method="separable-least-squares", fit_on=("ramp",), taps=count)
         predicted = identify.predict(model, record)
         names = np.array(record.segment_names)[record.segment]
@@ -255,8 +255,8 @@ def natural_frequency() -> list[str]:
     for label, frequency in (
         ("0.85π rad/s (the paper's)", 0.85 * np.pi),
         ("0.85 Hz", 2 * np.pi * 0.85),
-        ("1/Tω of the muscle", 1 / muscle.TIME_CONSTANT_S),
-        ("same slow-input lag as the muscle, 1/(ζTω)", 1 / (muscle.DAMPING * muscle.TIME_CONSTANT_S)),
+        ("1/Tω of the muscle", 1 / paper.TIME_CONSTANT_S),
+        ("same slow-input lag as the muscle, 1/(ζTω)", 1 / (paper.DAMPING * paper.TIME_CONSTANT_S)),
     ):
         found = fits(0.0, "ramp-deconvolution", natural_frequency_rad_s=frequency)
         lines.append(f"| {label} | {1 / frequency:.3f} | {found['clean']:.2f} | {found['unseen']:.2f} |")

@@ -18,7 +18,7 @@ from stimrig.identify.errors import IdentifyError
 from stimrig.identify.model import Model
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment import Curve
 from stimrig.identify.tracking import QUANTITIES, Values, follow, model_for_next, moved_model
 
 PULSE_RATE_HZ = 40.0

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     )
     from stimrig.identify.fitting import fit
     from stimrig.identify.model import Model
-    from stimrig.identify.records.read import read
+    from stimrig.identify.records import read
     from stimrig.identify.records.record import Record
     from stimrig.identify.results import Carried, Comparison, Diagnosis, Improvement
     from stimrig.identify.simulation.predict import predict
@@ -40,7 +40,7 @@ _PLACES = {
         "errors": ("BadModel", "BadRecord", "BadRequest", "Cancelled", "IdentifyError", "NotIdentifiable"),
         "fitting": ("fit",),
         "model": ("Model",),
-        "records.read": ("read",),
+        "records": ("read",),
         "records.record": ("Record",),
         "results": ("Carried", "Comparison", "Diagnosis", "Improvement"),
         "simulation.predict": ("predict",),

@@ -13,11 +13,9 @@ from stimrig.identify.diagnosis.improvement import helpful
 from stimrig.identify.diagnosis.search import search_effects
 from stimrig.identify.effects import get
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.effect_fit import effect_names, with_effects
+from stimrig.identify.estimation.effect_fit import effect_names, renewed_curve, with_effects
 from stimrig.identify.estimation.finish import finish
-from stimrig.identify.estimation.prepare import prepare
-from stimrig.identify.estimation.renewed_curve import renewed_curve
-from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.estimation.plain import fitted_rows, prepare
 from stimrig.identify.methods import check_options, method_of
 from stimrig.identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
 from stimrig.identify.model import Model

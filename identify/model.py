@@ -11,10 +11,9 @@ import numpy as np
 from stimrig.identify import model_schema
 from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
 from stimrig.identify.errors import BadModel
-from stimrig.identify.json_values import json_value
-from stimrig.identify.recruitment.curve import Curve, basis_from_dict, landmarks
-from stimrig.identify.shown import Sheet, Shown, estimate, fit_words, held_out_label, quantity
-from stimrig.identify.strict_json import BadJson, parse
+from stimrig.identify.json_text import BadJson, json_value, parse
+from stimrig.identify.recruitment import Curve, basis_from_dict, landmarks
+from stimrig.identify.summary import Sheet, Shown, estimate, fit_words, held_out_label, quantity
 
 if TYPE_CHECKING:
     from stimrig.identify.records.record import Record

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from stimrig.identify.json_values import json_value
+from stimrig.identify.json_text import json_value
 
 LONGEST_NAME = 63
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, fields
 from typing import Any, TypedDict
 
 from stimrig.identify.caution import caution
-from stimrig.identify.json_values import json_value
+from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
-from stimrig.identify.shown import Sheet, Shown, both_words, estimate, fit_words, probability, quantity, torque
+from stimrig.identify.summary import Sheet, Shown, both_words, estimate, fit_words, probability, quantity, torque
 
 Row = Mapping[str, Any]
 VERDICTS = {

@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from stimrig import errors
-from stimrig.identify.shown import register_plotter
+from stimrig.identify.summary import register_plotter
 
 if TYPE_CHECKING:
     from stimrig.api.charts.plot import plot
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stimrig.with_progress import carry, diagnose, fit, improve
 
 _PLACES = {
-    "read": ("stimrig.identify.records.read", "read"),
+    "read": ("stimrig.identify.records", "read"),
     "Record": ("stimrig.identify.records.record", "Record"),
     "Model": ("stimrig.identify.model", "Model"),
     "fit": ("stimrig.with_progress", "fit"),

@@ -18,7 +18,7 @@ from stimrig.api.outbox.messages import BatchIn, HelloIn, ItemIn
 from stimrig.api.store import Store
 from stimrig.api.store.centre_tables import CentreChain, CentreItem, CentreRig
 from stimrig.api.store.hashes import canonical, digest, storable
-from stimrig.identify.strict_json import BadJson, parse
+from stimrig.identify.json_text import BadJson, parse
 
 MOST_BATCH_BYTES = 4_000_000
 DEEPEST = 40

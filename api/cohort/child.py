@@ -32,9 +32,8 @@ from stimrig.api.workers.child import own_output, say
 from stimrig.api.workers.json_values import clean
 from stimrig.identify.diagnosis import candidates
 from stimrig.identify.errors import BadRecord, BadRequest, IdentifyError, NotIdentifiable
-from stimrig.identify.records import bounds
+from stimrig.identify.records import HDF5_MAGIC, bounds
 from stimrig.identify.records.hdf5 import StrictFile
-from stimrig.identify.records.read import HDF5_MAGIC
 
 IDLE_S = 600.0
 """A worker that outlives the run keeps no process for longer."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from stimrig import identify
 from stimrig.api.cohort.child import SAID, about
 from stimrig.api.cohort.fields import Known
+from stimrig.identify.records import HDF5_MAGIC
 from stimrig.identify.records.hdf5 import StrictFile
-from stimrig.identify.records.read import HDF5_MAGIC
 
 TORQUE = ("counter", "host_time_s", "sync")
 PULSES = (

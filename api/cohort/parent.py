@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 from stimrig.api.cohort.sources import SUFFIXES, Entry
 from stimrig.api.cohort.tasks import Task
 from stimrig.api.workers.process import environment
-from stimrig.identify.strict_json import BadJson, parse
+from stimrig.identify.json_text import BadJson, parse
 
 RECORDS_A_PROCESS = 500
 """After so many a fresh process is started: what a library never gives back cannot add up."""

@@ -25,8 +25,8 @@ KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}
 SENTENCES = (
     "identify/caution.py", "identify/errors.py", "identify/criticism/*.py", "identify/diagnosis/*.py",
     "identify/estimation/quality.py", "identify/effects/*.py", "identify/experiments/*.py", "identify/records/*.py",
-    "identify/fitting.py", "identify/dynamics/make_grid.py", "identify/estimation/rows.py",
-    "identify/estimation/effect_fit.py", "identify/estimation/pilot.py", "identify/methods/**/*.py",
+    "identify/fitting.py", "identify/dynamics/grid.py", "identify/estimation/plain.py",
+    "identify/estimation/effect_fit.py", "identify/methods/**/*.py",
     "identify/simulation/joint_surface.py", "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/adapters/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py",
     "rig/journal.py", "rig/limits.py", "rig/plan.py", "rig/protocols.py", "rig/score.py", "rig/sequences/*.py",
@@ -37,7 +37,7 @@ SENTENCES = (
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {
     "app.py", "openapi.py", "dependencies.py", "server.py", "static.py", "schemas.py", "own_file.py",
-    "hdf5_chunks.py", "confinement.py", "child.py",
+    "confinement.py", "child.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
 NAMED = {"Effect": ("name",), "Parameter": ("about",)}
@@ -54,6 +54,7 @@ NOT_SHOWN = {
     "spawn",
     "_",
     "lazy",
+    "BadChunk",
     "ngettext",
     "policy",
     "WireError",

@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from stimrig.api import language
 from stimrig.api.clock import asked_s
 from stimrig.api.errors import ApiError
-from stimrig.identify.strict_json import BadJson, NotJson, parse
+from stimrig.identify.json_text import BadJson, NotJson, parse
 
 log = logging.getLogger("stimrig.look_again")
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}

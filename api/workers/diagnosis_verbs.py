@@ -15,7 +15,7 @@ import numpy as np
 from stimrig import identify
 from stimrig.api.structure import held_by
 from stimrig.api.workers.json_values import clean
-from stimrig.identify.records import parts_csv
+from stimrig.identify.records.join import write_joined
 
 Progress = Callable[[float, str], None]
 POINTS = 900
@@ -109,6 +109,6 @@ def joined(parts: Sequence[str], out: str, progress: Progress, needs: Sequence[s
 
     progress(0.1, "joining the recordings")
     whole = several.read([Path(part) for part in parts], needs=needs, name=lambda number: f"recording {number + 1}")
-    parts_csv.write(whole, Path(out))
+    write_joined(whole, Path(out))
     with Path(out).open("rb") as file:
         return {"file_sha256": hashlib.file_digest(file, "sha256").hexdigest()}

@@ -19,8 +19,8 @@ from stimrig.api.workers.diagnosis_verbs import diagnosis, improve, joined
 from stimrig.api.workers.json_values import clean
 from stimrig.api.workers.prediction import forecast, invert
 from stimrig.api.workers.recorded_signals import recorded
-from stimrig.identify.records import parts_csv
 from stimrig.identify.records.cells import quoted
+from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.recording import attributes
 
 Progress = Callable[[float, str], None]
@@ -182,7 +182,7 @@ def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> di
     progress(0.1, "reading the recording")
     record = identify.read(Path(data), map=columns)
     progress(0.7, "writing")
-    parts_csv.write(record, Path(out))
+    write_joined(record, Path(out))
     return {"notes": list(record.notes), "of": record.source.participant}
 
 
@@ -192,7 +192,7 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     record = identify.read(Path(data))
     if len(record.parts) > 1:
         progress(0.7, "writing")
-        parts_csv.write(record, Path(out))
+        write_joined(record, Path(out))
         return {"rows": int(record.time_s.size)}
     if abs(record.pulse_rate_hz - 40.0) > 1e-6:
         message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"

@@ -9,8 +9,7 @@ import numpy as np
 from stimrig.identify.criticism.correlation import correlation_tests
 from stimrig.identify.criticism.shares import error_shares
 from stimrig.identify.criticism.where import worst_places
-from stimrig.identify.dynamics.make_grid import make_grid
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from stimrig.identify.estimation.quality import range_warnings

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import Grid, ends_of, runs
-from stimrig.identify.estimation.prepare import block_means
-from stimrig.identify.noise.slow_and_white import profile_noise
+from stimrig.identify.dynamics.grid import Grid, ends_of, runs
+from stimrig.identify.estimation.plain import block_means
+from stimrig.identify.noise.kernels import profile_noise
 
 LAGS = 25
 DRAWS = 1500

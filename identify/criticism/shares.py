@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.criticism.where import direction_of
-from stimrig.identify.dynamics.pulse_grid import runs
+from stimrig.identify.dynamics.grid import runs
 from stimrig.identify.records.record import Record
 
 LEVELS = 6

@@ -6,12 +6,10 @@ from stimrig.identify.diagnosis.candidates import Progress, silent
 from stimrig.identify.diagnosis.carried_effects import LAST, Judged, Reason, prior, rise, still_needed
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
 from stimrig.identify.effects import get, registry
-from stimrig.identify.estimation.effect_fit import detected_effects, effect_names
+from stimrig.identify.estimation.effect_fit import detected_effects, effect_names, renewed_curve
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.prepare import fit_plain, prepare
-from stimrig.identify.estimation.renewed_curve import renewed_curve
-from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
 from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record

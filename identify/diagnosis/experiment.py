@@ -10,7 +10,7 @@ from stimrig.identify import experiments
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Diagnosis, Result
-from stimrig.identify.shown import Sheet
+from stimrig.identify.summary import Sheet
 
 
 @dataclass(frozen=True, repr=False, eq=False)

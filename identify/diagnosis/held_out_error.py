@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.diagnosis.thresholds import FORM_ERROR, HELD_OUT_RISE, LEAST_HELD_OUT_ROWS, NEAR
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import get
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.records.record import FORGOTTEN_S

@@ -13,8 +13,8 @@ from stimrig.identify.diagnosis.search import MOST, EffectSearch, search_effects
 from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import get
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
-from stimrig.identify.estimation.evaluation import evaluate
 from stimrig.identify.estimation.finish import finish
+from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.diagnosis.thresholds import COUNTS, QUIET, STRUCTURE, STRUCTURE_SHARE
-from stimrig.identify.dynamics.pulse_grid import ends_of, runs
+from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.noise.level import band_part
-from stimrig.identify.noise.slow_and_white import profile_noise
+from stimrig.identify.noise import band_part
+from stimrig.identify.noise.kernels import profile_noise
 from stimrig.identify.records.record import Record
 
 

@@ -13,15 +13,13 @@ from stimrig.identify.diagnosis.search import EffectSearch
 from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import get
-from stimrig.identify.estimation.band_effect import band_as_effect, predict_fitted
-from stimrig.identify.estimation.effect_fit import effect_names
-from stimrig.identify.estimation.evaluation import evaluate
+from stimrig.identify.estimation.effect_fit import effect_names, knows_joint, renewed_curve
 from stimrig.identify.estimation.finish import describe_parameters
-from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.renewed_curve import knows_joint, renewed_curve
+from stimrig.identify.estimation.fit_statistics import evaluate
+from stimrig.identify.estimation.joint import Fitted, band_as_effect, predict_fitted
 from stimrig.identify.experiments import plan
 from stimrig.identify.results import Diagnosis
-from stimrig.identify.shown import probability, sure
+from stimrig.identify.summary import probability, sure
 
 MOST_PARAMETERS = 24
 """The wave of a tremor has hundreds."""
@@ -42,7 +40,7 @@ class Step:
     fitted : Fitted
         The model.
     statistics : dict
-        See `stimrig.identify.estimation.evaluation`.
+        See `stimrig.identify.estimation.fit_statistics`.
     """
 
     added: str | None

@@ -19,15 +19,14 @@ from stimrig.identify.estimation.effect_fit import (
     effect_names,
     fit_form,
     fit_from,
+    renewed_curve,
     try_effect,
     with_effects,
 )
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
-from stimrig.identify.estimation.prepare import fit_plain, prepare
-from stimrig.identify.estimation.renewed_curve import renewed_curve
-from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
 from stimrig.identify.estimation.samples import Raw
-from stimrig.identify.noise.level import NoiseLevel
+from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 

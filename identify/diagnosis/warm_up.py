@@ -6,9 +6,8 @@ import numpy as np
 
 from stimrig.identify.effects import registry
 from stimrig.identify.estimation.joint import start_from
-from stimrig.identify.estimation.prepare import fit_plain, prepare
-from stimrig.identify.estimation.rows import fitted_rows
-from stimrig.identify.noise.level import find_band
+from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
+from stimrig.identify.noise import find_band
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 

@@ -1,16 +1,17 @@
-"""The linear block G(q): second order in physical terms, or the general (l, n, d) of equations (1) to (3)."""
+"""The linear block G(q): second order in physical terms, or the general (l, n, d) of equations (1) to (3); and NARX."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.second_order import Core, transition
 
 if TYPE_CHECKING:
-    from stimrig.identify.dynamics.pulse_grid import Grid
+    from stimrig.identify.dynamics.grid import Grid
 
 
 TIME_CONSTANT_BOUNDS_S = (0.003, 4.0)
@@ -205,3 +206,31 @@ def linear_from_dict(data: dict) -> Linear:
         step_s=float(data["step_s"]),
         centre=float(data.get("centre", 0.0)),
     )
+
+
+NARX_LIMIT = 20.0
+"""Scaled torque at which a diverging free run_narx is stopped."""
+
+
+def run_narx(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
+    """Free run_narx from rest for one pulse width per interval, N·m above the baseline; limited if it diverges."""
+    variables, terms, weights = recipe["variables"], recipe["terms"], recipe["weights"]
+    width = (np.asarray(width_us, float) / recipe["width_scale_us"]).tolist()
+    lead = max((lag for _, lag in variables), default=1)
+    width, torque = [0.0] * lead + width, [0.0] * (lead + len(width))
+    for k in range(lead, len(width)):
+        value = [(torque if kind == 0 else width)[k - lag] for kind, lag in variables]
+        total = 0.0
+        for term, weight in zip(terms, weights, strict=True):
+            product = weight
+            for v in term:
+                product *= value[v]
+            total += product
+        torque[k] = min(max(total, -NARX_LIMIT), NARX_LIMIT)
+    return np.array(torque[lead:]) * recipe["torque_scale_nm"]
+
+
+def narx_at_samples(recipe: dict[str, Any], grid: Grid, centre: float) -> np.ndarray:
+    """Free run_narx at the record's samples, with its baseline, N·m, shape (N,)."""
+    means = run_narx(recipe, grid.held(grid.pulse_width_us)) + recipe["baseline_nm"]
+    return Discrete((1.0,), (1.0,), 0, grid.step_s, centre).between(grid, means)

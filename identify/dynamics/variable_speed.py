@@ -11,7 +11,7 @@ from enum import IntEnum
 import numpy as np
 from numba import njit
 
-from stimrig.identify.dynamics.boundary import step_matrix, through
+from stimrig.identify.dynamics.states import step_matrix, through
 
 PARTS = 3
 """Number of steps within a pulse interval in which a speed law is evaluated."""

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stimrig.identify.estimation.gram import gram
-from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.rows import joint_of
-from stimrig.identify.estimation.short_result import Short
-from stimrig.identify.noise.level import profile, whitened
+from stimrig.identify.estimation.joint import Fitted, gram
+from stimrig.identify.estimation.plain import joint_of
+from stimrig.identify.estimation.short_record import Short
+from stimrig.identify.noise import profile, whitened
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 

@@ -15,8 +15,8 @@ import numpy as np
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.model import Model
+from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.near_shape import KNOTS, Deviation, NearShape, dense_knots
-from stimrig.identify.recruitment.spline import SplineBasis
 
 EARLIER_DEVIATIONS = (Deviation(0.05, 1.0), Deviation(0.3, 0.8), Deviation(0.9, 0.8), Deviation(2.2, 0.2))
 """As `DEVIATIONS`, from the earlier curve: the posterior decides how far the shape itself changed."""

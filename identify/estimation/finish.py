@@ -10,20 +10,16 @@ from uuid import uuid4
 
 import numpy as np
 
-from stimrig.identify.dynamics.linear import Discrete, SecondOrder
-from stimrig.identify.dynamics.narx import run
-from stimrig.identify.dynamics.pulse_grid import Grid, runs
-from stimrig.identify.estimation.band_effect import band_as_effect
-from stimrig.identify.estimation.evaluation import evaluate
-from stimrig.identify.estimation.fit_statistics import fit_statistics, white_sd
-from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.dynamics.grid import Grid, runs
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
+from stimrig.identify.estimation.fit_statistics import evaluate, fit_statistics, white_sd
+from stimrig.identify.estimation.joint import Fitted, band_as_effect
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.uncertainty import bands
 from stimrig.identify.model import Covariance, Model, Noise
-from stimrig.identify.noise.ar1 import ar1_or_white
-from stimrig.identify.noise.level import whitened
-from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.noise import ar1_or_white, whitened
+from stimrig.identify.recruitment import Curve
 from stimrig.identify.simulation.joint_surface import Surfaces, joint_tables
 from stimrig.identify.simulation.predict import fingerprint, predict_on
 
@@ -224,7 +220,7 @@ def finish_discrete(
 ) -> Model:
     """The model of a method that gives a discrete block and a curve, but no covariance."""
     if extra and "narx" in extra:
-        response = run(extra["narx"], grid.held(grid.pulse_width_us))
+        response = run_narx(extra["narx"], grid.held(grid.pulse_width_us))
     else:
         response = block.filter(grid.held(curve(grid.pulse_width_us)))
     residual = np.nan_to_num(grid.torque_nm) - np.nan_to_num(response, nan=1e6, posinf=1e6, neginf=-1e6)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
-from stimrig.identify.dynamics.pulse_grid import Grid
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.predict import moves_with_joint, refuse_rate

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.noise.level import correlation_slopes, whitened
+from stimrig.identify.noise import correlation_slopes, whitened
 
 LAGS = 20
 ALARM = 0.01

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import runs
+from stimrig.identify.dynamics.grid import runs
 from stimrig.identify.effects.mains_hum import HARMONICS, line
 from stimrig.identify.records.record import Record
 

@@ -1,22 +1,22 @@
 """A short record fitted with a curve that never falls, near a known shape: draws of the whole posterior.
 
 A spline with a smoothness penalty needs a record that covers the curve. A short test does not: there the prior of
-`recruitment.near_shape` says what is plausible between the tested widths, and the draws show how little is known.
-"""
+`recruitment.near_shape` says what is plausible between the tested widths, and the draws show how little is known."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
-from stimrig.identify.dynamics.pulse_grid import Grid
-from stimrig.identify.estimation.curve_posterior import CurvePosterior, Mode
+from stimrig.identify.estimation.curve_posterior import CurvePosterior, Mode, Quadratic
 from stimrig.identify.estimation.earlier import Earlier
-from stimrig.identify.estimation.short_data import ShortData, direction
-from stimrig.identify.estimation.short_result import Short
-from stimrig.identify.noise.level import NoiseLevel
+from stimrig.identify.estimation.projection import Projection
+from stimrig.identify.noise import NoiseLevel, profile, whitened
+from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.near_shape import (
     FINE_KNOTS,
     KNOTS,
@@ -27,7 +27,176 @@ from stimrig.identify.recruitment.near_shape import (
     logistic,
     new_person,
 )
-from stimrig.identify.recruitment.spline import SplineBasis
+
+
+@dataclass(frozen=True)
+class Short:
+    """What a short record shows.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record on the grid of pulses.
+    rows : ndarray of bool, shape (K,)
+        Intervals that were fitted.
+    basis : SplineBasis
+        Of the curve.
+    sign : float
+        1 where stimulation raises the record's torque, -1 where it lowers it.
+    linear : SecondOrder
+        The most probable dynamics.
+    coefficients_nm : ndarray, shape (S, n)
+        Draws of the curve's coefficients, positive as the muscle pulls, N·m.
+    dynamics : ndarray, shape (S, 3)
+        Draws of T, s, ζ and the delay, s.
+    others_nm : ndarray, shape (S, E)
+        Draws of the baselines and initial states (torque, N·m, and rate, N·m/s).
+    modes : tuple of Mode
+        One for each kind of the curve's deviation from the known shape.
+    weights : ndarray, shape (M,)
+        Their probabilities.
+    noise : NoiseLevel
+        Of the intervals' means.
+    residual_nm : ndarray, shape (K,)
+        Measured minus the most probable model, N·m.
+    three : ndarray, shape (3,)
+        Log gain, middle and log width at the most probable mode.
+    likely : ndarray, shape (n + E,)
+        Steps of the curve, baselines and initial states at the most probable mode.
+    rise_us : float
+        Rise from 10 to 90 % for which the knots were made, µs.
+    strange : float
+        Probability that the curve is far from the known shape.
+    """
+
+    grid: Grid
+    rows: np.ndarray
+    basis: SplineBasis
+    sign: float
+    linear: SecondOrder
+    coefficients_nm: np.ndarray
+    dynamics: np.ndarray
+    others_nm: np.ndarray
+    modes: tuple[Mode, ...]
+    weights: np.ndarray
+    noise: NoiseLevel
+    residual_nm: np.ndarray
+    three: np.ndarray
+    likely: np.ndarray
+    rise_us: float
+    strange: float
+
+    @property
+    def largest_us(self) -> float:
+        """Largest width of the curve, µs."""
+        return self.basis.largest_us
+
+    @cached_property
+    def mean_nm(self) -> np.ndarray:
+        """Mean of the curve's coefficients, N·m."""
+        return self.coefficients_nm.mean(axis=0)
+
+    @cached_property
+    def plateau_nm(self) -> float:
+        """The mean curve at its largest width, N·m."""
+        return float(self.mean_nm[-1])
+
+
+CORRELATED = 6.0
+"""Log likelihood by which correlated noise must explain the residual better before it is believed."""
+LOG_T, LOG_DAMPING = (np.log(0.2), 1.2), (0.0, 0.8)
+"""Prior mean and standard deviation, as in `Problem.prior`."""
+
+
+class ShortData:
+    """One record, with the prior of everything but the curve.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record on the grid of pulses.
+    rows : ndarray of bool, shape (K,)
+        Intervals to fit.
+    sign : float
+        1 where stimulation raises the record's torque, -1 where it lowers it.
+    last : Earlier or None
+        What is known of this person from the last session.
+    """
+
+    def __init__(self, grid: Grid, rows: np.ndarray, sign: float, last: Earlier | None) -> None:
+        self.grid, self.rows, self.sign = grid, rows, sign
+        torque = grid.torque_nm[rows]
+        scale = self.scale_nm = max(float(np.percentile(np.abs(torque - np.median(torque[:8])), 98)), 1e-9)
+        each = max(float(np.median(grid.count[rows])), 1.0)
+        self.first_sd_nm = max(grid.noise_sd_nm / np.sqrt(each), 1e-4 * scale)
+        self.stretches = ends_of(grid.stretches(rows))
+        states = grid.starts.size
+        sd = np.r_[np.full(grid.begins.size, 0.5 * scale), np.tile([0.3 * scale, 2.0 * scale], states)]
+        lower, upper = grid.delay_bounds_s
+        dynamics_sd = np.array([LOG_T[1], LOG_DAMPING[1], max((upper - lower) / 2.0, 1e-5)])
+        self.dynamics_mean = np.array([LOG_T[0], LOG_DAMPING[0], 0.0])
+        self.dynamics_precision = np.diag(1.0 / dynamics_sd**2)
+        if last is not None:
+            self.dynamics_mean, self.dynamics_precision = last.dynamics(dynamics_sd[2])
+        quiet = torque[: max(int(0.2 / grid.step_s), 4)]
+        self.others_mean = np.r_[np.full(grid.begins.size, float(np.median(sign * quiet))), np.zeros(2 * states)]
+        self.others_precision = np.diag(1.0 / sd**2)
+
+    @property
+    def quiet(self) -> NoiseLevel:
+        """The noise of an interval's mean if it is only that of the samples."""
+        return NoiseLevel(0.0, 0.0, self.first_sd_nm)
+
+    def quadratic(self, basis: SplineBasis, linear: SecondOrder, noise: NoiseLevel, x: np.ndarray | None) -> Quadratic:
+        """The quadratic form at some dynamics; with the derivatives by the dynamics if a curve is given."""
+        projection = Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)
+        columns = projection.columns(linear)
+        n = basis.size
+        columns[:, :n] = np.cumsum(columns[:, :n][:, ::-1], axis=1)[:, ::-1]
+        mean, precision = self.others_mean, self.others_precision
+        if x is not None:
+            coefficients = np.r_[np.cumsum(x[:n]), x[n : columns.shape[1]]]
+            columns = np.concatenate([columns, projection.slopes(linear, coefficients)], axis=1)
+            at = np.array([np.log(linear.time_constant_s), np.log(linear.damping), linear.delay_s])
+            mean = np.r_[mean, self.dynamics_mean - at]
+            full = np.zeros((mean.size, mean.size))
+            full[: self.others_mean.size, : self.others_mean.size] = precision
+            full[self.others_mean.size :, self.others_mean.size :] = self.dynamics_precision
+            precision = full
+        target = np.where(self.rows, self.sign * self.grid.torque_nm, 0.0)
+        white = whitened(np.vstack([columns.T, target]), self.stretches, noise)
+        products = white @ white.T
+        return Quadratic(products[:-1, :-1], products[:-1, -1], float(products[-1, -1]), mean, precision)
+
+    def bounded(self, linear: SecondOrder, moved: np.ndarray) -> SecondOrder:
+        """Dynamics moved by changes of log T, log ζ and the delay, within their bounds."""
+        t = linear.time_constant_s * float(np.exp(np.clip(moved[0], -0.7, 0.7)))
+        z = linear.damping * float(np.exp(np.clip(moved[1], -0.7, 0.7)))
+        return SecondOrder(t, z, linear.delay_s + float(moved[2])).bounded(self.grid.delay_bounds_s)
+
+    def residual(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray) -> np.ndarray:
+        """Measured minus model, N·m, shape (K,)."""
+        projection = Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)
+        n = basis.size
+        mean = projection.columns(linear) @ np.r_[np.cumsum(x[:n]), x[n:]]
+        return np.where(self.grid.count > 0, self.sign * self.grid.torque_nm, 0.0) - mean
+
+    def noise(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray, near: NoiseLevel) -> NoiseLevel:
+        """The noise of the residual; at least that of the samples, and correlated only where that is plain."""
+        residual = self.residual(basis, linear, x)
+        sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
+        own = NoiseLevel(0.0, 0.0, max(sd, self.first_sd_nm))
+        slow, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)
+        flat = -0.5 * float(self.rows.sum()) * (np.log(2 * np.pi * sd * sd) + 1.0)
+        return replace(slow, sd_nm=max(slow.sd_nm, own.sd_nm)) if likelihood > flat + CORRELATED else own
+
+
+def direction(grid: Grid, rows: np.ndarray) -> float:
+    """1 where stimulation raises the torque, -1 where it lowers it."""
+    slow = SecondOrder(0.2, 0.9).on_grid(grid, grid.pulse_width_us)[rows]
+    torque = grid.torque_nm[rows]
+    return 1.0 if float((slow - slow.mean()) @ (torque - torque.mean())) >= 0.0 else -1.0
+
 
 DRAWS = 400
 OUTER = 10

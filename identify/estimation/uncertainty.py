@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.make_grid import make_grid
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment.curve import Basis
+from stimrig.identify.recruitment import Basis
 from stimrig.identify.simulation.predict import slopes
 
 POINTWISE = 1.959964

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import get
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.effect_fit import fitted_with
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.experiments.designs import Design, designs
-from stimrig.identify.noise.level import whitened
+from stimrig.identify.noise import whitened
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 

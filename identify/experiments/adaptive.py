@@ -13,14 +13,13 @@ from typing import Literal
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.errors import BadRequest, IdentifyError
 from stimrig.identify.estimation.averaged import averaged
 from stimrig.identify.estimation.earlier import Change, Earlier
-from stimrig.identify.estimation.prepare import prepare
+from stimrig.identify.estimation.plain import prepare
 from stimrig.identify.estimation.residual_tests import residual_tests
-from stimrig.identify.estimation.short_record import fit_short
-from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.estimation.short_record import Short, fit_short
 from stimrig.identify.experiments.designs import Piece, Segment, pieces
 from stimrig.identify.experiments.foresight import Foresight
 from stimrig.identify.experiments.knowledge import Knowledge, knowledge

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from stimrig.identify.dynamics.boundary import FROM_START, held_states, step_matrix
-from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.dynamics.states import FROM_START, held_states, step_matrix
+from stimrig.identify.estimation.short_record import Short
 from stimrig.identify.experiments.designs import Piece
 from stimrig.identify.experiments.knowledge import POINTS, knowledge, step_responses
 from stimrig.identify.experiments.target import Target

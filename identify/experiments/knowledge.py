@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stimrig.identify.estimation.short_result import Short
+from stimrig.identify.estimation.short_record import Short
 
 POINTS = 61
 LEVEL = 0.95

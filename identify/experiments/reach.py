@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stimrig.identify.dynamics.boundary import boundary_states
 from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.earlier import Change, Earlier
 from stimrig.identify.experiments.adaptive import Decision, decide

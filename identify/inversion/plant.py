@@ -12,7 +12,7 @@ from stimrig.identify.dynamics.second_order import recursion, transition
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.model import Model
-from stimrig.identify.recruitment.curve import THRESHOLD_SHARE
+from stimrig.identify.recruitment import THRESHOLD_SHARE
 from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.predict import LARGEST_RATE_CHANGE
 from stimrig.identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest

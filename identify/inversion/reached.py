@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import runs
+from stimrig.identify.dynamics.grid import runs
 from stimrig.identify.inversion.plant import NOTHING, Plant
 from stimrig.identify.inversion.reference import Reference
-from stimrig.identify.json_values import json_value
+from stimrig.identify.json_text import json_value
 
 TOLERANCE = 0.02
 """A torque that is missed by less of the largest torque counts as reached."""

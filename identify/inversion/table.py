@@ -9,7 +9,7 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.inversion.reference import MOST_SAMPLES, Reference
-from stimrig.identify.records import text
+from stimrig.identify.records.csv import COMMENTS, encoding_of, text_lines
 
 FIX = "Give a header time_s,torque_nm (or torque_nm alone) and one row of numbers a line."
 NAMES = {
@@ -39,9 +39,9 @@ def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Re
     BadRequest
         As `Reference.of`.
     """
-    encoding, _ = text.encoding_of(content, name)
-    lines = ((number, line.strip("\r\n ")) for number, line in enumerate(text.lines(content, encoding, name), 1))
-    rows = ((number, line) for number, line in lines if line.strip() and not line.startswith(text.COMMENTS))
+    encoding, _ = encoding_of(content, name)
+    lines = ((number, line.strip("\r\n ")) for number, line in enumerate(text_lines(content, encoding, name), 1))
+    rows = ((number, line) for number, line in lines if line.strip() and not line.startswith(COMMENTS))
     number, head = next(rows, (0, ""))
     if not head:
         raise BadRecord("empty", place=name, fix=FIX)

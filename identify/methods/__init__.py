@@ -11,7 +11,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.model import Model
 

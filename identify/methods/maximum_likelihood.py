@@ -1,29 +1,147 @@
 """Maximum likelihood: one joint estimate of recruitment and dynamics on all segments, with white or correlated noise.
 
 It differs from the paper: the cost (12), the output error, is minimised over recruitment and dynamics together, instead
-of one after the other; the noise may be correlated; the smoothness of the spline is chosen from the data.
-"""
+of one after the other; the noise may be correlated; the smoothness of the spline is chosen from the data. Other curves:
+power series (6), sigmoid (30), a monotone spline, near-sigmoid."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
 from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.averaged import averaged
+from stimrig.identify.estimation.earlier import Change, Earlier
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.pilot import estimate
-from stimrig.identify.estimation.prepare import to_fitted
-from stimrig.identify.estimation.rows import fitted_rows, still_rows
-from stimrig.identify.methods.support.alternatives import monotone, near_sigmoid, power_series, sigmoid
-from stimrig.identify.methods.support.common import flag, order_option
+from stimrig.identify.estimation.plain import estimate, fitted_rows, still_rows, to_fitted
+from stimrig.identify.estimation.projection import Projection, Solution, project, search
+from stimrig.identify.estimation.short_record import Short, fit_short
+from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.two_stage import general
 from stimrig.identify.model import Model
-from stimrig.identify.recruitment.knots import KNOTS
+from stimrig.identify.noise import log_likelihood, whiten
+from stimrig.identify.recruitment import basis_at
+from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis
+from stimrig.identify.recruitment.near_shape import DEVIATIONS
+from stimrig.identify.recruitment.smoothing import KNOTS
+
+HIGHEST_POWER = 9
+DRAWS = 1500
+NEAR_SIGMOID_OPTIONS = {"recruitment", "earlier", "order"}
+
+
+def power_series(first: Solution, order: int | None = None) -> tuple[Solution, str]:
+    """Joint estimate with the power series (6), of given order or of smallest BIC, and the reason."""
+    old = first.projection
+    largest = float(np.max(old.grid.pulse_width_us))
+    found: dict[int, tuple[float, Solution]] = {}
+    linear = first.linear
+    for power in [order] if order else range(1, HIGHEST_POWER + 1):
+        basis = PowerBasis(power, largest)
+        problem = Projection(old.grid, basis, np.zeros((power, power)), old.rows, old.delay_s)
+        solution = search(problem, linear)
+        rows = sum(s.stop - s.start for s in problem.stretches)
+        likelihood = log_likelihood(solution.residual_nm, problem.stretches, 0.0)
+        found[power] = (-2 * likelihood + power * np.log(rows), solution)
+        linear = solution.linear
+    best = min(found, key=lambda power: found[power][0])
+    return found[best][1], f"power series of order {best}" + ("" if order else ", by BIC")
+
+
+def sigmoid(first: Solution) -> Solution:
+    """Joint estimate with the sigmoid (30): shape and dynamics searched, gain and baseline projected out."""
+    from scipy.optimize import least_squares
+
+    old, start = first.projection, first.linear
+    largest = float(np.max(old.grid.pulse_width_us))
+    curve = old.basis.design(np.linspace(0.0, largest, 401)) @ first.coefficients[: old.basis.size]
+    half = curve[np.argmax(np.abs(curve))] / 2
+    middle = largest * float(np.argmin(np.abs(curve - half))) / 400
+    rise = np.ptp(np.flatnonzero((curve / (2 * half) > 0.2) & (curve / (2 * half) < 0.8))) if half else 100
+    steep = float(np.log(2.8 / max(largest * float(rise) / 400, largest / 400)))
+
+    def problem(x: np.ndarray) -> Projection:
+        basis: SigmoidBasis = basis_at(x[3], x[4] * largest, largest)
+        return Projection(old.grid, basis, np.zeros((1, 1)), old.rows, old.delay_s)
+
+    def linear(x: np.ndarray) -> SecondOrder:
+        return SecondOrder(
+            float(np.exp(x[0])), float(np.exp(x[1])), float(x[2]) if old.delay_s is None else old.delay_s
+        )
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        trial = problem(x)
+        solution = project(trial, linear(x), ar1=first.ar1)
+        return whiten(solution.residual_nm, trial.stretches, first.ar1)
+
+    bounds = np.log([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS])
+    earliest, latest = old.grid.delay_bounds_s
+    lower = [*bounds[:, 0], earliest, np.log(0.5 / largest), 0.0]
+    upper = [*bounds[:, 1], latest, np.log(2000.0 / largest), 1.2]
+    x0 = [np.log(start.time_constant_s), np.log(start.damping), start.delay_s, steep, middle / largest]
+    x0 = np.clip(x0, np.array(lower) + 1e-9, np.array(upper) - 1e-9)
+    found = least_squares(residual, x0, bounds=(lower, upper), x_scale=[0.05, 0.05, 0.005, 0.1, 0.02], xtol=1e-10)
+    return search(problem(found.x), linear(found.x), ar1=first.ar1, most=3)
+
+
+def monotone(solution: Solution) -> Solution:
+    """The solution with a recruitment curve that never falls (or never rises, if stimulation lowers the torque).
+
+    A B-spline curve rises if its coefficients rise. The coefficients are sums of steps of one sign, found by
+    non-negative least squares for the same penalised problem and the same dynamics.
+    """
+    from scipy.optimize import nnls
+
+    problem, size = solution.projection, solution.projection.basis.size
+    white = whiten(solution.columns, problem.stretches, solution.ar1)
+    target = whiten(problem.target, problem.stretches, solution.ar1)
+    penalty = np.zeros((white.shape[1], white.shape[1]))
+    penalty[:size, :size] = solution.weight * problem.roughness
+    hessian = white.T @ white + penalty
+    hessian += 1e-12 * np.diag(np.diag(hessian))
+    root = np.linalg.cholesky(hessian).T
+    right = np.linalg.solve(root.T, white.T @ target)
+    sign = 1.0 if np.sum(solution.coefficients[:size]) >= 0 else -1.0
+    steps = np.zeros((white.shape[1], size + 2 * problem.extras))
+    steps[:size, :size] = sign * np.tril(np.ones((size, size)))
+    for extra in range(problem.extras):  # these may have either sign
+        steps[size + extra, size + 2 * extra : size + 2 * extra + 2] = 1.0, -1.0
+    coefficients = steps @ nnls(root @ steps, right, maxiter=50 * steps.shape[1])[0]
+    return replace(solution, coefficients=coefficients)
+
+
+def near_sigmoid(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
+    """A curve that never falls, near a sigmoid or near the person's last curve, and why it is as it is.
+
+    Raises
+    ------
+    BadRequest
+        Options that belong to another kind of curve, or an earlier model that is none.
+    """
+    others = sorted(set(options) - NEAR_SIGMOID_OPTIONS)
+    if others or options.get("recruitment", "near-sigmoid") != "near-sigmoid":
+        against = ", ".join(others) or f"recruitment={options['recruitment']}"
+        raise BadRequest(f"not with {against}", place="recruitment", fix="Give near-sigmoid, and earlier or nothing.")
+    model = options.get("earlier")
+    if model is not None and not isinstance(model, Model):
+        raise BadRequest("not a model", place="earlier", fix="Give the person's last model, or none.")
+    last = None if model is None else Earlier(model, Change())
+    short = fit_short(grid, rows, last=last, fine=True, draws=DRAWS)
+    return averaged(short), [_why_near(short, last)]
+
+
+def _why_near(short: Short, last: Earlier | None) -> str:
+    if last is not None:
+        return "a curve that never falls, near that of the last model"
+    kind = DEVIATIONS[int(np.argmax(short.weights))]
+    return f"a curve that never falls; its slope is a sigmoid's times a factor of {np.exp(kind.sd):.1f} or less, mostly"
 
 
 class MaximumLikelihood:

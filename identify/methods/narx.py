@@ -14,15 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.linear import Discrete
-from stimrig.identify.dynamics.narx import run
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.dynamics.linear import Discrete, run_narx
 from stimrig.identify.estimation.finish import finish_discrete
-from stimrig.identify.estimation.rows import fitted_rows
-from stimrig.identify.methods.support.common import quiet_level
+from stimrig.identify.estimation.plain import fitted_rows
+from stimrig.identify.methods.common import quiet_level
 from stimrig.identify.model import Model
-from stimrig.identify.recruitment.curve import Curve
-from stimrig.identify.recruitment.spline import SplineBasis
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import SplineBasis
 
 MOST_TERMS = 14
 
@@ -109,7 +108,7 @@ def steady_curve(recipe: dict[str, Any], largest_us: float) -> Curve:
     """Steady-state torque of the free run for each pulse width, used as recruitment curve."""
     basis = SplineBasis(np.linspace(0.0, largest_us, 13))
     level = np.linspace(0.0, largest_us, 41)
-    torque = np.array([run(recipe, np.full(400, u))[-1] for u in level])
+    torque = np.array([run_narx(recipe, np.full(400, u))[-1] for u in level])
     design = basis.design(level)
     gram = design.T @ design + 1e-9 * np.eye(basis.size)
     return Curve(basis, np.linalg.solve(gram, design.T @ torque))

@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.boundary import boundary_states
+from stimrig.identify.dynamics.grid import Grid, runs
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import completed
-from stimrig.identify.methods.support.common import near_rest, quiet_level, segment_rows
+from stimrig.identify.methods.common import near_rest, quiet_level, segment_rows
 from stimrig.identify.model import Model, Noise
-from stimrig.identify.noise.ar1 import ar1_or_white
-from stimrig.identify.recruitment.sigmoid_fit import fit_points
+from stimrig.identify.noise import ar1_or_white
+from stimrig.identify.recruitment import fit_points
+from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import choose_weight
-from stimrig.identify.recruitment.spline import SplineBasis
 
 NATURAL_FREQUENCY_RAD_S = 0.85 * np.pi
 KNOTS_PER_S = 6.0

@@ -13,16 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
-from stimrig.identify.dynamics.pulse_grid import Grid
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import finish_discrete
-from stimrig.identify.estimation.rows import fitted_rows
-from stimrig.identify.methods.support.output_error import shifted
+from stimrig.identify.estimation.plain import fitted_rows
+from stimrig.identify.methods.common import shifted
 from stimrig.identify.model import Model
-from stimrig.identify.recruitment.curve import Curve
-from stimrig.identify.recruitment.sigmoid import SigmoidBasis
-from stimrig.identify.recruitment.sigmoid_fit import fit_shape
+from stimrig.identify.recruitment import Curve, fit_shape
+from stimrig.identify.recruitment.bases import SigmoidBasis
 
 TAPS = 41
 

@@ -1,0 +1,55 @@
+"""Records from files: tables of text (CSV), MAT files, or a sealed recording (HDF5); see docs/recording.md."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from stimrig.identify.errors import BadRecord
+from stimrig.identify.records import bounds, columns
+from stimrig.identify.records.mat import is_mat
+from stimrig.identify.records.record import Record
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+def read(
+    path: str | Path, pulse_rate_hz: float | None = None, map: Mapping[str, str] | Iterable[str] | None = None
+) -> Record:
+    """Read a record; its `notes` say what was assumed.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad`, `velocity_rad_s`,
+        `late_s`, `doubted`, and the columns of a joined record), a table or MAT file of another tool, or a sealed
+        recording.
+    pulse_rate_hz : float, optional
+        Pulses a second; by default what the recording says, else 40.
+    map : mapping or sequence of str, optional
+        Columns of another tool's file by ours: `{"torque_nm": "Drehmoment:Nm"}`, or `["torque_nm=Drehmoment:Nm"]`. The
+        unit after the last colon may be left out where the column's name holds it; `#3` is the third column.
+
+    Raises
+    ------
+    BadRecord
+        With file, line and column, and what to do.
+    """
+    path = Path(path)
+    if pulse_rate_hz is not None:
+        bounds.check_rate(pulse_rate_hz, "pulse rate")
+    given = columns.parsed(map)
+    content = bounds.content_of(path)
+    if content.startswith(HDF5_MAGIC):
+        from stimrig.identify.records.recording import read_recording
+
+        if given:
+            raise BadRecord("a sealed recording has its own columns", place=str(path), fix="Leave --map out.")
+        return read_recording(content, path, pulse_rate_hz)
+    if is_mat(content) or path.suffix.lower() == ".mat":
+        from stimrig.identify.records.mat import read_mat
+
+        return read_mat(content, path, pulse_rate_hz, given)
+    from stimrig.identify.records.csv import read_csv
+
+    return read_csv(content, path, pulse_rate_hz, given)

@@ -1,17 +1,90 @@
-"""Columns of another tool's file as a record: holes left out, times made even, segments found, all of it said."""
+"""Columns of another tool's file as a record: holes left out, times made even found, all of it said."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records import bounds, clock, segments
+from stimrig.identify.records import bounds, clock
 from stimrig.identify.records.columns import MAY_LACK
 from stimrig.identify.records.record import OPTIONAL, Record, Source
+
+REST_S = 0.9
+"""The lowest width held as long is rest; in a PRBS it is held for some 0.6 s at most."""
+EDGE_S = 0.2
+"""At the record's begin and end this is enough."""
+SMALL = 0.12
+"""Share of the widths' range up to which a change may be one of a ramp."""
+LEAST_CHANGES = 8
+LONGEST_HOLD_S = 0.3
+"""A ramp holds a width no longer; else it is a staircase."""
+LEAST_PRBS = 4
+MOST_TOLD = 8
+
+
+def find_segments(time_s: np.ndarray, width_us: np.ndarray) -> tuple[np.ndarray, list[str], str]:
+    """A segment's number for each row, shape (N,), the names by number, and what to say of it."""
+    first = np.append(0, np.flatnonzero(np.diff(width_us)) + 1)
+    level = width_us[first]
+    begin_s = np.append(time_s[first], time_s[-1])
+    held_s = np.diff(begin_s)
+    resting = _resting(level, held_s)
+    names: list[str] = []
+    starts: list[int] = []
+    edges = np.flatnonzero(np.diff(resting)) + 1
+    for a, b in zip([0, *edges.tolist()], [*edges.tolist(), level.size], strict=True):
+        pieces = [(a, "rest")] if resting[a] else _active(level[a:b], held_s[a:b], a, np.ptp(level))
+        for start, name in pieces:
+            if not names or names[-1] != name:
+                starts.append(int(first[start]))
+                names.append(name)
+    known = list(dict.fromkeys(names))
+    lengths = np.diff([*starts, width_us.size])
+    code = np.repeat([known.index(name) for name in names], lengths)
+    return code, known, _note(names, time_s[starts], float(time_s[-1]), float(level.min()))
+
+
+def _resting(level: np.ndarray, held_s: np.ndarray) -> np.ndarray:
+    """For each run of one width whether it is rest."""
+    lowest = level == level.min()
+    resting = lowest & (held_s >= REST_S)
+    resting[[0, -1]] |= lowest[[0, -1]] & (held_s[[0, -1]] >= EDGE_S)
+    return resting
+
+
+def _active(level: np.ndarray, held_s: np.ndarray, offset: int, span_us: float) -> list[tuple[int, str]]:
+    """The pieces of a stretch without rest, each with its first run."""
+    jumps = np.flatnonzero(np.abs(np.diff(level)) > SMALL * span_us) + 1
+    edges = [0, *jumps.tolist(), level.size]
+    ramps = [(a, b) for a, b in pairwise(edges) if b - a > LEAST_CHANGES and np.median(held_s[a:b]) <= LONGEST_HOLD_S]
+    pieces, done = [], 0
+    for a, b in [*ramps, (level.size, level.size)]:
+        if a > done:
+            pieces.append((offset + done, _switching(level[done:a])))
+        if b > a:
+            pieces.append((offset + a, "ramp"))
+        done = b
+    return pieces
+
+
+def _switching(level: np.ndarray) -> str:
+    if np.unique(level).size > 2:
+        return "multilevel"
+    return "prbs" if level.size >= LEAST_PRBS else "steps"
+
+
+def _note(names: list[str], starts_s: np.ndarray, end_s: float, lowest_us: float) -> str:
+    ends_s = np.append(starts_s[1:], end_s)
+    told = [f"{name} {a:.4g} to {b:.4g} s" for name, a, b in zip(names, starts_s, ends_s, strict=True)]
+    more = f" and {len(told) - MOST_TOLD} more" if len(told) > MOST_TOLD else ""
+    low = f"; the lowest width, {lowest_us:.4g} µs, is taken as rest" if lowest_us > 0 and "rest" in names else ""
+    return f"no segment column: found from the pulse widths: {', '.join(told[:MOST_TOLD])}{more}; none is held out{low}"
+
 
 LEAST_LARGEST_US = 1.0
 """A record whose largest pulse width is less has it in another unit."""
@@ -79,7 +152,7 @@ def record_of(found: Found) -> Record:
         rows, lambda row: found.at(row, "time_s"), lambda row: found.cell(row, "time_s"), found.pulse_rate_hz
     )
     if found.segment is None:
-        even["segment"], names, note = segments.found(even["time_s"], even["pulse_width_us"])
+        even["segment"], names, note = find_segments(even["time_s"], even["pulse_width_us"])
         notes.append(note)
         found = replace(found, names=names)
     found = found.noting(*notes)

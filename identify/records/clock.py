@@ -1,8 +1,7 @@
 """Times of samples as a uniform rate: freed of rounding and jitter, resampled where they are truly uneven.
 
 Lost samples and pauses stay gaps: a record has no rows there. What was done is said in notes, unless nothing but the
-rounding of the written times was taken away.
-"""
+rounding of the written times was taken away."""
 
 from __future__ import annotations
 
@@ -14,7 +13,102 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
-from stimrig.identify.records.pulse_slots import width_in_slots
+from stimrig.identify.records.record import Record
+
+NEARLY = 0.9
+"""Share of the pulse interval from which a sample is nearly as long."""
+
+
+def pulse_phase_s(record: Record) -> float:
+    """Time of the pulse slots after the first sample, modulo the pulse interval, s.
+
+    A change of width seen first in the sample at t puts a pulse into (t - 1/rate, t]. The phase that satisfies the
+    most changes is taken; of those, the latest (the pulse coincides with the sample that shows it).
+    """
+    changes = np.flatnonzero(np.diff(record.pulse_width_us)) + 1
+    step_s, sample_s = 1.0 / record.pulse_rate_hz, 1.0 / record.sample_rate_hz
+    if changes.size == 0 or sample_s > 0.999 * step_s:
+        return 0.0
+    latest = np.mod(record.time_s[changes] - record.time_s[0], step_s)
+    latest, often = np.unique(np.round(latest, 9), return_counts=True)
+    if sample_s > NEARLY * step_s:
+        # Any phase but a sliver is explained by all changes: the sliver tells. It is the widest without a change.
+        gaps = np.diff(np.r_[latest, latest[0] + step_s])
+        widest = int(np.argmax(gaps))
+        first = latest[(widest + 1) % latest.size]
+        return (
+            0.0
+            if gaps[widest] < 0.5 * (step_s - sample_s) or min(first, step_s - first) < 1e-3 * step_s
+            else float(first)
+        )
+    trial = np.linspace(0.0, step_s, 401)[:-1]
+    # How many changes each trial phase explains, with a tolerance of a hair for rounding.
+    lag = np.mod(latest[:, None] - trial[None, :] + 1e-3 * sample_s, step_s)
+    explained = often @ (lag < sample_s * 1.002)
+    best = np.flatnonzero(explained == explained.max())
+    anchor = trial[best[best.size // 2]]
+    # From the anchor the earliest 'latest' time is the bound; take it exactly, free of the trial's spacing.
+    ahead = np.mod(latest - anchor + 1e-3 * sample_s, step_s)
+    inside = ahead[ahead < sample_s * 1.002]
+    phase = float(np.mod(anchor + np.min(inside) - 1e-3 * sample_s, step_s))
+    return 0.0 if step_s - phase < 1e-9 else phase
+
+
+MOST_CHANGES = 2000
+TRIALS = 400
+EXPLAINED = 0.9
+"""Share of the changes of width that one phase of the pulses must explain, or the pulses do not keep to the rate."""
+
+
+def width_in_slots(
+    time_s: np.ndarray, width_us: np.ndarray, at_s: np.ndarray, before: np.ndarray, pulse_rate_hz: float
+) -> np.ndarray:
+    """Pulse widths at `at_s`, shape (M,).
+
+    A change of width that a sample shows came with a pulse between it and the sample before. Pulses keep to their rate:
+    all changes together tell when they come, far more closely than one. Where they do not, the last sample's width
+    stands.
+
+    Parameters
+    ----------
+    time_s, width_us : ndarray, shape (N,)
+        Samples, and the width in force at each.
+    at_s : ndarray, shape (M,)
+        Times that are asked for, rising.
+    before : ndarray of int, shape (M,)
+        The last sample at or before each.
+    pulse_rate_hz : float
+        Pulses a second.
+    """
+    phase_s = _phase_s(time_s, width_us, pulse_rate_hz)
+    if phase_s is None:
+        return width_us[before]
+    hair = 1e-6
+
+    def slot(moment_s: np.ndarray) -> np.ndarray:
+        return np.floor((moment_s - phase_s) * pulse_rate_hz + hair)
+
+    # The last sample that lies in the slot or before it.
+    last = np.searchsorted(slot(time_s), slot(at_s), side="right") - 1
+    return width_us[np.maximum(last, 0)]
+
+
+def _phase_s(time_s: np.ndarray, width_us: np.ndarray, pulse_rate_hz: float) -> float | None:
+    """When pulses come, modulo their interval, s: the latest phase that explains the most changes; None for none."""
+    changes = np.flatnonzero(np.diff(width_us)) + 1
+    if not changes.size:
+        return None
+    changes = changes[:: -(-changes.size // MOST_CHANGES)]
+    step_s = 1.0 / pulse_rate_hz
+    shown, unseen = np.mod(time_s[changes], step_s), time_s[changes] - time_s[changes - 1]
+    trial = np.arange(TRIALS) * step_s / TRIALS
+    explained = np.sum(np.mod(shown[:, None] - trial + 1e-9, step_s) < unseen[:, None], axis=0)
+    if explained.max() < EXPLAINED * changes.size:
+        return None
+    best = float(trial[np.argmax(explained)])
+    ahead = np.mod(shown - best + 1e-9, step_s)
+    return best + float(np.min(ahead[ahead < unseen])) - 1e-9
+
 
 PAUSE_S = 1.0
 """A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""

@@ -5,13 +5,53 @@ A unit is never guessed: a column whose name is known and whose unit is not is r
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records import units
 from stimrig.identify.records.record import OPTIONAL
+
+_TIME = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "µs": 1e-6, "us": 1e-6, "min": 60.0}
+_ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180}
+_ANGLE["°"] = _ANGLE["deg"]
+_FOOT_POUND_NM = 1.3558179483314004
+_FOOT_POUNDS = dict.fromkeys(("lbft", "lbfft", "ftlb", "ftlbf"), _FOOT_POUND_NM)
+_INCH_POUNDS = dict.fromkeys(("lbin", "lbfin", "inlb", "inlbf"), _FOOT_POUND_NM / 12)
+UNITS: dict[str, dict[str, float]] = {
+    "time_s": _TIME,
+    "pulse_width_us": {"µs": 1.0, "us": 1.0, "ms": 1e3, "s": 1e6, "ns": 1e-3},
+    "torque_nm": {"nm": 1.0, "mnm": 1e-3, "ncm": 1e-2, "nmm": 1e-3, "knm": 1e3, **_FOOT_POUNDS, **_INCH_POUNDS},
+    "angle_rad": _ANGLE,
+    "velocity_rad_s": {f"{unit}/{per}": factor for unit, factor in _ANGLE.items() for per in ("s", "sec")}
+    | {"rpm": 2 * math.pi / 60},
+    "late_s": _TIME,
+    "doubted": {"1": 1.0},
+    "segment": {},
+}
+"""For each column the units that are known, as `plain_unit` writes them, with the factor to the column's own unit."""
+SHOWN = {
+    "time_s": ("s", "ms", "µs"),
+    "pulse_width_us": ("µs", "ms", "s"),
+    "torque_nm": ("Nm", "mNm", "Ncm"),
+    "angle_rad": ("rad", "deg"),
+    "velocity_rad_s": ("rad/s", "deg/s", "rpm"),
+    "late_s": ("s", "ms", "µs"),
+}
+"""The usual ones, the column's own first: what messages offer."""
+_NO_SIGNS = str.maketrans({"μ": "µ", **dict.fromkeys("·⋅∙*. []()", None)})
+
+
+def plain_unit(unit: str) -> str:
+    """A unit without brackets, dots and capitals: 'N·m', '[Nm]' and 'N*m' are one."""
+    return unit.strip().translate(_NO_SIGNS).lower()
+
+
+def unit_factor(target: str, unit: str) -> float | None:
+    """By what a column's numbers are multiplied to come in its own unit; None where the unit is not known."""
+    return UNITS[target].get(plain_unit(unit))
+
 
 NEEDED = ("time_s", "pulse_width_us", "torque_nm")
 MAY_LACK = (*NEEDED, "angle_rad", "velocity_rad_s")
@@ -165,16 +205,16 @@ def _with_unit(name: str, target: str, index: int, below: str, asked: Asked | No
     if not unit and name == target:
         return Column(index)
     if not unit and asked is not None:
-        own = units.SHOWN.get(target, ("1",))[0]
+        own = SHOWN.get(target, ("1",))[0]
         return Column(index, note=f"{target} is {_short(name)!r}, taken in {own} as no unit is given")
     if not unit and target not in NEEDED:
         return None
-    factor = units.factor(target, unit) if unit else None
+    factor = unit_factor(target, unit) if unit else None
     if factor is None or (name == target and not wanted and factor != 1.0):
         raise _unit(name, target, unit, place)
     if not wanted:
         return Column(index, factor, "" if name == target else f"{target} is {_short(name)!r} in {_short(unit)}")
-    if written and units.factor(target, written) not in (None, factor):
+    if written and unit_factor(target, written) not in (None, factor):
         return Column(index, factor, f"{target} is taken in {unit} as --map says; its name says {_short(written)}")
     return Column(index, factor)
 
@@ -185,8 +225,8 @@ def _split(cell: str, target: str = "") -> tuple[str, str]:
         return cell, ""
     if match := _BRACKETS.match(cell[:LONGEST_NAME]):
         return match[1].strip(), next(text for text in match.groups()[1:] if text is not None).strip()
-    for known in (target,) if target else units.UNITS:
-        for tail in sorted(units.UNITS[known], key=len, reverse=True):
+    for known in (target,) if target else UNITS:
+        for tail in sorted(UNITS[known], key=len, reverse=True):
             ending = "_" + tail.replace("/", "_")
             if cell.lower().endswith(ending) and (target or _KNOWN.get(_name(cell[: -len(ending)])) == known):
                 return cell[: -len(ending)], tail
@@ -224,7 +264,7 @@ def _missing(cells: Sequence[str], missing: Sequence[str], given: Given, place: 
     if asked := next((given[target] for target in missing if target in given), None):
         return BadRecord(f"no column {_short(asked.text)!r} for {asked.target}", place=place, fix=f"It has: {here}.")
     target = missing[0]
-    unit = units.SHOWN[target][0]
+    unit = SHOWN[target][0]
     fix = f"Say which it is, for instance --map {target}=NAME:{unit}; it has: {here}."
     return BadRecord(f"no column {', '.join(missing)}", place=place, fix=fix)
 
@@ -238,13 +278,13 @@ def _twice(cells: Sequence[str], target: str, indices: Sequence[int], place: str
 
 
 def _unit(name: str, target: str, unit: str, place: str) -> BadRecord:
-    known = units.SHOWN.get(target, ("1",))
+    known = SHOWN.get(target, ("1",))
     shown = _short(_split(name, target)[0] or name)
     fix = f"Give --map {target}={shown}:{known[0]}" + (f" (or {', '.join(known[1:])})." if known[1:] else ".")
-    if target == "torque_nm" and units.plain(unit) in ("n", "kg", "kn", "v", "mv"):
+    if target == "torque_nm" and plain_unit(unit) in ("n", "kg", "kn", "v", "mv"):
         fix = "Torque is asked for: multiply by the lever arm or the sensor's scale first."
     said = f"its unit {_short(unit)!r} is not known" if unit else "its unit is not said"
-    if unit and units.factor(target, unit) is not None:
+    if unit and unit_factor(target, unit) is not None:
         said = f"below it stands {_short(unit)!r}"
     return BadRecord(f"column {_short(name)!r} is taken for {target}, but {said}", place=place, fix=fix)
 

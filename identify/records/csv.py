@@ -1,23 +1,406 @@
 """A record from a table of text, as the rig or another tool wrote it (docs/recording.md).
 
-It is read in blocks of rows, so that memory follows the numbers it holds and not what else is in the file.
-"""
+It is read in blocks of rows, so that memory follows the numbers it holds and not what else is in the file."""
 
 from __future__ import annotations
 
+import codecs
+import csv
 import hashlib
-from collections.abc import Mapping
-from dataclasses import replace
+import io
+import re
+from array import array
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records import bounds, columns, parts_csv, text
+from stimrig.identify.records import bounds, columns, join
 from stimrig.identify.records.assemble import PULSE_RATE_HZ, Found, check_widths, optional, record_of
-from stimrig.identify.records.columns import Column, Given
+from stimrig.identify.records.cells import as_written
+from stimrig.identify.records.columns import MAY_LACK, Column, Given
 from stimrig.identify.records.record import Record, Source, joined_source
-from stimrig.identify.records.table import Table
+
+LONGEST_LINE = 10_000
+"""Characters; no row of numbers has as many."""
+MOST_BEFORE = 100
+"""Lines before the header at most."""
+BLANKS = " "
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", BLANKS: "blanks"}
+COMMENTS = ("#", "%", "//")
+PIECE_BYTES = 2**20
+Row = tuple[int, list[str]]
+
+
+def encoding_of(content: bytes, name: str) -> tuple[str, str]:
+    """The codec of a text, and what of it was assumed (empty where the text says it itself).
+
+    Raises
+    ------
+    BadRecord
+        No text.
+    """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16", ""
+    if b"\0" in content:
+        head = content[:4096]
+        for codec, zeros, signs in (("utf-16-le", head[1::2], head[::2]), ("utf-16-be", head[::2], head[1::2])):
+            if zeros.count(0) > 0.9 * len(zeros) and b"\0" not in signs:
+                return codec, "read as UTF-16 text"
+        place = f"{name}, line {content.count(10, 0, content.index(0)) + 1}"
+        raise BadRecord("not text (a zero byte)", place=place, fix="Save the file as CSV text.")
+    if content.isascii() or _is_utf8(content):
+        return "utf-8-sig", ""
+    return "cp1252", "not UTF-8: read as Windows-1252 (Latin-1) text"
+
+
+def _is_utf8(content: bytes) -> bool:
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        for start in range(0, len(content), PIECE_BYTES):
+            decoder.decode(content[start : start + PIECE_BYTES])
+        decoder.decode(b"", final=True)
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def text_lines(content: bytes, encoding: str, name: str) -> Iterator[str]:
+    """The file's lines, none too long and not too many.
+
+    Raises
+    ------
+    BadRecord
+        Too long, too many, or bytes that are no text.
+    """
+    file = io.TextIOWrapper(io.BytesIO(content), encoding, newline="")
+    number = 0
+    try:
+        for number, line in enumerate(file, start=1):
+            if len(line) > LONGEST_LINE:
+                fix = "One row a line; is it text at all?"
+                raise BadRecord(f"more than {LONGEST_LINE} characters", place=f"{name}, line {number}", fix=fix)
+            if number > bounds.LARGEST_ROWS:
+                fix = "Cut the record, or resample it to a lower rate."
+                raise BadRecord(f"more than {bounds.LARGEST_ROWS} lines", place=f"{name}, line {number}", fix=fix)
+            yield line
+    except UnicodeDecodeError:
+        raise BadRecord("not text", place=f"{name}, line {number + 1}", fix="Save the file as UTF-8 CSV.") from None
+
+
+@dataclass
+class Layout:
+    """How a table is laid out, and its rows from the first one with numbers on."""
+
+    separator: str
+    header: list[str]
+    line: int
+    rows: Iterator[Row]
+    units: list[str] = field(default_factory=list)
+
+
+def find_layout(content: bytes, encoding: str, given: Given, name: str) -> Layout:
+    """Find header and separator among the first lines.
+
+    Raises
+    ------
+    BadRecord
+        No line names the columns that a record needs, or the rows do not stand under it.
+    """
+    source = text_lines(content, encoding, name)
+    before: list[str] = []
+    for number, line in enumerate(source, start=1):
+        before.append(line)
+        if number > MOST_BEFORE:
+            break
+        for separator in SEPARATORS:
+            cells = _cells(line, separator)
+            if len(cells) < len(columns.NEEDED) or not columns.complete(columns.places(cells, given)):
+                continue
+            if not _numbered(given):
+                return _below(
+                    Layout(separator, cells, number, _rows(source, separator, number + 1, name)), content, name
+                )
+            if _is_numbers(cells, given):
+                return Layout(separator, cells, 0, _rows(chain([line], source), separator, number, name))
+    raise _no_header(before, given, name)
+
+
+def _numbered(given: Given) -> bool:
+    """Whether columns are asked for by number, so that a header need not be."""
+    return all(target in given and given[target].name.startswith("#") for target in columns.NEEDED)
+
+
+def _is_numbers(cells: list[str], given: Given) -> bool:
+    at = [columns.places(cells, given)[target][0] for target in columns.NEEDED]
+    return all(is_number(cells[index].replace(",", ".")) for index in at)
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    text = line.strip().lstrip("#%").strip() if line.lstrip()[:1] in ("#", "%") else line.strip("\r\n")
+    if separator == BLANKS:
+        return re.sub(r"[ \t]+([\[(][^\[\]()]{0,40}[\])])", r"\1", text[:LONGEST_LINE]).split()
+    if separator not in text:
+        return []
+    try:
+        return [cell.strip() for cell in next(csv.reader([text], delimiter=separator), [])]
+    except csv.Error:
+        return []
+
+
+def _rows(source: Iterable[str], separator: str, first_line: int, name: str) -> Iterator[Row]:
+    """Rows with the number of their line; empty lines are passed over."""
+    if separator == BLANKS:
+        yield from ((number, cells) for number, line in enumerate(source, first_line) if (cells := line.split()))
+        return
+    reader = csv.reader(source, delimiter=separator)
+    before = first_line - 1
+    try:
+        for row in reader:
+            if row:
+                yield before + reader.line_num, row
+    except csv.Error as error:
+        place = f"{name}, line {before + reader.line_num}"
+        raise BadRecord(f"not CSV ({error})", place=place, fix="Save the file as comma-separated text.") from error
+
+
+def _below(found: Layout, content: bytes, name: str) -> Layout:
+    """With the row of units below the header, if there is one, taken off the rows, and comments left out."""
+    double = 2 * found.separator
+    if any(f"\n{sign}".encode() in content for sign in (*COMMENTS, double)) or b"\0" in content:
+        found.rows = ((line, row) for line, row in found.rows if not _is_aside(row))
+    found.rows = _no_wider(found, found.rows, name)
+    first = next(found.rows, None)
+    if first is None:
+        return found
+    line, row = first
+    filled = [cell.strip() for cell in row if cell.strip()]
+    known = {unit for target in columns.UNITS for unit in columns.UNITS[target]}
+    if any(columns.plain_unit(cell) in known for cell in filled) and not any(is_number(cell) for cell in filled):
+        found.units = row
+        return found
+    _check_width(found, line, row, name)
+    found.rows = chain([first], found.rows)
+    return found
+
+
+def _is_aside(row: list[str]) -> bool:
+    """Whether a row is a comment, or holds nothing."""
+    return row[0].lstrip().startswith(COMMENTS) or not any(cell.strip() for cell in row)
+
+
+def _no_wider(found: Layout, rows: Iterator[Row], name: str) -> Iterator[Row]:
+    """The rows; one further down with more cells than the header is refused as the first one is."""
+    width = len(found.header)
+    for line, row in rows:
+        if len(row) > width and any(cell.strip() for cell in row[width:]):
+            _check_width(found, line, row, name)
+        yield line, row
+
+
+def _check_width(found: Layout, line: int, row: list[str], name: str) -> None:
+    """Refuse rows that have more cells than the header has names: it is not known which cell is which."""
+    used = max((index for index, cell in enumerate(row, start=1) if cell.strip()), default=0)
+    if used == len(found.header) or (used < len(found.header) and used > 1 and found.separator != BLANKS):
+        return
+    fix = "Name every column."
+    if used < len(found.header):
+        fix = f"The header is separated by {SEPARATORS[found.separator]}: separate the rows alike."
+    elif found.separator == ",":
+        fix = "Name every column; with decimal commas, separate the cells with semicolons."
+    message = f"{used} {'cell' if used == 1 else 'cells'} under a header of {len(found.header)}"
+    raise BadRecord(message, place=f"{name}, line {line}", fix=fix)
+
+
+def _no_header(before: list[str], given: Given, name: str) -> BadRecord:
+    """What is missing in the line that comes closest to a header."""
+    best: tuple[float, int, list[str]] = (0.0, 1, [])
+    for number, line in enumerate(before, start=1):
+        for separator in SEPARATORS:
+            cells = _cells(line, separator)
+            score = len(columns.places(cells, given)) + (0.5 if sum(map(_is_word, cells)) >= 3 else 0)
+            if score > best[0]:
+                best = (score, number, cells)
+    _, number, cells = best
+    fix = "The first line must be time_s,pulse_width_us,torque_nm,segment, or name your columns with --map."
+    if not cells:
+        filled = any(line.strip("\ufeff \t\r\n") for line in before)
+        if filled and any(is_number(cell) for cell in re.split(r"[,;|\s]+", before[0].strip())[:1]):
+            fix = "Say which column is which: --map time_s=#1:s --map pulse_width_us=#2:µs --map torque_nm=#3:Nm."
+        return BadRecord("no header" if filled else "empty", place=f"{name}, line 1", fix=fix)
+    try:
+        columns.columns(cells, given, [], f"{name}, line {number}")
+    except BadRecord as error:
+        return error
+    fix = "Put one line with the columns' names before the numbers, or name each column with --map."
+    return BadRecord("no numbers follow the header", place=f"{name}, line {number}", fix=fix)
+
+
+def _is_word(cell: str) -> bool:
+    return bool(cell) and not is_number(cell.replace(",", "."))
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number as a measuring tool writes it: no digits of other scripts, no underscores."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return cell.isascii() and "_" not in cell
+
+
+BLOCK = 4096
+CUT = "Every row needs every column; was the file cut off?"
+MISSING = {"", "nan", "na", "n/a", "n.a.", "#n/a", "#nv", "null", "none", "-", "--"}
+"""What tools write where they have no number."""
+
+
+class Table:
+    """What the rows hold: numbers by column, segments by name, and the line each row stands in.
+
+    Parameters
+    ----------
+    name : str
+        How messages call the file.
+    columns : mapping of str to Column
+        Where each column stands, and its factor; a `segment` may be missing.
+    cells : mapping of str to int
+        Where the cells stand that describe a part; empty where the file has none.
+    commas : bool
+        Whether numbers may have decimal commas: not where commas separate the cells.
+    """
+
+    def __init__(self, name: str, columns: Mapping[str, Column], cells: Mapping[str, int], commas: bool) -> None:
+        self.name, self.columns, self.cells, self.commas = name, columns, cells, commas
+        self.lines = array("L")
+        self.segment = array("L")
+        self.names: dict[str, int] = {}
+        self.numbers = {column: array("d") for column in columns if column != "segment"}
+        self.parts: dict[int, dict[str, str]] = {}
+        """Cells that describe a part, by the row that it begins with."""
+        self.decimal = ""
+        """The decimal sign, once one was met."""
+
+    def fill(self, rows: Iterable[Row]) -> None:
+        """Take all rows in.
+
+        Raises
+        ------
+        BadRecord
+            With file, line and column.
+        """
+        source = iter(rows)
+        while block := list(islice(source, BLOCK)):
+            self._take([row for _, row in block], [line for line, _ in block])
+
+    def _take(self, rows: list[list[str]], lines: list[int]) -> None:
+        for column, values in self.numbers.items():
+            values.extend(self._column(rows, column, lines))
+        if self.cells:
+            self._take_parts(rows, lines)
+        if "segment" in self.columns:
+            self._take_segments(rows, lines)
+        self.lines.extend(lines)
+
+    def _take_segments(self, rows: list[list[str]], lines: list[int]) -> None:
+        at = self.columns["segment"].index
+        for row, line in zip(rows, lines, strict=True):
+            if len(row) <= at:
+                raise self._short(row, line, "segment")
+            text = as_written(row[at].strip())
+            code = self.names.get(text)
+            self.segment.append(self._new_name(text, line) if code is None else code)
+
+    def _take_parts(self, rows: list[list[str]], lines: list[int]) -> None:
+        """Keep the cells of each row with which a part begins."""
+        before = len(self.lines)
+        number = np.array(self.numbers["part"][max(before - 1, 0) :])
+        firsts = np.flatnonzero(np.diff(number)) + (0 if before else 1)
+        for index in firsts.tolist() if before else [0, *firsts.tolist()]:
+            row = rows[index]
+            if len(row) <= max(self.cells.values()):
+                raise self._short(row, lines[index], "pause_s")
+            self.parts[before + index] = {column: as_written(row[at].strip()) for column, at in self.cells.items()}
+            if len(self.parts) > bounds.MOST_PARTS:
+                fix = f"At most {bounds.MOST_PARTS} in one record."
+                raise BadRecord("too many parts", place=self.at(lines[index], "part"), fix=fix)
+
+    def _column(self, rows: list[list[str]], column: str, lines: list[int]) -> np.ndarray:
+        """The numbers of a column in its own unit; NaN where the file has none."""
+        found = self.columns[column]
+        try:
+            cells = [row[found.index] for row in rows]
+        except IndexError:
+            row, line = next(pair for pair in zip(rows, lines, strict=True) if len(pair[0]) <= found.index)
+            raise self._short(row, line, column) from None
+        text = "".join(cells)
+        self._settle_decimal(text, cells, column, lines)
+        if self.decimal == ",":
+            cells, text = [cell.replace(",", ".") for cell in cells], text.replace(",", ".")
+        try:
+            values = np.array([float(cell) for cell in cells])
+        except ValueError:
+            values = np.array([self._number(cell, column, line) for cell, line in zip(cells, lines, strict=True)])
+        # Python's float also takes digits of other scripts and underscores, which no measuring tool writes.
+        if not text.isascii() or "_" in text:
+            for cell, line in zip(cells, lines, strict=True):
+                self._number(cell, column, line)
+        if found.factor != 1.0:
+            values *= found.factor
+        missing = np.isnan(values) if column in MAY_LACK else False
+        bad = np.flatnonzero(~(np.abs(values) <= bounds.largest(column)) & ~np.asarray(missing))
+        if bad.size:
+            shown = _shown(cells[bad[0]].strip())
+            fix = "Remove the row's cause, or cut the record before it; values must be finite."
+            fix = bounds.fix_of(column, values[bad], fix)
+            raise BadRecord(
+                f"{shown} is no measurement" if shown else "empty", place=self.at(lines[bad[0]], column), fix=fix
+            )
+        return values
+
+    def _settle_decimal(self, text: str, cells: list[str], column: str, lines: list[int]) -> None:
+        """One decimal sign for the whole file."""
+        for sign in ",.":
+            if sign not in text:
+                continue
+            if (self.commas or sign == ".") and self.decimal in ("", sign):
+                self.decimal = sign
+                continue
+            cell, line = next(pair for pair in zip(cells, lines, strict=True) if sign in pair[0])
+            other = f"after numbers with a decimal {'comma' if sign == '.' else 'point'}"
+            message = f"{_shown(cell)!r} {other if self.decimal else 'between separating commas'}"
+            fix = "Write all numbers with a decimal point, without signs between thousands."
+            raise BadRecord(message, place=self.at(line, column), fix=fix)
+
+    def _number(self, cell: str, column: str, line: int) -> float:
+        """One number; NaN where the tool says that it has none."""
+        if cell.strip().lower() in MISSING:
+            return np.nan
+        if is_number(cell):
+            return float(cell)
+        message, fix = f"{_shown(cell)!r} is no number", "Give a number with a decimal point."
+        raise BadRecord(message, place=self.at(line, column), fix=fix)
+
+    def _new_name(self, text: str, line: int) -> int:
+        bounds.check_name(text, self.at(line, "segment"))
+        if len(self.names) == bounds.MOST_SEGMENTS:
+            fix = "Name segments by what they are (rest, prbs…), not each row."
+            raise BadRecord(f"more than {bounds.MOST_SEGMENTS} names", place=self.at(line, "segment"), fix=fix)
+        return self.names.setdefault(text, len(self.names))
+
+    def _short(self, row: list[str], line: int, column: str) -> BadRecord:
+        return BadRecord(f"only {len(row)} cells", place=self.at(line, column), fix=CUT)
+
+    def at(self, line: int, column: str) -> str:
+        """How messages call a cell."""
+        return f"{self.name}, line {line}, column {column}"
+
+
+def _shown(cell: str) -> str:
+    return cell if len(cell) <= 40 else f"{cell[:40]}…"
 
 
 def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, given: Given | None = None) -> Record:
@@ -31,8 +414,8 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
         With file, line and column, and what to do.
     """
     name = str(path)
-    encoding, encoded = text.encoding_of(content, name)
-    layout = text.layout(content, encoding, given or {}, name)
+    encoding, encoded = encoding_of(content, name)
+    layout = find_layout(content, encoding, given or {}, name)
     known = columns.columns(layout.header, given or {}, layout.units, f"{name}, line {layout.line}")
     cells = _cells_of_parts(layout.header, known, f"{name}, line {layout.line}")
     table = Table(name, known, cells, commas=layout.separator != ",")
@@ -53,11 +436,11 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
     return _joined(found, table, pulse_rate_hz) if cells else record_of(found)
 
 
-def _notes(encoded: str, layout: text.Layout, table: Table, known: Mapping[str, Column]) -> tuple[str, ...]:
+def _notes(encoded: str, layout: Layout, table: Table, known: Mapping[str, Column]) -> tuple[str, ...]:
     """What was assumed of how the file is written, and of its columns."""
     written = []
     if layout.separator != ",":
-        written.append(f"{text.SEPARATORS[layout.separator]} between cells")
+        written.append(f"{SEPARATORS[layout.separator]} between cells")
     if table.decimal == ",":
         written.append("decimal commas")
     if layout.line != 1:
@@ -72,10 +455,10 @@ def _cells_of_parts(header: list[str], known: dict[str, Column], place: str) -> 
     # One of them alone is a column of somebody else's.
     if not {"part", "pause_s", "segment"} <= set(header):
         return {}
-    if twice := [column for column in ("part", *parts_csv.CELLS) if header.count(column) > 1]:
+    if twice := [column for column in ("part", *join.CELLS) if header.count(column) > 1]:
         raise BadRecord(f"column {twice[0]} is there twice", place=place, fix="Keep one of them.")
     known["part"] = Column(header.index("part"))
-    return {column: header.index(column) for column in parts_csv.CELLS if column in header}
+    return {column: header.index(column) for column in join.CELLS if column in header}
 
 
 def _joined(found: Found, table: Table, pulse_rate_hz: float | None) -> Record:
@@ -83,10 +466,10 @@ def _joined(found: Found, table: Table, pulse_rate_hz: float | None) -> Record:
     for column, values in found.columns.items():
         if (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[column]))).size:
             place = found.at(int(bad[0]), column)
-            raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=parts_csv.FIX)
+            raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=join.FIX)
     check_widths(found.columns, found.at)
     time_s = found.columns["time_s"]
-    joined = parts_csv.parsed(found.columns, table.parts, table.lines, table.name)
+    joined = join.parsed(found.columns, table.parts, table.lines, table.name)
     bounds.check_span(time_s, found.at(time_s.size - 1, "time_s"))
     source = joined_source(joined.sources, found.source.name, found.source.sha256)
     return Record.from_arrays(

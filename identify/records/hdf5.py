@@ -2,12 +2,12 @@
 
 An HDF5 file may name other files (external storage, external and soft links, virtual datasets), declare a terabyte in a
 few bytes, or carry code's input in unusual types. So libhdf5 is asked only how a dataset is laid out, of a copy in
-memory. The numbers are then taken from the file's own bytes, each bound checked before memory is taken for it.
-"""
+memory. The numbers are then taken from the file's own bytes, each bound checked before memory is taken for it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,8 +16,109 @@ import numpy as np
 from h5py import h5a, h5d, h5f, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records import hdf5_chunks
 from stimrig.identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS
+
+LARGEST_CHUNK_BYTES = 16 * 2**20
+MOST_CHUNKS = 100_000
+OVERHEAD_BYTES = 4096
+"""What a filter may add to what cannot be packed."""
+
+
+class BadChunk(Exception):
+    """A piece of a dataset that is not what it is declared to be."""
+
+
+def file_piece(content: bytes, offset: int | None, size: int) -> memoryview:
+    """A stretch of the file.
+
+    Raises
+    ------
+    BadChunk
+        It was never written, or lies outside.
+    """
+    if offset is None:
+        raise BadChunk("values are declared and were never written")
+    if not (offset >= 0 and offset + size <= len(content)):
+        raise BadChunk("values are declared beyond the file's end")
+    return memoryview(content)[offset : offset + size]
+
+
+def read_chunks(
+    content: bytes, dataset: Any, length: int, filters: Sequence[int], dtype: np.dtype, size: int
+) -> np.ndarray:
+    """The values of a dataset in chunks of `length` values, each chunk written.
+
+    Raises
+    ------
+    BadChunk
+        Too large, too many, not written, or not what was declared.
+    """
+    full = length * dtype.itemsize
+    count = -(-size // length)
+    if not (0 < full <= LARGEST_CHUNK_BYTES):
+        raise BadChunk(f"chunks of {full} bytes, at most {LARGEST_CHUNK_BYTES} are read")
+    if count > MOST_CHUNKS:
+        raise BadChunk(f"{count} chunks, at most {MOST_CHUNKS} are read")
+    values = np.empty(size, dtype)
+    for start in range(0, size, length):
+        stored = dataset.get_chunk_info_by_coord((start,))
+        if stored.size > full + OVERHEAD_BYTES:
+            raise BadChunk("a chunk that is larger than what it holds")
+        packed = file_piece(content, stored.byte_offset, stored.size)
+        chunk = np.frombuffer(unpacked(packed, filters, stored.filter_mask, dtype.itemsize, full), dtype)
+        values[start : start + length] = chunk[: size - start]
+    return values
+
+
+def unpacked(data: Any, filters: Sequence[int], skipped: int, itemsize: int, full: int) -> Any:
+    """A chunk's bytes with its filters undone, the last one first.
+
+    Raises
+    ------
+    BadChunk
+        They do not give the chunk's size, or a checksum does not hold.
+    """
+    for index in reversed(range(len(filters))):
+        if skipped >> index & 1:
+            continue
+        if filters[index] == h5z.FILTER_DEFLATE:
+            data = inflated(data, full + OVERHEAD_BYTES)
+        elif filters[index] == h5z.FILTER_SHUFFLE:
+            data = np.frombuffer(data, np.uint8, len(data) // itemsize * itemsize).reshape(itemsize, -1).T.tobytes()
+        else:
+            data, stored = data[:-4], np.frombuffer(bytes(data[-4:]).ljust(4, b"\0"), "<u2")
+            if fletcher32(data) != (int(stored[0]) % 65535, int(stored[1]) % 65535):
+                raise BadChunk("a checksum does not hold; the file was damaged")
+    if len(data) != full:
+        raise BadChunk("a chunk that does not unpack to its size")
+    return data
+
+
+def inflated(data: Any, most: int) -> bytes:
+    """What gzip's filter packed, at most so many bytes.
+
+    Raises
+    ------
+    BadChunk
+        Damaged, or longer.
+    """
+    packer = zlib.decompressobj()
+    try:
+        found = packer.decompress(data, most)
+    except zlib.error as error:
+        raise BadChunk("packed data that do not unpack") from error
+    if not packer.eof:
+        raise BadChunk("packed data that are damaged, or longer than declared")
+    return found
+
+
+def fletcher32(data: Any) -> tuple[int, int]:
+    """Both sums of HDF5's checksum over words of two bytes, modulo 65535."""
+    even = bytes(data) + b"\0" * (len(data) % 2)
+    words = np.frombuffer(even, ">u2").astype(np.uint64)
+    second = int(np.sum(words * np.arange(words.size, 0, -1, dtype=np.uint64))) if words.size else 0
+    return int(words.sum()) % 65535, second % 65535
+
 
 FIX = "Give a sealed recording, as written by the rig at the end of a test."
 LONGEST_TEXT = 10_000
@@ -168,13 +269,13 @@ class StrictFile:
         plan = dataset.get_create_plist()
         try:
             if plan.get_layout() == h5d.CONTIGUOUS:
-                piece = hdf5_chunks.piece(self.content, dataset.get_offset(), size * dtype.itemsize)
+                piece = file_piece(self.content, dataset.get_offset(), size * dtype.itemsize)
                 return np.frombuffer(piece, dtype)
             filters = [plan.get_filter(index)[0] for index in range(plan.get_nfilters())]
             if unknown := [number for number in filters if number not in FILTERS]:
                 raise self._bad(f"a filter (number {unknown[0]}) other than gzip, shuffle and fletcher32", path)
-            return hdf5_chunks.read(self.content, dataset, plan.get_chunk()[0], filters, dtype, size)
-        except hdf5_chunks.BadChunk as error:
+            return read_chunks(self.content, dataset, plan.get_chunk()[0], filters, dtype, size)
+        except BadChunk as error:
             raise self._bad(str(error), path) from error
 
     @contextmanager

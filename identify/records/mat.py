@@ -1,10 +1,17 @@
-"""A record from a MAT file: variables, or the fields of one struct, named as the columns of a table."""
+"""A record from a MAT file (versions 5 to 7): variables, or the fields of one struct, named as the columns of a table.
+
+A MAT file may declare a terabyte in a few bytes, unpack to one, and hold objects and function handles. `scipy.io` takes
+memory for what is declared before it looks whether it is there; here each bound is checked first, and only variables
+that are asked for are unpacked."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import replace
+import math
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +19,255 @@ import numpy as np
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns
 from stimrig.identify.records.assemble import PULSE_RATE_HZ, Found, record_of
+from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS
 from stimrig.identify.records.columns import Column, Given
-from stimrig.identify.records.mat_file import CELL, CHAR, FIX, BadMat, Variable, variables
 from stimrig.identify.records.record import Record, Source
+
+HEADER_BYTES = 128
+HEAD_BYTES = 4096
+"""More than the head of any variable."""
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+TEXTS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
+MATRIX, PACKED = 14, 15
+CELL, STRUCT, CHAR = 1, 2, 4
+NUMERIC = range(6, 16)
+COMPLEX = 0x0800
+KINDS = {3: "an object", 5: "a sparse matrix", 16: "a function handle", 17: "an object (table, string, datetime, …)"}
+MOST_VARIABLES = 10_000
+LONGEST_TEXT = 10_000
+FIX = "Save plain columns of numbers from MATLAB: save('record.mat', 'time_s', 'pulse_width_us', 'torque_nm', '-v7')."
+OBJECTS = "Turn it into plain numbers or texts first: seconds(t), cellstr(s), table2struct(T, 'ToScalar', true)."
+
+
+class BadMat(Exception):
+    """A piece of a MAT file that is not what it is declared to be."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable that was not looked at closely yet.
+
+    Parameters
+    ----------
+    kind : int
+        MATLAB's class.
+    shape : tuple of int
+        Its dimensions, as declared.
+    flags : int
+        Whether it is complex.
+    body : memoryview
+        What follows its name.
+    order : str
+        "<" or ">".
+    packed : bool
+        Whether `body` holds the whole element as it was packed, its head included.
+    """
+
+    kind: int
+    shape: tuple[int, ...]
+    flags: int
+    body: memoryview
+    order: str
+    packed: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of elements, as declared."""
+        return math.prod(self.shape)
+
+    def _opened(self, most_bytes: int = LARGEST_FILE_BYTES) -> Variable:
+        if not self.packed:
+            return self
+        whole = memoryview(_unpacked(self.body, most_bytes))
+        tag, inside, _ = _element(whole, 0, self.order)
+        if tag != MATRIX:
+            raise BadMat("a packed variable that is none")
+        return _matrix(inside, self.order)[1]
+
+    def numbers(self) -> np.ndarray:
+        """Its numbers, as float64 in one dimension.
+
+        Raises
+        ------
+        BadMat
+            Not real numbers in a row or a column, or not all there.
+        """
+        if self.kind not in NUMERIC:
+            raise BadMat(f"{KINDS.get(self.kind, 'no numbers')}. {OBJECTS}")
+        if self.flags & COMPLEX:
+            raise BadMat("complex numbers. Give real ones.")
+        if max(self.shape, default=0) != self.size or self.size > LARGEST_ROWS:
+            raise BadMat(f"{'×'.join(map(str, self.shape))} numbers. Give one row or column of at most {LARGEST_ROWS}.")
+        here = self._opened(8 * self.size + HEAD_BYTES)
+        tag, data, _ = _element(here.body, 0, here.order)
+        if tag not in NUMBERS or len(data) != here.size * np.dtype(NUMBERS[tag]).itemsize:
+            raise BadMat("numbers that are declared and not there")
+        return np.frombuffer(data, here.order + NUMBERS[tag]).astype(float)
+
+    def texts(self) -> list[str]:
+        """Its texts: of a cell array each element's, of a character array each row's.
+
+        Raises
+        ------
+        BadMat
+            No texts, or not all there.
+        """
+        if self.kind not in (CHAR, CELL):
+            raise BadMat(f"{KINDS.get(self.kind, 'no texts')}. {OBJECTS}")
+        if self.size > LARGEST_ROWS:
+            raise BadMat(f"{self.size} texts. At most {LARGEST_ROWS} are read.")
+        here = self._opened()
+        if here.kind == CHAR:
+            return _rows_of(here)
+        found = []
+        for cell in _matrices(here, here.size):
+            if cell.kind != CHAR:
+                raise BadMat(f"a cell array with {KINDS.get(cell.kind, 'something')} in it. Give texts only.")
+            found.append("".join(_rows_of(cell)[:1]))
+        return found
+
+    def fields(self) -> dict[str, Variable]:
+        """The fields of a struct of one element; nothing for anything else.
+
+        Raises
+        ------
+        BadMat
+            Damaged.
+        """
+        if self.kind != STRUCT or self.size != 1:
+            return {}
+        here = self._opened()
+        if here.kind != STRUCT or here.size != 1:
+            return {}
+        _, length, place = _element(here.body, 0, here.order)
+        _, names, place = _element(here.body, place, here.order)
+        each = int.from_bytes(length[:4], "little" if here.order == "<" else "big")
+        if not 0 < each <= 64 or len(names) % each or len(names) > 64 * MOST_VARIABLES:
+            raise BadMat("names of fields that are none")
+        raw = bytes(names)
+        titles = [_name(raw[at : at + each]) for at in range(0, len(raw), each)]
+        inside = Variable(here.kind, here.shape, here.flags, here.body[place:], here.order)
+        return dict(zip(titles, _matrices(inside, len(titles)), strict=True))
+
+
+def variables(content: bytes, name: str) -> dict[str, Variable]:
+    """The variables of a MAT file by name, none of them unpacked.
+
+    Raises
+    ------
+    BadRecord
+        No MAT file of version 5 to 7, or damaged.
+    """
+    order = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}.get(content[124:HEADER_BYTES])
+    if order is None:
+        what = "a MAT file of version 7.3" if content.startswith(b"MATLAB 7.3") else "no MAT file of version 5 to 7"
+        raise BadRecord(what, place=name, fix=FIX)
+    view, place = memoryview(content), HEADER_BYTES
+    found: dict[str, Variable] = {}
+    elements = 0
+    try:
+        while place + 8 <= len(view):
+            tag, body, place = _element(view, place, order)
+            title, variable = _listed(tag, body, order)
+            if title:
+                found[title] = variable
+            elements += 1  # those without a name, or with one that was there before, count too
+            if elements > MOST_VARIABLES:
+                raise BadMat(f"more than {MOST_VARIABLES} variables")
+    except BadMat as error:
+        raise BadRecord(f"a damaged MAT file ({error})", place=name, fix=FIX) from error
+    return found
+
+
+def is_mat(content: bytes) -> bool:
+    """Whether a file is a MAT file, of version 5 to 7.3, by its first bytes."""
+    return content.startswith(b"MATLAB") and content[126:HEADER_BYTES] in (b"IM", b"MI")
+
+
+def _listed(tag: int, body: memoryview, order: str) -> tuple[str, Variable]:
+    """Name and head of a variable; of a packed one, no more is unpacked than that takes."""
+    if tag == MATRIX:
+        return _matrix(body, order)
+    if tag != PACKED:
+        return "", Variable(0, (), 0, body, order)
+    head = memoryview(_unpacked(body, HEAD_BYTES, whole=False))
+    inside, _, _ = struct.unpack_from(order + "IIQ", head.tobytes().ljust(16, b"\0"))
+    if inside != MATRIX:
+        return "", Variable(0, (), 0, body, order)
+    title, variable = _matrix(head[8:], order)
+    return title, Variable(variable.kind, variable.shape, variable.flags, body, order, packed=True)
+
+
+def _element(view: memoryview, place: int, order: str) -> tuple[int, memoryview, int]:
+    """Tag and data of an element, and where the next one begins."""
+    if not 0 <= place <= len(view) - 8:
+        raise BadMat("it ends within a variable")
+    tag, size = struct.unpack_from(order + "II", view, place)
+    if tag >> 16:  # up to four bytes stand in the tag itself
+        size, tag = tag >> 16, tag & 0xFFFF
+        if size > 4:
+            raise BadMat("a short element that is long")
+        return tag, view[place + 4 : place + 4 + size], place + 8
+    begin, end = place + 8, place + 8 + size
+    if end > len(view):
+        raise BadMat("it ends within a variable")
+    return tag, view[begin:end], end if tag == PACKED else end + -size % 8
+
+
+def _matrix(body: memoryview, order: str) -> tuple[str, Variable]:
+    """Name and head of a matrix; what follows its name stays closed."""
+    _, flags, place = _element(body, 0, order)
+    _, dims, place = _element(body, place, order)
+    _, title, place = _element(body, place, order)
+    if len(flags) != 8 or len(dims) % 4 or not 8 <= len(dims) <= 32 or len(title) > 64:
+        raise BadMat("a variable without a head")
+    (word,) = struct.unpack_from(order + "I", flags)
+    shape = tuple(np.frombuffer(dims, order + "i4").tolist())
+    if min(shape) < 0:
+        raise BadMat("a variable of less than nothing")
+    return _name(bytes(title)), Variable(word & 0xFF, shape, word & 0xFF00, body[place:], order)
+
+
+def _matrices(here: Variable, count: int) -> Iterator[Variable]:
+    place = 0
+    for _ in range(count):
+        tag, body, place = _element(here.body, place, here.order)
+        if tag != MATRIX:
+            raise BadMat("a cell or field that is no variable")
+        yield _matrix(body, here.order)[1] if len(body) else Variable(6, (0, 0), 0, body, here.order)
+
+
+def _rows_of(here: Variable) -> list[str]:
+    """The rows of a character array, without blanks behind."""
+    if here.size == 0:
+        return []
+    tag, data, _ = _element(here.body, 0, here.order)
+    codec = TEXTS.get(tag)
+    if codec is None or len(here.shape) != 2 or here.size > LARGEST_ROWS or here.shape[1] > LONGEST_TEXT:
+        raise BadMat("texts that are none")
+    order = {"<": "-le", ">": "-be"}[here.order] if codec in ("utf-16", "utf-32") else ""
+    text = bytes(data).decode(codec + order, "replace")
+    rows, length = here.shape
+    if len(text) < here.size:
+        raise BadMat("texts that are declared and not there")
+    return [text[row : rows * length : rows].rstrip() for row in range(rows)]
+
+
+def _name(raw: bytes) -> str:
+    return raw.partition(b"\0")[0].decode("ascii", "replace")
+
+
+def _unpacked(data: memoryview, most: int, whole: bool = True) -> bytes:
+    """What zlib packed, at most so many bytes; with `whole` no more may follow."""
+    packer = zlib.decompressobj()
+    try:
+        found = packer.decompress(data, most)
+    except zlib.error as error:
+        raise BadMat("packed data that do not unpack") from error
+    if whole and not packer.eof:
+        raise BadMat("packed data that are damaged, or longer than any record")
+    return found
+
 
 RATE = "pulse_rate_hz"
 """A variable of one number that says the pulse rate."""

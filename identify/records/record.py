@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.shown import Sheet, Shown, quantity
+from stimrig.identify.summary import Sheet, Shown, quantity
 
 HELD_OUT = "validate"
 """Rows of this segment are never used to fit or to choose an effect; they may only speak against one."""

@@ -1,1 +1,242 @@
-"""Recruitment curves: steady-state torque as a function of pulse width, zero at zero width; one file per basis."""
+"""Recruitment curves: steady-state torque as a function of pulse width, zero at zero width; inverse, landmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from stimrig.identify.errors import BadModel
+from stimrig.identify.recruitment.bases import SigmoidBasis
+
+
+class Basis(Protocol):
+    """The basis functions of one kind of recruitment curve; all are zero at zero pulse width."""
+
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def largest_us(self) -> float: ...
+
+    def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray: ...
+
+    def to_dict(self) -> dict: ...
+
+
+@dataclass(frozen=True)
+class Curve:
+    """f(u) = sum of coefficients times basis functions, N·m.
+
+    Parameters
+    ----------
+    basis : Basis
+        Functions of the pulse width.
+    coefficients_nm : ndarray, shape (basis.size,)
+        N·m.
+    """
+
+    basis: Basis
+    coefficients_nm: np.ndarray
+
+    def __call__(self, pulse_width_us: np.ndarray) -> np.ndarray:
+        """Torque at steady state for pulse widths of any shape, N·m."""
+        return self.basis.design(np.asarray(pulse_width_us, float)) @ self.coefficients_nm
+
+    def slope(self, pulse_width_us: np.ndarray) -> np.ndarray:
+        """df/du, N·m/µs."""
+        return self.basis.design(np.asarray(pulse_width_us, float), 1) @ self.coefficients_nm
+
+    def table(self, tolerance: float = 2e-4, most: int = 2001) -> tuple[np.ndarray, np.ndarray]:
+        """Pulse widths, µs, and torques, N·m, dense enough for linear interpolation.
+
+        The spacing is halved until the error at the midpoints is below `tolerance` times the curve's range.
+        """
+        size = 151
+        while True:
+            u = np.linspace(0.0, self.basis.largest_us, size)
+            torque = self(u)
+            middle = (u[1:] + u[:-1]) / 2
+            worst = np.max(np.abs(self(middle) - (torque[1:] + torque[:-1]) / 2))
+            if worst <= tolerance * max(float(np.ptp(torque)), 1e-12) or 2 * size > most:
+                return u, torque
+            size = 2 * size - 1
+
+    def inverse(self) -> tuple[np.ndarray, np.ndarray]:
+        """Torques, N·m, strictly rising from 0, and the smallest pulse width that reaches each, µs.
+
+        The running maximum is inverted, so a curve that falls somewhere still has one answer: the smallest charge that
+        gives the torque.
+        """
+        u, torque = self.table()
+        sign = 1.0 if torque[np.argmax(np.abs(torque))] >= 0 else -1.0
+        top = np.maximum.accumulate(sign * torque)
+        if not top[-1] > 0.0:
+            return np.zeros(1), np.zeros(1)
+        level = np.linspace(0.0, float(top[-1]), 201)
+        reached = np.searchsorted(top, level, side="left")
+        before = np.maximum(reached - 1, 0)
+        rise = np.where(reached > before, top[reached] - top[before], 1.0)
+        share = np.where(reached > before, (level - top[before]) / rise, 0.0)
+        return sign * level, u[before] + share * (u[reached] - u[before])
+
+    def to_dict(self) -> dict:
+        return {"basis": self.basis.to_dict() | {"coefficients_nm": [float(x) for x in self.coefficients_nm]}}
+
+
+@dataclass(frozen=True)
+class FixedShape:
+    """A gain times a given curve, as a basis: for steps that estimate only the dynamics."""
+
+    curve: Curve
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return 1
+
+    @property
+    def largest_us(self) -> float:
+        """Pulse width beyond which the curve is held, µs."""
+        return self.curve.basis.largest_us
+
+    def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Shape (..., 1)."""
+        return (self.curve.basis.design(np.asarray(pulse_width_us, float), derivative) @ self.curve.coefficients_nm)[
+            ..., None
+        ]
+
+    def to_dict(self) -> dict:
+        return self.curve.to_dict()
+
+
+def basis_from_dict(data: dict[str, Any]) -> Basis:
+    """The basis that `to_dict` describes.
+
+    Raises
+    ------
+    BadModel
+        Its kind is unknown.
+    """
+    from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis, SplineBasis
+
+    kinds = {"cubic-spline": SplineBasis, "power-series": PowerBasis, "sigmoid": SigmoidBasis}
+    if data.get("kind") not in kinds:
+        raise BadModel(
+            f"unknown basis {data.get('kind')!r}", place="recruitment.basis.kind", fix=f"Known: {', '.join(kinds)}."
+        )
+    return kinds[data["kind"]].from_dict(data)
+
+
+THRESHOLD_SHARE = 0.05
+"""At the threshold the curve has gone this share of its way to the plateau; at saturation all but this share."""
+
+
+def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[str, dict[str, Any]]:
+    """The landmarks by name, each with `value`, `sd` and `unit`.
+
+    A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients.
+
+    Parameters
+    ----------
+    curve : Curve
+        f(u); where it falls, its plateau is below zero.
+    covariance_nm2 : ndarray, shape (basis.size, basis.size), optional
+        Covariance of the coefficients, N²·m².
+    """
+    width_us, torque_nm = curve.table()
+    top = int(np.argmax(np.abs(torque_nm)))
+    plateau_nm = float(torque_nm[top])
+    at_top = curve.basis.design(width_us[top : top + 1])[0]
+
+    def crossing(share: float) -> dict[str, Any]:
+        at_us = _crossing(width_us, torque_nm, share * plateau_nm)
+        if at_us is None:
+            return _estimate(None, None, "µs")
+        place = np.array([at_us])
+        # The width at which f(u) = share · plateau moves by the change of that difference over the curve's slope.
+        moved = _sd(curve.basis.design(place)[0] - share * at_top, covariance_nm2)
+        slope = abs(float(curve.slope(place)[0]))
+        return _estimate(at_us, moved / slope if moved is not None and slope > 0.0 else None, "µs")
+
+    return {
+        "threshold_us": crossing(THRESHOLD_SHARE),
+        "plateau_nm": _estimate(plateau_nm, _sd(at_top, covariance_nm2), "N·m"),
+        "saturation_us": crossing(1.0 - THRESHOLD_SHARE),
+    }
+
+
+def _crossing(width_us: np.ndarray, torque_nm: np.ndarray, level_nm: float) -> float | None:
+    """The first width at which the curve reaches a torque, linear between the table's rows."""
+    sign = 1.0 if level_nm >= 0 else -1.0
+    reached = np.flatnonzero(sign * torque_nm[1:] >= sign * level_nm)
+    if reached.size == 0 or level_nm == 0.0:
+        return None
+    first = int(reached[0])
+    low, high = torque_nm[first], torque_nm[first + 1]
+    share = (level_nm - low) / (high - low)
+    return float(width_us[first] + share * (width_us[first + 1] - width_us[first]))
+
+
+def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:
+    return None if covariance is None else float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
+
+
+def _estimate(value: float | None, sd: float | None, unit: str) -> dict[str, Any]:
+    return {"value": value, "sd": sd, "unit": unit}
+
+
+def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:
+    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search."""
+    a2 = float(np.exp(steepness_log))
+    return SigmoidBasis(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
+
+
+def fit_shape(
+    residual_of: Callable[[SigmoidBasis], np.ndarray], largest_us: float, seen_us: np.ndarray
+) -> SigmoidBasis:
+    """Least-squares estimate of the two shape parameters: a coarse scan, then a bounded trust-region search.
+
+    Parameters
+    ----------
+    residual_of : callable
+        Gives the residual for a shape, with all linear parameters solved for.
+    largest_us : float
+        Largest pulse width.
+    seen_us : ndarray
+        Pulse widths that were applied, µs; they bound the middle.
+    """
+    from scipy.optimize import least_squares
+
+    top = max(float(np.max(seen_us)), 1e-6)
+    scan = [
+        (float(np.log(steep / top)), share * top)
+        for steep in (3.0, 6.0, 12.0, 25.0, 60.0)
+        for share in (0.15, 0.3, 0.45, 0.6, 0.8)
+    ]
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return residual_of(basis_at(x[0], x[1] * top, largest_us))
+
+    costs = [float(np.sum(residual(np.array([s, m / top])) ** 2)) for s, m in scan]
+    best = scan[int(np.argmin(costs))]
+    bounds = ([np.log(0.5 / top), 0.0], [np.log(2000.0 / top), 1.2])
+    found = least_squares(
+        residual, [best[0], best[1] / top], bounds=bounds, x_scale=[0.3, 0.05], xtol=1e-12, ftol=1e-14, gtol=1e-14
+    )
+    return basis_at(found.x[0], found.x[1] * top, largest_us)
+
+
+def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:
+    """The sigmoid fitted to points, with its gain."""
+    largest = float(np.max(width_us))
+
+    def gain_and_residual(basis: SigmoidBasis) -> tuple[float, np.ndarray]:
+        column = basis.design(width_us)[:, 0]
+        gain = float(column @ torque_nm / max(float(column @ column), 1e-300))
+        return gain, torque_nm - gain * column
+
+    basis = fit_shape(lambda b: gain_and_residual(b)[1], largest, width_us)
+    return Curve(basis, np.array([gain_and_residual(basis)[0]]))

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from stimrig.identify.recruitment.spline import SplineBasis
+from stimrig.identify.recruitment.bases import SplineBasis
 
 KNOTS, FINE_KNOTS = 61, 121
 """The second where the first leave a residual: at a sudden bend, or in a muscle of few large units."""

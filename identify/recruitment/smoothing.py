@@ -1,4 +1,4 @@
-"""Smoothness of a recruitment curve: the penalty's weight from the data, by restricted maximum likelihood (REML)."""
+"""Knots of the recruitment spline, the penalty on its bending, and the penalty's weight from the data (REML)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,87 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+
+from stimrig.identify.recruitment.bases import SplineBasis
+
+KNOTS = 31
+SMOOTH_KNOTS = 19
+"""Enough if the pilot's curve rises over more than a quarter of the range: less to compute, and nothing is lost."""
+QUIET_KNOTS = 61
+"""For very small noise: the error of fewer knots at a bend would look like an effort or a tremor."""
+PILOT_KNOTS = 9
+NARROWEST_US = 0.5
+STRAIGHTEST = 0.003
+"""The penalty expects at least this share of the strongest bending everywhere, so no part is forced to be straight."""
+
+
+def knots_for(pilot_curve: tuple[np.ndarray, np.ndarray]) -> int:
+    """Number of knots that a curve needs, from the width of its rise (10 to 90 %) in a pilot fit."""
+    u, torque = pilot_curve
+    level = np.abs(torque) / max(float(np.max(np.abs(torque))), 1e-300)
+    rise = u[np.argmax(level >= 0.9)] - u[np.argmax(level >= 0.1)]
+    return SMOOTH_KNOTS if rise > u[-1] / 4 else KNOTS
+
+
+def adapted_knots(pilot_curve: tuple[np.ndarray, np.ndarray], largest_us: float, count: int = KNOTS) -> np.ndarray:
+    """Knots from a pilot curve (pulse widths, torques): their density follows half the length, half the bending."""
+    u, torque = pilot_curve
+    bend = np.abs(np.gradient(np.gradient(torque, u), u)) ** 0.5
+    # Smoothed, since the pilot shows the place of the bend only roughly.
+    width = max(u.size // 40, 1)
+    bend = np.convolve(np.pad(bend, width, mode="edge"), np.ones(2 * width + 1) / (2 * width + 1), mode="valid")
+    density = 0.5 + 0.5 * bend / max(float(np.mean(bend)), 1e-300)
+    mass = np.r_[0.0, np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(u))]
+    count = int(min(count, max(largest_us / NARROWEST_US, 4)))
+    knots = np.interp(np.linspace(0.0, mass[-1], count), mass, u)
+    knots[0], knots[-1] = 0.0, largest_us
+    return knots
+
+
+FEW_LEVELS = 6
+
+
+def bending_order(widths_us: np.ndarray) -> int:
+    """Derivative that the penalty keeps small: the third, or with few different widths the second.
+
+    With few widths a penalty on the third derivative would leave a parabola between them undetermined.
+    """
+    return 3 if np.unique(widths_us).size > FEW_LEVELS else 2
+
+
+def spline_roughness(
+    basis: SplineBasis, pilot: tuple[SplineBasis, np.ndarray] | None = None, order: int = 3
+) -> np.ndarray:
+    """Penalty ∫ω f'''² over the knots (or ∫ω f''²), scaled to have no unit.
+
+    The third derivative is used because a recruitment curve is a smooth bend, not a straight line. ω allows bending
+    where the curve bends: it follows the third derivative of a pilot, or else the spacing of the knots. So a rise
+    within a few µs does not make the plateau rough.
+
+    Parameters
+    ----------
+    basis : SplineBasis
+        The spline that is penalised.
+    pilot : tuple of SplineBasis and ndarray, optional
+        Basis and coefficients of a first estimate.
+    order : int
+        Derivative that the penalty keeps small, 3 or 2 (see `bending_order`).
+    """
+    if order == 2:
+        return basis.roughness * basis.largest_us**3
+    gaps = np.diff(basis.knots_us)
+    middle = basis.knots_us[:-1] + gaps / 2
+    third = basis.design(middle, derivative=3)
+    if pilot is None:
+        ease = (gaps / gaps.mean()) ** 3
+    else:
+        own = pilot[0].knots_us
+        centre = (own[1:] + own[:-1]) / 2
+        energy = (pilot[0].design(centre, derivative=3) @ pilot[1]) ** 2
+        energy = np.convolve(np.pad(energy, 2, mode="edge"), [0.1, 0.2, 0.4, 0.2, 0.1], mode="valid")
+        ease = 1.0 / (np.interp(middle, centre, energy) / max(float(energy.max()), 1e-300) + STRAIGHTEST)
+    return third.T @ (third * (ease * gaps)[:, None]) * basis.largest_us**5
+
 
 LOWEST, HIGHEST = 1e-9, 1e9
 """Bounds of the weight, relative to the balance of data and penalty."""

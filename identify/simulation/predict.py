@@ -10,15 +10,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from stimrig.identify import model_schema
-from stimrig.identify.dynamics import narx
-from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder
-from stimrig.identify.dynamics.make_grid import make_grid
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid, make_grid
+from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, narx_at_samples
 from stimrig.identify.effects import get
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadModel
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment.curve import Curve
+from stimrig.identify.recruitment import Curve
 from stimrig.identify.simulation.joint_surface import Acting, angle_range
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
@@ -73,7 +71,7 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
     """As `predict`, for a record on its grid."""
     if isinstance(model.linear, Discrete):
         if model.extra.get("narx"):
-            return narx.at_samples(model.extra["narx"], grid, model.linear.centre)
+            return narx_at_samples(model.extra["narx"], grid, model.linear.centre)
         return model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us)) + model.baseline_nm
     problem, theta = problem_of(model, grid)
     unpredictable = frozenset(e["id"] for e in model.effects if not get(e["id"]).predictable)

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
-from stimrig.identify.dynamics.mean_weights import read_means
 from stimrig.identify.dynamics.second_order import Core
+from stimrig.identify.dynamics.states import read_means
 from stimrig.identify.dynamics.variable_speed import SpeedLaw, run_core
 from stimrig.identify.effects.base import Form, Parameter
-from stimrig.identify.recruitment.curve import Basis
+from stimrig.identify.recruitment import Basis
 from stimrig.identify.simulation.setup import WITHIN, Setup
 
 _NONE = np.zeros((0, 1))

@@ -9,9 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import Grid, ends_of
+from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.effects.base import Scene
-from stimrig.identify.recruitment.curve import Basis
+from stimrig.identify.recruitment import Basis
 
 WITHIN = 5
 """A joint that turns round within a pulse interval has dry friction on both sides: the middle knows one of them."""

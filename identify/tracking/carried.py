@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.make_grid import make_grid
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Form, Scene
 from stimrig.identify.errors import BadModel
 from stimrig.identify.model import Model
 from stimrig.identify.model_schema import parameter_value
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment.curve import Curve
-from stimrig.identify.recruitment.spline import SplineBasis
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.tracking.forms import placed
 from stimrig.identify.tracking.state import State, Values
 

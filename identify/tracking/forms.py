@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects.base import Form, Parameter, Scene
 from stimrig.identify.model import Model
 from stimrig.identify.simulation.predict import problem_of

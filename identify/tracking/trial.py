@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stimrig.identify.dynamics.make_grid import make_grid
-from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record

@@ -22,7 +22,8 @@ from stimrig.api.cohort import bids, dictionary
 from stimrig.api.models import inverted
 from stimrig.api.web.routes import trend
 from stimrig.api.workers import verbs
-from stimrig.identify.records import cells, parts_csv
+from stimrig.identify.records import cells
+from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.record import Record, Source
 from tests.harness.cohort_records import Session, write
 
@@ -31,7 +32,7 @@ WRITES = re.compile(r'csv\.(?:Dict)?[wW]riter|savetxt|to_csv|write_csv|"(?:,|;|\
 ONLY_NUMBERS = "numbers under a header of ours"
 DOORS: dict[str, tuple[int, str]] = {
     "identify/records/cells.py": (1, "the writer itself"),
-    "identify/records/parts_csv.py": (3, "test_a_joined_record"),
+    "identify/records/join.py": (3, "test_a_joined_record"),
     "api/workers/verbs.py": (2, "test_a_recording"),
     "api/web/routes/trend.py": (2, "test_a_trend"),
     "api/web/routes/recordings.py": (4, "names the kind of what api/workers/verbs.py wrote, and of files as they came"),
@@ -80,7 +81,7 @@ def test_a_number_stays_a_number() -> None:
 
 def test_a_joined_record(tmp_path: Path) -> None:
     record = named()
-    parts_csv.write(record, tmp_path / "joined.csv")
+    write_joined(record, tmp_path / "joined.csv")
     assert texts_of(tmp_path / "joined.csv", "segment", "name") >= {cells.told(text) for text in HOSTILE}
     back = identify.read(tmp_path / "joined.csv")
     assert back.segment_names == record.segment_names

@@ -9,7 +9,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.cli import main
-from stimrig.identify.records import parts_csv
+from stimrig.identify.records.join import write_joined
 from tests.api.test_cli import run
 from tests.api.test_worker import made_up_csv
 from tests.identify import hidden_muscles
@@ -83,7 +83,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         hidden_muscles.record("electromechanical_delay", seed=7), effects=["electromechanical_delay"]
     )
     model.write_text(earlier.to_json())
-    parts_csv.write(hidden_muscles.record("", seed=8), data)
+    write_joined(hidden_muscles.record("", seed=8), data)
     return model, data
 
 

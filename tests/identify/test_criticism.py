@@ -10,7 +10,7 @@ import pytest
 from stimrig import identify
 from stimrig.identify.criticism import compare
 from stimrig.identify.criticism.correlation import _auto, _bands, _cross, _filtered
-from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.grid import make_grid
 from tests.identify import hidden_muscles
 
 

@@ -11,7 +11,7 @@ from stimrig.identify import fit
 from stimrig.identify.effects import get, library, registry
 from stimrig.identify.effects.base import STAGES
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.estimation.plain import fit_plain, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem

@@ -11,11 +11,10 @@ import pytest
 from stimrig import identify
 from stimrig.identify.criticism import compare
 from stimrig.identify.criticism.correlation import correlation_tests
-from stimrig.identify.dynamics import pulse_grid
-from stimrig.identify.dynamics.make_grid import make_grid
-from stimrig.identify.dynamics.pulse_grid import Grid
+from stimrig.identify.dynamics import grid as pulse_grid
+from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.methods import methods
-from stimrig.identify.records.read import read
+from stimrig.identify.records import read
 from stimrig.identify.records.record import OPTIONAL, Record
 from stimrig.identify.simulation.predict import predict
 from tests.harness.muscle import FINE_HZ, Patient, second_order

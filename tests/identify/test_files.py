@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.identify.records.read import read
+from stimrig.identify.records import read
 from tests.harness.patients import Patient, make_record
 
 HEADER = "time_s,pulse_width_us,torque_nm,segment"

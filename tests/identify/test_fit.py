@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from stimrig import identify
+from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.estimation.evaluation import BLOCK_S, FOLDS, held_out_change
-from stimrig.identify.estimation.fit_statistics import best_fit_percent
+from stimrig.identify.estimation.fit_statistics import BLOCK_S, FOLDS, best_fit_percent, held_out_change
 from stimrig.identify.estimation.joint import solve
-from stimrig.identify.estimation.prepare import fit_plain, prepare
-from stimrig.identify.paper import muscle
+from stimrig.identify.estimation.plain import fit_plain, prepare
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 from tests.harness.patients import Patient, make_record
@@ -220,7 +219,7 @@ def test_an_effect_that_is_asked_for_is_fitted_to_its_end() -> None:
     patient = Patient.draw(rng)
     rng.choice(5), rng.choice(3)  # as `python -m bench goals` draws rate and noise, in whose records it was seen
     baseline_nm = float(rng.uniform(-1, 1))
-    record, _ = make_record(patient, rng, noise_nm=0.1, baseline_nm=baseline_nm, pulses=muscle.protocol())
+    record, _ = make_record(patient, rng, noise_nm=0.1, baseline_nm=baseline_nm, pulses=paper.protocol())
     plain = identify.fit(record)
     delayed = identify.fit(record, effects=["electromechanical_delay:delay"])
     assert delayed.fit["fit_percent"] > plain.fit["fit_percent"] - 0.1

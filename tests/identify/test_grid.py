@@ -8,14 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from stimrig.identify.dynamics import pulse_grid
-from stimrig.identify.dynamics.boundary import boundary_states
+from stimrig.identify.dynamics import grid as pulse_grid
+from stimrig.identify.dynamics.grid import make_grid, runs
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.make_grid import make_grid
-from stimrig.identify.dynamics.pulse_grid import runs
 from stimrig.identify.dynamics.second_order import transition
+from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.noise.ar1 import best_ar1, log_likelihood, whiten
+from stimrig.identify.noise import best_ar1, log_likelihood, whiten
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
 

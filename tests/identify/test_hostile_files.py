@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from stimrig import identify
+from stimrig.identify.json_text import BadJson, parse
 from stimrig.identify.records import bounds
 from stimrig.identify.records.hdf5 import StrictFile
-from stimrig.identify.strict_json import BadJson, parse
 from tests.harness import hostile_shapes as shapes
 
 pytestmark = pytest.mark.slow

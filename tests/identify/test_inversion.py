@@ -16,8 +16,8 @@ from stimrig.identify.inversion.demand import BEND, RIDGE, Banded, Bounds, best_
 from stimrig.identify.inversion.plant import on_pulses
 from stimrig.identify.inversion.table import read_reference
 from stimrig.identify.model import Model
-from stimrig.identify.recruitment.curve import Curve
-from stimrig.identify.recruitment.sigmoid import SigmoidBasis
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import SigmoidBasis
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 from tests.identify import hidden_muscles
 

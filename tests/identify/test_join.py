@@ -10,12 +10,10 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify import Record
-from stimrig.identify.dynamics.make_grid import make_grid
-from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.estimation.prepare import fit_plain, prepare
-from stimrig.identify.records import parts_csv
-from stimrig.identify.records.join import PAUSE_S, join
+from stimrig.identify.estimation.plain import fit_plain, prepare
+from stimrig.identify.records.join import PAUSE_S, join, write_joined
 from stimrig.identify.records.record import Part, Pulses, Source
 
 
@@ -45,7 +43,7 @@ def same(one: Record, other: Record, *, but: tuple[str, ...] = ()) -> bool:
 
 def through_file(joined: Record, folder: Path) -> Record:
     path = folder / "joined.csv"
-    parts_csv.write(joined, path)
+    write_joined(joined, path)
     return identify.read(path)
 
 
@@ -341,7 +339,7 @@ def test_column_part_of_somebody_else_is_passed_over(tmp_path):
 def test_file_with_wrong_parts_is_refused(tmp_path, column, value, says):
     a, b = record(400), record(400, name="b", seed=2)
     path = tmp_path / "joined.csv"
-    parts_csv.write(join([a, b], [0.0, 16.0] if column == "folded_s" else [0.0, 100.0]), path)
+    write_joined(join([a, b], [0.0, 16.0] if column == "folded_s" else [0.0, 100.0]), path)
     lines = path.read_text().splitlines()
     place = lines[0].split(",").index(column)
     for number in range(a.time_s.size + 1, len(lines)) if column == "part" else [a.time_s.size + 1]:

@@ -16,7 +16,7 @@ from scipy.io import loadmat, savemat
 
 from stimrig import identify
 from stimrig.identify import plain_mat
-from stimrig.identify.records.mat_file import BadMat, variables
+from stimrig.identify.records.mat import BadMat, variables
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from stimrig import identify
+from stimrig.identify import paper
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
-from stimrig.identify.dynamics.make_grid import make_grid
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.methods import Method, method_of, methods
-from stimrig.identify.methods.support.output_error import choose_order, output_error
-from stimrig.identify.paper import table1
+from stimrig.identify.methods.two_stage import choose_order, output_error
 from tests.harness.patients import Patient, make_record, multilevel, prbs
 
 ALL = ("maximum-likelihood", "narx", "ramp-deconvolution", "separable-least-squares", "two-stage")
@@ -185,7 +185,7 @@ def test_output_error_recovers_known_coefficients_from_multilevel_input():
 
 def test_table1_rows_and_progress():
     seen = []
-    found = table1.run(2, lambda share, text: seen.append((share, text)), noise_levels_nm=(0.0, 0.1))
+    found = paper.table1(2, lambda share, text: seen.append((share, text)), noise_levels_nm=(0.0, 0.1))
     assert len(found["rows"]) == 8
     assert seen[-1][0] == pytest.approx(1.0)
     row = {(r["noise_nm"], r["method"]): r for r in found["rows"]}

@@ -13,10 +13,8 @@ from stimrig import identify
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.estimation.quality import range_warnings
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment.curve import Curve
-from stimrig.identify.recruitment.power import PowerBasis
-from stimrig.identify.recruitment.sigmoid import SigmoidBasis
-from stimrig.identify.recruitment.spline import SplineBasis
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis, SplineBasis
 from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 

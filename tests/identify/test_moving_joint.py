@@ -15,7 +15,7 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import changed, record
-from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import get
 from stimrig.identify.effects.passive_torque import relaxed
 from stimrig.identify.errors import BadModel, BadRequest

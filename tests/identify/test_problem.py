@@ -7,7 +7,7 @@ import pytest
 
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from stimrig.identify.effects import get
-from stimrig.identify.estimation.prepare import fit_plain, prepare
+from stimrig.identify.estimation.plain import fit_plain, prepare
 from stimrig.identify.records.join import join
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup

@@ -10,7 +10,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.criticism import compare
-from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent
 from stimrig.identify.estimation.quality import quality
 from tests.harness.patients import Patient, make_record

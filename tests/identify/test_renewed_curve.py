@@ -13,11 +13,9 @@ from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.diagnosis.result import steps
 from stimrig.identify.diagnosis.search import search_effects
 from stimrig.identify.effects import get
-from stimrig.identify.estimation.effect_fit import fitted_with, with_effects
+from stimrig.identify.estimation.effect_fit import fitted_with, renewed_curve, with_effects
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.prepare import prepare
-from stimrig.identify.estimation.renewed_curve import renewed_curve
-from stimrig.identify.estimation.rows import fitted_rows
+from stimrig.identify.estimation.plain import fitted_rows, prepare
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.methods.maximum_likelihood import METHOD
 from stimrig.identify.records.record import Record
@@ -70,7 +68,7 @@ def test_a_model_is_not_lost_where_no_better_curve_is_found(monkeypatch: pytest.
         raise np.linalg.LinAlgError("not positive definite")
 
     base = first()
-    monkeypatch.setattr(f"stimrig.identify.estimation.renewed_curve.{step}", fails)
+    monkeypatch.setattr(f"stimrig.identify.estimation.effect_fit.{step}", fails)
     assert renewed_curve(base) is base
 
 

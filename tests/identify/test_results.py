@@ -16,7 +16,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.methods import methods
-from stimrig.identify.shown import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
+from stimrig.identify.summary import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
 from tests.harness import few_effects
 from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
@@ -281,7 +281,7 @@ def test_an_estimate_without_a_deviation_has_no_plus_minus():
 
 
 def test_results_are_drawn_by_the_registered_plotter(results, record, monkeypatch):
-    monkeypatch.setattr("stimrig.identify.shown._plotters", [])
+    monkeypatch.setattr("stimrig.identify.summary._plotters", [])
     with pytest.raises(identify.BadRequest, match="no plotter is registered"):
         results["model"].plot(record)
     drawn = []

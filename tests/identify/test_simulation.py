@@ -8,11 +8,11 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.hidden_records import generate
 from stimrig.identify.effects import get
-from stimrig.identify.estimation.band_effect import predict_fitted
 from stimrig.identify.estimation.effect_fit import fitted_with, try_effect
-from stimrig.identify.estimation.prepare import fit_plain, prepare
-from stimrig.identify.noise.level import NoiseLevel, band_part, profile, whitened
-from stimrig.identify.noise.slow_and_white import whiten_rows
+from stimrig.identify.estimation.joint import predict_fitted
+from stimrig.identify.estimation.plain import fit_plain, prepare
+from stimrig.identify.noise import NoiseLevel, band_part, profile, whitened
+from stimrig.identify.noise.kernels import whiten_rows
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 from tests.identify import hidden_muscles

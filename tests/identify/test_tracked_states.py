@@ -13,7 +13,7 @@ import pytest
 
 from stimrig.hardware_sim.offline import simulate
 from stimrig.hardware_sim.patients import registry
-from stimrig.identify.dynamics.make_grid import make_grid
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import registry as effects
 from stimrig.identify.errors import BadModel
 from stimrig.identify.fitting import fit

@@ -12,8 +12,7 @@ from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p
 from stimrig.identify.estimation.uncertainty import prediction_band
-from stimrig.identify.noise.ar1 import ar1_or_white, best_ar1, log_likelihood, whiten
-from stimrig.identify.noise.level import NoiseLevel, correlation_slopes
+from stimrig.identify.noise import NoiseLevel, ar1_or_white, best_ar1, correlation_slopes, log_likelihood, whiten
 from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 

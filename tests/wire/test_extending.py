@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from stimrig.identify.records.read import read
+from stimrig.identify.records import read
 from tests.harness.processes import Bench, RigClient, default_plan
 
 pytestmark = pytest.mark.wire

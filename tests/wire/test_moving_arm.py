@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stimrig.identify.records.read import read
+from stimrig.identify.records import read
 from stimrig.identify.records.record import Record
 from tests.harness.processes import Bench, default_plan
 

@@ -35,7 +35,7 @@ def diagnose(
 def diagnosis_lines(found: dict[str, Any]) -> list[str]:
     """A diagnosis for people."""
     from stimrig.identify.caution import caution
-    from stimrig.identify.shown import held_out_label, probability, sure
+    from stimrig.identify.summary import held_out_label, probability, sure
 
     base, verdict, doubt = found["base"], found["verdict"], caution(found)
     said = str(VERDICTS.get(verdict, verdict)).rstrip(".")
@@ -80,7 +80,7 @@ def next_step(found: dict[str, Any], doubt: str) -> str:
 
 def effect_lines(effect: dict[str, Any]) -> list[str]:
     """One candidate."""
-    from stimrig.identify.shown import probability, sure
+    from stimrig.identify.summary import probability, sure
 
     p = float(effect.get("probability") or 0.0)
     lines = [

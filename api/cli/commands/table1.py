@@ -15,10 +15,10 @@ def table1(
     as_json: Json = False,
 ) -> None:
     """Best-fit rates at each noise level, ours beside the paper's."""
-    from stimrig.identify.paper import table1 as table_one
+    from stimrig.identify import paper
 
     with progress_bar() as progress:
-        found = table_one.run(trials, progress)
+        found = paper.table1(trials, progress)
     say_json(found) if as_json else say(*lines(found))
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stimrig.identify.dynamics.pulse_grid import Grid, runs
+from stimrig.identify.dynamics.grid import Grid, runs
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.rows import rows_of
+from stimrig.identify.estimation.plain import rows_of
 
 
 def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarray:
@@ -97,3 +97,8 @@ def flag(value: object, name: str) -> bool:
     if text not in {"true", "false", "1", "0", "yes", "no"}:
         raise BadRequest(f"invalid value {value!r}", place=name, fix="Give true or false.")
     return text in {"true", "1", "yes"}
+
+
+def shifted(values: np.ndarray, by: int) -> np.ndarray:
+    """Values `by` rows later, from rest."""
+    return np.concatenate([np.zeros(by), values[: values.size - by]]) if by else values

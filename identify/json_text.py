@@ -1,4 +1,4 @@
-"""Strict reading of JSON from outside: limited depth, no duplicate keys."""
+"""Values as JSON can hold them, and strict reading of JSON from outside: limited depth, no duplicate keys."""
 
 from __future__ import annotations
 
@@ -7,6 +7,26 @@ import math
 import re
 from collections import Counter
 from typing import Any
+
+import numpy as np
+
+
+def json_value(value: Any) -> Any:
+    """Arrays as lists, numpy numbers as numbers, and numbers that are not finite as None."""
+    if isinstance(value, dict):
+        return {str(key): json_value(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return json_value(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [json_value(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
+
 
 DEEPEST = 32
 TOKEN = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)|[\[{]|[\]}]', re.DOTALL)

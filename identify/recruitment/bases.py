@@ -1,4 +1,4 @@
-"""Cubic spline recruitment: equation (8) of the paper, in the basis of B-splines."""
+"""Bases of recruitment curves: cubic splines (8), power series (6) and the sigmoid (30) of the paper."""
 
 from __future__ import annotations
 
@@ -106,3 +106,91 @@ def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 
     values = np.zeros((at.size, size))
     np.put_along_axis(values, span[:, None] - degree + np.arange(degree + 1), local, axis=1)
     return values
+
+
+@dataclass(frozen=True)
+class PowerBasis:
+    """Powers 1 … order of u / scale.
+
+    Parameters
+    ----------
+    order : int
+        Highest power.
+    scale_us : float
+        Pulse width that is scaled to 1, so that all powers have a similar size, µs.
+    """
+
+    order: int
+    scale_us: float
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.order
+
+    @property
+    def largest_us(self) -> float:
+        """Pulse width beyond which the curve is held, µs."""
+        return self.scale_us
+
+    def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Powers (or a derivative) at pulse widths of any shape; shape (..., order)."""
+        u = np.clip(np.asarray(pulse_width_us, float), 0.0, self.scale_us) / self.scale_us
+        columns = []
+        for p in range(1, self.order + 1):
+            lead = float(np.prod(np.arange(p, p - derivative, -1))) if derivative else 1.0
+            columns.append(lead * u ** max(p - derivative, 0) / self.scale_us**derivative)
+        return np.stack(columns, axis=-1)
+
+    def to_dict(self) -> dict:
+        return {"kind": "power-series", "order": self.order, "scale_us": self.scale_us}
+
+    @classmethod
+    def from_dict(cls, data: dict) -> PowerBasis:
+        return cls(int(data["order"]), float(data["scale_us"]))
+
+
+@dataclass(frozen=True)
+class SigmoidBasis:
+    """The sigmoid of equation (30) with its two shape parameters fixed: one coefficient, the gain a1 in N·m.
+
+    Parameters
+    ----------
+    a2_per_us : float
+        Steepness, 1/µs, positive.
+    a3 : float
+        Position: half of the gain is reached where e^{a2 u} = a3 + 2.
+    largest_us : float
+        Largest pulse width it was fitted on, µs.
+    """
+
+    a2_per_us: float
+    a3: float
+    largest_us: float = 300.0
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return 1
+
+    def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Shape (..., 1); derivatives by the closed form, up to the second."""
+        u = np.asarray(pulse_width_us, float)
+        decay = np.exp(-self.a2_per_us * np.maximum(u, 0.0))
+        bottom = 1.0 + self.a3 * decay
+        if derivative == 0:
+            value = (1.0 - decay) / bottom
+        elif derivative == 1:
+            value = self.a2_per_us * (1.0 + self.a3) * decay / bottom**2
+        elif derivative == 2:
+            value = self.a2_per_us**2 * (1.0 + self.a3) * decay * (self.a3 * decay - 1.0) / bottom**3
+        else:
+            raise ValueError("derivatives up to the second")
+        return value[..., None]
+
+    def to_dict(self) -> dict:
+        return {"kind": "sigmoid", "a2_per_us": self.a2_per_us, "a3": self.a3, "largest_us": self.largest_us}
+
+    @classmethod
+    def from_dict(cls, data: dict) -> SigmoidBasis:
+        return cls(float(data["a2_per_us"]), float(data["a3"]), float(data.get("largest_us", 300.0)))

@@ -1,0 +1,403 @@
+"""From a record to the fit of the plain structure: which rows are fitted, a pilot with few knots, the final spline.
+
+Of a moving joint, the rows at one angle are fitted to begin with. The set-up is shared by all candidates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from stimrig.identify.dynamics.grid import Grid, make_grid
+from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.joint import Fitted, solve
+from stimrig.identify.estimation.projection import Projection, Solution, State, bounded, descend, search
+from stimrig.identify.estimation.samples import Raw, inspect, white_noise
+from stimrig.identify.noise import NoiseLevel, ar1_or_white, whiten
+from stimrig.identify.records.record import HELD_OUT, Record
+from stimrig.identify.recruitment.bases import SplineBasis
+from stimrig.identify.recruitment.smoothing import (
+    KNOTS,
+    PILOT_KNOTS,
+    QUIET_KNOTS,
+    adapted_knots,
+    bending_order,
+    knots_for,
+    spline_roughness,
+)
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
+
+LEAST_ROWS = 8
+STILL_RAD_S = 0.05
+"""A joint that moves more slowly is held still."""
+ONE_ANGLE_RAD = 0.09
+"""Angles that differ from the middle by less are one: 5 degrees, within which the active torque hardly changes."""
+LEAST_S = 3.0
+"""Stimulation at one angle from which a first curve can be found there."""
+LEAST_WIDTHS = 5
+WIDEST_SHARE = 0.9
+"""The widest pulse at this angle is at least this share of the widest one anywhere."""
+
+
+def rows_of(grid: Grid, names: Sequence[str]) -> np.ndarray:
+    """bool, shape (K,): intervals of segments with these names."""
+    wanted = np.array([name in names for name in grid.record.segment_names])
+    return wanted[grid.segment]
+
+
+def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
+    """Rows to fit: those of the named segments and the rests, which determine the baseline; never held-out rows.
+
+    Raises
+    ------
+    BadRequest
+        A named segment is not in the record, or is the held-out one.
+    NotIdentifiable
+        Fewer than eight pulse intervals are left to fit.
+    """
+    if fit_on is not None:
+        check_segments(grid, fit_on)
+        rows = grid.fitted & rows_of(grid, (*fit_on, "rest"))
+    else:
+        rows = grid.fitted
+    refuse_few(rows)
+    return rows
+
+
+def refuse_few(rows: np.ndarray) -> None:
+    """Refuse too few rows to fit.
+
+    Raises
+    ------
+    NotIdentifiable
+        With their number.
+    """
+    if rows.sum() < LEAST_ROWS:
+        raise NotIdentifiable(
+            f"only {int(rows.sum())} pulse intervals may be fitted", fix="Give rows of segments other than `validate`."
+        )
+
+
+def check_segments(grid: Grid, names: Sequence[str]) -> None:
+    """Refuse names of segments that the record does not have, and the held-out one.
+
+    Raises
+    ------
+    BadRequest
+        With the names that can be used.
+    """
+    there = tuple(dict.fromkeys(grid.record.segment_names))
+    for name in names:
+        if name == HELD_OUT:
+            raise BadRequest("rows of `validate` are never fitted", place="fit_on", fix="Name other segments.")
+        if name not in there:
+            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", fix=f"It has: {', '.join(there)}.")
+
+
+def still_rows(grid: Grid, rows: np.ndarray) -> np.ndarray:
+    """Of some rows, those in which the joint is held at the angle with most stimulation, shape (K,).
+
+    Where the joint never moved, where there is no angle, or where too little was stimulated at any one angle: all.
+    """
+    if grid.angle_rad is None or not moves(grid, rows):
+        return rows
+    own = np.zeros(grid.size, bool)
+    still = rows & (np.abs(_velocity(grid)) < STILL_RAD_S)
+    if still.any():
+        own = still & (np.abs(grid.angle_rad - _middle(grid.angle_rad, still, grid.pulse_width_us)) < ONE_ANGLE_RAD)
+    widths_us = grid.pulse_width_us[own & (grid.pulse_width_us > 0)]
+    enough = (
+        widths_us.size * grid.step_s >= LEAST_S
+        and np.unique(widths_us).size >= LEAST_WIDTHS
+        and widths_us.max() >= WIDEST_SHARE * grid.pulse_width_us[rows].max()
+    )
+    return own if enough else rows
+
+
+def moves(grid: Grid, rows: np.ndarray) -> bool:
+    """Whether the joint is at more than one angle in some rows."""
+    return grid.angle_rad is not None and bool(np.ptp(grid.angle_rad[rows]) > 2 * ONE_ANGLE_RAD)
+
+
+def joint_of(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
+    """Fields of a `Setup`: the reference angle, and the range of the fitted angles; none without an angle.
+
+    The reference is the angle at which most was stimulated while the joint was still, else the median while stimulated:
+    it does not depend on where the record begins.
+    """
+    if grid.angle_rad is None:
+        return {}
+    still = rows & (np.abs(_velocity(grid)) < STILL_RAD_S) & (grid.pulse_width_us > 0)
+    stimulated = rows & (grid.pulse_width_us > 0)
+    if still.any():
+        reference = _middle(grid.angle_rad, still, grid.pulse_width_us)
+    else:
+        reference = float(np.median(grid.angle_rad[stimulated if stimulated.any() else rows]))
+    return {
+        "reference_rad": reference,
+        "angle_range_rad": (float(grid.angle_rad[rows].min()), float(grid.angle_rad[rows].max())),
+    }
+
+
+def _middle(angle_rad: np.ndarray, still: np.ndarray, width_us: np.ndarray) -> float:
+    """The angle around which most stimulated rows lie, rad: the median of those in the fullest window."""
+    at = np.sort(angle_rad[still & (width_us > 0)])
+    if not at.size:
+        at = np.sort(angle_rad[still])
+    ends = np.searchsorted(at, at + 2 * ONE_ANGLE_RAD, side="right")
+    first = int(np.argmax(ends - np.arange(at.size)))
+    return float(np.median(at[first : ends[first]]))
+
+
+def _velocity(grid: Grid) -> np.ndarray:
+    assert grid.angle_rad is not None
+    if grid.velocity_rad_s is not None:
+        return np.nan_to_num(grid.velocity_rad_s)
+    return np.gradient(np.nan_to_num(grid.angle_rad), grid.step_s)
+
+
+STARTS_S = (0.12, 0.4)
+ROUNDING = 2e-5
+"""Share of the torque's range below which a residual is not noise."""
+QUIET = 0.0015
+"""If the noise of a sample is below this share of the torque's range, the spline gets more knots: its error at a bend
+would be visible."""
+CURVE_POINTS = 201
+
+
+def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Solution:
+    """A first fit with few knots, from the best of several starting values of the time constant.
+
+    Raises
+    ------
+    NotIdentifiable
+        The pulse width or the torque never changes.
+    """
+    largest = float(np.max(grid.pulse_width_us))
+    seen = grid.pulse_width_us[rows]
+    if not largest > 0 or np.ptp(seen) <= 0:
+        raise NotIdentifiable(
+            "the pulse width never changes in the fitted rows" if largest > 0 else "the record has no pulse",
+            fix="Record a PRBS and a ramp.",
+        )
+    if np.ptp(grid.torque_nm[rows]) <= 0:
+        raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
+    basis = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
+    order = bending_order(grid.pulse_width_us[rows])
+    projection = Projection(grid, basis, spline_roughness(basis, order=order), rows, delay_s)
+    target = whiten(projection.target, projection.stretches, 0.0)
+    delay = 0.0 if delay_s is None else delay_s
+    starts = [State(projection, bounded(projection, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
+    best = min(starts, key=lambda state: state.cost)
+    return descend(best, most=12, tolerance=0.5)
+
+
+def designed(first: Solution, count: int | None = None) -> tuple[Projection, SecondOrder]:
+    """The projection with its final spline, and the start of its search, from a pilot.
+
+    The few knots of the pilot show roughly where the curve bends. A curve with all knots shows place and size of the
+    bend better; repeating this once improves a steep rise.
+    """
+    old = first.projection
+    curve = pilot_curve(first)
+    count = knots_for(curve) if count is None else count
+    basis = SplineBasis(adapted_knots(curve, float(np.max(old.grid.pulse_width_us)), count))
+    order = bending_order(old.grid.pulse_width_us[old.rows])
+    projection = Projection(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.delay_s)
+    target = whiten(projection.target, projection.stretches, 0.0)
+    for _ in range(2):
+        coefficients = State(projection, first.linear, target, 0.0, None).coefficients[: basis.size]
+        projection, basis = _redesigned(projection, basis, coefficients, count)
+    return projection, first.linear
+
+
+def _redesigned(
+    old: Projection, basis: SplineBasis, coefficients: np.ndarray, count: int
+) -> tuple[Projection, SplineBasis]:
+    """The projection with knots and penalty from a first curve."""
+    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
+    new = SplineBasis(adapted_knots((u, basis.design(u) @ coefficients), basis.largest_us, count))
+    order = bending_order(old.grid.pulse_width_us[old.rows])
+    roughness = spline_roughness(new, (basis, coefficients), order)
+    return Projection(old.grid, new, roughness, old.rows, old.delay_s), new
+
+
+def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """The curve of a solution on 201 pulse widths."""
+    basis = solution.projection.basis
+    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
+    return u, basis.design(u) @ solution.coefficients[: basis.size]
+
+
+def estimate(
+    grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: float | None = None
+) -> tuple[Solution, float]:
+    """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
+    first = pilot_solution(grid, rows, delay_s)
+    quiet = 0.0 < grid.noise_sd_nm < QUIET * float(np.ptp(grid.torque_nm[rows]))
+    projection, start = designed(first, QUIET_KNOTS if knots is None and quiet else knots)
+    solution = search(projection, start)
+    ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
+    if delta_bic > 0 and knots is None and projection.basis.size < KNOTS:
+        # The correlation may come from a bend that few knots cannot follow: first try all knots.
+        projection, start = designed(first, KNOTS)
+        solution = search(projection, start)
+        ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
+    # Without noise the residual is rounding and the spline's own error, which need no noise model.
+    still = solution.variance < (ROUNDING * float(np.ptp(projection.target[rows]))) ** 2
+    for _ in range(0 if still else 3):
+        if delta_bic <= 0:
+            break
+        solution = search(projection, solution.linear, ar1=ar1)
+        before = ar1
+        ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
+        if abs(ar1 - before) < 0.01:
+            break
+    return solution, delta_bic
+
+
+LEAST_SPREAD = 0.2
+"""The noise of a part is taken as at least this share of the largest one."""
+NEGLIGIBLE_LAG_S, QUICK_S = 1e-3, 3e-3
+"""A second lag below the first value hardly changes the torque, and a search stops there: it is restarted at
+QUICK_S."""
+
+
+def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
+    """Means over pulse intervals, N·m; NaN where there is no sample."""
+    total = np.bincount(grid.interval, torque_nm, minlength=grid.size) / np.maximum(grid.count, 1)
+    return np.where(grid.count > 0, total, np.nan)
+
+
+def prepare(record: Record) -> tuple[Grid, Raw]:
+    """Put a record on its grid, without hum and with its white noise; and what its samples show.
+
+    Raises
+    ------
+    BadRecord, NotIdentifiable
+        No grid can be made, too few rows may be fitted, there is no pulse, or the torque never changes.
+    """
+    grid = make_grid(record)
+    refuse_few(grid.fitted)
+    if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
+        raise NotIdentifiable("the record has no pulse", fix="Record a PRBS and a ramp.")
+    if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
+        raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
+    raw = inspect(record, grid.start_s)
+    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm), raw
+
+
+def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
+    """Fit the plain structure. Its set-up is shared by all candidates of the record.
+
+    Knots and smoothness of the recruitment curve are chosen here. They are not changed while effects are tried; once
+    that is over, those of a joint that moves may be chosen again (`renewed_curve`).
+    """
+    return to_fitted(estimate(grid, still_rows(grid, rows))[0], rows)
+
+
+def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20) -> Fitted:
+    """The solution of the joint problem on some rows, with white and slow noise, started from a projected solution.
+
+    The projected solution may be of fewer rows, where the joint moves in the others: see `still_rows`.
+    """
+    solution = _with_zeros(solution, rows)
+    setup = setup_of(solution, rows)
+    problem = Problem(setup, [])
+    size, linear = solution.projection.basis.size, solution.linear
+    values = np.zeros(problem.size)
+    values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
+    parts = setup.grid.begins.size
+    values[list(problem.baselines)] = setup.to_muscle(solution.coefficients[size : size + parts])
+    values[list(problem.initials)] = setup.sign * solution.coefficients[size + parts :]
+    values[problem.coefficients] = setup.sign * solution.coefficients[:size]
+    noise = NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
+    fitted = solve(problem, problem.from_physical(values), noise, most=most)
+    values = fitted.physical
+    quick_s, slow_s = 0.5 * values[0] / values[1], 2.0 * values[0] * values[1]
+    if not most or quick_s > NEGLIGIBLE_LAG_S:
+        return fitted
+    values[0] = np.sqrt(QUICK_S * slow_s)
+    values[1:3] = 0.5 * (QUICK_S + slow_s) / values[0], 0.0
+    theta = np.clip(problem.from_physical(values), problem.lower, problem.upper)
+    return max(fitted, solve(problem, theta, noise, most=most), key=lambda found: found.log_evidence)
+
+
+def _with_zeros(solution: Solution, rows: np.ndarray) -> Solution:
+    """The solution with a zero for parts of which it has no row: the middle of their torque without pulses."""
+    projection, grid = solution.projection, solution.projection.grid
+    found = solution.coefficients.copy()
+    for part in range(grid.begins.size):
+        own = rows & (grid.part == part)
+        if own.any() and not np.any(projection.rows & own):
+            rest = own & (grid.pulse_width_us == 0)
+            found[projection.basis.size + part] = np.median(grid.torque_nm[rest if rest.any() else own])
+    return replace(solution, coefficients=found)
+
+
+def setup_of(solution: Solution, rows: np.ndarray) -> Setup:
+    """The set-up that all candidates share, from the projected solution and the rows that are fitted."""
+    projection, grid = solution.projection, solution.projection.grid
+    size = projection.basis.size
+    curve = projection.basis.design(np.linspace(0.0, projection.basis.largest_us, 101)) @ solution.coefficients[:size]
+    sign = 1.0 if curve[np.argmax(np.abs(curve))] >= 0 else -1.0
+    zero = float(solution.coefficients[size])
+    target = sign * (grid.torque_nm - zero)
+    parts = grid.begins.size
+    own_zero = sign * (solution.coefficients[size : size + parts][grid.part] - zero)
+    smooth = np.convolve(np.where(rows, target - own_zero, 0.0), np.ones(3) / 3, "same")
+    scale = float(np.percentile(np.abs(smooth[rows]), 99.5))
+    return Setup(
+        grid=grid,
+        target_nm=target,
+        fitted=rows,
+        basis=projection.basis,
+        roughness=solution.weight / max(solution.variance, 1e-300) * projection.roughness,
+        scale_nm=max(scale, 1e-9),
+        noise_sd_nm=grid.noise_sd_nm,
+        delay_bounds_s=grid.delay_bounds_s if projection.delay_s is None else (projection.delay_s, projection.delay_s),
+        zero_nm=zero,
+        sign=sign,
+        spread=_spread(grid),
+        reference_s=_reference(grid, rows),
+        **joint_of(grid, rows),
+    )
+
+
+def _spread(grid: Grid) -> np.ndarray | float:
+    """Noise of each interval, divided by the mean noise: each part of a record has its own noise."""
+    parts = grid.begins.size
+    if parts == 1:
+        return 1.0
+    record = grid.record
+    kept = grid.counted & ~record.held_out
+    parts_sd = [_part_noise(record, record.torque_nm[kept & (record.part == part)]) for part in range(parts)]
+    own = np.array(parts_sd)
+    known = own[np.isfinite(own)]
+    if not known.size:
+        return 1.0
+    own = np.where(np.isfinite(own), own, known.mean())
+    # Even a very quiet part does not get an unlimited weight.
+    own = np.maximum(own, LEAST_SPREAD * own.max())
+    return (own / own.mean())[grid.part]
+
+
+def _part_noise(record: Record, torque_nm: np.ndarray) -> float:
+    """White noise of a sample of one part, at least that of its quantisation, N·m; NaN with fewer than 16 samples."""
+    if torque_nm.size < 16:
+        return float("nan")
+    step = np.abs(np.diff(torque_nm))
+    count = float(np.min(step[step > 0], initial=np.inf))
+    return max(white_noise(record, torque_nm), count / np.sqrt(12.0) if np.isfinite(count) else 0.0)
+
+
+def _reference(grid: Grid, rows: np.ndarray) -> float:
+    """Mean time of the fitted pulses below the largest width, s; of all pulses if there is none."""
+    width = grid.pulse_width_us
+    partly = rows & (width > 0) & (width < 0.97 * width.max())
+    at = np.flatnonzero(partly if partly.any() else rows & (width > 0))
+    return float(np.mean(at) * grid.step_s) if at.size else 0.0
