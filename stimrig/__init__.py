@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from stimrig.api.client.rest import Client
     from stimrig.identify import Model, Record, compare, next_experiment, predict, read
     from stimrig.identify.effects import library as effects
-    from stimrig.with_progress import carry, diagnose, fit, improve
+    from stimrig.progress import carry, diagnose, fit, improve
 
 _PLACES = {
     "read": ("stimrig.identify.records", "read"),
     "Record": ("stimrig.identify.records.record", "Record"),
     "Model": ("stimrig.identify.model", "Model"),
-    "fit": ("stimrig.with_progress", "fit"),
-    "carry": ("stimrig.with_progress", "carry"),
+    "fit": ("stimrig.progress", "fit"),
+    "carry": ("stimrig.progress", "carry"),
     "predict": ("stimrig.identify.simulation.predict", "predict"),
     "compare": ("stimrig.identify.criticism", "compare"),
-    "diagnose": ("stimrig.with_progress", "diagnose"),
-    "improve": ("stimrig.with_progress", "improve"),
+    "diagnose": ("stimrig.progress", "diagnose"),
+    "improve": ("stimrig.progress", "improve"),
     "next_experiment": ("stimrig.identify.diagnosis.experiment", "next_experiment"),
     "effects": ("stimrig.identify.effects", "library"),
     "plot": ("stimrig.api.charts.plot", "plot"),
