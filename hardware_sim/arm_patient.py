@@ -39,9 +39,8 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import cont2discrete, lfilter
 
-from stimrig.hardware_sim.arm.law import Floats, Number
-from stimrig.hardware_sim.arm.mechanics import Mechanics
-from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Tissue, law
+from stimrig.hardware_sim.arm.laws import LAWS, Floats, Number
+from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Mechanics, Tissue, law, law_name
 from stimrig.hardware_sim.hidden.base import Base, draw_base
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
@@ -100,15 +99,13 @@ class ArmPatient:
     @cached_property
     def truth(self) -> dict[str, Any]:
         """What was drawn, as plain values."""
-        laws = {place: getattr(self.tissue, place) for place in ("passive", "torque_angle", "torque_velocity")}
+        laws = {place: getattr(self.tissue, place) for place in LAWS}
         return {
             "seed": self.seed,
             "muscle": self.base.describe(),
             "range_rad": list(self.range_rad),
             "mechanics": asdict(self.tissue.mechanics),
-            **{
-                place: {"law": type(each).__module__.rpartition(".")[2], **asdict(each)} for place, each in laws.items()
-            },
+            **{place: {"law": law_name(place, each), **asdict(each)} for place, each in laws.items()},
         }
 
 

@@ -10,8 +10,9 @@ from dataclasses import fields
 from typing import NoReturn
 
 from stimrig.hardware_sim import stimulators
-from stimrig.hardware_sim.arm import registry as arms
-from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES
+from stimrig.hardware_sim.arm.laws import LAWS
+from stimrig.hardware_sim.arm.movers import MOVERS
+from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS
 from stimrig.hardware_sim.errors import SettingsError
 from stimrig.hardware_sim.load_cells import cells, transports
 from stimrig.hardware_sim.patients import registry
@@ -137,7 +138,7 @@ def _arm(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--arm",
         metavar="MODE[,SETTING=NUMBER…]|FILE",
-        help=f"what holds or moves the elbow: {', '.join(arms.modes())}, or a TOML or JSON file; with --hidden also "
+        help=f"what holds or moves the elbow: {', '.join(MOVERS)}, or a TOML or JSON file; with --hidden also "
         "'design', the movement that its effect was sized on (default: no arm, the joint is still and has no sensor)",
     )
     group.add_argument(
@@ -145,7 +146,7 @@ def _arm(group: argparse._ArgumentGroup) -> None:
         action="append",
         default=[],
         metavar="PLACE=NAME[,PARAMETER=NUMBER…]",
-        help=f"another law of its tissue, at {', '.join(PLACES)}; may be repeated (default: "
+        help=f"another law of its tissue, at {', '.join(LAWS)}; may be repeated (default: "
         f"{', '.join(f'{place}={name}' for place, name in DEFAULT_LAWS.items())}; each place has 'none')",
     )
     group.add_argument(

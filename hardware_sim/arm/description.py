@@ -7,7 +7,7 @@
     from_deg = 30
     to_deg = 120
     deg_s = 20
-    [mechanics]           # what `stimrig.hardware_sim.arm.mechanics` says of the forearm
+    [mechanics]           # what `Mechanics` says of the forearm
     weight_nm = 2.8
     [passive]             # the law of each place, and its parameters
     law = "linear_friction"
@@ -26,14 +26,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from stimrig.hardware_sim.arm import registry
-from stimrig.hardware_sim.arm.mechanics import Mechanics
+from stimrig.hardware_sim.arm.laws import LAWS
 from stimrig.hardware_sim.arm.motion import LARGEST_DEG, SMALLEST_DEG, within
-from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES, Tissue, built, law
+from stimrig.hardware_sim.arm.movers import MOVERS
+from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS, Mechanics, Tissue, build, law
 from stimrig.hardware_sim.errors import ArmError
 from stimrig.hardware_sim.tables import read_table
 
-KEYS = ("mode", "movement", "mechanics", *PLACES)
+KEYS = ("mode", "movement", "mechanics", *LAWS)
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,12 @@ def read(text: str) -> Arm:
         It is neither a mode with settings nor a readable file that describes an arm.
     """
     mode, *pairs = text.split(",")
-    if mode in registry.modes():
+    if mode in MOVERS:
         return Arm(mode, dict(_number(_halves(pair)) for pair in pairs))
     path = Path(text)
     if path.suffix.lower() in {".toml", ".json"} or path.exists():
         return _from_file(path)
-    raise ArmError(f"--arm {text}: neither a file nor one of {', '.join(registry.modes())}")
+    raise ArmError(f"--arm {text}: neither a file nor one of {', '.join(MOVERS)}")
 
 
 def with_laws(arm: Arm, texts: Sequence[str]) -> Arm:
@@ -113,7 +113,7 @@ def _from_file(path: Path) -> Arm:
 
 
 def _tissue(tables: dict[str, dict[str, Any]]) -> Tissue:
-    mechanics = built(Mechanics, "mechanics", tables.pop("mechanics"))
+    mechanics = build(Mechanics, "mechanics", tables.pop("mechanics"))
     laws = {}
     for place, table in tables.items():
         parameters = {key: value for key, value in table.items() if key != "law"}

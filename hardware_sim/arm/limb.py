@@ -16,9 +16,9 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
-from stimrig.hardware_sim.arm import registry
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.motion import Begin, Motion
+from stimrig.hardware_sim.arm.movers import make_mover
 from stimrig.hardware_sim.errors import ArmError
 from stimrig.hardware_sim.patients.muscle import Muscle
 
@@ -57,7 +57,7 @@ class Limb:
         """
         self._advance(time_s)
         begin = Begin(self._time_s, self.motion, self._seed + SEEDS_APART * self._moves)
-        mover = registry.make(mode, begin, settings)
+        mover = make_mover(mode, begin, settings)
         if not (mover.holds or self._inertia_kg_m2 > 0.0):
             raise ArmError(f"mode '{mode}': a forearm without inertia (a hidden patient's) cannot be let go")
         self._mover, self._moves = mover, self._moves + 1

@@ -1,4 +1,4 @@
-"""The arm's laws together: g(x, ẋ), 1 at the reference angle at rest, and h(x, ẋ).
+"""The arm's laws together: g(x, ẋ), 1 at the reference angle at rest, and h(x, ẋ); and the forearm as a body.
 
 The reference angle is that at which the muscle alone, without a moving joint, is described: 90 degrees.
 """
@@ -11,15 +11,48 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from stimrig.hardware_sim.arm import passive, torque_angle, torque_velocity
-from stimrig.hardware_sim.arm.law import AngleLaw, Number, PassiveLaw, VelocityLaw
-from stimrig.hardware_sim.arm.mechanics import Mechanics
+import numpy as np
+
+from stimrig.hardware_sim.arm.laws import LAWS, AngleLaw, Number, PassiveLaw, VelocityLaw, above
 from stimrig.hardware_sim.errors import ArmError
-from stimrig.hardware_sim.scan import modules_with
 
 REFERENCE_RAD = math.pi / 2.0
-PLACES = {"passive": passive, "torque_angle": torque_angle, "torque_velocity": torque_velocity}
 DEFAULT_LAWS = {"passive": "double_exponential", "torque_angle": "force_length", "torque_velocity": "hill"}
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """The forearm as a rigid body in a plane.
+
+    Gravity pulls with -weight_nm · sin(angle + upper_arm_deg): the upper arm hangs down at 0 degrees, where the
+    straight arm needs no torque, and points forward at 90. `weight_nm` 0 (as it is unless given) is a forearm in a
+    horizontal plane. Beyond `least_deg` and `most_deg` a stop pushes back, stiffer while it is being compressed, and
+    never pulls (Hunt and Crossley 1975).
+
+    Winter 2009, table 4.1: forearm and hand have 0.022 of the body's mass, the centre of mass at 0.682 and a radius of
+    gyration about the elbow of 0.827 of the length from elbow to wrist. For 75 kg and 0.254 m: 1.65 kg, an inertia of
+    0.073 kg·m², and 2.8 N·m when it is horizontal.
+    """
+
+    inertia_kg_m2: float = above(0.0, 0.07)
+    weight_nm: float = 0.0
+    upper_arm_deg: float = 0.0
+    least_deg: float = -5.0
+    most_deg: float = 145.0
+    stop_nm_per_rad: float = above(0.0, 200.0)
+    stop_loss_s_per_rad: float = 0.5
+
+    def gravity_nm(self, angle_rad: Number) -> Number:
+        """Gravity's torque on the elbow, flexion positive."""
+        return -self.weight_nm * np.sin(angle_rad + math.radians(self.upper_arm_deg))
+
+    def stops_nm(self, angle_rad: Number, velocity_rad_s: Number) -> Number:
+        """What the stops push with, flexion positive."""
+        over = np.maximum(angle_rad - math.radians(self.most_deg), 0.0)
+        under = np.maximum(math.radians(self.least_deg) - angle_rad, 0.0)
+        flexed = over * np.maximum(1.0 + self.stop_loss_s_per_rad * velocity_rad_s, 0.0)
+        extended = under * np.maximum(1.0 - self.stop_loss_s_per_rad * velocity_rad_s, 0.0)
+        return self.stop_nm_per_rad * (extended - flexed)
 
 
 def law(place: str, name: str, parameters: Mapping[str, Any] | None = None) -> Any:
@@ -30,31 +63,34 @@ def law(place: str, name: str, parameters: Mapping[str, Any] | None = None) -> A
     ArmError
         There is no such place, law or parameter, or a value is not a finite number or out of range.
     """
-    if place not in PLACES:
-        raise ArmError(f"the arm has no laws of {place!r}; it has {', '.join(PLACES)}")
-    modules = modules_with(PLACES[place], "Law")
-    if name not in modules:
-        raise ArmError(f"unknown law of {place} {name!r}; there are {', '.join(modules)}")
-    return built(modules[name].Law, f"law {name} of {place}", parameters or {})
+    if place not in LAWS:
+        raise ArmError(f"the arm has no laws of {place!r}; it has {', '.join(LAWS)}")
+    if name not in LAWS[place]:
+        raise ArmError(f"unknown law of {place} {name!r}; there are {', '.join(LAWS[place])}")
+    return build(LAWS[place][name], f"law {name} of {place}", parameters or {})
 
 
-def built(kind: Any, what: str, parameters: Mapping[str, Any]) -> Any:
-    """The dataclass of numbers `kind` with these parameters; its `ABOVE` says what some must be above.
+def law_name(place: str, law: Any) -> str:
+    """The name by which `law` gives it."""
+    return next(name for name, kind in LAWS[place].items() if type(law) is kind)
+
+
+def build(kind: Any, what: str, parameters: Mapping[str, Any]) -> Any:
+    """The dataclass of numbers `kind` with these parameters, each above what its field says.
 
     Raises
     ------
     ArmError
         It has no such parameter, or a value is not a finite number or out of range.
     """
-    known = [each.name for each in dataclasses.fields(kind)]
+    known = {each.name: each.metadata.get("above", -math.inf) for each in dataclasses.fields(kind)}
     for key, value in parameters.items():
         if key not in known:
             raise ArmError(f"{what} has no parameter '{key}'; it has {', '.join(known) or 'none'}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ArmError(f"parameter '{key}' of {what} must be a finite number, not {value!r}")
-        lowest = getattr(kind, "ABOVE", {}).get(key, -math.inf)
-        if not value > lowest:
-            raise ArmError(f"parameter '{key}' of {what} must be above {lowest:g}, not {value!r}")
+        if not value > known[key]:
+            raise ArmError(f"parameter '{key}' of {what} must be above {known[key]:g}, not {value!r}")
     return kind(**parameters)
 
 
@@ -62,11 +98,9 @@ def built(kind: Any, what: str, parameters: Mapping[str, Any]) -> Any:
 class Tissue:
     """The laws of one arm and its mechanics."""
 
-    passive: PassiveLaw = field(default_factory=lambda: law("passive", DEFAULT_LAWS["passive"]))
-    torque_angle: AngleLaw = field(default_factory=lambda: law("torque_angle", DEFAULT_LAWS["torque_angle"]))
-    torque_velocity: VelocityLaw = field(
-        default_factory=lambda: law("torque_velocity", DEFAULT_LAWS["torque_velocity"])
-    )
+    passive: PassiveLaw = field(default_factory=LAWS["passive"][DEFAULT_LAWS["passive"]])
+    torque_angle: AngleLaw = field(default_factory=LAWS["torque_angle"][DEFAULT_LAWS["torque_angle"]])
+    torque_velocity: VelocityLaw = field(default_factory=LAWS["torque_velocity"][DEFAULT_LAWS["torque_velocity"]])
     mechanics: Mechanics = field(default_factory=Mechanics)
 
     def g(self, angle_rad: Number, velocity_rad_s: Number) -> Number:
@@ -82,5 +116,5 @@ class Tissue:
 
 def bare() -> Tissue:
     """No tissue, no mass and no stops: the joint's torque is the muscle's own, whatever that makes of the movement."""
-    laws = {place: law(place, "none") for place in PLACES}
+    laws = {place: law(place, "none") for place in LAWS}
     return Tissue(**laws, mechanics=Mechanics(inertia_kg_m2=0.0, stop_nm_per_rad=0.0))

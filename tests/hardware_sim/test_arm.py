@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.arm import description, registry
+from stimrig.hardware_sim.arm import description
 from stimrig.hardware_sim.arm.description import Arm
+from stimrig.hardware_sim.arm.laws import LAWS, StandardLinearSolid
 from stimrig.hardware_sim.arm.limb import Limb
-from stimrig.hardware_sim.arm.mechanics import Mechanics
 from stimrig.hardware_sim.arm.motion import Begin, Motion
-from stimrig.hardware_sim.arm.passive.standard_linear_solid import Law as Solid
-from stimrig.hardware_sim.arm.tissue import PLACES, REFERENCE_RAD, Tissue, bare, law
+from stimrig.hardware_sim.arm.movers import MOVERS, make_mover
+from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Mechanics, Tissue, bare, law
 from stimrig.hardware_sim.errors import ArmError
 from stimrig.hardware_sim.patients import registry as patients
-from stimrig.hardware_sim.scan import modules_with
 
 STEP_S = 1.0 / 1600.0
 RANGE = np.radians(np.linspace(0.0, 140.0, 71))
@@ -50,19 +49,15 @@ def heavy(**mechanics: Any) -> Tissue:
     return replace(bare(), mechanics=Mechanics(**{"inertia_kg_m2": 0.07, **mechanics}))
 
 
-def names(place: str) -> list[str]:
-    return list(modules_with(PLACES[place], "Law"))
-
-
 class TestLaws:
     def test_there_are_several_of_each(self) -> None:
-        assert set(names("passive")) >= {
+        assert set(LAWS["passive"]) >= {
             "double_exponential", "fibre_exponential", "linear_friction", "standard_linear_solid",
         }  # fmt: skip
-        assert set(names("torque_angle")) >= {"parabola", "force_length", "moment_arm", "arm_and_length"}
-        assert set(names("torque_velocity")) >= {"hill", "logarithmic", "bell"}
+        assert set(LAWS["torque_angle"]) >= {"parabola", "force_length", "moment_arm", "arm_and_length"}
+        assert set(LAWS["torque_velocity"]) >= {"hill", "logarithmic", "bell"}
 
-    @pytest.mark.parametrize("name", names("passive"))
+    @pytest.mark.parametrize("name", LAWS["passive"])
     def test_tissue_pushes_back_from_both_ends_and_never_gives_energy(self, name: str) -> None:
         passive = law("passive", name)
         still = passive.torque_nm(RANGE, 0.0)
@@ -76,7 +71,7 @@ class TestLaws:
         assert work_j <= 1e-9
         assert work_j < -0.01 or name == "none"
 
-    @pytest.mark.parametrize("name", names("torque_angle"))
+    @pytest.mark.parametrize("name", LAWS["torque_angle"])
     def test_a_share_is_positive_and_has_one_best_angle(self, name: str) -> None:
         share = law("torque_angle", name).share(RANGE)
         assert np.all((share > 0.0) & (share <= 1.1))
@@ -84,7 +79,7 @@ class TestLaws:
         assert np.count_nonzero(rising[1:] != rising[:-1]) <= 1
         assert Tissue(torque_angle=law("torque_angle", name)).g(REFERENCE_RAD, 0.0) == pytest.approx(1.0)
 
-    @pytest.mark.parametrize("name", names("torque_velocity"))
+    @pytest.mark.parametrize("name", LAWS["torque_velocity"])
     def test_a_muscle_that_shortens_gives_less_and_one_that_is_stretched_more(self, name: str) -> None:
         velocity = np.linspace(-8.0, 20.0, 400)
         share = law("torque_velocity", name).share(np.full(400, REFERENCE_RAD), velocity)
@@ -114,7 +109,7 @@ class TestLaws:
         assert thelen.share(2.0) == pytest.approx(math.exp(-0.25 / 0.45))
 
     def test_a_solid_relaxes_with_its_time_constant(self) -> None:
-        solid = Solid(stiffness_nm_per_rad=2.0, lasting_share=0.5, relaxation_s=1.0, viscosity_nm_s=0.0)
+        solid = StandardLinearSolid(stiffness_nm_per_rad=2.0, lasting_share=0.5, relaxation_s=1.0, viscosity_nm_s=0.0)
         memory = solid.begin(1.0)
         for _ in range(1600):
             memory = solid.step(memory, 1.5, STEP_S)
@@ -256,13 +251,13 @@ class TestMovers:
         assert np.abs(np.diff(velocity)).max() < 0.35, "the fastest servo's acceleration in one step"
         assert np.all(np.degrees(angle) > -10.0) and np.all(np.degrees(angle) < 160.0)
 
-    @pytest.mark.parametrize("mode", registry.modes())
+    @pytest.mark.parametrize("mode", MOVERS)
     def test_the_movement_does_not_depend_on_when_it_is_looked_at(self, mode: str) -> None:
         if mode == "free":
             return
         settings = {"script": {"points": [[0, 40], [1, 60], [2, 50]]}, "held": {"angle_deg": 40}}.get(mode, {})
         begin = Begin(0.0, Motion(1.2), seed=5)
-        often, seldom = registry.make(mode, begin, settings), registry.make(mode, begin, settings)
+        often, seldom = make_mover(mode, begin, settings), make_mover(mode, begin, settings)
         for k in range(1, 3001):
             seen = often.advance(0.001 * k, lambda _x, _v: 0.0)
             if k % 377 == 0:
@@ -284,7 +279,7 @@ class TestMovers:
             "damping": 1.0,
             "pause_s": 9,
         }
-        robot = registry.make("robot", Begin(0.0, Motion(math.radians(99.0))), {**settings, "limit_deg_s": 1000.0})
+        robot = make_mover("robot", Begin(0.0, Motion(math.radians(99.0))), {**settings, "limit_deg_s": 1000.0})
         for time_s in np.linspace(0.05, 1.0, 20):
             angle = robot.advance(float(time_s), lambda _x, _v: 0.0).angle_rad
             turn = 2.0 * math.pi * time_s

@@ -1,1 +1,0 @@
-"""What holds or moves the forearm: one file each with a class `Mover`, found by scanning this folder."""
