@@ -104,7 +104,7 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     await server.start(rig, ask, config.socket)
     print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
     notifier.ready()
-    with StopKey(loop, lambda: ask(lambda: _stop_by_key(rig))) as key:
+    with StopKey(lambda: ask(lambda: _stop_by_key(rig))) as key:
         if key.watched:
             log.info("any key in this terminal stops stimulation; Ctrl-C ends the rig")
         while not stop.is_set() and parent in (None, os.getppid()):

@@ -81,7 +81,7 @@ def described() -> dict[str, str]:
     return {name: " ".join(doc.partition("\n\n")[0].split()) for name, doc in words.items()}
 
 
-def _segment(name: str, sequence: str = "", **settings: Any) -> SegmentPlan:
+def _segment(name: str, sequence: str = "", /, **settings: Any) -> SegmentPlan:
     return SegmentPlan(name=name, sequence=sequence or name, settings=settings)
 
 

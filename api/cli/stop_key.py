@@ -5,17 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import select
 import sys
-import termios
-import threading
-import tty
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import httpx
 
+from stimrig.rig import keys
 from stimrig.rig.messages import StatusRequest, StopEvidence, StopRequest
 
 if TYPE_CHECKING:
@@ -29,10 +26,8 @@ CONFIRMED, NOTHING = "stopped: the rig confirms that stimulation is off", "no te
 DOUBT = "THE STOP IS NOT CONFIRMED. Use the stimulator's own emergency switch now."
 
 
-class StopKey:
+class StopKey(keys.StopKey):
     """Listens for a key as long as it is open; does nothing where standard input is no terminal.
-
-    Keys are read in a thread of its own: nothing that the program waits for delays a stop. Ctrl-C stays what it is.
 
     Parameters
     ----------
@@ -46,53 +41,13 @@ class StopKey:
 
     def __init__(self, stop: Callable[[], str], tell: Callable[[str], object], descriptor: int | None = None) -> None:
         self.stop, self.tell = stop, tell
-        self.descriptor = standard_input() if descriptor is None else descriptor
-        self.listens = False
-        self._before: list[object] = []
-        self._thread: threading.Thread | None = None
+        super().__init__(self._press, standard_input() if descriptor is None else descriptor, in_foreground)
 
-    def __enter__(self) -> StopKey:
-        if self.descriptor < 0 or not os.isatty(self.descriptor) or not in_foreground(self.descriptor):
-            return self
-        self._before = termios.tcgetattr(self.descriptor)
-        tty.setcbreak(self.descriptor, termios.TCSANOW)  # a key at once, unechoed; Ctrl-C still interrupts
-        self._ending, self._end = os.pipe()
-        self._thread = threading.Thread(target=self._listen, name="stop key", daemon=True)
-        self.listens = True
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._thread is None:
-            return
-        os.write(self._end, b"x")
-        self._thread.join(STATUS_S + STOP_S)
-        if in_foreground(self.descriptor):
-            with contextlib.suppress(termios.error):  # the terminal was closed
-                termios.tcsetattr(self.descriptor, termios.TCSANOW, self._before)  # pyright: ignore[reportArgumentType]
-        os.close(self._end)
-        if not self._thread.is_alive():
-            os.close(self._ending)
-
-    def _listen(self) -> None:
-        while True:
-            ready, _, _ = select.select([self.descriptor, self._ending], [], [])
-            if self._ending in ready:
-                return
-            if not in_foreground(self.descriptor):  # put in the background: the keys are another program's
-                if select.select([self._ending], [], [], STATUS_S)[0]:
-                    return
-                continue
-            try:
-                pressed = os.read(self.descriptor, 4096)
-            except OSError:
-                return
-            if not pressed:  # the terminal was closed
-                return
-            try:
-                self.tell(self.stop())
-            except Exception as error:
-                self.tell(f"{DOUBT} ({type(error).__name__}: {error})")
+    def _press(self) -> None:
+        try:
+            self.tell(self.stop())
+        except Exception as error:
+            self.tell(f"{DOUBT} ({type(error).__name__}: {error})")
 
 
 def standard_input() -> int:
@@ -104,9 +59,9 @@ def standard_input() -> int:
 
 
 def in_foreground(descriptor: int) -> bool:
-    """Whether the terminal's keys are for this program."""
+    """Whether it is a terminal whose keys are for this program."""
     try:
-        return os.tcgetpgrp(descriptor) == os.getpgrp()
+        return os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp()
     except OSError:  # not the controlling terminal: nobody takes turns on it
         return True
 

@@ -4,7 +4,7 @@ A sequence is a module with three parts:
 
 - `Settings`: a pydantic model, units in the names.
 - `pulse_count(settings, pulse_rate_hz)`: the number of pulses (those of 0 µs included), computed without building them,
-  so that too long a sequence is refused before it is built.
+  so that too long a sequence is refused before it is built; not needed where the settings have `duration_s`.
 - `pulse_widths(settings, pulse_rate_hz) -> ndarray`: a pure function that returns one width in µs for each pulse.
 
 The module's name is the sequence's id. To add a sequence, add a file. A sequence that jumps between levels by design
@@ -42,9 +42,6 @@ class Sequence(Protocol):
     """Interface of a module in this folder."""
 
     Settings: type[SequenceSettings]
-
-    @staticmethod
-    def pulse_count(settings: Any, pulse_rate_hz: float) -> int: ...
 
     @staticmethod
     def pulse_widths(settings: Any, pulse_rate_hz: float) -> NDArray[np.float64]: ...
@@ -118,7 +115,9 @@ def jumps(sequence_id: str, settings: dict[str, Any]) -> bool:
 
 def pulse_count(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> int:
     """Number of pulses that `build` would return, without building them."""
-    return find(sequence_id).pulse_count(settings_of(sequence_id, settings), pulse_rate_hz)
+    checked: Any = settings_of(sequence_id, settings)
+    count = getattr(find(sequence_id), "pulse_count", None)
+    return pulses_in(checked.duration_s, pulse_rate_hz) if count is None else count(checked, pulse_rate_hz)
 
 
 def pulses_in(duration_s: float, pulse_rate_hz: float) -> int:

@@ -31,11 +31,6 @@ class Settings(SequenceSettings):
         return self
 
 
-def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
-    return pulses_in(settings.duration_s, pulse_rate_hz)
-
-
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
     """Widths in µs, shape (duration × rate,)."""
     rng = np.random.default_rng(settings.seed)

@@ -13,11 +13,6 @@ class Settings(SequenceSettings):
     duration_s: float = Field(2.0, gt=0, le=600, description="length, s")
 
 
-def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
-    return pulses_in(settings.duration_s, pulse_rate_hz)
-
-
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
     """Zeros, shape (duration × rate,)."""
     return np.zeros(pulses_in(settings.duration_s, pulse_rate_hz))

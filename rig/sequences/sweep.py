@@ -16,11 +16,6 @@ class Settings(SequenceSettings):
     jumps: bool = Field(False, description="whether the first width may be any jump away from the pulse before it")
 
 
-def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
-    return pulses_in(settings.duration_s, pulse_rate_hz)
-
-
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
     """Widths in µs, shape (duration × rate,); both ends are reached, a single pulse has the last width."""
     count = pulses_in(settings.duration_s, pulse_rate_hz)

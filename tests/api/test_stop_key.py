@@ -56,7 +56,7 @@ def test_any_key_stops_a_running_test(
     before, words = termios.tcgetattr(program), []
     stop = at_rig(service.rig.path) if way == "rig" else at_service(service.url, TOKEN)
     with StopKey(stop, words.append, program) as key:
-        assert key.listens
+        assert key.watched
         test_id = started(client, service, participant)
         os.write(keyboard, b"x")
         assert told(words) == [stop_key.CONFIRMED]
@@ -130,10 +130,10 @@ def test_what_is_not_confirmed_says_what_to_do(
 def test_without_a_terminal_nothing_listens(tmp_path: Path) -> None:
     reading, writing = os.pipe()
     with StopKey(lambda: "never", print, reading) as key, (tmp_path / "file").open("w") as file:
-        assert not key.listens
+        assert not key.watched
         os.write(writing, b"x")
         with StopKey(lambda: "never", print, file.fileno()) as other:
-            assert not other.listens
+            assert not other.watched
     assert os.read(reading, 1) == b"x", "what is not a terminal is not read"
     os.close(reading)
     os.close(writing)

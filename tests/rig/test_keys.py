@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import pty
 import select
@@ -21,34 +20,14 @@ from tests.rig.live import LiveRig
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 30.0
 CHILD = """
-import asyncio, sys
+import threading
 from stimrig.rig.keys import StopKey
-async def main():
-    pressed = asyncio.Event()
-    with StopKey(asyncio.get_running_loop(), pressed.set) as key:
-        print("watching" if key.watched else "blind", flush=True)
-        await asyncio.wait_for(pressed.wait(), 20)
-    print("stopped", flush=True)
-asyncio.run(main())
+pressed = threading.Event()
+with StopKey(pressed.set) as key:
+    print("watching" if key.watched else "blind", flush=True)
+    pressed.wait(20)
+print("stopped" if pressed.is_set() else "lost", flush=True)
 """
-
-
-class Loop(asyncio.AbstractEventLoop):
-    """One that reads when the test says so."""
-
-    def __init__(self) -> None:
-        self.readers: dict[object, Callable[[], object]] = {}
-
-    def add_reader(self, fd, callback, *_):  # pyright: ignore
-        self.readers[fd] = callback
-
-    def remove_reader(self, fd):  # pyright: ignore
-        return self.readers.pop(fd, None) is not None
-
-    def read(self, fd: int) -> None:
-        """Once something is there."""
-        assert select.select([fd], [], [], PATIENCE_S)[0]
-        self.readers[fd]()
 
 
 @pytest.fixture
@@ -60,44 +39,42 @@ def terminal() -> Iterator[tuple[int, int]]:
         os.close(fd)
 
 
+def soon(true: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.005)
+
+
 def test_one_key_is_one_stop_and_the_terminal_is_given_back(terminal: tuple[int, int]):
     person, ours = terminal
-    before, loop, pressed = termios.tcgetattr(ours), Loop(), list[int]()
-    with StopKey(loop, lambda: pressed.append(1), ours, lambda _: True) as key:
+    before, pressed = termios.tcgetattr(ours), list[int]()
+    with StopKey(lambda: pressed.append(1), ours, lambda _: True) as key:
         assert key.watched
         assert not termios.tcgetattr(ours)[3] & (termios.ICANON | termios.ECHO)
         assert termios.tcgetattr(ours)[3] & termios.ISIG  # Ctrl-C is a signal as ever
-        for n, keys in enumerate((b" ", b"\x1b[A"), start=1):
+        for n, keys in enumerate((b" ", b"\x1b[A"), start=1):  # an arrow is one key
             os.write(person, keys)
-            loop.read(ours)
-            assert len(pressed) == n
-        assert not select.select([ours], [], [], 0)[0], "an arrow is one key"
-    assert termios.tcgetattr(ours) == before
-    assert loop.readers == {}
+            soon(lambda n=n: len(pressed) == n)
+    assert termios.tcgetattr(ours) == before and len(pressed) == 2
 
 
-def test_without_a_terminal_of_its_own_nothing_is_read(terminal: tuple[int, int]):
+def test_without_a_terminal_of_its_own_or_in_the_background_nothing_is_read(terminal: tuple[int, int]):
     read, write = os.pipe()
     os.write(write, b"x")
     for fd in (terminal[1], read):  # a terminal that is not this process's, and none
         assert not in_front(fd)
-        loop = Loop()
-        with StopKey(loop, lambda: pytest.fail("not meant for us"), fd) as key:
+        with StopKey(lambda: pytest.fail("not meant for us"), fd) as key:
             assert not key.watched
-            assert loop.readers == {}
     assert os.read(read, 1) == b"x"
     os.close(read)
     os.close(write)
-
-
-def test_moved_to_the_background_it_lets_go(terminal: tuple[int, int]):
-    person, ours = terminal
-    front, loop = [True], Loop()
-    with StopKey(loop, lambda: pytest.fail("not ours"), ours, lambda _: front[0]):
+    front, asked = [True], list[int]()
+    with StopKey(lambda: pytest.fail("not ours"), terminal[1], lambda _: asked.append(1) or front[0]):
         front[0] = False
-        os.write(person, b" \n")
-        loop.read(ours)
-        assert loop.readers == {}
+        os.write(terminal[0], b" \n")
+        soon(lambda: len(asked) > 1)
+    assert select.select([terminal[1]], [], [], 0)[0], "the keys are for another process"
 
 
 def test_in_a_real_terminal():

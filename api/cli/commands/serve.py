@@ -39,7 +39,7 @@ def serve(
         say(*welcome(services, settings), *rig_state(services, found))
         try:
             with StopKey(at_rig(services.socket), say) as key:
-                if key.listens:
+                if key.watched:
                     say("any key stops a running test; Ctrl-C ends the service" + ("" if found else " and the rig"))
                 while True:
                     time.sleep(0.2)

@@ -123,7 +123,7 @@ def target_of(text: str) -> dict[str, float]:
 
 def announce(key: StopKey) -> None:
     """Say that a key stops, where one does."""
-    if key.listens:
+    if key.watched:
         say_aside("any key stops the test")
 
 
