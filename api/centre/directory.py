@@ -11,7 +11,7 @@ from sqlalchemy import Select, exists, select, tuple_
 from stimrig.api.centre import clean
 from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.models.summary import VERDICTS
+from stimrig.api.models.stored_model import VERDICTS
 from stimrig.api.store import Store
 from stimrig.api.store.centre_tables import (
     CentreDecision,

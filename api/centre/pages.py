@@ -22,7 +22,7 @@ from stimrig.api.clock import unix_of
 from stimrig.api.effect_words import effect_words
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.models import changes
-from stimrig.api.models.summary import followed
+from stimrig.api.models.stored_model import followed
 from stimrig.api.people.auth import LOCKED, Principal, Scope
 from stimrig.api.store.centre_tables import CentreEffect, CentreRig
 from stimrig.api.web.dependencies import Administrator, ModelReader

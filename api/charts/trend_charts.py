@@ -15,10 +15,9 @@ from stimrig.api import language
 from stimrig.api.charts.svg import plain, ticks
 from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.language import _, lazy
-from stimrig.api.models import trend_words
-from stimrig.api.models.changes import BEYOND
+from stimrig.api.models import changes
+from stimrig.api.models.changes import BEYOND, UNBROKEN, Name
 from stimrig.api.models.tracking import Bounds
-from stimrig.api.models.trend_words import UNBROKEN, Name
 
 WIDE, TALL = 400.0, 128.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 12.0, 20.0
@@ -44,15 +43,15 @@ def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def order(sessions: Sequence[dict[str, Any]]) -> list[str]:
     """The figures that sessions have, in the order in which they are shown."""
     names = dict.fromkeys(name for one in sessions for name in one["figures"])
-    first = [name for name in trend_words.NAMES if name not in trend_words.LAST]
+    first = [name for name in changes.NAMES if name not in changes.LAST]
     effects = [name for name in names if "." in name]
-    return [name for name in (*first, *effects, *trend_words.LAST) if name in names]
+    return [name for name in (*first, *effects, *changes.LAST) if name in names]
 
 
 def panel(figure: str, sessions: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One figure over the sessions."""
     unit = next((one["figures"][figure]["unit"] for one in sessions if figure in one["figures"]), "1")
-    name = trend_words.name_of(figure, unit)
+    name = changes.name_of(figure, unit)
     points = [point(one, figure, name) for one in sessions]
     known = [one for one in points if one["value"] is not None]
     return {
@@ -67,7 +66,7 @@ def point(session: dict[str, Any], figure: str, name: Name) -> Point:
     """A session's value in the unit that is shown, and what is said of it."""
     found = session["figures"].get(figure) or {"value": None, "uncertainty": None}
     value, uncertainty = found["value"], found["uncertainty"]
-    words = trend_words.with_uncertainty(value, uncertainty, name)
+    words = changes.uncertain_words(value, uncertainty, name)
     if value is not None and name.unit != "1":
         words = f"{words}{UNBROKEN}{name.unit}"
     return {

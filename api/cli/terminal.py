@@ -227,7 +227,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 def percent(value: float | None) -> str:
     """A best-fit % for people; why there is none."""
-    from stimrig.api.models.summary import UNDEFINED
+    from stimrig.api.models.model_json import UNDEFINED
 
     return UNDEFINED if value is None or not math.isfinite(value) else f"{value:.2f} %"
 
@@ -256,10 +256,10 @@ def carried_lines(found: Mapping[str, Any] | None) -> list[str]:
 
 def model_report(document: dict[str, Any]) -> list[str]:
     """What a person reads off a model."""
-    from stimrig.api.models import summary
+    from stimrig.api.models import model_json
 
-    fit, judged = summary.figures(document), summary.quality(document)
-    dynamics, curve = summary.dynamics(document), summary.recruitment(document)
+    fit, judged = model_json.figures(document), model_json.quality(document)
+    dynamics, curve = model_json.dynamics(document), model_json.recruitment(document)
     effects = ", ".join(effect["id"] for effect in document.get("effects") or []) or "none"
     in_turn = "in turn, cross-validated: " if fit["held_out_by"] == "cross-validation" else ""
     lines = [

@@ -129,7 +129,7 @@ def _branches(choice: ast.IfExp) -> list[str]:
 
 def _is_sentence(text: str) -> bool:
     return bool(re.search(r"[A-Za-z]{2}.* .*[A-Za-z]{2}", text)) and not re.search(
-        r"\n|^[/<]|charset=|\w = |{:|\w' =", text
+        r"\n|^[/<]|charset=|default-src|\w = |{:|\w' =", text
     )
 
 

@@ -8,30 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from stimrig.api.language import _, lazy, plain
-from stimrig.api.language import decimal as _decimal
-from stimrig.api.models.summary import followed
+from stimrig.api.language import _, lazy, localised, plain
+from stimrig.api.models.model_json import followed
 
 Act = Literal["approve", "add", "test", "fit"]
 
 
-@dataclass(frozen=True)
-class Gate:
-    """Texts of a check that failed.
-
-    Parameters
-    ----------
-    found : str
-        What was found.
-    look : str
-        What to do where the model is usable with care.
-    test : str
-        What to do where it is not usable.
-    risk : str
-        What the controller would do wrong.
-    """
+class Gate(NamedTuple):
+    """Texts of a check that failed: what was found, what to do with a model that is usable with care and with one that
+    is not usable, and what the controller would do wrong."""
 
     found: Any
     look: Any
@@ -187,17 +174,12 @@ def advice(verdict: str, found: Sequence[Finding], missing: Sequence[str]) -> Ad
 
 def risks(document: dict[str, Any], found: Sequence[Finding]) -> list[str]:
     """What a controller would risk with a model that is not usable, in sentences."""
-    error = error_percent(document)
+    fit = (document.get("fit") or {}).get("held_out_fit_percent")
     said = list(dict.fromkeys(finding.risk for finding in found))
-    if error is not None:
+    if fit is not None:
+        error = f"{100.0 - fit:.0f}"
         said.append(_("On pulses not used for fitting the error is %(percent)s %% of the torque.", percent=error))
     return said or [_("Nobody knows how far the torque will be from what the controller expects.")]
-
-
-def error_percent(document: dict[str, Any]) -> str | None:
-    """What the model leaves over of the torque on rows not used to fit, as a number in text."""
-    fit = (document.get("fit") or {}).get("held_out_fit_percent")
-    return None if fit is None else f"{100.0 - fit:.0f}"
 
 
 def fit_sentence(fit: dict[str, Any]) -> str:
@@ -207,13 +189,9 @@ def fit_sentence(fit: dict[str, Any]) -> str:
         return ""
     if found.percent <= 0.0:
         return _("%(where)s the model does not follow the torque at all.", where=found.where)
-    reached = _percent(found.percent)
+    reached = localised(f"{found.percent:.1f}")
     follows = _("%(where)s the model follows %(reached)s %% of the torque", where=found.where, reached=reached)
     if found.ceiling_percent is None:
         return f"{follows}."
-    limit = _("sensor noise limits this to %(ceiling)s %%", ceiling=_percent(found.ceiling_percent))
+    limit = _("sensor noise limits this to %(ceiling)s %%", ceiling=localised(f"{found.ceiling_percent:.1f}"))
     return f"{follows}; {limit}."
-
-
-def _percent(value: float) -> str:
-    return f"{value:.1f}".replace(".", _decimal())

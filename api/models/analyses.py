@@ -6,23 +6,18 @@ import asyncio
 import hashlib
 import json
 import logging
-import secrets
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
-
-from sqlalchemy import select
-from sqlalchemy.orm import Session
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.models import reasons, stored
+from stimrig.api.models import model_json
 from stimrig.api.models.carried_structure import CarriedStructure
-from stimrig.api.models.places import Site, site_of_recording
+from stimrig.api.models.explanation import require_evidence
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, audit, uploads
-from stimrig.api.store.tables import Analysis, Model, Recording, Test
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import Analysis, Model, Recording
 from stimrig.api.workers.pool import Call, Pool
 
 log = logging.getLogger("stimrig.analyses")
@@ -35,12 +30,12 @@ HALF_DONE = 0.5
 
 def is_plain(model: Model) -> bool:
     """Whether a version's structure is the plain one: no effects around f(u) and a G of second order."""
-    return not model.effects and "time_constant_s" in stored.read(model)["linear"]
+    return not model.effects and "time_constant_s" in model_json.read(model)["linear"]
 
 
 def structure_of(model: Model) -> list[str]:
     """The effects of a version, each `id:form` or, where no form is named, `id`."""
-    held = stored.read(model).get("effects") or []
+    held = model_json.read(model).get("effects") or []
     return [f"{effect['id']}:{effect.get('form') or ''}".removesuffix(":") for effect in held]
 
 
@@ -65,7 +60,7 @@ class Analyses:
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
         """Measurement against model; with another recording's id, the model against that one."""
-        given = {"model_json": stored.text(model)}
+        given = {"model_json": model_json.text(model)}
         if recording_id in (None, model.recording_id):
             return await self._kept(model, "comparison", given)
         digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
@@ -73,7 +68,7 @@ class Analyses:
 
     async def curves(self, model: Model) -> dict[str, Any]:
         """Measured, predicted and commanded curves, thinned to what a screen shows."""
-        return await self._kept(model, "curves", {"model_json": stored.text(model)})
+        return await self._kept(model, "curves", {"model_json": model_json.text(model)})
 
     async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
         """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
@@ -84,17 +79,12 @@ class Analyses:
         """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
         if is_plain(model):
             return self.first_version(model), "diagnosis", {}
-        return model, OWN_DIAGNOSIS, {"model_json": stored.text(model)}
+        return model, OWN_DIAGNOSIS, {"model_json": model_json.text(model)}
 
     def first_version(self, model: Model) -> Model:
         """The first version made from the model's recording: what is found of its plain structure is kept with it."""
         rows = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc, limit=1)
         return rows[0]
-
-    def _plain_eldest(self, model: Model) -> Model:
-        """The recording's first version where that is plain like the model, else the model."""
-        first_version = self.first_version(model)
-        return first_version if is_plain(first_version) else model
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """The diagnosis if it has been made."""
@@ -209,7 +199,7 @@ class Analyses:
             detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
             raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
         if not force:
-            reasons.require_evidence(await self.diagnosis(model, on_call), model.effects, added)
+            require_evidence(await self.diagnosis(model, on_call), model.effects, added)
         path = await asyncio.to_thread(self.path, model.recording_id)
         held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
         asked = [held.get(effect, effect) for effect in effects]
@@ -242,11 +232,9 @@ class Analyses:
         They descend from the model; of the plain structure, from the recording's first version if that has it, too.
         """
         path = await asyncio.to_thread(self.path, model.recording_id)
-        plain = await asyncio.to_thread(is_plain, model)
-        given: dict[str, Any] = {} if plain else {"model_json": stored.text(model)}
+        place, _kind, given = await asyncio.to_thread(self._criticised, model)
         found = await self.asked("improve", on_call, data=path, **given)
-        first = await asyncio.to_thread(self._plain_eldest, model) if plain else model
-        rows = await asyncio.to_thread(self._store_steps, found, first, by)
+        rows = await asyncio.to_thread(self._store_steps, found, place if is_plain(place) else model, by)
         return {key: value for key, value in found.items() if key != "models"}, rows
 
     def _store_steps(self, found: dict[str, Any], first: Model, by: str) -> list[Model]:
@@ -264,51 +252,3 @@ class Analyses:
                 )
             rows.append(row)
         return rows
-
-    # ---- several recordings ---------------------------------------------------------------------------------
-
-    async def join(self, parts: Sequence[str], participant: str, needs: Sequence[str] = ()) -> Recording:
-        """Recordings as one, itself a recording (`origin` joined), to which all else applies.
-
-        Parameters
-        ----------
-        parts : sequence of str
-            Their ids; where all begins are known the order is that of time.
-        needs : sequence of str
-            Columns that each of them must have, such as `angle_rad`; one that a part lacks is left out of the whole.
-        """
-        paths = [await asyncio.to_thread(self.path, part) for part in parts]
-        identity = f"{uploads.JOINED}{secrets.token_hex(8)}"
-        made = self.settings.exports_dir / f"{identity}.csv"  # all that a worker may write to
-        kept = self.settings.recordings_dir / made.name
-        try:
-            found = await self.asked("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
-            digest = found["file_sha256"]
-            await asyncio.to_thread(made.replace, uploads.part_of(kept))
-        except BaseException:
-            made.unlink(missing_ok=True)
-            raise
-        stored = asyncio.to_thread(self._store_joined, kept, digest, participant, list(parts))
-        return await asyncio.shield(stored)
-
-    def _one_site(self, session: Session, parts: list[str]) -> Site | None:
-        """Where all parts stimulated; 409 where that was not one site."""
-        tests = {test.recording_id: test for test in session.scalars(select(Test).where(Test.recording_id.in_(parts)))}
-        rows = session.scalars(select(Recording).where(Recording.id.in_(parts)))
-        sites = [site_of_recording(row, tests.get(row.id)) for row in rows]
-        if any(site != sites[0] for site in sites):
-            detail = "The recordings were made at different sites; what was learnt at one says nothing of another."
-            raise ApiError(409, "other-site", "These recordings are of several sites", detail)
-        return sites[0]
-
-    def _store_joined(self, kept: Path, digest: str, participant: str, parts: list[str]) -> Recording:
-        now, identity = self.clock.utc(), kept.stem
-        row = Recording(id=identity, participant=participant, path=str(kept), file_sha256=digest, origin="joined")
-        row.test_id, row.created_utc = None, now
-        with uploads.taken_in(kept), self.store.write() as session:
-            site = self._one_site(session, parts)
-            row.site = None if site is None else list(site)
-            session.add(row)
-            session.flush()
-            audit.write(session, now, "service", "join recordings", identity, parts=parts, sha256=digest)
-        return row

@@ -1,4 +1,4 @@
-"""What differs between two models of a muscle by more than its uncertainty, and what puts the comparison in doubt.
+"""What differs between two models of a muscle by more than its uncertainty, in figures and in words; what is in doubt.
 
 The standard deviations of both models say what the noise of the two records does. On emulated muscles that had not
 changed they are right for most figures and too small for some (a curve's bend between two knots, an effect that no
@@ -8,10 +8,14 @@ model holds). So a floor is added to them: `python -m bench.trend`, docs/results
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from typing import Any
 
-from stimrig.api.models.headline import Figure
+from stimrig.api import language
+from stimrig.api.effect_words import effect_words, effects_words, parameter_words
+from stimrig.api.language import _, lazy
+from stimrig.api.models.model_json import Figure
 
 BEYOND = 2.0
 """A change is told where it is more than so many times its uncertainty."""
@@ -35,23 +39,16 @@ class Floor:
         return max(self.share * abs(value), self.amount)
 
 
-SAME_STRUCTURE = {
-    "threshold_us": Floor(amount=2.5),
-    "plateau_nm": Floor(share=0.02),
-    "time_constant_s": Floor(share=0.02),
-    "damping": Floor(share=0.025),
-    "delay_s": Floor(amount=0.001),
+FLOORS = {
+    "threshold_us": (Floor(amount=2.5), Floor(amount=10.0)),
+    "plateau_nm": (Floor(share=0.02), Floor(share=0.15)),
+    "time_constant_s": (Floor(share=0.02), Floor(share=0.2)),
+    "damping": (Floor(share=0.025), Floor(share=0.35)),
+    "delay_s": (Floor(amount=0.001), Floor(amount=0.005)),
 }
-OTHER_STRUCTURE = {
-    "threshold_us": Floor(amount=10.0),
-    "plateau_nm": Floor(share=0.15),
-    "time_constant_s": Floor(share=0.2),
-    "damping": Floor(share=0.35),
-    "delay_s": Floor(amount=0.005),
-}
-"""Where method or effects differ, the same figure means something else: fatigue in a model raises its plateau."""
-SAME_EFFECT, OTHER_EFFECT = Floor(share=0.1), Floor(share=0.3)
-"""Of an effect's parameter."""
+"""In the same structure, and where method or effects differ: fatigue in a model raises its plateau."""
+OF_EFFECT = (Floor(share=0.1), Floor(share=0.3))
+"""The same of an effect's parameter."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +68,15 @@ class State:
         return self.method == other.method and sorted(self.structure) == sorted(other.structure)
 
 
+def structure_of(effects: Collection[str], figures: dict[str, Figure]) -> tuple[str, ...]:
+    """Each effect as `id:form`, `id` where its form is not known: a parameter means something else in another form."""
+    forms = {name.partition(".")[0]: figure["form"] for name, figure in figures.items() if figure.get("form")}
+    return tuple(sorted(f"{effect}:{forms.get(effect, '')}".removesuffix(":") for effect in effects))
+
+
+# ---- in figures ---------------------------------------------------------------------------------------------------
+
+
 def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
     """How far a figure moved, and how sure that is; None where it cannot be said.
 
@@ -88,8 +94,7 @@ def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
     found |= {"difference": second - first, "percent": 100 * (second - first) / abs(first) if first else None}
     if old.get("sd") is None or new.get("sd") is None:
         return found | {"uncertainty": None, "times": None, "beyond": False}
-    floor = _floor(name, before.same_structure(now)).at(first)
-    uncertainty = math.hypot(old["sd"], new["sd"], floor)
+    uncertainty = math.hypot(old["sd"], new["sd"], _floor(name, before.same_structure(now)).at(first))
     times = abs(second - first) / uncertainty if uncertainty > 0 else 0.0
     return found | {"uncertainty": uncertainty, "times": times, "beyond": times > BEYOND}
 
@@ -98,21 +103,19 @@ def uncertainty(name: str, figure: Figure) -> float | None:
     """A figure's own uncertainty, in its unit, such that of two they add up to that of their difference."""
     if figure.get("value") is None or figure.get("sd") is None:
         return None
-    floor = _floor(name, True).at(figure["value"])
-    return math.hypot(figure["sd"], floor / math.sqrt(2))
+    return math.hypot(figure["sd"], _floor(name, True).at(figure["value"]) / math.sqrt(2))
 
 
 def _floor(name: str, same: bool) -> Floor:
-    if "." in name:
-        return SAME_EFFECT if same else OTHER_EFFECT
-    return (SAME_STRUCTURE if same else OTHER_STRUCTURE)[name]
+    return (OF_EFFECT if "." in name else FLOORS[name])[0 if same else 1]
 
 
 def comparable(before: State, now: State) -> list[str]:
     """The figures that both have and that mean the same in both."""
-    forms = {name: (before.figures[name].get("form"), figure.get("form")) for name, figure in now.figures.items()
-             if name in before.figures}  # fmt: skip
-    names = [name for name, (old, new) in forms.items() if old == new]
+    names = [
+        name for name, figure in now.figures.items()
+        if name in before.figures and before.figures[name].get("form") == figure.get("form")
+    ]  # fmt: skip
     if not same_current(before, now):
         names = [name for name in names if name not in OF_THE_CURVE]
     return [name for name in names if name.partition(".")[0] not in OF_THE_RECORD]
@@ -133,19 +136,128 @@ def changed(before: State, now: State) -> list[dict[str, Any]]:
 
 def doubts(before: State, now: State) -> list[dict[str, Any]]:
     """What differs in the conditions, each `kind` with `before` and `now`."""
-    found: list[dict[str, Any]] = []
+    found: list[tuple[str, Any, Any]] = []
     if not same_current(before, now):
-        found.append({"kind": "current", "before": before.current_ma, "now": now.current_ma})
+        found.append(("current", before.current_ma, now.current_ma))
     elif before.current_ma is None or now.current_ma is None:
-        found.append({"kind": "current unknown", "before": before.current_ma, "now": now.current_ma})
+        found.append(("current unknown", before.current_ma, now.current_ma))
     if before.method != now.method:
-        found.append({"kind": "method", "before": before.method, "now": now.method})
+        found.append(("method", before.method, now.method))
     if sorted(before.structure) != sorted(now.structure):
-        found.append({"kind": "effects", "before": list(before.structure), "now": list(now.structure)})
+        found.append(("effects", list(before.structure), list(now.structure)))
     old, new = dict(before.notes), dict(now.notes)
     noted = [(kind, old.get(kind, ""), new.get(kind, "")) for kind in sorted(old.keys() | new.keys())]
-    return found + [
-        {"kind": kind, "before": first, "now": second}
-        for kind, first, second in noted
-        if first.split() != second.split()
-    ]
+    found += [(kind, first, second) for kind, first, second in noted if first.split() != second.split()]
+    return [{"kind": kind, "before": first, "now": second} for kind, first, second in found]
+
+
+# ---- in words -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Name:
+    """How a figure is called, the unit it is shown in, and the factor from the stored unit to that one.
+
+    `digits` after the point; None: three significant ones. `in_percent`: whether a change of it is told in per cent.
+    """
+
+    words: Any
+    unit: str
+    factor: float = 1.0
+    digits: int | None = None
+    in_percent: bool = False
+
+
+NAMES = {
+    "threshold_us": Name(lazy("Threshold"), "µs", digits=1),
+    "plateau_nm": Name(lazy("Plateau"), "N·m", digits=2, in_percent=True),
+    "time_constant_s": Name(lazy("Time constant"), "s", digits=3, in_percent=True),
+    "damping": Name(lazy("Damping"), "1", digits=3, in_percent=True),
+    "delay_s": Name(lazy("Delay"), "ms", 1e3, digits=1),
+    "follows_percent": Name(lazy("Follows"), "%", digits=1),
+    "noise_sd_nm": Name(lazy("Noise of the torque sensor"), "N·m", digits=3),
+    "charge_uc": Name(lazy("Dose (charge)"), "mC", 1e-3, digits=2),
+    "current_ma": Name(lazy("Current"), "mA", digits=1),
+}
+"""In the order in which they are shown; those from the fourth last on after the effects' parameters."""
+UNBROKEN = "\u00a0"
+"""Between a number and its unit no line ends."""
+LAST = ("follows_percent", "noise_sd_nm", "charge_uc", "current_ma")
+KINDS = {"electrodes": lazy("electrodes"), "side": lazy("the side"), "posture": lazy("posture")}
+
+
+def name_of(figure: str, unit: str = "1") -> Name:
+    """A figure's name; of an effect's parameter, the effect and the parameter without its unit."""
+    if figure in NAMES:
+        return NAMES[figure]
+    effect, _dot, parameter = figure.partition(".")
+    return Name(f"{effect_words(effect)}, {parameter_words(parameter)}", unit, in_percent=True)
+
+
+def value_words(value: float | None, name: Name, unit: bool = True) -> str:
+    """A value in the unit in which it is shown, as the page's language writes it."""
+    if value is None:
+        return "–"
+    scaled = value * name.factor
+    digits = name.digits if name.digits is not None else _digits(scaled)
+    text = language.localised(f"{round(scaled, digits) + 0.0:.{digits}f}".replace("-", "−"))  # + 0.0: no "−0"
+    return f"{text}{UNBROKEN}{name.unit}" if unit and name.unit != "1" else text
+
+
+def uncertain_words(value: float | None, uncertainty: float | None, name: Name, sign: bool = False) -> str:
+    """A value with twice its uncertainty, without the unit; a difference has its sign."""
+    if uncertainty and name.digits is None:  # as many digits as are known
+        name = replace(name, digits=max(0, _digits(BEYOND * uncertainty * name.factor) - 1))
+    words = value_words(value, name, unit=False)
+    if sign and value is not None and not words.startswith("−"):
+        words = f"+{words}"
+    if value is None or uncertainty is None:
+        return words
+    return f"{words} ± {value_words(BEYOND * uncertainty, name, unit=False)}"
+
+
+def _digits(value: float) -> int:
+    return min(6, max(0, 2 - math.floor(math.log10(abs(value))))) if value else 0
+
+
+def sentences(before: State, now: State, since_utc: str) -> list[str]:
+    """What changed beyond its uncertainty, a sentence each; one that says so where nothing did."""
+    day = language.day(since_utc)
+    moved = [_sentence(one, day) for one in changed(before, now)]
+    return moved or [_("Nothing changed beyond its uncertainty since %(day)s.", day=day)]
+
+
+def _sentence(one: dict[str, Any], day: str) -> str:
+    """A change, and how sure it is. Of a falling curve the plateau's size is compared."""
+    name = name_of(one["figure"], one["unit"])
+    if one["before"] * one["now"] < 0:
+        amounts = {"before": value_words(one["before"], name), "now": value_words(one["now"], name)}
+        return _("%(figure)s: %(now)s, it was %(before)s on %(day)s.", figure=name.words, day=day, **amounts)
+    if name.in_percent and one["percent"] is not None:
+        amount = f"{abs(one['percent']):.{1 if abs(one['percent']) < 9.95 else 0}f}{UNBROKEN}%"
+    else:
+        amount = value_words(abs(one["difference"]), name)
+    given = {"figure": name.words, "amount": language.localised(amount), "day": day}
+    if abs(one["now"]) < abs(one["before"]):
+        return _("%(figure)s %(amount)s lower than on %(day)s, more than twice its uncertainty.", **given)
+    return _("%(figure)s %(amount)s higher than on %(day)s, more than twice its uncertainty.", **given)
+
+
+def doubt_sentences(before: State, now: State) -> list[str]:
+    """What puts the comparison in doubt, a sentence each."""
+    return [_doubt(one["kind"], one["before"], one["now"]) for one in doubts(before, now)]
+
+
+def _doubt(kind: str, before: Any, now: Any) -> str:
+    if kind == "current unknown":
+        return _("The current of a recording is not known: threshold and plateau compare only at the same current.")
+    if kind == "current":
+        given = {name: value_words(value, NAMES["current_ma"]) for name, value in (("before", before), ("now", now))}
+        return _("The current was %(before)s, now it is %(now)s: threshold and plateau are not compared.", **given)
+    if kind == "effects":
+        given = {name: effects_words(value) or _("none") for name, value in (("before", before), ("now", now))}
+        return _("The models' effects differ (%(before)s, then %(now)s): only large differences are told.", **given)
+    given = {"before": str(before or "–")[:80], "now": str(now or "–")[:80]}
+    if kind == "method":
+        return _("The methods differ (%(before)s, then %(now)s): only large differences are told.", **given)
+    return _("The notes on %(kind)s differ: “%(before)s”, then “%(now)s”.", kind=KINDS.get(kind, kind), **given)

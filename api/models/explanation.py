@@ -7,8 +7,8 @@ from typing import Any
 
 from stimrig.api.clinical_words import segment_words
 from stimrig.api.effect_words import effect_words, effects_words, parameter_words, within, without_unit
+from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised, ngettext, plain
-from stimrig.api.models.reasons import refusal
 from stimrig.api.structure import worded
 from stimrig.identify.caution import caution, only_open
 
@@ -323,3 +323,48 @@ def noisy(comparison: dict[str, Any]) -> bool:
     """Whether more is left than noise would leave."""
     times = times_noise(comparison)
     return times is not None and times > NOISE_LIKE
+
+
+# ---- effects that the recording does not ask for --------------------------------------------------------------------
+
+
+def require_evidence(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[str]) -> None:
+    """Refuse effects that the recording does not ask for.
+
+    Raises
+    ------
+    ApiError
+        409, with the reason for each effect.
+    """
+    reasons = {effect: refusal(diagnosis, present, effect) for effect in added}
+    found = {effect: reason for effect, reason in reasons.items() if reason}
+    if found:
+        detail = " ".join(f"{effect}: {reason}" for effect, reason in found.items())
+        detail += (
+            " To add it against the evidence, send `force` and a reason; the held-out error then shows its effect."
+        )
+        raise ApiError(
+            409, "effect-not-there", "The recording gives no evidence for this effect", detail, reasons=found
+        )
+
+
+def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> str | None:
+    """Why the recording does not ask for an effect; None where it does, or cannot tell it from one it asks for."""
+    for entry in diagnosis.get("missing") or []:
+        if entry["effect"] == effect:
+            return None
+        if effect in (entry.get("confused_with") or []) and entry["effect"] not in present:
+            return None
+    rows = [row for rows in diagnosis.get("candidates") or [] for row in rows if row["effect"] == effect]
+    if not rows:
+        return "it was not tested on this recording: the recording lacks the columns that it needs."
+    gain = rows[-1]["log_evidence_gain"]
+    if gain <= 0:
+        return f"the recording speaks against it (log evidence {gain:+.1f})."
+    better = [entry for entry in diagnosis.get("missing") or [] if entry["effect"] != effect]
+    if better and rows[0]["log_evidence_gain"] > 6:
+        names = " and ".join((entry.get("name") or entry["effect"]).lower() for entry in better)
+        name = ((diagnosis.get("library") or {}).get(effect) or {}).get("name", effect).lower()
+        beside = f"with it in the model, {name} gains too little (log evidence {gain:+.1f})."
+        return f"{names} explains the same error better; {beside}"
+    return f"the evidence is too weak (log evidence {gain:+.1f}): what it explains looks like noise."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,7 @@ from sqlalchemy.orm import Session, defer
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.models import headline, reasons, stored, summary
+from stimrig.api.models import model_json
 from stimrig.api.models.places import Site, in_words, kept, site_of, site_of_recording
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, seen
@@ -26,6 +27,34 @@ TOLD = (
     "created_utc", "created_by",
 )  # fmt: skip
 """What clients see of a version's row as it is."""
+
+POOR = ("not usable", "unknown")
+"""The verdicts with which an approval needs a reason."""
+WORDS, LETTERS, DIFFERENT = 3, 10, 5
+"""So many different words, so many letters, so many different letters; "ok", "asdf" and "......" have fewer."""
+WHAT_TO_WRITE = (
+    "Write in a few words why the controller may have this model and who watches it, "
+    "for example: only the delay is used today, the engineer stands by."
+)
+
+
+def is_reason(text: str) -> bool:
+    """Whether a text says something: a few different words, none of them one letter held down."""
+    words = [word.casefold() for word in re.findall(r"[^\W\d_]+", text)]
+    letters = "".join(words)
+    return (
+        len(set(words)) >= WORDS
+        and len(letters) >= LETTERS
+        and len(set(letters)) >= DIFFERENT
+        and not any(re.search(r"(.)\1{3}", word) for word in words)
+    )
+
+
+def refuse_without(verdict: str, reason: str) -> None:
+    """Refuse to approve a model that is not usable without a reason. Raises ApiError (422): what to write."""
+    if verdict in POOR and not is_reason(reason):
+        title = "This model is not usable: say why it is approved all the same"
+        raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
 
 
 @dataclass(frozen=True)
@@ -79,7 +108,11 @@ class Versions:
             carried=carried,
             method=str(document.get("method", "")),
             effects=[str(effect["id"]) for effect in document.get("effects") or []],
-            fit={**summary.figures(document), **summary.quality(document), "figures": headline.of(document)},
+            fit={
+                **model_json.figures(document),
+                **model_json.quality(document),
+                "figures": model_json.muscle_figures(document),
+            },
             document=body,
             etag=hashlib.sha256(body).hexdigest(),
             created_utc=now,
@@ -160,7 +193,7 @@ class Versions:
             seen.check(session, seen.decisions(row.participant))
             holding = self.approved(row.participant)
             self._decide(session, row, False, by, words)
-            usable = self.quality(parent)["verdict"] not in reasons.POOR
+            usable = self.quality(parent)["verdict"] not in POOR
             if holding is not None and holding.model_id == row.id and usable:
                 self._decide(session, parent, True, by, words, holding.tracking)
         return parent
@@ -181,8 +214,8 @@ class Versions:
         """
         row = self.get(model_id)
         if approved:
-            stored.whole(row)
-            reasons.refuse_without(self.quality(row)["verdict"], reason)
+            model_json.whole(row)
+            refuse_without(self.quality(row)["verdict"], reason)
         with self.store.write() as session:
             if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
@@ -285,7 +318,7 @@ class Versions:
         if found is None or found.approval_id != approval.id:
             row = self.get(approval.model_id)
             found = self._served[participant] = Served(
-                row.id, stored.whole(row), f'"{row.etag}"', approval.id, approval.at_utc
+                row.id, model_json.whole(row), f'"{row.etag}"', approval.id, approval.at_utc
             )
         return found
 
@@ -309,9 +342,9 @@ class Versions:
             return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
         if row.etag not in self._read:
             try:
-                self._read[row.etag] = summary.quality(json.loads(row.document))
+                self._read[row.etag] = model_json.quality(json.loads(row.document))
             except (ValueError, TypeError, AttributeError):  # unknown; that it is damaged its own page says
-                self._read[row.etag] = summary.quality({})
+                self._read[row.etag] = model_json.quality({})
         return self._read[row.etag]
 
     def document(self, row: Model) -> dict[str, Any]:

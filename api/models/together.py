@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from collections.abc import Sequence
+from pathlib import Path
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.models.analyses import Analyses, OnCall
-from stimrig.api.store import audit
-from stimrig.api.store.tables import Model, Recording
+from stimrig.api.models.places import Site, site_of_recording
+from stimrig.api.store import audit, uploads
+from stimrig.api.store.tables import Model, Recording, Test
 
 JOINT_EFFECTS = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
 """What the torque does with angle and velocity, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):
@@ -66,7 +72,7 @@ def _found(analyses: Analyses, participant: str, recordings: Sequence[str]) -> l
 async def _joined(analyses: Analyses, rows: list[Recording], participant: str, needs: list[str]) -> Recording:
     """The recordings as one; where one of them does not do, it is named by its id and not by its number."""
     try:
-        return await analyses.join([row.id for row in rows], participant, needs)
+        return await join(analyses, [row.id for row in rows], participant, needs)
     except ApiError as error:
         for number, row in enumerate(rows, start=1):
             if str(error.extra.get("place", "")) == f"recording {number}":
@@ -82,4 +88,52 @@ def _store(
     row = analyses.versions.add(model_json, participant, whole.id, by)
     with analyses.store.write() as session:
         audit.write(session, analyses.clock.utc(), by, "fit recordings together", row.id, recordings=list(parts))
+    return row
+
+
+async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs: Sequence[str] = ()) -> Recording:
+    """Recordings as one, itself a recording (`origin` joined), to which all else applies.
+
+    Parameters
+    ----------
+    parts : sequence of str
+        Their ids; where all begins are known the order is that of time.
+    needs : sequence of str
+        Columns that each of them must have, such as `angle_rad`; one that a part lacks is left out of the whole.
+    """
+    paths = [await asyncio.to_thread(analyses.path, part) for part in parts]
+    settings = analyses.settings
+    made = settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"  # all that a worker may write to
+    kept = settings.recordings_dir / made.name
+    try:
+        found = await analyses.asked("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
+        await asyncio.to_thread(made.replace, uploads.part_of(kept))
+    except BaseException:
+        made.unlink(missing_ok=True)
+        raise
+    stored = asyncio.to_thread(_store_joined, analyses, kept, found["file_sha256"], participant, list(parts))
+    return await asyncio.shield(stored)
+
+
+def _one_site(session: Session, parts: list[str]) -> Site | None:
+    """Where all parts stimulated; 409 where that was not one site."""
+    tests = {test.recording_id: test for test in session.scalars(select(Test).where(Test.recording_id.in_(parts)))}
+    rows = session.scalars(select(Recording).where(Recording.id.in_(parts)))
+    sites = [site_of_recording(row, tests.get(row.id)) for row in rows]
+    if any(site != sites[0] for site in sites):
+        detail = "The recordings were made at different sites; what was learnt at one says nothing of another."
+        raise ApiError(409, "other-site", "These recordings are of several sites", detail)
+    return sites[0]
+
+
+def _store_joined(analyses: Analyses, kept: Path, digest: str, participant: str, parts: list[str]) -> Recording:
+    now, identity = analyses.clock.utc(), kept.stem
+    row = Recording(id=identity, participant=participant, path=str(kept), file_sha256=digest, origin="joined")
+    row.test_id, row.created_utc = None, now
+    with uploads.taken_in(kept), analyses.store.write() as session:
+        site = _one_site(session, parts)
+        row.site = None if site is None else list(site)
+        session.add(row)
+        session.flush()
+        audit.write(session, now, "service", "join recordings", identity, parts=parts, sha256=digest)
     return row

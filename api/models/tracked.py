@@ -12,7 +12,7 @@ from sqlalchemy.orm import defer
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.models import headline, stored, tracking
+from stimrig.api.models import model_json, tracking
 from stimrig.api.models.places import Place, differ, place_of
 from stimrig.api.models.registry import Served, Versions
 from stimrig.api.models.tracking import NOT_FOLLOWED, Bounds, Limits
@@ -29,43 +29,29 @@ SUPERSEDED = "Another model was approved, or this approval ended, before the tri
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial that is to be followed.
-
-    Parameters
-    ----------
-    test : Test
-        Its test, which has a recording.
-    approval : Approval
-        The one under which it was begun.
-    model_json : str
-        The approved MODEL.json.
-    bounds, alarms : Bounds
-        What a person allowed, and beyond what they are asked.
-    problem : str
-        Why the approved model cannot be followed; empty where it can.
-    number : int
-        Of the approval's trials, from 1.
-    state : dict or None
-        What is known from the last trial that was followed; None: there is none.
-    missed : int
-        Trials since then that were not followed.
-    earlier : list of list of dict
-        The levels of the trials under earlier approvals of this person, oldest first: how fast they change.
-    since : str
-        Id of the recording that `state` was found from; without one, of the approved model's.
-    """
+    """A trial that is to be followed, with its test's recording."""
 
     test: Test
     approval: Approval
+    """The one under which it was begun."""
     model_json: str
+    """The approved MODEL.json."""
     bounds: Bounds
+    """What a person allowed."""
     alarms: Bounds
+    """Beyond what they are asked."""
     problem: str
+    """Why the approved model cannot be followed; empty where it can."""
     number: int
+    """Of the approval's trials, from 1."""
     state: dict[str, Any] | None
+    """What is known from the last trial that was followed; None: there is none."""
     missed: int
+    """Trials since then that were not followed."""
     earlier: list[list[dict[str, Any]]]
+    """The levels of the trials under earlier approvals of this person, oldest first: how fast they change."""
     since: str
+    """Id of the recording that `state` was found from; without one, of the approved model's."""
 
 
 class TrackedVersions:
@@ -95,8 +81,8 @@ class TrackedVersions:
         followed = [row for row in rows if row.step is not None]
         model, text, bounds, alarms, problem = self.versions.get(approval.model_id), "", Bounds(), Bounds(), ""
         try:
-            limits, threshold_us = Limits(**approval.tracking), headline.threshold_us(model)
-            text, bounds, alarms = stored.text(model), limits.bounds(threshold_us), limits.alarms(threshold_us)
+            limits, threshold_us = Limits(**approval.tracking), model_json.threshold_us(model)
+            text, bounds, alarms = model_json.text(model), limits.bounds(threshold_us), limits.alarms(threshold_us)
         except ApiError as error:
             problem = error.detail
         return Trial(
@@ -130,7 +116,7 @@ class TrackedVersions:
 
     def text(self, approval: Approval) -> str:
         """The approved MODEL.json. Raises ApiError (500) where it is damaged."""
-        return stored.text(self.versions.get(approval.model_id))
+        return model_json.text(self.versions.get(approval.model_id))
 
     def rows(self, approval_id: int) -> list[Tracked]:
         """The trials of an approval, the oldest first, without what was served."""
@@ -254,7 +240,7 @@ class TrackedVersions:
                 if row.document is not None:
                     return row.document.decode()
             base = model_id
-        return stored.text(self.versions.get(base))
+        return model_json.text(self.versions.get(base))
 
     def version_of(self, model_id: str) -> Model:
         """The version itself, or the one from which it was tracked. Raises ApiError (404)."""
@@ -277,7 +263,7 @@ class TrackedVersions:
             "approved_model_id": approval.model_id,
             "approved_utc": approval.at_utc,
             "limits": approval.tracking,
-            "threshold_us": headline.threshold_us(model),
+            "threshold_us": model_json.threshold_us(model),
             "served_utc": served.at_utc if served else None,
             "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0) if served else None,
             "etag": served.etag if served else None,

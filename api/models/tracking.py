@@ -169,6 +169,21 @@ OUTCOMES = {
     "no-torque": lazy("next to no torque came: look at electrodes and cables"),
     "not-followed": lazy("not followed"),
 }
+SENTENCES = {
+    "gain": (
+        "In trial %(number)s the plateau is %(change)s lower than %(than)s.",
+        "In trial %(number)s the plateau is %(change)s higher than %(than)s.",
+    ),
+    "threshold_shift_us": (
+        "In trial %(number)s the threshold is %(change)s lower than %(than)s.",
+        "In trial %(number)s the threshold is %(change)s higher than %(than)s.",
+    ),
+    "time_scale": (
+        "In trial %(number)s the muscle is %(change)s faster than %(than)s.",
+        "In trial %(number)s the muscle is %(change)s slower than %(than)s.",
+    ),
+}
+"""Lower or faster, higher or slower: for the catalogues, and for `_`."""
 MIDDLES = {"gain": 1.0, "threshold_shift_us": 0.0, "time_scale": 1.0}
 NARROW = {"gain": 0.05, "threshold_shift_us": 5.0, "time_scale": 0.1}
 """The muscle is called unchanged where each band holds the middle and leaves it by no more than this."""
@@ -191,21 +206,12 @@ def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
     same_day = local_day(since_utc) == local_day(last)
     said = {"number": known[-1]["number"], "than": _than(since_utc, same_day)}
     found = []
-    if sign := _sure(now, "gain"):
-        said["change"] = _percent(now["gain"]["value"])
-        lower = _("In trial %(number)s the plateau is %(change)s lower than %(than)s.", **said)
-        higher = _("In trial %(number)s the plateau is %(change)s higher than %(than)s.", **said)
-        found.append(lower if sign < 0 else higher)
-    if sign := _sure(now, "threshold_shift_us"):
-        said["change"] = localised(f"{abs(now['threshold_shift_us']['value']):.1f} µs")
-        lower = _("In trial %(number)s the threshold is %(change)s lower than %(than)s.", **said)
-        higher = _("In trial %(number)s the threshold is %(change)s higher than %(than)s.", **said)
-        found.append(lower if sign < 0 else higher)
-    if sign := _sure(now, "time_scale"):
-        said["change"] = _percent(now["time_scale"]["value"])
-        faster = _("In trial %(number)s the muscle is %(change)s faster than %(than)s.", **said)
-        slower = _("In trial %(number)s the muscle is %(change)s slower than %(than)s.", **said)
-        found.append(faster if sign < 0 else slower)
+    for name, (lower, higher) in SENTENCES.items():
+        if sign := _sure(now, name):
+            value = now[name]["value"]
+            shift = name == "threshold_shift_us"
+            change = localised(f"{abs(value):.1f} µs") if shift else _percent(value)
+            found.append(_(lower if sign < 0 else higher, change=change, **said))
     if found:
         return found
     if all(_narrow(now, name) for name in MIDDLES):

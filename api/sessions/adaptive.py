@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.models import stored
+from stimrig.api.models import stored_model
 from stimrig.api.models.places import Place, differ, place_of, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive_follower import Follower, Told
@@ -115,7 +115,7 @@ class AdaptiveTests(Watched):
         found = []
         for row in [row for row in rows if row.recording_id not in elsewhere][-MOST_MODELS:]:
             with contextlib.suppress(ApiError):
-                found.append(stored.text(row))
+                found.append(stored_model.text(row))
         return found
 
     # ---- while it plays, and after it ------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.models import together
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.kinds import Kinds
@@ -201,7 +202,7 @@ class Lifecycle:
         if joins is None:
             return recording, None
         model = await asyncio.to_thread(self.versions.get, joins)
-        return await self.analyses.join([model.recording_id, recording.id], row.participant), model.id
+        return await together.join(self.analyses, [model.recording_id, recording.id], row.participant), model.id
 
     def warnings(self, recording_id: str) -> list[str]:
         """What was found doubtful about a recording, in sentences: by the rig, or when its first model was made."""

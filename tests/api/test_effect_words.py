@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 from stimrig.api import language
 from stimrig.api.effect_words import EFFECTS, PARAMETERS, effects_words, without_unit
 from stimrig.api.language import translated
-from stimrig.api.models import explanation, headline, trend_words
+from stimrig.api.models import changes, explanation, model_json
 from stimrig.identify import effects
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 from tests.api.test_access import signed_in
@@ -34,14 +34,14 @@ def test_titles_and_main_parameters_are_those_of_the_library() -> None:
     for entry in effects.library():
         for form in entry["forms"] if entry["id"] in EFFECTS else ():
             held = {"id": entry["id"], "parameters": {one["name"]: 1.0 for one in form["parameters"]}}
-            (figure,) = [name for name in headline.of(PLAIN | {"effects": [held]}) if "." in name]
+            (figure,) = [name for name in model_json.muscle_figures(PLAIN | {"effects": [held]}) if "." in name]
             assert without_unit(figure.partition(".")[2]) in PARAMETERS, figure
 
 
 def test_words_in_german() -> None:
     with language.using("de"):
         assert effects_words(["fatigue:by_pulses", "mains_hum"]) == "Ermüdung (by pulses), Netzbrummen"
-        assert trend_words.name_of("fatigue.depth", "1").words == "Ermüdung, Tiefe"
+        assert changes.name_of("fatigue.depth", "1").words == "Ermüdung, Tiefe"
         assert translated("recruitment_hysteresis: the evidence is too weak (log evidence +0.3): what it explains "
                           "looks like noise.").startswith("Hysterese der Rekrutierung: ")  # fmt: skip
         for effect in EFFECTS:

@@ -9,8 +9,8 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api.models import next_step
-from stimrig.api.models.next_step import Situation, Today
+from stimrig.api.web.pages import next_view
+from stimrig.api.web.pages.next_view import Situation, Today, next_step
 from tests.api.conftest import Service, run_test, wait_done
 from tests.api.test_access import csrf, signed_in
 
@@ -61,7 +61,7 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
 
 @pytest.mark.parametrize(("so", "kind", "words", "leads"), TABLE)
 def test_each_state_has_one_step(so: dict[str, Any], kind: str, words: str, leads: str) -> None:
-    step = next_step.of(Situation("P1", **so))
+    step = next_step(Situation("P1", **so))
     assert (step.kind, step.href) == (kind, "" if leads == "form" else leads)
     assert words in step.words
     assert bool(step.button) == bool(leads), "a line without a way on has no button"
@@ -70,14 +70,14 @@ def test_each_state_has_one_step(so: dict[str, Any], kind: str, words: str, lead
 def test_the_table_names_every_kind_and_every_state_of_the_rig() -> None:
     from stimrig.api.web.pages.rig_state import WORDS
 
-    assert {kind for _, kind, _, _ in TABLE} == set(next_step.Kind.__args__)
+    assert {kind for _, kind, _, _ in TABLE} == set(next_view.Kind.__args__)
     for state in WORDS:
-        assert next_step.of(Situation("P1", rig=state)).words
+        assert next_step(Situation("P1", rig=state)).words
 
 
 def test_keys_tell_steps_apart() -> None:
     """A page that shows one step and hears of another key is out of date."""
-    keys = {next_step.of(Situation("P1", **so)).key for so, *_ in TABLE}
+    keys = {next_step(Situation("P1", **so)).key for so, *_ in TABLE}
     assert len(keys) > 15
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api.models import advice, reasons
+from stimrig.api.models import advice, registry
 from stimrig.identify.estimation import quality
 from tests.api.conftest import Service, run_test
 from tests.api.test_access import csrf, signed_in
@@ -39,12 +39,12 @@ def make_poor(service: Service, model: str) -> str:
 
 @pytest.mark.parametrize("text", NONE)
 def test_no_reason(text: str) -> None:
-    assert not reasons.is_reason(text)
+    assert not registry.is_reason(text)
 
 
 @pytest.mark.parametrize("text", SOME)
 def test_a_reason(text: str) -> None:
-    assert reasons.is_reason(text)
+    assert registry.is_reason(text)
 
 
 def test_the_api_wants_a_reason_for_a_model_that_is_not_usable(

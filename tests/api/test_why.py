@@ -12,7 +12,7 @@ import h5py
 import httpx
 import pytest
 
-from stimrig.api.models import explanation, reasons
+from stimrig.api.models import explanation
 from stimrig.hardware_sim import hidden_records
 from tests.api.conftest import Service, run_test, soon, wait_done
 from tests.api.test_access import csrf, signed_in
@@ -171,7 +171,7 @@ def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client
 
 def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]], effect: str) -> str | None:
     rounds = [[{"effect": name, "log_evidence_gain": gain} for name, gain in found] for found in gains]
-    return reasons.refusal({"missing": missing, "candidates": rounds}, [], effect)
+    return explanation.refusal({"missing": missing, "candidates": rounds}, [], effect)
 
 
 def test_reasons_against_an_effect() -> None:

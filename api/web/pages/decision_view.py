@@ -15,7 +15,7 @@ from starlette.datastructures import FormData
 
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised
-from stimrig.api.models import advice, headline, reasons, stored
+from stimrig.api.models import advice, model_json, registry
 from stimrig.api.models.tracking import QUANTITIES, Limits
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx
@@ -48,7 +48,7 @@ async def approve(request: Request, context: Ctx, who: Approver, model_id: str, 
     row = await asyncio.to_thread(context.versions.get, model_id)
     sent = await request.form()
     tracking = read_tracking(sent)
-    if _poor(context, row) and not reasons.is_reason(reason):
+    if _poor(context, row) and not registry.is_reason(reason):
         given = {name: sent[name] for name in LABELS if name in sent}
         return await _question(request, context, row, who.session_hash, reason, given)
     await models.let_have(context, model_id, who.name, reason.strip()[:500], tracking)
@@ -72,7 +72,7 @@ async def reject(context: Ctx, who: Approver, model_id: str, reason: Reason = ""
 
 
 def _poor(context: Context, row: Model) -> bool:
-    return context.versions.quality(row)["verdict"] in reasons.POOR
+    return context.versions.quality(row)["verdict"] in registry.POOR
 
 
 async def _question(
@@ -80,7 +80,7 @@ async def _question(
     sent: dict[str, Any] | None = None,
 ) -> Response:  # fmt: skip
     """What would be risked, and the field for the reason; with what was typed where it is no reason."""
-    document = stored.read(row)
+    document = model_json.read(row)
     return page(
         request,
         "approve_poor.html",
@@ -90,8 +90,8 @@ async def _question(
         ask_password=not await context.people.is_confirmed(session),
         typed=written,
         sent=sent,
-        threshold_us=headline.threshold_us(row),
-        what_to_write=reasons.WHAT_TO_WRITE,
+        threshold_us=model_json.threshold_us(row),
+        what_to_write=registry.WHAT_TO_WRITE,
     )
 
 

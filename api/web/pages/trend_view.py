@@ -13,7 +13,7 @@ from stimrig.api import language
 from stimrig.api.charts import model_charts, trend_charts
 from stimrig.api.charts.model_charts import MOST
 from stimrig.api.errors import ApiError
-from stimrig.api.models import changes, stored, trend_words
+from stimrig.api.models import changes, model_json
 from stimrig.api.models.trend import Session
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader
@@ -42,7 +42,7 @@ async def compare(
     at = next((number for number, row in enumerate(rows) if row.id == reference), 0)
     sides = await asyncio.gather(*(side(context, rows, number) for number in range(len(rows))))
     names = [language.when(row.created_utc) for row in rows]
-    documents = [stored.read(row) for row in rows]
+    documents = [model_json.read(row) for row in rows]
     return page(
         request,
         "compare.html",
@@ -51,7 +51,7 @@ async def compare(
         reference=at,
         table=comparison(sessions, at),
         doubts=[
-            (names[number], trend_words.doubted(sessions[at].state(), one.state()))
+            (names[number], changes.doubt_sentences(sessions[at].state(), one.state()))
             for number, one in enumerate(sessions)
             if number != at
         ],
@@ -98,7 +98,7 @@ def comparison(sessions: Sequence[Session], reference: int) -> list[dict[str, An
     """The figures, a row each: the value of every model, and how far it is from the reference's."""
     documents = [one.shown()["figures"] for one in sessions]
     known = dict.fromkeys(name for figures in documents for name in figures)
-    order = [*(name for name in trend_words.NAMES if name in known), *(name for name in known if "." in name)]
+    order = [*(name for name in changes.NAMES if name in known), *(name for name in known if "." in name)]
     return [compared(name, sessions, documents, reference) for name in order]
 
 
@@ -107,11 +107,11 @@ def compared(
 ) -> dict[str, Any]:
     """One figure of all models."""
     unit = next(figures[figure]["unit"] for figures in documents if figure in figures)
-    name = trend_words.name_of(figure, unit)
+    name = changes.name_of(figure, unit)
     cells = []
     for number, figures in enumerate(documents):
         one = figures.get(figure) or {"value": None, "uncertainty": None}
-        words = trend_words.with_uncertainty(one["value"], one["uncertainty"], name)
+        words = changes.uncertain_words(one["value"], one["uncertainty"], name)
         cell: dict[str, Any] = {"words": words, "where": one.get("where", ""), "difference": None, "beyond": False}
         if number != reference:
             cell |= apart(figure, sessions[reference], sessions[number], name)
@@ -119,13 +119,13 @@ def compared(
     return {"name": name.words, "unit": "" if name.unit == "1" else name.unit, "cells": cells}
 
 
-def apart(figure: str, before: Session, now: Session, name: trend_words.Name) -> dict[str, Any]:
+def apart(figure: str, before: Session, now: Session, name: changes.Name) -> dict[str, Any]:
     """A difference in words, and whether it is beyond twice its uncertainty."""
     old, new = before.state(), now.state()
     found = changes.difference(figure, old, new) if figure in changes.comparable(old, new) else None
     if found is None:
         return {"difference": None, "beyond": False}
-    words = trend_words.with_uncertainty(found["difference"], found["uncertainty"], name, sign=True)
+    words = changes.uncertain_words(found["difference"], found["uncertainty"], name, sign=True)
     return {"difference": words, "beyond": found["beyond"]}
 
 
@@ -141,21 +141,21 @@ async def trend(request: Request, context: Ctx, _who: ModelReader, code: str) ->
         sessions=[row(one) for one in reversed(documents)],
         panels=trend_charts.panels(documents),
         changes=rest.newest(found),
-        columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(trend_words.name_of, COLUMNS)],
+        columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(changes.name_of, COLUMNS)],
         most=MOST,
     )
 
 
 def row(session: dict[str, Any]) -> dict[str, Any]:
     """A session in the table."""
-    names = [(figure, trend_words.name_of(figure)) for figure in COLUMNS]
+    names = [(figure, changes.name_of(figure)) for figure in COLUMNS]
     cells = [cell(session["figures"][figure], name) for figure, name in names if figure in session["figures"]]
     return {**session, "cells": cells}
 
 
-def cell(figure: dict[str, Any], name: trend_words.Name) -> dict[str, Any]:
+def cell(figure: dict[str, Any], name: changes.Name) -> dict[str, Any]:
     """A figure with its 95 % band; `where`: on which pulses it was found, where that is not always the same."""
-    words, _sign, band = trend_words.with_uncertainty(figure["value"], figure["uncertainty"], name).partition(" ± ")
+    words, _sign, band = changes.uncertain_words(figure["value"], figure["uncertainty"], name).partition(" ± ")
     return {"name": name.words, "words": words, "band": band, "where": figure.get("where", "")}
 
 

@@ -9,7 +9,7 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from stimrig.api import language
-from stimrig.api.models import changes, trend_words
+from stimrig.api.models import changes
 from stimrig.api.models.trend import Session
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
 from stimrig.api.web.responses.base import answers
@@ -58,8 +58,8 @@ def between(before: Session, now: Session) -> dict[str, Any]:
         "since_model_id": before.model.id,
         "model_id": now.model.id,
         "differences": changes.changed(old, new),
-        "sentences": trend_words.told(old, new, before.at_utc),
-        "doubts": trend_words.doubted(old, new),
+        "sentences": changes.sentences(old, new, before.at_utc),
+        "doubts": changes.doubt_sentences(old, new),
     }
 
 

@@ -1,0 +1,238 @@
+"""MODEL.json: the bytes as they were stored, and what a person reads off it.
+
+Figures and verdict, threshold and plateau, natural period and damping; and the figures that are followed over sessions,
+each with its standard deviation.
+"""
+
+from __future__ import annotations
+
+import cmath
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from stimrig.api.errors import ApiError
+from stimrig.api.language import _
+
+if TYPE_CHECKING:
+    from stimrig.api.store.tables import Model
+
+# ---- as it was stored ---------------------------------------------------------------------------------------------
+
+
+def whole(row: Model) -> bytes:
+    """A version's bytes, for the controller and for files. Raises ApiError (500) where they are damaged."""
+    if hashlib.sha256(row.document).hexdigest() != row.etag:
+        detail = (
+            f"{row.id} is no longer what was stored (its checksum differs). Restore the database from a backup, or fit "
+            "its recording again."
+        )
+        raise ApiError(500, "model-damaged", "The stored model is damaged", detail)
+    return row.document
+
+
+def read(row: Model) -> dict[str, Any]:
+    """A version's document. Raises ApiError (500) where it is damaged."""
+    return json.loads(whole(row))
+
+
+def text(row: Model) -> str:
+    """A version's document as workers are given it. Raises ApiError (500) where it is damaged."""
+    return whole(row).decode()
+
+
+# ---- verdict and fit ----------------------------------------------------------------------------------------------
+
+UNDEFINED = "not defined: the torque is level there"
+"""What stands where a model has an error but no best-fit %."""
+VERDICTS = ("usable", "usable with care", "not usable")
+"""Best first."""
+FORMER = {"good": "usable", "poor": "not usable"}
+"""What older versions called them; their "usable" stood between the two."""
+DEFAULTS = {
+    "usable": "Nothing speaks against it.",
+    "usable with care": "Look at where it fails before relying on it.",
+    "not usable": "Do not rely on it.",
+}
+FIT = (
+    "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
+    "rms_nm", "held_out_rms_nm", "held_out_by", "noise_sd_nm",
+)  # fmt: skip
+
+
+def figures(document: dict[str, Any]) -> dict[str, Any]:
+    """The few numbers of a MODEL.json a person looks at first."""
+    fit = document.get("fit") or {}
+    return {name: fit.get(name) for name in FIT}
+
+
+def quality(document: dict[str, Any]) -> dict[str, Any]:
+    """identify's verdict on a model, as its MODEL.json stores it: nothing is judged here.
+
+    Older models are read so: a verdict of a former vocabulary by its place in today's; without words, the first reason;
+    whatever is stored, no better than its gates; "unknown" where there is no verdict.
+
+    Returns
+    -------
+    dict
+        ``verdict`` (usable, usable with care, not usable, unknown), ``words`` (a sentence), ``reasons`` (a list).
+    """
+    stored = document.get("quality") or {}
+    gates = stored.get("gates") or {}
+    verdict = stored.get("verdict")
+    if verdict == "usable" and not gates:  # only identify writes gates
+        verdict = "usable with care"
+    verdict = FORMER.get(str(verdict), verdict)
+    if verdict not in VERDICTS:
+        return {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
+    refused = [gate.get("severity") == "refuse" for gate in gates.values() if not gate.get("passed", True)]
+    allowed = "not usable" if any(refused) else "usable with care" if refused else "usable"
+    worse = max(verdict, allowed, key=VERDICTS.index)
+    reasons = list(stored.get("reasons") or [])
+    words = stored.get("words") if worse == verdict else None
+    first = f"{reasons[0][:1].upper()}{reasons[0][1:].rstrip('.')}." if reasons else DEFAULTS[worse]
+    return {"verdict": worse, "words": words or first, "reasons": reasons}
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How much of the torque a model follows: the figure that says how good it is, the same on every page.
+
+    Best fit, and the most that the sensor noise allows on the same pulses, %; None where it is not defined. `where`:
+    the pulses it was found on, as the beginning of a sentence.
+    """
+
+    percent: float | None
+    ceiling_percent: float | None
+    where: str
+
+
+def followed(fit: Mapping[str, Any]) -> Followed:
+    """The figure of a model's `fit`: of pulses not used for fitting where there are any."""
+    if fit.get("held_out_fit_percent") is None:
+        where = _("On the pulses that it was fitted to")
+        return Followed(fit.get("fit_percent"), fit.get("ceiling_percent"), where)
+    if fit.get("held_out_by") == "cross-validation":
+        where = _("On parts of the recording that were left out in turn")
+    else:
+        where = _("On pulses not used for fitting")
+    return Followed(fit["held_out_fit_percent"], fit.get("held_out_ceiling_percent"), where)
+
+
+# ---- curve and dynamics -------------------------------------------------------------------------------------------
+
+THRESHOLD_SHARE = 0.05
+"""The threshold is where the recruitment curve has gone this share of its way to the plateau."""
+
+
+def recruitment(document: dict[str, Any]) -> dict[str, float | None]:
+    """Threshold (µs), plateau (N·m) and the width at which 95 % of it is reached (µs).
+
+    Where stimulation lowers the record's torque the curve falls, and its plateau is below zero.
+    """
+    width_us, torque_nm = document["recruitment"]["pulse_width_us"], document["recruitment"]["torque_nm"]
+    low, high = torque_nm[0], max(torque_nm, key=lambda torque: abs(torque - torque_nm[0]))
+    way = [(torque - low) / (high - low) if high != low else 0.0 for torque in torque_nm]
+    return {
+        "threshold_us": _crossing(width_us, way, THRESHOLD_SHARE),
+        "plateau_nm": high,
+        "saturation_us": _crossing(width_us, way, 1 - THRESHOLD_SHARE),
+    }
+
+
+def _crossing(width_us: list[float], way: list[float], level: float) -> float | None:
+    for index in range(1, len(width_us)):
+        before, after = way[index - 1], way[index]
+        if before < level <= after:
+            share = (level - before) / (after - before)
+            return width_us[index - 1] + share * (width_us[index] - width_us[index - 1])
+    return None
+
+
+def dynamics(document: dict[str, Any]) -> dict[str, Any]:
+    """Tω (s), ζ and delay (s) where the linear part is of second order; its poles (1/s) besides.
+
+    Tω and ζ are those of eq. (31) with damping: 1 / (Tω² s² + 2 ζ Tω s + 1).
+    """
+    linear = document["linear"]
+    found: dict[str, Any] = {key: linear.get(key) for key in ("time_constant_s", "damping", "delay_s")}
+    step_s = linear.get("step_s") or 1.0 / document["sample_rate_hz"]
+    poles = _poles(linear["a"], step_s)
+    found["poles_per_s"] = [[round(pole.real, 4), round(pole.imag, 4)] for pole in poles]
+    if found["time_constant_s"] is None and len(poles) == 2 and abs(poles[0] * poles[1]) > 0:
+        speed = math.sqrt(abs(poles[0] * poles[1]))
+        found["time_constant_s"], found["damping"] = 1.0 / speed, -(poles[0] + poles[1]).real / 2 / speed
+    return found
+
+
+def _poles(a: list[float], step_s: float) -> list[complex]:
+    """Continuous poles of a denominator of at most second order, 1/s."""
+    while len(a) > 1 and a[-1] == 0.0:
+        a = a[:-1]
+    if len(a) == 2:
+        roots = [complex(-a[1] / a[0])]
+    elif len(a) == 3:
+        root = cmath.sqrt(a[1] ** 2 - 4 * a[0] * a[2])
+        roots = [(-a[1] + root) / (2 * a[0]), (-a[1] - root) / (2 * a[0])]
+    else:
+        return []
+    return [cmath.log(root) / step_s for root in roots if root != 0]
+
+
+def validity(document: dict[str, Any]) -> str | None:
+    """What the model holds for, in one sentence; None where it does not say."""
+    known = document.get("valid_for") or {}
+    named = []
+    if known.get("pulse_width_us"):
+        named.append("pulse widths of {:.0f}–{:.0f} µs".format(*known["pulse_width_us"]))
+    if known.get("torque_nm"):
+        largest = max(known["torque_nm"], key=abs)
+        named.append(f"torques up to {largest:.1f} N·m" if largest >= 0 else f"torques down to {largest:.1f} N·m")
+    if known.get("pulse_rate_hz"):
+        named.append("{:.0f}–{:.0f} pulses/s".format(*known["pulse_rate_hz"]))
+    return f"Valid for {', '.join(named)}." if named else None
+
+
+# ---- followed over sessions ---------------------------------------------------------------------------------------
+
+Figure = dict[str, Any]
+"""`value`, `sd` (None where it is not known) and `unit`; of an effect's parameter, the effect's `form` besides."""
+UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "damping": "1", "delay_s": "s"}
+MAIN = {
+    "asymmetric_relaxation": ("ratio", "fall_s"),
+    "passive_torque": ("stiffness_nm_per_rad",),
+    "recruitment_hysteresis": ("half_width_us", "share"),
+    "tremor": ("frequency_hz",),
+    "voluntary_effort": ("height_0_nm", "height_1_nm"),
+}
+"""The parameters that stand for an effect, first choice first; of others the first one that they name."""
+
+
+def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
+    """Threshold, plateau, time constant, damping, delay, and each effect's main parameter as `effect.parameter`.
+
+    Models from before the figures were stored have their values, without standard deviations.
+    """
+    stored = (document.get("uncertainty") or {}).get("figures") or {}
+    values = {**recruitment(document), **dynamics(document)}
+    found = {
+        name: stored.get(name) or {"value": values.get(name), "sd": None, "unit": unit} for name, unit in UNITS.items()
+    }
+    for effect in document.get("effects") or []:
+        known = effect.get("parameters") or {}
+        wanted = [name for name in MAIN.get(effect["id"], ()) if name in known] or list(known)[:1]
+        for name in wanted[:1]:
+            given = known[name] if isinstance(known[name], dict) else {"value": known[name]}
+            figure = {"value": given.get("value"), "sd": given.get("sd"), "unit": given.get("unit") or "1"}
+            found[f"{effect['id']}.{name}"] = {**figure, "form": effect.get("form") or ""}
+    return found
+
+
+def threshold_us(row: Model) -> float | None:
+    """The threshold of a version's curve, µs; None where it has none. Raises ApiError (500) where it is damaged."""
+    known = row.fit.get("figures") or muscle_figures(read(row))
+    value: float | None = known["threshold_us"]["value"]
+    return value
