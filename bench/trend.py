@@ -19,7 +19,7 @@ import numpy as np
 
 from bench.stamp import RESULTS, written_by
 from stimrig import identify
-from stimrig.api.models import changes, model_json
+from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden_records import generate
@@ -68,7 +68,7 @@ def records(effect: str | None, seed: int, noise: str) -> list[identify.Record]:
 def state(record: identify.Record, effects: tuple[str, ...] = ()) -> State:
     """A record's model as the pages compare it."""
     document = identify.fit(record, effects=effects).to_dict()
-    figures = model_json.muscle_figures(document)
+    figures = stored_model.muscle_figures(document)
     return State(figures, document["method"], changes.structure_of(list(effects), figures))
 
 

@@ -227,7 +227,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 def percent(value: float | None) -> str:
     """A best-fit % for people; why there is none."""
-    from stimrig.api.models.model_json import UNDEFINED
+    from stimrig.api.models.stored_model import UNDEFINED
 
     return UNDEFINED if value is None or not math.isfinite(value) else f"{value:.2f} %"
 
@@ -256,10 +256,10 @@ def carried_lines(found: Mapping[str, Any] | None) -> list[str]:
 
 def model_report(document: dict[str, Any]) -> list[str]:
     """What a person reads off a model."""
-    from stimrig.api.models import model_json
+    from stimrig.api.models import stored_model
 
-    fit, judged = model_json.figures(document), model_json.quality(document)
-    dynamics, curve = model_json.dynamics(document), model_json.recruitment(document)
+    fit, judged = stored_model.figures(document), stored_model.quality(document)
+    dynamics, curve = stored_model.dynamics(document), stored_model.recruitment(document)
     effects = ", ".join(effect["id"] for effect in document.get("effects") or []) or "none"
     in_turn = "in turn, cross-validated: " if fit["held_out_by"] == "cross-validation" else ""
     lines = [

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from stimrig.api.language import _, lazy, localised, plain
-from stimrig.api.models.model_json import followed
+from stimrig.api.models.stored_model import followed
 
 Act = Literal["approve", "add", "test", "fit"]
 

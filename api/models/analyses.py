@@ -11,7 +11,7 @@ from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.models import model_json
+from stimrig.api.models import stored_model
 from stimrig.api.models.carried_structure import CarriedStructure
 from stimrig.api.models.explanation import require_evidence
 from stimrig.api.models.registry import Versions
@@ -30,12 +30,12 @@ HALF_DONE = 0.5
 
 def is_plain(model: Model) -> bool:
     """Whether a version's structure is the plain one: no effects around f(u) and a G of second order."""
-    return not model.effects and "time_constant_s" in model_json.read(model)["linear"]
+    return not model.effects and "time_constant_s" in stored_model.read(model)["linear"]
 
 
 def structure_of(model: Model) -> list[str]:
     """The effects of a version, each `id:form` or, where no form is named, `id`."""
-    held = model_json.read(model).get("effects") or []
+    held = stored_model.read(model).get("effects") or []
     return [f"{effect['id']}:{effect.get('form') or ''}".removesuffix(":") for effect in held]
 
 
@@ -60,7 +60,7 @@ class Analyses:
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
         """Measurement against model; with another recording's id, the model against that one."""
-        given = {"model_json": model_json.text(model)}
+        given = {"model_json": stored_model.text(model)}
         if recording_id in (None, model.recording_id):
             return await self._kept(model, "comparison", given)
         digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
@@ -68,7 +68,7 @@ class Analyses:
 
     async def curves(self, model: Model) -> dict[str, Any]:
         """Measured, predicted and commanded curves, thinned to what a screen shows."""
-        return await self._kept(model, "curves", {"model_json": model_json.text(model)})
+        return await self._kept(model, "curves", {"model_json": stored_model.text(model)})
 
     async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
         """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
@@ -79,7 +79,7 @@ class Analyses:
         """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
         if is_plain(model):
             return self.first_version(model), "diagnosis", {}
-        return model, OWN_DIAGNOSIS, {"model_json": model_json.text(model)}
+        return model, OWN_DIAGNOSIS, {"model_json": stored_model.text(model)}
 
     def first_version(self, model: Model) -> Model:
         """The first version made from the model's recording: what is found of its plain structure is kept with it."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from stimrig.api.errors import ApiError
-from stimrig.api.models import model_json
+from stimrig.api.models import stored_model
 from stimrig.api.models.explanation import name_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
@@ -67,7 +67,7 @@ class CarriedStructure:
         if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
             return plain
         try:
-            found = await self._begun("carry", path, on_call, model_json=model_json.text(earlier), **how)
+            found = await self._begun("carry", path, on_call, model_json=stored_model.text(earlier), **how)
         except (ApiError, OSError, ValueError) as error:  # all that a call can end with
             found = {"json": None, "found": _not_carried(error)}
         return await asyncio.to_thread(self._store, found, plain, earlier)

@@ -15,7 +15,7 @@ from typing import Any
 from stimrig.api import language
 from stimrig.api.effect_words import effect_words, effects_words, parameter_words
 from stimrig.api.language import _, lazy
-from stimrig.api.models.model_json import Figure
+from stimrig.api.models.stored_model import Figure
 
 BEYOND = 2.0
 """A change is told where it is more than so many times its uncertainty."""

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, defer
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.models import model_json
+from stimrig.api.models import stored_model
 from stimrig.api.models.places import Site, in_words, kept, site_of, site_of_recording
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, seen
@@ -109,9 +109,9 @@ class Versions:
             method=str(document.get("method", "")),
             effects=[str(effect["id"]) for effect in document.get("effects") or []],
             fit={
-                **model_json.figures(document),
-                **model_json.quality(document),
-                "figures": model_json.muscle_figures(document),
+                **stored_model.figures(document),
+                **stored_model.quality(document),
+                "figures": stored_model.muscle_figures(document),
             },
             document=body,
             etag=hashlib.sha256(body).hexdigest(),
@@ -214,7 +214,7 @@ class Versions:
         """
         row = self.get(model_id)
         if approved:
-            model_json.whole(row)
+            stored_model.whole(row)
             refuse_without(self.quality(row)["verdict"], reason)
         with self.store.write() as session:
             if approved or self._brings_back(row):
@@ -318,7 +318,7 @@ class Versions:
         if found is None or found.approval_id != approval.id:
             row = self.get(approval.model_id)
             found = self._served[participant] = Served(
-                row.id, model_json.whole(row), f'"{row.etag}"', approval.id, approval.at_utc
+                row.id, stored_model.whole(row), f'"{row.etag}"', approval.id, approval.at_utc
             )
         return found
 
@@ -342,9 +342,9 @@ class Versions:
             return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
         if row.etag not in self._read:
             try:
-                self._read[row.etag] = model_json.quality(json.loads(row.document))
+                self._read[row.etag] = stored_model.quality(json.loads(row.document))
             except (ValueError, TypeError, AttributeError):  # unknown; that it is damaged its own page says
-                self._read[row.etag] = model_json.quality({})
+                self._read[row.etag] = stored_model.quality({})
         return self._read[row.etag]
 
     def document(self, row: Model) -> dict[str, Any]:

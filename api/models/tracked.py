@@ -12,7 +12,7 @@ from sqlalchemy.orm import defer
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.models import model_json, tracking
+from stimrig.api.models import stored_model, tracking
 from stimrig.api.models.places import Place, differ, place_of
 from stimrig.api.models.registry import Served, Versions
 from stimrig.api.models.tracking import NOT_FOLLOWED, Bounds, Limits
@@ -81,8 +81,8 @@ class TrackedVersions:
         followed = [row for row in rows if row.step is not None]
         model, text, bounds, alarms, problem = self.versions.get(approval.model_id), "", Bounds(), Bounds(), ""
         try:
-            limits, threshold_us = Limits(**approval.tracking), model_json.threshold_us(model)
-            text, bounds, alarms = model_json.text(model), limits.bounds(threshold_us), limits.alarms(threshold_us)
+            limits, threshold_us = Limits(**approval.tracking), stored_model.threshold_us(model)
+            text, bounds, alarms = stored_model.text(model), limits.bounds(threshold_us), limits.alarms(threshold_us)
         except ApiError as error:
             problem = error.detail
         return Trial(
@@ -116,7 +116,7 @@ class TrackedVersions:
 
     def text(self, approval: Approval) -> str:
         """The approved MODEL.json. Raises ApiError (500) where it is damaged."""
-        return model_json.text(self.versions.get(approval.model_id))
+        return stored_model.text(self.versions.get(approval.model_id))
 
     def rows(self, approval_id: int) -> list[Tracked]:
         """The trials of an approval, the oldest first, without what was served."""
@@ -240,7 +240,7 @@ class TrackedVersions:
                 if row.document is not None:
                     return row.document.decode()
             base = model_id
-        return model_json.text(self.versions.get(base))
+        return stored_model.text(self.versions.get(base))
 
     def version_of(self, model_id: str) -> Model:
         """The version itself, or the one from which it was tracked. Raises ApiError (404)."""
@@ -263,7 +263,7 @@ class TrackedVersions:
             "approved_model_id": approval.model_id,
             "approved_utc": approval.at_utc,
             "limits": approval.tracking,
-            "threshold_us": model_json.threshold_us(model),
+            "threshold_us": stored_model.threshold_us(model),
             "served_utc": served.at_utc if served else None,
             "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0) if served else None,
             "etag": served.etag if served else None,

@@ -16,9 +16,9 @@ from sqlalchemy import Row, select
 
 from stimrig.api.clock import Clock, local_day
 from stimrig.api.errors import ApiError
-from stimrig.api.models import changes, model_json
+from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
-from stimrig.api.models.model_json import followed
+from stimrig.api.models.stored_model import followed
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Approval, Model, Note, Recording, Test
 from stimrig.api.workers.pool import Pool
@@ -48,7 +48,7 @@ class Session:
     charge_uc: float | None
     test_ids: tuple[str, ...]
     notes: list[Note] = field(default_factory=list)
-    figures: dict[str, model_json.Figure] = field(default_factory=dict)
+    figures: dict[str, stored_model.Figure] = field(default_factory=dict)
 
     def state(self) -> State:
         """What is compared of it."""
@@ -152,7 +152,7 @@ class Trend:
         for one in old:
             one.figures = known.get(one.model.id) or one.figures
 
-    def _known(self, ids: Sequence[str]) -> dict[str, dict[str, model_json.Figure]]:
+    def _known(self, ids: Sequence[str]) -> dict[str, dict[str, stored_model.Figure]]:
         rows = self.store.all(Analysis, Analysis.kind == KEPT_AS, Analysis.model_id.in_(ids))
         return {row.model_id: row.document for row in rows}
 
@@ -160,7 +160,7 @@ class Trend:
         """Read the model's whole document, once: without standard deviations where a worker cannot make them."""
         row = await asyncio.to_thread(self.store.get, Model, one.model.id)
         try:
-            document = model_json.read(row)
+            document = stored_model.read(row)
         except ApiError:  # it has no figures; that it is damaged its own page says
             return
         try:
@@ -168,12 +168,12 @@ class Trend:
             document["uncertainty"] = {**(document.get("uncertainty") or {}), "figures": made["figures"]}
         except ApiError as error:
             if error.status >= 500:  # not the document's fault: the next look tries again
-                one.figures = model_json.muscle_figures(document)
+                one.figures = stored_model.muscle_figures(document)
                 return
-        one.figures = model_json.muscle_figures(document)
+        one.figures = stored_model.muscle_figures(document)
         await asyncio.to_thread(self._keep, row.id, one.figures)
 
-    def _keep(self, model_id: str, figures: dict[str, model_json.Figure]) -> None:
+    def _keep(self, model_id: str, figures: dict[str, stored_model.Figure]) -> None:
         with self.store.write() as session:
             session.merge(Analysis(model_id=model_id, kind=KEPT_AS, document=figures, created_utc=self.clock.utc()))
 

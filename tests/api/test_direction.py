@@ -7,7 +7,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.cli.commands.diagnose import effect_lines
-from stimrig.api.models import explanation, model_json
+from stimrig.api.models import explanation, stored_model
 from stimrig.api.web.pages.environment import environment
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
@@ -55,11 +55,11 @@ def test_the_diagnosis_tells_it_too_in_a_terminal_and_on_the_page() -> None:
 def test_threshold_plateau_and_validity_are_those_of_the_same_cell_mounted_upright() -> None:
     record = hidden_muscles.record("fatigue", seed=5)
     upright, inverted = (identify.fit(record.with_torque(12 + sign * record.torque_nm)).to_dict() for sign in (1, -1))
-    one, other = model_json.recruitment(upright), model_json.recruitment(inverted)
+    one, other = stored_model.recruitment(upright), stored_model.recruitment(inverted)
     assert one["threshold_us"] == pytest.approx(other["threshold_us"], abs=1)
     assert one["saturation_us"] == pytest.approx(other["saturation_us"], abs=1)
     assert one["plateau_nm"] is not None and one["plateau_nm"] > 1
     assert other["plateau_nm"] == pytest.approx(-one["plateau_nm"], rel=0.01)
-    assert "torques up to" in str(model_json.validity(upright)) and "torques down to -" in str(
-        model_json.validity(inverted)
+    assert "torques up to" in str(stored_model.validity(upright)) and "torques down to -" in str(
+        stored_model.validity(inverted)
     )

@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 from stimrig.api import language
 from stimrig.api.effect_words import EFFECTS, PARAMETERS, effects_words, without_unit
 from stimrig.api.language import translated
-from stimrig.api.models import changes, explanation, model_json
+from stimrig.api.models import changes, explanation, stored_model
 from stimrig.identify import effects
 from tests.api.conftest import TOKEN, Service, run_test, shared_service
 from tests.api.test_access import signed_in
@@ -34,7 +34,7 @@ def test_titles_and_main_parameters_are_those_of_the_library() -> None:
     for entry in effects.library():
         for form in entry["forms"] if entry["id"] in EFFECTS else ():
             held = {"id": entry["id"], "parameters": {one["name"]: 1.0 for one in form["parameters"]}}
-            (figure,) = [name for name in model_json.muscle_figures(PLAIN | {"effects": [held]}) if "." in name]
+            (figure,) = [name for name in stored_model.muscle_figures(PLAIN | {"effects": [held]}) if "." in name]
             assert without_unit(figure.partition(".")[2]) in PARAMETERS, figure
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from stimrig.api import language
-from stimrig.api.models.model_json import followed
+from stimrig.api.models.stored_model import followed
 from tests.api.conftest import Service, run_test, shared_service
 from tests.api.test_access import csrf, signed_in
 

@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from stimrig import identify
-from stimrig.api.models import changes, model_json
+from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.store.tables import Analysis, Model
 from stimrig.api.workers.pool import WORKER
@@ -46,7 +46,7 @@ def three(**last: Any) -> list[Planned]:
 def test_figures_carry_deviations_that_agree_with_what_pages_show() -> None:
     document = identify.fit(sessions.record(Planned(Patient(), 0.0), 3)).to_dict()
     figures = document["uncertainty"]["figures"]
-    read_off = {**model_json.recruitment(document), **model_json.dynamics(document)}
+    read_off = {**stored_model.recruitment(document), **stored_model.dynamics(document)}
     for name, figure in figures.items():
         assert figure["value"] == pytest.approx(read_off[name], rel=1e-9), name
         assert 0 < figure["sd"] < 0.1 * max(abs(figure["value"]), 0.05), name

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stimrig.api.cli import main
-from stimrig.api.models import model_json
+from stimrig.api.models import stored_model
 from stimrig.api.models.registry import Versions
 from tests.api.conftest import REAL, run_service
 from tests.harness.patients import Patient, make_record
@@ -78,12 +78,12 @@ def test_level_held_out_torque_has_no_percent(
 ) -> None:
     data = record_csv(tmp_path / "level.csv", follows=True, level=True)
     printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
-    assert f"held out       {model_json.UNDEFINED}, rms" in printed
+    assert f"held out       {stored_model.UNDEFINED}, rms" in printed
     fit = json.loads((tmp_path / "MODEL.json").read_text())["fit"]
     assert fit["held_out_fit_percent"] is None and fit["held_out_ceiling_percent"] is None
     assert fit["held_out_rms_nm"] > 0
-    assert model_json.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
-    assert model_json.UNDEFINED in report.read_text("utf-8")
+    assert stored_model.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
+    assert stored_model.UNDEFINED in report.read_text("utf-8")
     for service in run_service(tmp_path / "service", short_dir, REAL):
         with service.client() as client:
             client.post("/v1/participants", json={"code": "P1"})
@@ -94,7 +94,7 @@ def test_level_held_out_torque_has_no_percent(
             assert found["held_out_fit_percent"] is None and found["held_out_rms_nm"] > 0
             assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
             for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
-                assert model_json.UNDEFINED in client.get(path).text
+                assert stored_model.UNDEFINED in client.get(path).text
             assert client.get("/participants/P1").status_code == client.get("/").status_code == 200
 
 
@@ -114,7 +114,7 @@ def test_level_held_out_torque_has_no_percent(
 )
 def test_older_models_are_read(stored: dict[str, Any] | None, verdict: str, words: str) -> None:
     document = {"fit": {}} | ({} if stored is None else {"quality": stored})
-    found = model_json.quality(document)
+    found = stored_model.quality(document)
     assert found["verdict"] == verdict and found["words"].startswith(words)
     row: Any = SimpleNamespace(fit={}, etag="1", document=json.dumps(document).encode())
     versions = Versions(None, None)  # pyright: ignore[reportArgumentType]

@@ -15,7 +15,7 @@ from starlette.datastructures import FormData
 
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised
-from stimrig.api.models import advice, model_json, registry
+from stimrig.api.models import advice, registry, stored_model
 from stimrig.api.models.tracking import QUANTITIES, Limits
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx
@@ -80,7 +80,7 @@ async def _question(
     sent: dict[str, Any] | None = None,
 ) -> Response:  # fmt: skip
     """What would be risked, and the field for the reason; with what was typed where it is no reason."""
-    document = model_json.read(row)
+    document = stored_model.read(row)
     return page(
         request,
         "approve_poor.html",
@@ -90,7 +90,7 @@ async def _question(
         ask_password=not await context.people.is_confirmed(session),
         typed=written,
         sent=sent,
-        threshold_us=model_json.threshold_us(row),
+        threshold_us=stored_model.threshold_us(row),
         what_to_write=registry.WHAT_TO_WRITE,
     )
 

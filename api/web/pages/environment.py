@@ -15,7 +15,7 @@ from jinja2.runtime import Context
 from stimrig.api import clinical_words, effect_words, language
 from stimrig.api.charts.figure import PAGE_CONFIG
 from stimrig.api.language import words
-from stimrig.api.models.model_json import followed
+from stimrig.api.models.stored_model import followed
 
 HERE = Path(__file__).parent
 

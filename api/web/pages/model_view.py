@@ -11,7 +11,7 @@ from fastapi.responses import RedirectResponse, Response
 from stimrig.api import language
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.errors import ApiError
-from stimrig.api.models import advice, carried_structure, explanation, model_json
+from stimrig.api.models import advice, carried_structure, explanation, stored_model
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.requests import EffectsIn, TestIn
 from stimrig.api.store.tables import Model
@@ -30,7 +30,7 @@ TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improv
 async def model(request: Request, context: Ctx, who: ModelReader, model_id: str, diagnose: int = -1) -> Response:
     """A model beside its measurement, and why it fails. `diagnose`: 1 begins a diagnosis anew, 0 begins none."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    document = model_json.read(row)
+    document = stored_model.read(row)
     measured = await measurement(context, row)
     diagnosis = await looked_at(context, row, who.name, diagnose)
     found = advice.findings(document)
@@ -48,7 +48,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, model_id: str,
         changes=await trend_view.changes_of(context, row),
         ask_password=not await context.people.is_confirmed(who.session_hash),
         **await facts(context, row, document),
-        threshold_us=model_json.threshold_us(row),
+        threshold_us=stored_model.threshold_us(row),
         problem=measured["problem"],
         reasons=[] if found else version["reasons"],
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
@@ -63,9 +63,9 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
     """What a model's page and its report show alike."""
     return {
         "document": document,
-        "recruitment": model_json.recruitment(document),
-        "dynamics": model_json.dynamics(document),
-        "validity": model_json.validity(document),
+        "recruitment": stored_model.recruitment(document),
+        "dynamics": stored_model.dynamics(document),
+        "validity": stored_model.validity(document),
         "warnings": await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
         "now_utc": context.clock.utc(),
     }

@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
-from stimrig.api.models import explanation, model_json
+from stimrig.api.models import explanation, stored_model
 from stimrig.api.web.pages.environment import HERE, environment
 from stimrig.api.web.pages.static import packaged
 
@@ -36,14 +36,14 @@ def comparison_html(
     comparison : dict or None
         As `identify.compare` gives it, cleaned and thinned.
     """
-    judged = model_json.quality(document)
+    judged = stored_model.quality(document)
     return _page(
         "report.html",
         title=f"{name}: measurement against model",
-        model={**model_json.figures(document), **judged, "id": document["model_id"], "method": document["method"]},
+        model={**stored_model.figures(document), **judged, "id": document["model_id"], "method": document["method"]},
         effects=[effect["id"] for effect in document.get("effects") or []],
-        recruitment=model_json.recruitment(document),
-        dynamics=model_json.dynamics(document),
+        recruitment=stored_model.recruitment(document),
+        dynamics=stored_model.dynamics(document),
         test=test,
         figures={
             **model_charts.of_model(document, curves, comparison),

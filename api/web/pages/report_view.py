@@ -13,7 +13,7 @@ from stimrig.api.charts import joint_charts, model_charts
 from stimrig.api.charts.svg import svg
 from stimrig.api.clock import local_day
 from stimrig.api.language import _
-from stimrig.api.models import advice, explanation, model_json
+from stimrig.api.models import advice, explanation, stored_model
 from stimrig.api.models.places import Site, site_of, site_of_recording
 from stimrig.api.store.tables import Model, Note, Participant, Recording, Test
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader
@@ -34,7 +34,7 @@ def _versions(context: Context, lineage: list[Model], shown: str) -> list[dict[s
 async def report(request: Request, context: Ctx, _who: ModelReader, model_id: str) -> Response:
     """One sheet on a model."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    document = model_json.read(row)
+    document = stored_model.read(row)
     measured = await measurement(context, row)
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)

@@ -13,7 +13,7 @@ from stimrig.api import language
 from stimrig.api.charts import model_charts, trend_charts
 from stimrig.api.charts.model_charts import MOST
 from stimrig.api.errors import ApiError
-from stimrig.api.models import changes, model_json
+from stimrig.api.models import changes, stored_model
 from stimrig.api.models.trend import Session
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader
@@ -42,7 +42,7 @@ async def compare(
     at = next((number for number, row in enumerate(rows) if row.id == reference), 0)
     sides = await asyncio.gather(*(side(context, rows, number) for number in range(len(rows))))
     names = [language.when(row.created_utc) for row in rows]
-    documents = [model_json.read(row) for row in rows]
+    documents = [stored_model.read(row) for row in rows]
     return page(
         request,
         "compare.html",

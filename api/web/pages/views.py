@@ -14,7 +14,7 @@ from stimrig.api.charts.svg import svg
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, plain, translated
-from stimrig.api.models import model_json
+from stimrig.api.models import stored_model
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import Context, Ctx, LiveReader, Tester
 from stimrig.api.web.pages.model_view import measurement
@@ -100,7 +100,7 @@ async def measured(context: Context, model_id: str) -> Markup | None:
     found = await measurement(context, row)
     if found["curves"] is None:
         return None
-    figure = model_charts.of_model(model_json.read(row), found["curves"], found["comparison"])["comparison"]
+    figure = model_charts.of_model(stored_model.read(row), found["curves"], found["comparison"])["comparison"]
     return svg(figure, 1160.0, 520.0, _("Torque measured and predicted, what is left, and the pulse width, over time"))
 
 

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Header, Query, Response
 
 from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError
-from stimrig.api.models import model_json
+from stimrig.api.models import stored_model
 from stimrig.api.models.tracking import Limits
 from stimrig.api.sessions.requests import ApprovalIn, DecisionIn
 from stimrig.api.store import seen
@@ -101,7 +101,7 @@ def one_model(context: Ctx, _who: ModelReader, model_id: str, response: Response
     response.headers["ETag"] = context.store.etag(
         context.clock, f"/v1/models/{model_id}", seen.decisions(row.participant)
     )
-    return {**context.versions.document(row), "model": model_json.read(row)}
+    return {**context.versions.document(row), "model": stored_model.read(row)}
 
 
 @router.get("/models/{model_id}/file", response_class=Response, responses={200: published("model", "MODEL.json")})
@@ -109,7 +109,7 @@ def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
     """MODEL.json, as it was stored."""
     row = context.versions.get(model_id)
     headers = {"Content-Disposition": f'attachment; filename="{row.id}.json"', "ETag": f'"{row.etag}"'}
-    return Response(model_json.whole(row), media_type="application/json", headers=headers)
+    return Response(stored_model.whole(row), media_type="application/json", headers=headers)
 
 
 @router.post("/models/{model_id}/approve", response_model=VersionOut)
