@@ -49,7 +49,7 @@ SLOW = (
     ),
     *(
         f"tests/rig/test_{name}.py"
-        for name in ("adaptive", "angle_recording", "angle_run", "damaged", "lsl_live", "rate", "run")
+        for name in ("adaptive", "angle_recording", "angle_run", "damaged", "lsl_live", "plausibility", "run")
     ),
     "tests/stimrig/test_stimrig.py",
 )

@@ -88,7 +88,7 @@ def test_a_stop_of_the_unit_leaves_time_to_seal_and_a_crash_is_followed_by_a_sta
 
 
 def test_a_rig_that_hangs_is_found_and_one_that_is_busy_is_let_be() -> None:
-    """What the process sends: tests/rig/test_notify.py."""
+    """What the process sends: tests/rig/test_process.py."""
     assert (RIG["Type"], RIG["NotifyAccess"]) == (["notify"], ["main"])
     assert 10 * BEAT_PERIOD_S < int(RIG["WatchdogSec"][0]) <= 60
     assert "AF_UNIX" in RIG["RestrictAddressFamilies"][0].split()

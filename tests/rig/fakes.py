@@ -1,4 +1,4 @@
-"""A stimulator and a load cell that live on a virtual clock, in one thread: for tests of gate, receiver and run."""
+"""Devices that live on a virtual clock, in one thread, and tests on them: for gate, receivers, score and run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from stimrig.rig import archive, assembly, journal, limits, plan
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
@@ -15,7 +16,7 @@ from stimrig.rig.acquire.health import DEFAULT_WATCH, Watch
 from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.run import Halt, RunResult, TestRun
 from stimrig.rig.adapters.files import Files
-from stimrig.rig.errors import DeviceError
+from stimrig.rig.errors import DeviceError, RigError
 from stimrig.rig.gate import Gate
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.limits import Admitted, Steps
@@ -284,3 +285,35 @@ def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:
 
 def void(*_: object) -> None:
     """Throw values away."""
+
+
+PULSES_HZ = 40.0
+
+
+FIXED = [rest(0.5), hold("first"), SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.5, "down_s": 0.5})]
+
+
+def adaptive(
+    folder: Path, max_duration_s: float = 10.0, max_nms: float = 1e4, fixed: list[SegmentPlan] = FIXED, **more: Any
+) -> VirtualRig:
+    bounds = AdaptivePlan(max_duration_s=max_duration_s, max_torque_time_nms=max_nms)
+    return VirtualRig(folder, fixed, adaptive=bounds, **more)
+
+
+def extend(rig: VirtualRig, after: int, segments: list[SegmentPlan]) -> None:
+    """Lay segments behind pulse `after`: before the test begins, or beside its sender."""
+    return rig.machine.tasks.begin(rig.run.score.extend(after, segments), "extend").result
+
+
+def refusals(*requests: Callable[[], object]) -> list[RigError]:
+    """What the requests raise, in order."""
+    found: list[RigError] = []
+    for request in requests:
+        with pytest.raises(RigError) as told:
+            request()
+        found.append(told.value)
+    return found
+
+
+def widths_sent(rig: VirtualRig) -> list[int]:
+    return [pulse.pulse_width_us for _, pulse in rig.stimulator.sent]

@@ -1,18 +1,22 @@
-"""A test that is extended while it plays: what plays, what comes too late, and how it ends."""
+"""A test that is extended while it plays: what plays, what is written, and that no limit of the whole is broken."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from stimrig.rig import plan
-from stimrig.rig.errors import BusyError, RigError, TooLateError
-from stimrig.rig.messages import AHEAD, SegmentPlan
-from tests.rig.adaptive import FIXED, RATE_HZ, adaptive, extend, hold, refusals, rest, widths_sent
-from tests.rig.fakes import VirtualRig, slow_work
+from stimrig.rig import archive, assembly, journal, limits, plan
+from stimrig.rig.errors import BusyError, JournalError, PlanError, RecordingError, RefusedError, RigError, TooLateError
+from stimrig.rig.journal import Kind, LaidBlock
+from stimrig.rig.messages import AHEAD, AdaptivePlan, SegmentPlan
+from stimrig.rig.score import MAX_CHECKED, MAX_EXTENSION_S, MAX_EXTENSION_SEGMENTS
+from stimrig.rig.signals import PulseStatus
+from tests.rig.fakes import FIXED, PULSES_HZ, VirtualRig, adaptive, extend, hold, refusals, rest, slow_work, widths_sent
+from tests.rig.test_damaged import blocks_of
 
 
 def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(tmp_path: Path):
@@ -29,7 +33,7 @@ def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(t
     assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5]
     planned_us = recording.columns["pulses/pulse_width_us"]
     assert np.array_equal(planned_us[: len(same.test.pulse_width_us)], same.test.pulse_width_us)
-    assert np.flatnonzero(planned_us)[-1] == len(planned_us) - 1 - RATE_HZ
+    assert np.flatnonzero(planned_us)[-1] == len(planned_us) - 1 - PULSES_HZ
     assert (recording.attributes["adaptive"], recording.attributes["ended_by"]) == (1, "plan")
     assert same.recording().attributes["adaptive"] == 0
 
@@ -45,9 +49,9 @@ def test_what_is_added_plays_at_its_boundary_and_the_fixed_plan_goes_on_after_it
     assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5, 3.5, 4.5]
     sent_us = recording.columns["pulses/sent_pulse_width_us"]
     assert np.all(sent_us[20:60] == 100) and np.all(sent_us[100:140] == 300)
-    assert result.summary["duration_s"] == pytest.approx(len(sent_us) / RATE_HZ)
+    assert result.summary["duration_s"] == pytest.approx(len(sent_us) / PULSES_HZ)
     times = np.array([time_s for time_s, _ in rig.stimulator.sent])
-    assert np.allclose((times - times[0]) * RATE_HZ, np.round((times - times[0]) * RATE_HZ))
+    assert np.allclose((times - times[0]) * PULSES_HZ, np.round((times - times[0]) * PULSES_HZ))
     assert '"by": "extension"' in recording.attributes["laid"] and '"seed": 3' in recording.attributes["laid"]
 
 
@@ -66,7 +70,7 @@ def test_an_answer_to_an_old_boundary_is_refused_and_so_is_the_same_one_twice(tm
 @pytest.mark.parametrize("early", [True, False])
 def test_the_boundary_is_decided_two_periods_before_it(tmp_path: Path, early: bool):
     rig = adaptive(tmp_path)
-    at_s = 0.5 - AHEAD / RATE_HZ + (-0.001 if early else 0.001)
+    at_s = 0.5 - AHEAD / PULSES_HZ + (-0.001 if early else 0.001)
     ask = lambda: extend(rig, 20, [hold("added")])  # noqa: E731
     rig.at(at_s, ask if early else lambda: found.extend(refusals(ask)))
     found: list[RigError] = []
@@ -102,7 +106,7 @@ def test_enough_ends_it_well(tmp_path: Path, at_once: bool, pulses: int):
     assert len(rig.stimulator.sent) == pulses
     recording = rig.recording()
     assert recording.names == ["rest", "first", "rest"]
-    assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
+    assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / PULSES_HZ + 1.0)
     assert len(recording.columns["pulses/status"]) == 20 + pulses + 40
     told = next(event for event in recording.events if event["event"] == "ended")
     assert (told["by"], told["reason"], told["index"]) == ("enough", "P1's nurse", 20 + pulses)
@@ -116,7 +120,7 @@ def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
     found: list[RigError] = []
     rig.at(1.3, lambda: found.extend(refusals(lambda: extend(rig, len(score.laid), [hold()]))))
     result = rig.execute()
-    assert result.summary["duration_s"] == pytest.approx(0.5 + len(rig.stimulator.sent) / RATE_HZ + 1.0)
+    assert result.summary["duration_s"] == pytest.approx(0.5 + len(rig.stimulator.sent) / PULSES_HZ + 1.0)
     assert 19 <= len(rig.stimulator.sent) <= 21
     assert "is ending (enough)" in str(found[0])
     assert [event["event"] for event in rig.recording().events].count("ended") == 2
@@ -129,7 +133,7 @@ def test_enough_right_before_a_boundary_begins_no_further_segment(tmp_path: Path
     rig.at(1.5 - before_s, lambda: rig.run.score.enough("me", at_once=False))
     result = rig.execute()
     assert (result.summary["ended_by"], len(rig.stimulator.sent)) == ("enough", pulses)
-    assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / RATE_HZ + 1.0)
+    assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / PULSES_HZ + 1.0)
 
 
 def test_enough_before_the_first_pulse_sends_none(tmp_path: Path):
@@ -167,3 +171,277 @@ def test_the_earliest_pulse_is_that_of_an_extension(tmp_path: Path):
     rig = adaptive(tmp_path, fixed=[rest(0.5), rest(2.0), hold("first")])
     assert rig.test.first_pulse == 20
     assert plan.build(rig.plan.model_copy(update={"adaptive": None}), rig.table).first_pulse == 100
+
+
+def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: extend(rig, 20, [hold("added")]))
+    rig.at(1.7, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    laid_to, seen = 20, []
+    for kind, payload in journal.read(rig.path).blocks:
+        if kind == Kind.LAID:
+            block = LaidBlock.of_bytes(payload)
+            assert len(block.pulse_width_us) == block.segment.end - block.segment.start
+            laid_to = block.segment.end
+            seen.append(block.segment.by)
+        elif kind == Kind.INTENT:
+            assert journal.INTENT.unpack(payload)[0] < laid_to
+    assert seen == ["extension", "plan", "end"]
+
+
+def test_a_disk_that_takes_no_segment_ends_it_as_a_fault(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: setattr(rig.journal, "_failure", "disk full"))
+    rig.at(0.3, lambda: refusals(lambda: extend(rig, 20, [hold()])))
+    result = rig.execute()
+    assert (result.outcome, result.reason, rig.stimulator.sent) == ("fault", "disk full", [])
+    (tmp_path / "2").mkdir()
+    rig = adaptive(tmp_path / "2")
+    rig.journal._failure = "disk full"
+    with pytest.raises(JournalError):
+        extend(rig, 20, [hold()])
+    assert len(rig.run.score.laid) == 20
+
+
+@pytest.mark.slow
+def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    rig.at(0.2, lambda: extend(rig, 20, [hold("added", max_pulse_width_us=150.0)]))
+    rig.at(1.8, lambda: rig.run.score.enough("me", at_once=True))
+    rig.execute()
+    whole = rig.path.read_bytes()
+    copy, acknowledged = tmp_path / "copy.journal", []
+    for end in np.linspace(0, len(whole), 25).astype(int):
+        copy.write_bytes(whole[:end])
+        try:
+            contents = journal.read(copy)
+            recording = assembly.assemble(contents, "fault", "killed")
+        except RecordingError as error:
+            assert end < 9000, error  # header and plan
+            continue
+        columns = recording.columns
+        assert recording.attributes["outcome"] == ("completed" if contents.ended else "fault")
+        told, intents = (sum(kind == of for kind, _ in contents.blocks) for of in (Kind.ACKED, Kind.INTENT))
+        assert np.sum(columns["pulses/status"] == PulseStatus.ACKNOWLEDGED) == told
+        assert np.sum(np.nan_to_num(columns["pulses/current_ma"]) > 0) == intents
+        assert np.sum(np.nan_to_num(columns["pulses/sent_pulse_width_us"]) > 0) == intents
+        assert np.all(np.isfinite(columns["torque/time_s"]))
+        assert len({len(column) for path, column in columns.items() if path.startswith("pulses/")}) == 1
+        acknowledged.append(told)
+        archive.to_bytes(recording)
+    assert acknowledged == sorted(acknowledged) and acknowledged[-1] > 50
+    at = blocks_of(whole, Kind.LAID)
+    assert len(at) == 3
+    for lost in ([0], [1], [2], [0, 1], [0, 1, 2]):
+        spoiled = bytearray(whole)
+        for number in lost:
+            spoiled[at[number] + 20] ^= 255
+        copy.write_bytes(spoiled)
+        recording = assembly.assemble(journal.read(copy))
+        sent = recording.columns["pulses/sent_pulse_width_us"]
+        assert np.nan_to_num(sent)[np.nan_to_num(sent) > 0].tolist() == widths_sent(rig)
+        assert "journal is damaged" in recording.attributes["journal_note"]
+        if 0 in lost:
+            assert "which segments pulses 21 to" in recording.attributes["journal_note"]
+            assert "added" not in recording.names
+
+
+WRONG: dict[str, tuple[list[SegmentPlan], type[RigError], str]] = {
+    "nothing": ([], PlanError, "0 segments; give 1 to 8"),
+    "too many": ([rest(0.1)] * (MAX_EXTENSION_SEGMENTS + 1), PlanError, "9 segments"),
+    "ten thousand": ([rest(0.1)] * 10_000, PlanError, "10000 segments"),
+    "too long": ([rest(MAX_EXTENSION_S), rest(1.0)], RefusedError, "at most 30 s an extension"),
+    "an hour": ([SegmentPlan(name="x", sequence="prbs", settings={"chips": 100_000})], RefusedError, "30 s"),
+    "wide": ([hold(max_pulse_width_us=281.0)], RefusedError, "hold, pulse 1: pulse_width_us 281 .*profile"),
+    "NaN": ([SegmentPlan(name="x", sequence="widths", settings={"pulse_width_us": [math.nan]})], PlanError, "finite"),
+    "infinite": ([SegmentPlan(name="x", sequence="sweep", settings={"to_pulse_width_us": math.inf})], PlanError, "fin"),
+    "negative": ([SegmentPlan(name="x", sequence="widths", settings={"pulse_width_us": [-1.0]})], RefusedError, "-1"),
+    "a text": ([SegmentPlan(name="x", sequence="rest", settings={"duration_s": "1"})], PlanError, "duration_s"),
+    "no such sequence": ([SegmentPlan(name="x", sequence="os", settings={})], PlanError, "unknown"),
+    "no pulse": ([rest(0.001)], PlanError, "too short for one pulse"),
+    "one wrong of two": ([rest(0.5), hold(max_pulse_width_us=1e9)], RefusedError, "1e\\+09"),
+    "a sudden rise": (
+        [SegmentPlan(name="x", sequence="sweep", settings={"from_pulse_width_us": 60.0})], RefusedError, "rise_us 60"
+    ),
+    "no name": ([SegmentPlan(name="", sequence="rest")], PlanError, "name 1"),
+    "a long name": ([SegmentPlan(name="x" * 61, sequence="rest")], PlanError, "name 1"),
+    "a name with a NUL": ([SegmentPlan(name="a\0b", sequence="rest")], PlanError, "name 1"),
+    "a name with a line's end": ([SegmentPlan(name="a\nb", sequence="rest")], PlanError, "name 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_extension_is_refused_and_lays_nothing(tmp_path: Path, name: str):
+    segments, kind, words = WRONG[name]
+    rig = adaptive(tmp_path, 60.0, max_pulse_width_us=280.0)
+    with pytest.raises(kind, match=words):
+        extend(rig, 20, segments)
+    assert len(rig.run.score.laid) == 20
+    assert Kind.LAID not in {kind for kind, _ in journal.read(rig.path).blocks}
+
+
+def test_the_dose_is_that_of_the_whole_test(tmp_path: Path):
+    """3 s at 6 µC are 720 µC: the third second is refused, and the fixed plan's next is not played after the second."""
+    base = limits.tightened(limits.HARD_LIMITS, "charge_per_test_uc", 600.0, "rig file")
+    rig = adaptive(tmp_path, base=base, fixed=[rest(0.5), hold("first"), hold("second")])
+    extend(rig, 20, [hold("added")])
+    with pytest.raises(RefusedError, match=r"charge_per_test_uc 720 .*rig file"):
+        extend(rig, 60, [hold("two more"), hold("seconds")])
+    result = rig.execute()
+    assert (result.summary["ended_by"], result.summary["charge_uc"]) == ("limit", 480.0)
+    assert rig.recording().names == ["rest", "added", "first", "rest"]
+    told = next(event for event in rig.recording().events if event["event"] == "ended")
+    assert "charge_per_test_uc 720" in told["reason"]
+
+
+def test_the_charge_of_a_second_holds_across_a_boundary(tmp_path: Path):
+    base = limits.tightened(limits.HARD_LIMITS, "charge_per_second_uc", 150.0, "rig file")
+    half = [rest(1.0), hold("first", on_s=0.5)]
+    rig = adaptive(tmp_path, base=base, fixed=half)
+    extend(rig, 40, [hold("a", on_s=0.5)])
+    with pytest.raises(RefusedError, match="charge_per_second_uc 240"):
+        extend(rig, 60, [hold("b", on_s=0.5)])
+    extend(rig, 60, [rest(1.0), hold("c", on_s=0.5)])
+    assert rig.execute().summary["ended_by"] == "limit"  # the fixed plan's half second would follow one without a pause
+    assert rig.recording().names == ["rest", "a", "rest", "c", "rest"]
+
+
+def test_the_rise_is_counted_from_the_last_pulse_that_is_laid(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    down = {"from_pulse_width_us": 300.0, "to_pulse_width_us": 120.0}
+    extend(rig, 20, [hold("up"), SegmentPlan(name="down", sequence="sweep", settings=down)])
+    up = {"from_pulse_width_us": 170.0, "to_pulse_width_us": 300.0}
+    extend(rig, 100, [SegmentPlan(name="on", sequence="sweep", settings=up)])
+    again = {"from_pulse_width_us": 120.0, "to_pulse_width_us": 171.0}
+    extend(rig, 140, [SegmentPlan(name="down", sequence="sweep", settings=again)])
+    wide = {"from_pulse_width_us": 222.0, "to_pulse_width_us": 222.0}
+    with pytest.raises(RefusedError, match="width_rise_us 51"):
+        extend(rig, 180, [SegmentPlan(name="on", sequence="sweep", settings=wide)])
+
+
+def test_the_bound_of_the_whole_test_holds_with_its_safe_end(tmp_path: Path):
+    rig = adaptive(tmp_path, max_duration_s=10.0)
+    with pytest.raises(RefusedError, match=r"duration_s 10\.025 .*request"):
+        extend(rig, 20, [rest(9.525)])
+    with pytest.raises(RefusedError, match=r"with its safe end: duration_s 10\.1"):
+        extend(rig, 20, [hold(on_s=8.6)])
+    extend(rig, 20, [hold(on_s=8.5)])
+    assert rig.run.score.left(0.0).duration_left_s == pytest.approx(1.0)
+
+
+def test_a_fixed_plan_that_does_not_fit_its_own_bound_is_refused_before_the_first_pulse(tmp_path: Path):
+    with pytest.raises(RefusedError, match=r"with its safe end: duration_s 3\.475 s is outside 0 … 3\.4"):
+        adaptive(tmp_path, max_duration_s=3.4)
+    (tmp_path / "rested").mkdir()
+    assert adaptive(tmp_path / "rested", max_duration_s=3.475).test.longest_s == 3.475
+    for wrong in (math.nan, math.inf, 0.0, -1.0):
+        with pytest.raises(ValueError, match=r"greater than 0|finite number"):
+            AdaptivePlan(max_duration_s=wrong, max_torque_time_nms=1.0)
+        with pytest.raises(ValueError, match=r"greater than 0|finite number"):
+            AdaptivePlan(max_duration_s=1.0, max_torque_time_nms=wrong)
+
+
+@pytest.mark.parametrize("pending", ["", "enough", "laid"])
+def test_the_measured_torque_time_ends_it_within_a_pulse(tmp_path: Path, pending: str):
+    """Neither what is laid far ahead nor an end that waits for its boundary plays on over the bound."""
+    rig = adaptive(tmp_path, max_nms=5.0, fixed=[rest(0.5), hold("long", on_s=3.0), hold("more", on_s=3.0)])
+    if pending == "enough":
+        rig.at(0.6, lambda: rig.run.score.enough("me", at_once=False))
+    if pending == "laid":
+        rig.at(0.6, lambda: extend(rig, 140, [hold("ahead", on_s=3.0)]))
+    at_end: list[float] = []
+    rig.stimulator.on_send = lambda _: at_end.append(rig.run.torque_time_nms)
+    result = rig.execute()
+    assert (result.outcome, result.summary["ended_by"]) == ("completed", "torque_time")
+    a_pulse_nms = 6.0 / PULSES_HZ
+    assert at_end[-1] < 5.0 + a_pulse_nms
+    assert 5.0 < result.summary["torque_time_nms"] < 5.0 + 2 * a_pulse_nms + 6.0 * 0.1  # the torque falls within 0.1 s
+    recording = rig.recording()
+    assert recording.names == ["rest", "long", "rest"]
+    assert result.summary["duration_s"] == pytest.approx(recording.columns["segments/start_s"][-1] + 1.0, abs=1e-6)
+
+
+def test_the_torque_time_is_counted_from_rest_and_through_lost_samples(tmp_path: Path):
+    rig = adaptive(tmp_path, fixed=[rest(0.5), hold("first", on_s=2.0), rest(2.0)])
+    rig.cell.add_nm = -3.0
+    rig.at(1.5, lambda: setattr(rig.cell, "skip", 100))
+    result = rig.execute()
+    assert result.outcome == "completed"
+    assert result.summary["torque_time_nms"] == pytest.approx(6.0 * 2.0, rel=0.05)
+
+
+def test_only_so_many_are_checked_for_one_boundary(tmp_path: Path):
+    rig = adaptive(tmp_path)
+    wrong = [hold(max_pulse_width_us=1000.0)]
+    found = refusals(*[lambda: extend(rig, 20, wrong)] * (MAX_CHECKED + 3), lambda: extend(rig, 20, [hold()]))
+    assert [type(error) for error in found] == [RefusedError] * MAX_CHECKED + [BusyError] * 4
+    refusals(*[lambda: extend(rig, 19, wrong)] * 100)
+    rig.at(0.7, lambda: extend(rig, 60, [hold("added")]))  # the next boundary
+    rig.execute()
+    assert rig.recording().names == ["rest", "first", "added", "ramp", "rest"]
+
+
+def mad_segment(rng: np.random.Generator) -> SegmentPlan:
+    """One of the library's segments, most of them within the limits."""
+    wide = float(rng.choice([80.0, 200.0, 280.0, 280.5, 281.0, 400.0, 1e9, -1.0], p=[0.3, 0.3, 0.2, *[0.04] * 5]))
+    long_s = float(rng.choice([0.001, 0.025, 0.3, 1.0, 5.0, 31.0], p=[0.05, 0.1, 0.4, 0.35, 0.05, 0.05]))
+    jumps = bool(rng.random() < 0.7)
+    kinds: list[tuple[str, dict[str, Any]]] = [
+        ("rest", {"duration_s": long_s}),
+        ("steps", {"on_s": long_s, "off_s": 0.1, "repeats": 1, "max_pulse_width_us": wide}),
+        ("ramp", {"up_s": long_s, "down_s": 0.1, "max_pulse_width_us": wide}),
+        ("sweep", {"from_pulse_width_us": wide, "to_pulse_width_us": 100.0, "duration_s": long_s, "jumps": jumps}),
+        ("widths", {"pulse_width_us": [wide] * int(rng.integers(1, 30)), "jumps": jumps}),
+        ("prbs", {"bits": int(rng.integers(2, 5)), "clock_pulses": 1, "max_pulse_width_us": wide}),
+    ]
+    sequence, settings = kinds[int(rng.integers(len(kinds)))]
+    return SegmentPlan(name=f"s{rng.integers(100)}", sequence=sequence, settings=settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path: Path, seed: int):
+    """Right and wrong extensions at random times, some ends among them; judged by arithmetic of its own."""
+    rng = np.random.default_rng(1300 + seed)
+    base = limits.tightened(limits.HARD_LIMITS, "charge_per_test_uc", 900.0, "rig file")
+    base = limits.tightened(base, "charge_per_second_uc", 180.0, "rig file")
+    pause = [rest(0.3), hold("a", 0.5, max_pulse_width_us=200.0), rest(0.5), hold("b", 0.5, max_pulse_width_us=150.0)]
+    rig = adaptive(tmp_path, 12.0, 60.0, pause, base=base, max_pulse_width_us=280.0)
+    score, counts, shown = rig.run.score, {"laid": 0, "refused": 0}, [rig.run.score.laid]
+
+    def ask() -> None:
+        before = score.laid
+        after = len(before) + int(rng.choice([0, 0, 0, 0, 1, -1, 40]))
+        try:
+            extend(rig, after, [mad_segment(rng) for _ in range(rng.integers(0, 4))])
+        except RigError:
+            counts["refused"] += 1
+            assert score.laid is before
+        else:
+            counts["laid"] += 1
+            assert np.array_equal(score.laid.pulse_width_us[: len(before)], before.pulse_width_us)
+            assert score.laid.segments[: len(before.segments)] == before.segments
+        shown.append(score.laid)
+
+    for at_s in np.sort(rng.uniform(-0.1, 12.0, 250)):
+        rig.at(float(at_s), ask)
+    if seed % 2:
+        rig.at(
+            float(rng.uniform(3.0, 6.0)), lambda: None if score.ended_by else score.enough("me", bool(seed % 4 == 1))
+        )
+    result = rig.execute()
+    assert result.outcome == "completed", result.reason
+    assert counts["laid"] > 3 and counts["refused"] > 10
+    times = np.array([time_s for time_s, _ in rig.stimulator.sent])
+    sent_us = np.array(widths_sent(rig), dtype=float)
+    assert sent_us.max() <= 280
+    assert sent_us.sum() * 20e-3 <= 900
+    for time_s in times:
+        assert sent_us[(times >= time_s) & (times < time_s + 1 - 1e-6)].sum() * 20e-3 <= 180 + 1e-9
+    recording = rig.recording()
+    planned_us = recording.columns["pulses/pulse_width_us"]
+    assert len(planned_us) / PULSES_HZ <= 12.0
+    assert np.all(planned_us[-40:] == 0)
+    assert np.array_equal(np.floor(planned_us[planned_us >= 1]), sent_us)
+    assert len(recording.names) <= 200

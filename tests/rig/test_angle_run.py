@@ -17,8 +17,7 @@ from stimrig.rig.control.summary import warnings
 from stimrig.rig.errors import DeviceError, PlanError, RefusedError
 from stimrig.rig.messages import AdaptivePlan, AnglePlan
 from stimrig.rig.signals import Pulse, PulseStatus
-from tests.rig.adaptive import extend, refusals
-from tests.rig.fakes import VirtualRig, hold, rest
+from tests.rig.fakes import VirtualRig, extend, hold, refusals, rest
 
 RANGE = (math.radians(20), math.radians(120))
 REST = [rest(5.0)]

@@ -1,9 +1,11 @@
-"""A damaged journal: what was felt is in what is sealed, or the text says that it may be missing."""
+"""A damaged journal or a process that died: what was felt is told, or the text says that it may be missing."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,10 +14,14 @@ import pytest
 from stimrig.api.cli import main
 from stimrig.rig import archive, assembly, journal, recover
 from stimrig.rig.adapters.files import Files
+from stimrig.rig.assembly import _Pulses
 from stimrig.rig.errors import RecordingError
-from stimrig.rig.journal import Kind
+from stimrig.rig.journal import JournalContents, Kind
 from stimrig.rig.messages import SegmentPlan
 from tests.rig.fakes import VirtualRig, header, journal_at
+from tests.rig.live import ACK_S, SPEED, LiveRig
+from tests.simulator.disk import SimulatedDisk
+from tests.simulator.world import World
 
 ROOT = Path(__file__).parents[2]
 SECTOR = 4096
@@ -209,3 +215,72 @@ def test_the_verb_gives_one_line_and_an_exit_code(
         assert len(told.err.splitlines()) == 1
     with pytest.raises(SystemExit, match="2"):
         recover.main([])
+
+
+def test_a_sender_that_lost_the_processor_wrote_before_the_ack() -> None:
+    """The ack of pulse 0 was read before the sender could look at its clock, that of 1 as usual, of 2 never."""
+    blocks: list[tuple[Kind, bytes]] = []
+    for index, (written_s, acked_s) in enumerate([(10.0042, 10.0013), (10.0251, 10.0262), (10.0503, None)]):
+        blocks.append((Kind.INTENT, journal.INTENT.pack(index, 10.0 + 0.025 * index, 0.0, 120.0, 20.0)))
+        blocks.append((Kind.WRITTEN, journal.WRITTEN.pack(index, index, written_s)))
+        if acked_s is not None:
+            blocks.append((Kind.ACKED, journal.ACKED.pack(index, acked_s)))
+    pulses = _Pulses(np.full(3, 120.0), 20.0, 10.0)
+    pulses.take(JournalContents(Path("j"), blocks, 0, 0))
+    columns = pulses.columns(40.0, 0.075, blocks_missing=False, notes=[])
+    expected_s = [0.0013, 0.0251, 0.0503]
+    np.testing.assert_allclose(columns["pulses/written_time_s"], expected_s, atol=1e-9)
+
+
+Make = Callable[..., LiveRig]
+PULSES = 10
+
+
+def died(
+    make: Make, cut: Kind | None = None, acknowledged: bool = True, boot_id: str = "this-boot"
+) -> tuple[list[float], dict[str, Any]]:
+    """Charge of each pulse that was felt as a process died, µC, and what the next one tells; `cut`: its last block of
+    that kind, and what came after it, was not written any more."""
+    live = make(disk=SimulatedDisk(World(0)))
+    disk: Any = live.machine.disk
+    live.machine.boot_id = boot_id
+    live.start(live.plan("one", hold_s=20.0))
+    live.wait_pulses(PULSES)
+    live.machine.wait(2 * ACK_S if acknowledged else 0.0)
+    felt_uc = [pulse.charge_uc for _, pulse in live.stimulator.sent]
+    file = disk.files[live.config.data_dir / "journals" / "one.journal"]
+    if cut is not None:
+        data = bytes(file.data)
+        places = [i for i in range(len(data)) if (block := journal.block_at(data, i)) is not None and block[0] == cut]
+        del file.data[places[-1] :]
+    assert live.rig.player.run is not None
+    live.rig.player.run.journal._failure = "dead"  # nothing of that process is written any more
+    disk.process_ended()
+    again = make(disk=disk, clock=live.clock)
+    assert again.rig.status().state == "uncertain" and again.rig.finished is not None
+    return felt_uc, again.rig.finished.summary
+
+
+@pytest.mark.parametrize(
+    ("cut", "acknowledged", "doubtful"), [(None, True, 0), (None, False, 1), (Kind.WRITTEN, False, 1)]
+)
+def test_what_the_journal_knows_is_told_and_a_pulse_that_is_in_doubt_counts(
+    make: Make, cut: Kind | None, acknowledged: bool, doubtful: int
+):
+    felt_uc, summary = died(make, cut, acknowledged)
+    assert summary["recovered"] is True
+    assert summary["pulses"] == PULSES and summary["charge_uc"] == pytest.approx(sum(felt_uc))
+    assert 0.5 + (PULSES - 1) / 40 <= summary["duration_s"] < 1.5
+    assert summary["torque_time_nms"] > 0 and summary["torque_peak_nm"] > 0
+    assert (summary["doubtful_pulses"], summary["dose_is_bound"]) == (doubtful, doubtful > 0)
+    told = [words for words in summary["warnings"] if words.startswith("dose: of ")]
+    assert len(told) == (doubtful > 0)
+
+
+def test_after_a_power_failure_what_the_disk_may_have_lost_counts(make: Make):
+    """The journal is synced twice a second, and a disk that takes none for 3 s ends the test."""
+    felt_uc, summary = died(make, boot_id="the boot before")
+    lost = summary["pulses"] - PULSES
+    assert lost == pytest.approx(3.5 * SPEED * 40, abs=2)
+    assert summary["charge_uc"] == pytest.approx(sum(felt_uc) + lost * felt_uc[-1])
+    assert summary["dose_is_bound"] is True and summary["doubtful_pulses"] >= lost
