@@ -37,7 +37,7 @@ from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, holds, uploads
 from stimrig.api.store.holds import Holds, ServiceLock
-from stimrig.api.store.tables import Recording
+from stimrig.api.store.tables import Model, Recording
 from stimrig.api.web.guards import anyone_even_locked, anyone_signed_in, require
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.stop_guard import Press, anyone_who_may_stop
@@ -203,6 +203,14 @@ Rearmer = Annotated[Principal, Security(require(Scope.REARM), scopes=[Scope.REAR
 Approver = Annotated[Principal, Security(require(Scope.APPROVE_MODEL), scopes=[Scope.APPROVE_MODEL])]
 ModelReader = Annotated[Principal, Security(require(Scope.READ_MODEL), scopes=[Scope.READ_MODEL])]
 Administrator = Annotated[Principal, Security(require(Scope.ADMINISTER), scopes=[Scope.ADMINISTER])]
+
+
+async def _version(context: Ctx, model_id: str) -> Model:
+    return await asyncio.to_thread(context.versions.get, model_id)
+
+
+Version = Annotated[Model, Depends(_version)]
+"""The model version of the path's `model_id`; after who asks for it, so that only they hear that there is none."""
 
 PROBLEM: dict[int | str, dict[str, Any]] = {
     code: problem(text)

@@ -11,7 +11,7 @@ import pytest
 from stimrig.api import language
 from stimrig.api.models.tracking import OUTCOMES, sentences
 from stimrig.api.web.pages.decision_view import tracking_words
-from stimrig.api.web.responses.trend import TrialOut
+from stimrig.api.web.responses.models import TrialOut
 from tests.api.conftest import Service
 from tests.api.test_access import csrf, signed_in
 from tests.api.test_tracked import play, say, tracked

@@ -18,7 +18,7 @@ from stimrig.api.language import _, lazy, localised
 from stimrig.api.models import advice, registry, stored_model
 from stimrig.api.models.tracking import QUANTITIES, Limits
 from stimrig.api.store.tables import Model
-from stimrig.api.web.dependencies import Approver, Context, Ctx
+from stimrig.api.web.dependencies import Approver, Context, Ctx, Version
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.render import page
@@ -34,25 +34,23 @@ LABELS = {
 
 
 @router.get("/approve")
-async def ask(request: Request, context: Ctx, who: Approver, model_id: str) -> Response:
+async def ask(request: Request, context: Ctx, who: Approver, row: Version) -> Response:
     """The question before a model that is not usable is approved; the model's page where none is needed."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     if not _poor(context, row):
-        return RedirectResponse(f"/models/{model_id}", 303)
+        return RedirectResponse(f"/models/{row.id}", 303)
     return await _question(request, context, row, who.session_hash)
 
 
 @router.post("/approve")
-async def approve(request: Request, context: Ctx, who: Approver, model_id: str, reason: Reason = "") -> Response:
+async def approve(request: Request, context: Ctx, who: Approver, row: Version, reason: Reason = "") -> Response:
     """Let the controller have a version; one that is not usable wants a reason."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     sent = await request.form()
     tracking = read_tracking(sent)
     if _poor(context, row) and not registry.is_reason(reason):
         given = {name: sent[name] for name in LABELS if name in sent}
         return await _question(request, context, row, who.session_hash, reason, given)
-    await models.let_have(context, model_id, who.name, reason.strip()[:500], tracking)
-    return RedirectResponse(f"/models/{model_id}", 303)
+    await models.let_have(context, row, who.name, reason.strip()[:500], tracking)
+    return RedirectResponse(f"/models/{row.id}", 303)
 
 
 @router.post("/reject")

@@ -15,7 +15,7 @@ from stimrig.api.models import advice, carried_structure, explanation, stored_mo
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.requests import EffectsIn, TestIn
 from stimrig.api.store.tables import Model
-from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester
+from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.pages import next_view, starting, trend_view, typed
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.routes import criticism, participants
@@ -27,9 +27,8 @@ TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improv
 
 
 @router.get("/models/{model_id}")
-async def model(request: Request, context: Ctx, who: ModelReader, model_id: str, diagnose: int = -1) -> Response:
+async def model(request: Request, context: Ctx, who: ModelReader, row: Version, diagnose: int = -1) -> Response:
     """A model beside its measurement, and why it fails. `diagnose`: 1 begins a diagnosis anew, 0 begins none."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     document = stored_model.read(row)
     measured = await measurement(context, row)
     diagnosis = await looked_at(context, row, who.name, diagnose)
@@ -158,21 +157,19 @@ async def cancel_diagnosis(context: Ctx, _who: Tester, model_id: str) -> Respons
 async def add_effect(
     context: Ctx,
     who: Tester,
-    model_id: str,
+    row: Version,
     effect: Annotated[str, Form()] = "",
     force: Annotated[str, Form()] = "",
     reason: Annotated[str, Form()] = "",
 ) -> Response:
     """Add one effect."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     body = typed.checked(EffectsIn, effects=[effect], reason=reason[:500], force=bool(force))
     return await to_job(criticism.begin_adding(context, row, body, who.name))
 
 
 @router.post("/models/{model_id}/improve")
-async def improve(context: Ctx, who: Tester, model_id: str) -> Response:
+async def improve(context: Ctx, who: Tester, row: Version) -> Response:
     """Add what is missing, one by one."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     return await to_job(criticism.begin_improving(context, row, who.name))
 
 
@@ -184,9 +181,8 @@ async def undo(context: Ctx, who: Approver, model_id: str) -> Response:
 
 
 @router.post("/models/{model_id}/experiment")
-async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
+async def run_experiment(context: Ctx, who: Tester, row: Version) -> Response:
     """To the question before the diagnosis' next experiment; its recording is joined to this model's."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     experiment = (found or {}).get("experiment")
     if not experiment:
@@ -195,7 +191,7 @@ async def run_experiment(context: Ctx, who: Tester, model_id: str) -> Response:
     body = TestIn.model_validate(
         {"participant": row.participant, "kind": "next-experiment", "segments": experiment["segments"], "joins": row.id}
     )
-    return RedirectResponse(await starting.ask(context, who, body, back=f"/models/{model_id}#experiment"), 303)
+    return RedirectResponse(await starting.ask(context, who, body, back=f"/models/{row.id}#experiment"), 303)
 
 
 # ---- long work ----------------------------------------------------------------------------------------------

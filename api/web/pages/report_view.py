@@ -16,7 +16,7 @@ from stimrig.api.language import _
 from stimrig.api.models import advice, explanation, stored_model
 from stimrig.api.models.places import Site, site_of, site_of_recording
 from stimrig.api.store.tables import Model, Note, Participant, Recording, Test
-from stimrig.api.web.dependencies import Context, Ctx, ModelReader
+from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
 from stimrig.api.web.pages.model_view import facts, measurement
 from stimrig.api.web.pages.render import page
 
@@ -31,9 +31,8 @@ def _versions(context: Context, lineage: list[Model], shown: str) -> list[dict[s
 
 
 @router.get("/models/{model_id}/report")
-async def report(request: Request, context: Ctx, _who: ModelReader, model_id: str) -> Response:
+async def report(request: Request, context: Ctx, _who: ModelReader, row: Version) -> Response:
     """One sheet on a model."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     document = stored_model.read(row)
     measured = await measurement(context, row)
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)

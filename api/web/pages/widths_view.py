@@ -14,29 +14,27 @@ from stimrig.api.errors import ApiError
 from stimrig.api.language import _
 from stimrig.api.models import inverted as words
 from stimrig.api.store.tables import Model
-from stimrig.api.web.dependencies import Context, Ctx, ModelReader
+from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
 from stimrig.api.web.pages.render import page
-from stimrig.api.web.routes.prediction import inverted
+from stimrig.api.web.routes.models import invert as find_widths
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 
 
 @router.get("/widths")
-async def show(request: Request, context: Ctx, _who: ModelReader, model_id: str) -> Response:
+async def show(request: Request, context: Ctx, _who: ModelReader, row: Version) -> Response:
     """The form."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     return await shown(request, context, row)
 
 
 @router.post("/widths")
 async def invert(
-    request: Request, context: Ctx, _who: ModelReader, model_id: str, file: Annotated[UploadFile | None, File()] = None
+    request: Request, context: Ctx, _who: ModelReader, row: Version, file: Annotated[UploadFile | None, File()] = None
 ) -> Response:
     """The widths for a reference that was sent; what is wrong with it stands above the form."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     table = text_of(await file.read()) if file is not None else ""
     try:
-        found = await inverted(context, model_id, {"table": table})
+        found = await find_widths(context, row.id, {"table": table})
     except ApiError as error:
         if error.status != 422:
             raise
@@ -47,7 +45,7 @@ async def invert(
 @router.post("/widths.csv")
 async def download(context: Ctx, _who: ModelReader, model_id: str, reference: Annotated[str, Form()] = "") -> Response:
     """The same as a table: time, pulse width, reference, prediction."""
-    found = await inverted(context, model_id, {"table": reference})
+    found = await find_widths(context, model_id, {"table": reference})
     headers = {"Content-Disposition": 'attachment; filename="widths.csv"'}
     return PlainTextResponse(words.table(found), media_type="text/csv; charset=utf-8", headers=headers)
 

@@ -14,7 +14,7 @@ class AngleOut(AngleStatus, Document):
     """The joint's angle now, and how its sensor was calibrated."""
 
 
-class MissingOut(Document):
+class StretchOut(Document):
     """A stretch of angles that was not seen yet in one direction and at one speed."""
 
     direction: Literal["flexion", "extension"]
@@ -34,7 +34,7 @@ class CoverageOut(Document):
     seen_s: float = Field(description="time after which a cell is seen, s")
     share: float = Field(description="of the cells that must be seen, 0 to 1")
     enough: bool = Field(description="at most a tenth is missing: the test ends")
-    missing: list[MissingOut]
+    missing: list[StretchOut]
 
 
 class DosesOut(Document):

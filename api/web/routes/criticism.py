@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 
 from stimrig.api.sessions.requests import EffectsIn
 from stimrig.api.store.tables import Model
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.responses.base import answers, published
 from stimrig.api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
 from stimrig.api.workers.tracker import Job
@@ -24,25 +24,22 @@ Wait = Annotated[bool, Query(description="false: answer 202 at once, with the jo
 async def comparison(
     context: Ctx,
     _who: ModelReader,
-    model_id: str,
+    row: Version,
     recording: Annotated[str | None, Query(description="another recording than the model's own")] = None,
 ) -> dict[str, Any]:
     """Measurement against the model's free run: the error split up, the worst places, tests of the residual."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     return await context.analyses.comparison(row, recording)
 
 
 @router.get("/models/{model_id}/curves", **answers(CurvesOut))
-async def curves(context: Ctx, _who: ModelReader, model_id: str) -> dict[str, Any]:
+async def curves(context: Ctx, _who: ModelReader, row: Version) -> dict[str, Any]:
     """The measured, predicted and commanded curves and the step response, thinned to what a screen shows."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     return await context.analyses.curves(row)
 
 
 @router.get("/models/{model_id}/diagnosis", response_model=DiagnosisOut, responses=LATER)
-async def diagnosis(context: Ctx, who: ModelReader, model_id: str, wait: Wait = True) -> Any:
+async def diagnosis(context: Ctx, who: ModelReader, row: Version, wait: Wait = True) -> Any:
     """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     if wait or await asyncio.to_thread(context.analyses.known_diagnosis, row) is not None:
         return await context.analyses.diagnosis(row)
     return later(begin_diagnosis(context, row, who.name))
@@ -66,9 +63,8 @@ async def add_effects(
 
 
 @router.post("/models/{model_id}/improve", status_code=201, response_model=ImprovementOut, responses=LATER)
-async def improve(context: Ctx, who: Tester, model_id: str, response: Response, wait: Wait = True) -> Any:
+async def improve(context: Ctx, who: Tester, row: Version, response: Response, wait: Wait = True) -> Any:
     """Add effects one by one while the evidence lasts; each step is a version."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
     if not wait:
         return later(begin_improving(context, row, who.name))
     found, rows = await context.analyses.improve(row, who.name)

@@ -1,4 +1,4 @@
-"""Models: versions, approval, what the controller gets, and what its trials said of the muscle."""
+"""Models: versions, approval, what the controller gets, what its trials said of the muscle; a trial foretold."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from email.utils import formatdate
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Response
+from pydantic import Field, FiniteFloat, StrictBool, model_validator
 
 from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
 from stimrig.api.models.tracking import Limits
-from stimrig.api.sessions.requests import ApprovalIn, DecisionIn
+from stimrig.api.sessions.limits import tighter
+from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn
 from stimrig.api.store import seen
-from stimrig.api.store.tables import Model
-from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader
+from stimrig.api.store.tables import Model, Participant
+from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.responses.base import answers, published
-from stimrig.api.web.responses.models import VersionOut
-from stimrig.api.web.responses.trend import TrackingOut
+from stimrig.api.web.responses.models import InversionOut, PredictionOut, TrackingOut, VersionOut
 from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
@@ -95,19 +96,16 @@ def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]
 
 
 @router.get("/models/{model_id}", response_model=None, responses={200: WITH_MODEL})
-def one_model(context: Ctx, _who: ModelReader, model_id: str, response: Response) -> dict[str, Any]:
+def one_model(context: Ctx, _who: ModelReader, row: Version, response: Response) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
-    row = context.versions.get(model_id)
-    response.headers["ETag"] = context.store.etag(
-        context.clock, f"/v1/models/{model_id}", seen.decisions(row.participant)
-    )
+    about = seen.decisions(row.participant)
+    response.headers["ETag"] = context.store.etag(context.clock, f"/v1/models/{row.id}", about)
     return {**context.versions.document(row), "model": stored_model.read(row)}
 
 
 @router.get("/models/{model_id}/file", response_class=Response, responses={200: published("model", "MODEL.json")})
-def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
+def model_file(_who: ModelReader, row: Version) -> Response:
     """MODEL.json, as it was stored."""
-    row = context.versions.get(model_id)
     headers = {"Content-Disposition": f'attachment; filename="{row.id}.json"', "ETag": f'"{row.etag}"'}
     return Response(stored_model.whole(row), media_type="application/json", headers=headers)
 
@@ -116,16 +114,15 @@ def model_file(context: Ctx, _who: ModelReader, model_id: str) -> Response:
 async def approve(context: Ctx, who: Approver, model_id: str, body: ApprovalIn | None = None) -> dict[str, Any]:
     """Let the controller have this version, and what is tracked from it within limits, until the day ends."""
     given = body or ApprovalIn()
-    row = await let_have(context, model_id, who.name, given.reason, given.tracking.limits())
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    await let_have(context, row, who.name, given.reason, given.tracking.limits())
     return await asyncio.to_thread(context.versions.document, row)
 
 
-async def let_have(context: Context, model_id: str, by: str, reason: str, tracking: Limits) -> Model:
+async def let_have(context: Context, row: Model, by: str, reason: str, tracking: Limits) -> None:
     """Approve a version; the worker that follows its trials is warm by the first one."""
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    await asyncio.to_thread(context.versions.decide, model_id, True, by, reason, tracking)
+    await asyncio.to_thread(context.versions.decide, row.id, True, by, reason, tracking)
     context.runner.trials.warm(row.participant)
-    return row
 
 
 @router.post("/models/{model_id}/reject", response_model=VersionOut)
@@ -140,3 +137,106 @@ def undo(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = N
     """Go back to the version this one was made from; nothing is deleted."""
     parent = context.versions.undo(model_id, who.name, body.reason if body else "")
     return context.versions.document(parent)
+
+
+# ---- a trial foretold: what widths would give, and which widths give a torque that is wanted -------------------------
+
+REST_S = 1.0
+"""Before and after a trial: its torque is measured against the rest before it."""
+RISE = "width_rise_us"
+Column = Annotated[list[FiniteFloat], Field(min_length=1, max_length=60_000)]
+WidthUs = Annotated[FiniteFloat, Field(ge=0, le=500)]
+Angles = Annotated[
+    list[Annotated[FiniteFloat, Field(ge=-7, le=7)]],
+    Field(
+        min_length=1, max_length=60_000, description="of the joint where it moves, rad; as many as torques or widths"
+    ),
+]
+
+
+class WidthsIn(Body):
+    """One pulse width for each pulse."""
+
+    pulse_width_us: Annotated[list[WidthUs], Field(min_length=1, max_length=12_000, description="µs")]
+    pulse_rate_hz: Annotated[FiniteFloat, Field(ge=10, le=100)] = 40.0
+    angle_rad: Angles | None = None
+
+    @model_validator(mode="after")
+    def _as_many(self) -> WidthsIn:
+        if self.angle_rad is not None and len(self.angle_rad) != len(self.pulse_width_us):
+            raise ValueError(f"{len(self.angle_rad)} angles for {len(self.pulse_width_us)} widths: give one for each")
+        return self
+
+
+@router.post("/models/{model_id}/prediction", **answers(PredictionOut))
+async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
+    """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included.
+
+    Of a version, or of one that was tracked from it (its `model_id`).
+    """
+    text = await asyncio.to_thread(context.tracked.text_of, model_id)
+    call = context.pool.submit(
+        "forecast", urgent=True, model_json=text, pulse_width_us=body.pulse_width_us,
+        pulse_rate_hz=body.pulse_rate_hz, angle_rad=body.angle_rad,
+    )  # fmt: skip
+    found = await call.result
+    return {"model_id": model_id, "pulse_rate_hz": body.pulse_rate_hz, **found}
+
+
+class ReferenceIn(Body):
+    """A torque to follow."""
+
+    reference_torque_nm: Annotated[Column, Field(description="above rest, N·m; one for each pulse, without `time_s`")]
+    time_s: Annotated[Column, Field(description="times of the torques, s, rising; of any rate")] | None = None
+    angle_rad: Angles | None = None
+    pulse_rate_hz: FiniteFloat | None = Field(None, ge=10, le=100, description="None: the model's")
+    max_pulse_width_us: FiniteFloat | None = Field(None, gt=0, le=500, description="never above the participant's, µs")
+    max_rise_us: FiniteFloat | None = Field(None, gt=0, le=500, description="from pulse to pulse, µs; None: the rig's")
+    whole_us: StrictBool = Field(True, description="whole µs")
+
+
+@router.post("/models/{model_id}/widths", **answers(InversionOut))
+async def widths(context: Ctx, _who: ModelReader, model_id: str, body: ReferenceIn) -> dict[str, Any]:
+    """The pulse widths whose predicted torque follows a reference best, and where and why it is out of reach.
+
+    Of a version, or of one that was tracked from it (its `model_id`).
+    """
+    given = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz"})
+    return await invert(context, model_id, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
+
+
+async def invert(
+    context: Context, model_id: str, given: dict[str, Any], width_us: float | None = None, rise_us: float | None = None,
+    whole: bool = True,
+) -> dict[str, Any]:  # fmt: skip
+    """What a worker makes of a reference, within the limits of participant and rig.
+
+    Parameters
+    ----------
+    given : dict
+        The reference, as the verb `invert` takes it.
+    width_us, rise_us : float, optional
+        Further limits.
+    """
+    text = await asyncio.to_thread(context.tracked.text_of, model_id)
+    version = await asyncio.to_thread(context.tracked.version_of, model_id)
+    participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
+    largest_us = tighter(width_us, participant.profile.get("max_pulse_width_us"))
+    rise_us = tighter(rise_us, _rise_of_rig(context))
+    call = context.pool.submit(
+        "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=whole, **given
+    )
+    found = await call.result
+    limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us}
+    return {"model_id": model_id, **found, **limits, "segments": segments(found["pulse_width_us"])}
+
+
+def _rise_of_rig(context: Context) -> float | None:
+    bound = context.rig.status.limits.get(RISE) if context.rig.status else None
+    return bound.hi if bound else None
+
+
+def segments(pulse_width_us: list[float]) -> list[dict[str, Any]]:
+    """A trial of these widths between two rests, for `POST /v1/tests`."""
+    rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": REST_S}}
+    return [rest, {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": pulse_width_us}}, rest]

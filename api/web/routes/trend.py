@@ -13,7 +13,7 @@ from stimrig.api.models import changes
 from stimrig.api.models.trend import Session
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
 from stimrig.api.web.responses.base import answers
-from stimrig.api.web.responses.trend import TrendOut
+from stimrig.api.web.responses.models import TrendOut
 from stimrig.api.web.routes import participants
 from stimrig.identify.records.cells import lines
 
