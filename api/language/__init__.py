@@ -6,12 +6,28 @@ What is stored and what `/v1` answers is English. A text is translated when a pa
 
 from __future__ import annotations
 
-from stimrig.api.language.catalogues import CODES, DEFAULT, best, names
-from stimrig.api.language.numbers import clock, day, decimal, localised, separators, until, when, zone
 from stimrig.api.language.translated import plain, translated
-from stimrig.api.language.words import _, code, lazy, locale, ngettext, using
+from stimrig.api.language.words import (
+    CODES,
+    DEFAULT,
+    _,
+    best,
+    clock,
+    code,
+    day,
+    decimal,
+    lazy,
+    locale,
+    localised,
+    names,
+    ngettext,
+    until,
+    using,
+    when,
+    zone,
+)  # fmt: skip
 
 __all__ = [
     "CODES", "DEFAULT", "_", "best", "clock", "code", "day", "decimal", "lazy", "locale", "localised", "names",
-    "ngettext", "plain", "separators", "translated", "until", "using", "when", "zone",
+    "ngettext", "plain", "translated", "until", "using", "when", "zone",
 ]  # fmt: skip

@@ -18,7 +18,7 @@ from babel.messages.catalog import Catalog
 from babel.messages.extract import extract_from_file
 from babel.messages.pofile import write_po
 
-from stimrig.api.language.catalogues import CODES, DEFAULT, HERE, catalogue
+from stimrig.api.language.words import CODES, DEFAULT, HERE, catalogue
 
 ROOT = HERE.parents[1]
 KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}
@@ -61,9 +61,58 @@ NOT_SHOWN = {
 }
 """Calls whose texts no page shows: descriptions of the API, patterns, logs, and what is extracted already."""
 
+VOCABULARY = (
+    # roles of people
+    "administrator", "clinician", "engineer", "researcher", "controller", "reader",
+    # states of a test
+    "requested", "running", "sealing", "identifying", "completed", "stopped", "fault", "failed", "refused", "cancelled",
+    # methods
+    "maximum-likelihood", "two-stage", "ramp-deconvolution", "separable-least-squares", "narx", "plain",
+    # tests of a residual
+    "whiteness", "structure",
+    # what aligned the clocks of stimulator and load cell
+    "sync", "regression",
+    # directions of a pulse width
+    "rising", "falling", "held", "rising %(segment)s", "falling %(segment)s",
+    # how sure, how much
+    "very probably", "probably", "possibly", "something", "expired", "empty", "1 place", "%(count)s places",
+    # what is joined
+    "%(one)s and %(other)s", "%(one)s from %(other)s", "%(name)s (%(form)s)", " by %(who)s", "with %(effects)s",
+    # a sentence without the figure that `stimrig.api.structure.worded` takes away; made by `format`
+    "%(test)s should separate %(those)s.", "%(test)s is the best test to separate %(those)s, but it may not be enough.",
+    "pulse widths of %(range)s µs", "%(range)s pulses/s",
+    # what was not found, what ran
+    "file", "job", "model", "participant", "recording", "schema", "test", "token", "user", "comparison", "diagnosis",
+    "identification", "prediction",
+    # effects by their ids
+    "recruitment hysteresis", "asymmetric relaxation", "electromechanical delay", "mixed fibres", "threshold drift",
+    "baseline drift", "voluntary effort", "output saturation", "sensor clipping", "series compliance", "torque angle",
+    "torque velocity", "passive torque", "activation dependent speed", "catch like", "activation_dependent_speed",
+    "asymmetric_relaxation", "baseline_drift", "catch_like", "electromechanical_delay", "mains_hum", "mixed_fibres",
+    "output_saturation", "passive_torque", "recruitment_hysteresis", "sensor_clipping", "series_compliance",
+    "threshold_drift", "torque_angle", "torque_velocity", "voluntary_effort",
+    # what a worker does
+    "tried %(effect)s", "comparing", "done", "loading", "predicting", "writing",
+    # what a controller's trials tell
+    "gain", "threshold", "time scale",
+    # limits
+    "rig file", "%(least)s to %(most)s µs",
+    # where in a file
+    "%(name)s, line %(line)s", "%(name)s, sample %(number)s", "%(name)s, attribute %(attribute)s", "attribute %(name)s",
+    "recording %(number)s", "%(unit)s (or %(others)s)", "negative",
+    # thresholds; states of the rig and of the stimulator
+    "comfort", "motor", "sensory", "arming", "calibrating", "disconnected", "latched", "ready", "stopping", "uncertain",
+    "not initialised", "low level initialised", "mid level initialised", "mid level running", "did not answer",
+    # why and by whom the rig was stopped; what it answered
+    "stop pressed on the page", "%(reason)s (by %(who)s)", "device: %(state)s",
+)  # fmt: skip
+"""Words that are stored or answered as they are, and translated where a page shows them (`|translated`); and what may
+stand at a place of a sentence that is put together elsewhere (`f"No{more} effect of the library …"`)."""
+
 
 def messages() -> Iterator[str | tuple[str, ...]]:
     """All messages of the source."""
+    yield from VOCABULARY
     for path in sorted((ROOT / "api").rglob("*.html")):
         options = {"newstyle_gettext": "true", "trimmed": "true", "trim_blocks": "true", "lstrip_blocks": "true"}
         yield from _marked("jinja2.ext:babel_extract", path, options)

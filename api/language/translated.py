@@ -15,9 +15,7 @@ from itertools import islice
 
 from markupsafe import Markup
 
-from stimrig.api.language.catalogues import DEFAULT, catalogue, translations
-from stimrig.api.language.numbers import localised
-from stimrig.api.language.words import code
+from stimrig.api.language.words import DEFAULT, catalogue, code, localised, translations
 
 _PLACE = re.compile(r"%\((\w+)\)s")
 _END = re.compile(r"(?<=[.!?;:,]) ")

@@ -1,19 +1,77 @@
-"""The language in which the page under way is written, and texts in it.
+"""The language in which the page under way is written: its texts, its numbers and times; English where nobody set it.
 
-It is set for each request; English where nobody has set it.
+Each file `<code>.po` in this folder is a language of the pages; nothing else names it. Units stay SI.
 """
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from datetime import datetime, timedelta
+from functools import cache
+from pathlib import Path
 from typing import Any
 
-from babel import Locale
-from babel.support import LazyProxy
+from babel import Locale, UnknownLocaleError
+from babel.dates import format_date
+from babel.messages.catalog import Catalog
+from babel.messages.mofile import write_mo
+from babel.messages.pofile import read_po
+from babel.support import LazyProxy, Translations
 
-from stimrig.api.language.catalogues import CODES, DEFAULT, translations
+HERE = Path(__file__).parent
+DEFAULT = "en"
+"""The language of the source."""
+CODES = (DEFAULT, *sorted(path.stem for path in HERE.glob("*.po")))
+"""The languages that there are."""
+
+
+def names() -> dict[str, str]:
+    """Each language's own name, by its code."""
+    return {code: (Locale.parse(code).get_language_name(code) or code).capitalize() for code in CODES}
+
+
+@cache
+def catalogue(code: str) -> Catalog:
+    """The messages of a language; none for English."""
+    if code == DEFAULT:
+        return Catalog(locale=code)
+    with (HERE / f"{code}.po").open("rb") as file:
+        return read_po(file, locale=code)
+
+
+@cache
+def translations(code: str) -> Translations:
+    """The catalogue as gettext uses it."""
+    compiled = io.BytesIO()
+    write_mo(compiled, catalogue(code))
+    compiled.seek(0)
+    return Translations(compiled)
+
+
+def best(accepted: str) -> str:
+    """The language for an `Accept-Language` header (RFC 9110, 12.5.4): the one with most weight that we have."""
+    wanted = []
+    for place, part in enumerate(accepted[:400].split(",")):
+        tag, _, weight = part.partition(";q=")
+        try:
+            wanted.append((-float(weight or 1.0), place, tag.strip()))
+        except ValueError:
+            continue
+    for weight, _, tag in sorted(wanted):
+        try:
+            code = Locale.parse(tag, sep="-").language if weight < 0 else ""
+        except (ValueError, UnknownLocaleError, TypeError):
+            continue
+        if code in CODES:
+            return code
+    return DEFAULT
+
+
+# ---- texts ----------------------------------------------------------------------------------------------------------
 
 _code: ContextVar[str] = ContextVar("language", default=DEFAULT)
 
@@ -61,3 +119,55 @@ def ngettext(one: str, many: str, count: int, **values: Any) -> str:
 def lazy(message: str) -> Any:
     """A message of a table that is made when the program starts: translated each time that it is shown."""
     return LazyProxy(_, message, enable_cache=False)
+
+
+# ---- numbers and times -----------------------------------------------------------------------------------------------
+
+_POINT = re.compile(r"(?<=\d)\.(?=\d)")
+
+
+def decimal() -> str:
+    """The decimal sign."""
+    return str(locale().number_symbols["latn"]["decimal"])
+
+
+def localised(text: str) -> str:
+    """A text with the decimal points of its numbers as the language writes them; times and versions are not numbers."""
+    return text if decimal() == "." else _POINT.sub(decimal(), text)
+
+
+def _local(label: str) -> datetime:
+    return datetime.fromisoformat(label.replace("Z", "+00:00")).astimezone()
+
+
+def day(label: str | None, year: bool = True) -> str:
+    """A UTC label as a day, where this machine stands: 12 Nov 2026."""
+    if not label:
+        return "–"
+    pattern = "dd MMM yyyy" if year else "d MMM"
+    return format_date(_local(label).date(), pattern, locale=locale())
+
+
+def when(label: str | None) -> str:
+    """A UTC label in the machine's local time, to the minute."""
+    return f"{day(label)}, {_local(label):%H:%M}" if label else "–"
+
+
+def until(label: str | None) -> str:
+    """As `when`, of an end: midnight is shown as the last minute of the day that it ends."""
+    if label and (end := _local(label)).strftime("%H:%M") == "00:00":
+        label = (end - timedelta(minutes=1)).isoformat()
+    return when(label)
+
+
+def clock(label: str | None) -> str:
+    """A UTC label as the time of day where this machine stands, to the second."""
+    return f"{_local(label):%H:%M:%S}" if label else "–"
+
+
+def zone(label: str) -> str:
+    """The zone that `when` writes in at that time: UTC+1."""
+    offset = _local(label).utcoffset() or timedelta(0)
+    minutes = round(offset.total_seconds() / 60)
+    sign, (hours, rest) = "+" if minutes >= 0 else "−", divmod(abs(minutes), 60)
+    return "UTC" if not minutes else f"UTC{sign}{hours}" + (f":{rest:02d}" if rest else "")

@@ -14,7 +14,7 @@ from stimrig.api.language import _, clock, day, lazy, localised, when
 LEAST_PERCENT, MOST_PERCENT, USUAL_PERCENT = 0.0, 60.0, 20.0
 QUANTITIES = {"gain": "gain", "threshold_shift_us": "threshold", "time_scale": "time scale"}
 """The quantities of `stimrig.identify.tracking`, named here, too, so that the service need not load it, and what people
-read; the same words stand in `stimrig.api.language.vocabulary`."""
+read; the same words stand in `stimrig.api.language.extract`."""
 CONTRADICTS, NO_TORQUE, NOT_FOLLOWED = "contradicts", "no-torque", "not-followed"
 NEW_TEST = "A new test is needed; the shortest is the adaptive test, which stops by itself."
 

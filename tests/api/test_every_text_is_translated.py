@@ -40,7 +40,7 @@ def made_up() -> Iterator[None]:
         if message:
             one = f"⟦{message}⟧" if isinstance(message, str) else tuple(f"⟦{form}⟧" for form in message)
             made.add(message, one)
-    names = ("catalogues", "words", "translated")
+    names = ("words", "translated")
     modules = [importlib.import_module(f"stimrig.api.language.{name}") for name in names]
     pages = [importlib.import_module(name) for name in ("stimrig.api.language", "stimrig.api.web.pages.choices")]
     with pytest.MonkeyPatch.context() as patch:

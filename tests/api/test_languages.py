@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig.api import language
-from stimrig.api.language import catalogues, extract, translated
-from stimrig.api.language.catalogues import best
+from stimrig.api.language import extract, translated, words
+from stimrig.api.language.words import best
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
 
@@ -30,7 +30,7 @@ PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
 def test_the_browsers_language_is_taken_where_there_is_one(
     accepted: str, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(catalogues, "CODES", ("en", "de"))  # whatever other languages somebody added
+    monkeypatch.setattr(words, "CODES", ("en", "de"))  # whatever other languages somebody added
     assert best(accepted) == code
 
 
@@ -68,7 +68,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "The fit is good.": "Die Anpassung ist gut.",
     }.items():
         made.add(message, translation)
-    monkeypatch.setattr(catalogues, "catalogue", lambda _code: made)
+    monkeypatch.setattr(words, "catalogue", lambda _code: made)
     monkeypatch.setattr(translated_module(), "catalogue", lambda _code: made)
     forget()
     yield
@@ -84,7 +84,7 @@ def translated_module() -> Any:
 
 def forget() -> None:
     module = translated_module()
-    for cached in (catalogues.translations, module._certain, module._message, module._patterns, module._same):
+    for cached in (words.translations, module._certain, module._message, module._patterns, module._same):
         cached.cache_clear()
 
 
@@ -149,7 +149,7 @@ def test_every_message_has_its_translation(code: str) -> None:
 @pytest.mark.parametrize("code", [code for code in language.CODES if code != language.DEFAULT])
 def test_translations_keep_the_places(code: str) -> None:
     wrong = []
-    for entry in catalogues.catalogue(code):
+    for entry in words.catalogue(code):
         if not entry.id:
             continue
         wanted = {place for form in forms_of(entry.id) for place in PLACE.findall(form)}
@@ -160,11 +160,11 @@ def test_translations_keep_the_places(code: str) -> None:
 
 
 def test_a_catalogue_is_one_file_and_ships() -> None:
-    assert {path.stem for path in catalogues.HERE.glob("*.po")} | {"en"} == set(language.CODES)
+    assert {path.stem for path in words.HERE.glob("*.po")} | {"en"} == set(language.CODES)
     assert '"*.po"' in (Path(__file__).parents[2] / "pyproject.toml").read_text()
 
 
 @pytest.mark.parametrize("code", ["xq", "pt_BR", "../de", "--renew"])
 def test_no_catalogue_is_begun_for_what_is_no_language(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert extract.main([code]) == 2
-    assert "no language" in capsys.readouterr().err and catalogues.CODES == language.CODES
+    assert "no language" in capsys.readouterr().err and words.CODES == language.CODES

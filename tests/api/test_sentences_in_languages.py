@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stimrig.api import language
-from stimrig.api.language import catalogues, extract
+from stimrig.api.language import extract, words
 from stimrig.api.language.translated import PERSON, of
 
 LANGUAGES = [code for code in language.CODES if code != language.DEFAULT]
@@ -21,7 +21,7 @@ PLACE = re.compile(r"%\((\w+)\)s")
 def test_each_message_is_recognised_as_itself(code: str) -> None:
     wrong, seen = [], set()
     with language.using(code):
-        for entry in catalogues.catalogue(code):
+        for entry in words.catalogue(code):
             shape = PLACE.sub("%", str(entry.id))
             if isinstance(entry.id, str) and entry.id and entry.string and shape not in seen:
                 seen.add(shape)
@@ -92,21 +92,21 @@ def test_a_text_of_many_half_sentences_is_given_up(code: str) -> None:
 @pytest.mark.parametrize("code", LANGUAGES)
 def test_renewing_a_catalogue_loses_nothing(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / f"{code}.po"
-    shutil.copy(catalogues.HERE / path.name, path)
-    before = {str(entry.id): entry.string for entry in catalogues.catalogue(code)}
-    head = catalogues.catalogue(code).header_comment
-    for module in (catalogues, extract):
+    shutil.copy(words.HERE / path.name, path)
+    before = {str(entry.id): entry.string for entry in words.catalogue(code)}
+    head = words.catalogue(code).header_comment
+    for module in (words, extract):
         monkeypatch.setattr(module, "HERE", tmp_path)
     monkeypatch.setattr(extract, "CODES", (language.DEFAULT, code))
-    catalogues.catalogue.cache_clear()
+    words.catalogue.cache_clear()
     try:
         extract.main([])
-        catalogues.catalogue.cache_clear()
-        after = catalogues.catalogue(code)
+        words.catalogue.cache_clear()
+        after = words.catalogue(code)
         assert {str(entry.id): entry.string for entry in after if entry.id and entry.string}.items() <= before.items()
         assert after.header_comment == head and sum(1 for entry in after if entry.string) > 500
     finally:
-        catalogues.catalogue.cache_clear()
+        words.catalogue.cache_clear()
 
 
 HOSTILE = [
