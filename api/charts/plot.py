@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from stimrig.api.charts import diagnosis_charts, model_charts
 from stimrig.api.charts.figure import CHART_CONFIG, in_light
 from stimrig.api.models import explanation
-from stimrig.api.workers.verbs import curves, runs, thinned
+from stimrig.api.workers.curves import curves, runs, thinned
 from stimrig.identify import BadRequest, Comparison, Improvement, Model, Record, compare
 
 BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]

@@ -95,13 +95,13 @@ def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects:
     IdentifyError
         One cannot be read, they do not go together, or one lacks what one of the `effects` needs.
     """
-    from stimrig.api.workers import several
+    from stimrig.api.workers import recordings
 
     twice = [path for number, path in enumerate(data) if path in data[:number]]
     if twice:
         raise InputError(f"{twice[0]}: named twice. Name each recording once.")
     needs = _needed(effects) if len(data) > 1 else []
-    return several.read(data, columns, needs, note=lambda words: print(words, file=sys.stderr))
+    return recordings.read(data, columns, needs, note=lambda words: print(words, file=sys.stderr))
 
 
 def _needed(effects: Sequence[str]) -> list[str]:

@@ -42,7 +42,7 @@ def view(
     Parameters
     ----------
     diagnosis : dict
-        As `stimrig.api.workers.diagnosis_verbs.diagnosis` gives it, or identify's own.
+        As `stimrig.api.workers.verbs.diagnosis` gives it, or identify's own.
     comparison : dict or None
         `identify.compare` of the model that is looked at.
     effects : sequence of str

@@ -23,7 +23,7 @@ from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Tell, Watc
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Participant, Test
-from stimrig.api.workers.adviser import Adviser
+from stimrig.api.workers.pool import Adviser
 from stimrig.rig.messages import SAFE_END_S, AdaptivePlan, FinishedEvent, PreviewRequest, SegmentPlan, TestPlan
 
 ADAPTIVE = "adaptive"

@@ -19,7 +19,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions.kinds import SERVICE, Watcher
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.workers.adviser import Adviser
+from stimrig.api.workers.pool import Adviser
 from stimrig.rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
 
 log = logging.getLogger("stimrig.adaptive")

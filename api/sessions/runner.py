@@ -32,8 +32,7 @@ from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.tables import Participant, Test, Token
-from stimrig.api.workers.adviser import Adviser
-from stimrig.api.workers.pool import Pool
+from stimrig.api.workers.pool import Adviser, Pool
 from stimrig.rig.messages import (
     EnoughRequest,
     Extended,

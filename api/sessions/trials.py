@@ -21,7 +21,7 @@ from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
-from stimrig.api.workers.adviser import Adviser
+from stimrig.api.workers.pool import Adviser
 
 log = logging.getLogger("stimrig.tracking")
 SEQUENCE = "sequence"

@@ -41,10 +41,9 @@ from stimrig.api.store.tables import Model, Recording
 from stimrig.api.web.guards import anyone_even_locked, anyone_signed_in, require
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.stop_guard import Press, anyone_who_may_stop
-from stimrig.api.workers.adviser import Adviser
-from stimrig.api.workers.pool import WORKER, Pool
+from stimrig.api.workers.jobs import Jobs
+from stimrig.api.workers.pool import WORKER, Adviser, Pool
 from stimrig.api.workers.process import Places
-from stimrig.api.workers.tracker import Jobs
 
 log = logging.getLogger("stimrig.api")
 

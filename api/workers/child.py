@@ -1,9 +1,9 @@
 """A worker process: one call at a time from standard input, one JSON object a line each way.
 
 ``{"call": 1, "verb": "fit", "arguments": {…}}`` in; ``progress``, then ``result`` or ``error`` out.
-It ends with the service, also in the middle of a call; a cancelled call's worker is killed. Before the first
+It ends with who started it, also in the middle of a call; a cancelled call's worker is killed. Before the first
 call it shuts itself in (`api.workers.confinement`): what it reads, others may have made. ``--reads`` and ``--writes``
-name the folders that stay open.
+name the folders that stay open. A cohort's records are computed by the same process, with verbs of its own.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import select
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -20,21 +22,21 @@ from stimrig.identify.errors import IdentifyError
 
 PROCESSOR_S = 900.0
 """Of processor time for a call that names no other bound."""
+VERBS = "stimrig.api.workers.verbs"
 
 
 def main() -> None:
-    """Serve calls until the input closes."""
+    """Serve calls until the input closes, or nobody calls for long."""
     confinement.end_with_parent()
     out = own_output()
-    os.environ.setdefault(
-        "OPENBLAS_NUM_THREADS", "1"
-    )  # as in `stimrig.api.cli`: small matrices gain nothing from a second
-    os.nice(5)  # the rig's sender goes first
-    say(out, {"ready": True, "left_open": shut_in()})
-    for line in sys.stdin:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second
+    options = parsed()
+    os.nice(options.nice)
+    say(out, {"ready": True, "left_open": shut_in(options)})
+    while select.select([sys.stdin], [], [], options.idle_s)[0] and (line := sys.stdin.readline()):
         request = json.loads(line)
         confinement.limit_time(request.get("processor_s", PROCESSOR_S))
-        say(out, {"call": request["call"], **run(request, out)})
+        say(out, {"call": request["call"], **run(request, out, options.verbs)})
 
 
 def own_output() -> TextIO:
@@ -44,24 +46,38 @@ def own_output() -> TextIO:
     return out
 
 
-def shut_in() -> dict[str, str]:
-    """Leave open only what the command line names; what could not be shut."""
-    parser = argparse.ArgumentParser(prog="stimrig.api.workers.child")
+def parsed() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="api.workers.child")
     parser.add_argument("--reads", type=Path, action="append", default=[])
     parser.add_argument("--writes", type=Path, action="append", default=[])
-    options = parser.parse_args()
-    return confinement.confine(options.reads, options.writes)
+    parser.add_argument("--verbs", default=VERBS, help="module with a table of what can be called")
+    parser.add_argument(
+        "--memory", type=int, help="bytes beyond what the verbs' libraries take, loaded first"
+    )
+    parser.add_argument("--nice", type=int, default=5, help="the rig's sender goes first")
+    parser.add_argument("--idle-s", type=float, help="end after so long without a call")
+    return parser.parse_args()
 
 
-def run(request: dict[str, Any], out: TextIO) -> dict[str, Any]:
+def shut_in(options: argparse.Namespace) -> dict[str, str]:
+    """Leave open only what the command line names; what could not be shut."""
+    memory_bytes = confinement.MEMORY_BYTES
+    if options.memory is not None:
+        import_module(options.verbs).load()
+        memory_bytes = options.memory + (confinement.taken() or (memory_bytes, 0))[0]
+    return confinement.confine(options.reads, options.writes, memory_bytes)
+
+
+def run(request: dict[str, Any], out: TextIO, verbs: str = VERBS) -> dict[str, Any]:
     """Do one call; its result or its error as an object."""
-    from stimrig.api.workers import verbs
 
     def progress(fraction: float, text: str = "") -> None:
         say(out, {"call": request["call"], "progress": float(fraction), "text": str(text)})
 
     try:
-        return {"result": verbs.VERBS[request["verb"]](progress=progress, **request["arguments"])}
+        verb = import_module(verbs).VERBS[request["verb"]]
+        return {"result": verb(progress=progress, **request["arguments"])}
     except Exception as error:
         return {"error": describe(error)}
 

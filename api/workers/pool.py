@@ -1,4 +1,4 @@
-"""identify at work in processes of its own: never in the web process, cancellable, kept warm."""
+"""identify at work in processes of its own: never in the web process, cancellable, kept warm; some beside the queue."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from stimrig.api.errors import ApiError
 from stimrig.api.logs import current_test
 from stimrig.api.workers.process import WORKER, Call, Places, Worker, cancelled
 
@@ -138,3 +139,48 @@ class Pool:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await asyncio.gather(*(worker.close() for worker in self.workers))
+
+
+class Adviser:
+    """Answers one question at a time, beside the pool: nothing else keeps it busy.
+
+    It is started by the first question, so whoever asks none has no such process. For an adaptive test that is what it
+    can reach: during the test it is warm.
+
+    Parameters
+    ----------
+    command : tuple of str
+        How to start the worker; tests put another in its place.
+    places : Places
+        The folders that it may reach.
+    """
+
+    def __init__(self, command: tuple[str, ...] = WORKER, places: Places | None = None) -> None:
+        self.worker = Worker(command, places or Places())
+        self._numbers = itertools.count(1)
+        self._turn = asyncio.Lock()
+        self._knows: asyncio.subprocess.Process | None = None
+        """The process that keeps the test."""
+
+    async def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
+        """Its answer.
+
+        Raises
+        ------
+        ApiError
+            The worker refused, took too long or died; the next question starts a new one, which knows of no test.
+        """
+        async with self._turn:
+            if verb == "adaptive_advise" and await self.worker.start() is not self._knows:
+                detail = "It ended between two questions. Your data are safe. See logs/api.log."
+                raise ApiError(500, "worker-died", "The worker process died", detail)
+            if verb == "adaptive_begin":
+                self._knows = None
+            found = await self.worker.run(Call(next(self._numbers), verb, arguments))
+            if verb == "adaptive_begin":
+                self._knows = self.worker.process
+            return found
+
+    async def close(self) -> None:
+        """End the process."""
+        await self.worker.close()

@@ -12,7 +12,7 @@ import numpy as np
 
 from stimrig import identify
 from stimrig.api.workers.json_values import clean
-from stimrig.api.workers.several import begun
+from stimrig.api.workers.recordings import begun
 
 Progress = Callable[[float, str], None]
 MOST_MISSED = 50

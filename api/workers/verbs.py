@@ -1,12 +1,10 @@
 """What a worker process does, verb by verb: paths and plain objects in, plain objects out.
 
-Imported by the worker only; the web process never loads numpy, and never fits.
+Imported by the worker and the command line only; the web process never loads numpy, and never fits.
 """
 
 from __future__ import annotations
 
-import hashlib
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,18 +12,15 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.api.structure import held_by
 from stimrig.api.workers import adaptive_verbs, tracking_verbs
-from stimrig.api.workers.diagnosis_verbs import diagnosis, improve, joined
+from stimrig.api.workers.curves import comparison, drawn, recorded
 from stimrig.api.workers.json_values import clean
-from stimrig.api.workers.prediction import forecast, invert
-from stimrig.api.workers.recorded_signals import recorded
-from stimrig.identify.records.cells import quoted
-from stimrig.identify.records.join import write_joined
-from stimrig.identify.records.recording import attributes
+from stimrig.api.workers.recordings import export_csv, find_recording, joined, plain_csv
 
 Progress = Callable[[float, str], None]
-POINTS = 2400
-"""Most points in a drawn curve: more than a screen has pixels."""
+SIGNATURE_POINTS = 900
+"""Points of a signature's curve: it is drawn small."""
 
 
 def fit(
@@ -73,75 +68,133 @@ def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     return {"json": found.models[1].to_json() if len(found.models) > 1 else None, "found": clean(found.finding())}
 
 
-def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
-    """The curves a page draws: measured, predicted, commanded, and the step response."""
-    progress(0.1, "reading the recording")
-    record = identify.read(Path(data))
-    progress(0.5, "predicting")
-    return clean(curves(identify.Model.from_json(model_json), record))
+def diagnosis(
+    data: str, progress: Progress, model_json: str | None = None, columns: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """What is missing in a model's structure, what each effect would explain, and the test that decides.
+
+    Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis.
+    """
+    return diagnosed(identify.read(Path(data), map=columns), progress, model_json)
 
 
-def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
-    """Measurement against model: identify's comparison, its series thinned."""
-    progress(0.1, "reading the recording")
-    record = identify.read(Path(data))
-    model = identify.Model.from_json(model_json)
-    progress(0.4, "comparing")
-    return thinned(identify.compare(model, record).to_dict())
+def diagnosed(record: Any, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
+    """The same of a record that was read."""
+    from stimrig.identify import effects
+
+    model = None if model_json is None else identify.Model.from_json(model_json)
+    structure = held_by(model, record)
+    found = identify.diagnose(record, model, lambda share, text="": progress(0.8 * share, text)).to_dict()
+    found["structure"] = structure
+    found["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(found)}
+    progress(0.82, "what each effect would explain")
+    found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]], structure)
+    found["experiment"] = experiment(found["missing"])
+    return clean(found)
 
 
-def thinned(found: dict[str, Any]) -> dict[str, Any]:
-    """A comparison whose series hold no more points than a screen shows, five digits each."""
-    series = found.get("series") or {}
-    longest = max((len(values) for values in series.values() if isinstance(values, list)), default=0)
-    pick = slice(None, None, max(1, math.ceil(longest / POINTS)))
-    short = {key: _rounded(values[pick]) if isinstance(values, list) else values for key, values in series.items()}
-    return {**found, "series": short}
+def mentioned(found: dict[str, Any]) -> set[str]:
+    """Ids of all effects that a diagnosis speaks of."""
+    named = {entry["effect"] for entry in found["missing"]}
+    named |= {rival for entry in found["missing"] for rival in entry.get("confused_with") or []}
+    return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
 
 
-def _rounded(values: list[Any]) -> list[Any]:
-    return [round(value, 5) if isinstance(value, float) else value for value in values]
+def signatures(record: Any, effects: Sequence[str], structure: Sequence[str] = ()) -> dict[str, Any]:
+    """What each effect explains of what the model before it leaves: seen beside expected.
 
-
-def curves(model: Any, record: Any) -> dict[str, Any]:
-    """The measured, predicted and commanded curves, thinned to what a screen shows."""
-    predicted = np.asarray(identify.predict(model, record))
-    time_s, torque_nm = np.asarray(record.time_s), np.asarray(record.torque_nm)
-    step = max(1, math.ceil(len(time_s) / POINTS))
-    labels = [str(record.segment_names[index]) for index in record.segment]
-    pick = slice(None, None, step)
-    return {
-        "time_s": time_s[pick].round(5).tolist(),
-        "torque_nm": torque_nm[pick].round(5).tolist(),
-        "predicted_torque_nm": predicted[pick].round(5).tolist(),
-        "pulse_width_us": np.asarray(record.pulse_width_us)[pick].round(2).tolist(),
-        "segments": runs(labels, time_s),
-        "step_response": step_response(model.to_dict()),
-    }
-
-
-def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:
-    """Stretches of rows that carry the same segment's name."""
-    found: list[dict[str, Any]] = []
-    for index, label in enumerate(labels):
-        if not found or found[-1]["name"] != label:
-            found.append({"name": label, "start_s": float(time_s[index])})
-        found[-1]["end_s"] = float(time_s[index])
+    ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
+    The first model is the structure criticised. An effect whose model cannot be fitted alone has none.
+    """
+    pick = slice(None, None, max(1, -(-record.time_s.size // SIGNATURE_POINTS)))
+    found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
+    held = list(structure)
+    before = np.asarray(identify.predict(identify.fit(record, effects=held), record))
+    for effect in effects:
+        held.append(effect)
+        try:
+            after = np.asarray(identify.predict(identify.fit(record, effects=held), record))
+        except identify.IdentifyError:
+            held.pop()
+            continue
+        seen = record.torque_nm - before
+        found[effect] = {"seen_nm": smooth(record, seen)[pick].round(4), "expected_nm": (after - before)[pick].round(4)}
+        before = after
     return found
 
 
-def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, list[float]]:
-    """The linear part's answer to a unit step (eq. 2 of the paper: B(q)/A(q)), thinned."""
-    from scipy.signal import lfilter
+def smooth(record: Any, values: Any) -> Any:
+    """Running mean over a tenth of a second, so that a slow signature is seen through the noise."""
+    width = max(1, round(0.1 * record.sample_rate_hz))
+    padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
+    return np.convolve(padded, np.ones(width) / width, "valid")
 
-    linear, rate_hz = document["linear"], float(document["sample_rate_hz"])
-    count = max(2, round(seconds * rate_hz))
-    response = np.asarray(lfilter(linear["b"], linear["a"], np.ones(count)))
-    delay = int(linear.get("delay_samples", 0))
-    # A pulse may act up to a sample before it is written down: then the response begins within itself.
-    response = np.concatenate([np.zeros(max(delay, 0)), response[max(-delay, 0) :]])[:count]
-    pick = slice(None, None, max(1, count // 400))
-    return {"time_s": (np.arange(response.size) / rate_hz)[pick].tolist(), "response": response[pick].round(6).tolist()}
+
+def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """The test that separates the first effect with rivals from them; None where no effect has any."""
+    from stimrig.identify.diagnosis.experiment import planned
+
+    found = planned(missing)
+    return found and {**found.to_dict(), "effect": found.rivals[0]}
+
+
+def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json: str | None = None) -> dict[str, Any]:
+    """Effects added to a model's structure one by one while the evidence lasts, each step with its model."""
+    record = identify.read(Path(data))
+    model = None if model_json is None else identify.Model.from_json(model_json)
+    structure = held_by(model, record)
+    return {**identify.improve(record, progress, force=tuple(force), model=model).to_dict(), "structure": structure}
+
+
+def forecast(
+    progress: Progress,
+    model_json: str,
+    pulse_width_us: list[float],
+    pulse_rate_hz: float = 40.0,
+    angle_rad: list[float] | None = None,
+) -> dict[str, Any]:
+    """Mean torque that the pulses give in each pulse's period, N·m, effects included, after one second of rest.
+
+    `angle_rad`: of the joint in each pulse's period, where it moves.
+    """
+    from stimrig.identify.simulation.pulses import Motion, above_rest
+
+    progress(0.1, "predicting")
+    model = identify.Model.from_json(model_json)
+    motion = None if angle_rad is None else Motion.of(np.asarray(angle_rad, float), pulse_rate_hz)
+    torque = above_rest(model, np.asarray(pulse_width_us, float), pulse_rate_hz, motion)
+    return {"torque_nm": torque.round(6).tolist()}
+
+
+def invert(
+    progress: Progress,
+    model_json: str,
+    reference_torque_nm: list[float] | None = None,
+    time_s: list[float] | None = None,
+    angle_rad: list[float] | None = None,
+    table: str | None = None,
+    pulse_rate_hz: float | None = None,
+    largest_us: float | None = None,
+    rise_us: float | None = None,
+    whole: bool = True,
+) -> dict[str, Any]:
+    """The pulse widths whose predicted torque follows a reference best, and where it cannot be reached and why.
+
+    The reference comes as numbers, or as the text of a CSV file (`table`).
+    """
+    from stimrig.identify.inversion import Reference
+    from stimrig.identify.inversion import invert as widths_for
+    from stimrig.identify.inversion.table import read_reference
+
+    progress(0.1, "inverting")
+    model = identify.Model.from_json(model_json)
+    rate_hz = pulse_rate_hz or model.pulse_rate_hz
+    if table is not None:
+        reference = read_reference(table.encode(), "the upload", rate_hz)
+    else:
+        reference = Reference.of(reference_torque_nm, time_s, angle_rad=angle_rad, pulse_rate_hz=rate_hz)
+    found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole)
+    return clean(found.to_dict())
 
 
 def effects(progress: Progress) -> dict[str, Any]:
@@ -154,79 +207,23 @@ def effects(progress: Progress) -> dict[str, Any]:
 
 def warm(progress: Progress) -> dict[str, Any]:
     """Load identify and its compiled parts, so that the fit after a test starts at once."""
-    from stimrig.identify.records.csv import read_csv
-
     progress(0.1, "loading")
-    identify.fit(read_csv(_warm_csv().encode(), Path("warm.csv")))
+    identify.fit(_warm_record())
     adaptive_verbs.warm()
     return {}
 
 
-def _warm_csv() -> str:
+def _warm_record() -> Any:
     """A small made-up record, only to have every compiled part compiled: a lag behind a switching input."""
-    rows, torque = ["time_s,pulse_width_us,torque_nm,segment"], 0.0
-    for index in range(800):
-        seconds = index / 40
-        level = (
-            0.0 if seconds < 1 else 200.0 * (index // 13 % 2) if seconds < 9 else max(0.0, 200 - 40 * abs(seconds - 14))
-        )
-        torque += (level / 40 - torque) / 20
-        name = "rest" if seconds < 1 else "prbs" if seconds < 9 else "ramp"
-        wobble = 0.03 * math.sin(index * index * 0.7)
-        rows.append(f"{seconds:.4f},{level:.1f},{torque + wobble:.5f},{name}")
-    return "\n".join(rows) + "\n"
+    from scipy.signal import lfilter
 
-
-def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> dict[str, Any]:
-    """A table or MAT file of another tool as a CSV file in our own layout, by what `--map` says of its columns."""
-    progress(0.1, "reading the recording")
-    record = identify.read(Path(data), map=columns)
-    progress(0.7, "writing")
-    write_joined(record, Path(out))
-    return {"notes": list(record.notes), "of": record.source.participant}
-
-
-def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
-    """A recording as a CSV file in the layout that `identify.read` takes in (docs/recording.md's times and widths)."""
-    progress(0.1, "reading the recording")
-    record = identify.read(Path(data))
-    if len(record.parts) > 1:
-        progress(0.7, "writing")
-        write_joined(record, Path(out))
-        return {"rows": int(record.time_s.size)}
-    if abs(record.pulse_rate_hz - 40.0) > 1e-6:
-        message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
-        raise identify.BadRecord(message, fix="Take the HDF5 file.")
-    names = ["time_s", "pulse_width_us", "torque_nm"]
-    also = record.columns()
-    columns = [column.tolist() for column in (*(getattr(record, name) for name in names), *also.values())]
-    told = [quoted(name) for name in record.segment_names]
-    segments = [told[index] for index in record.segment.tolist()]
-    progress(0.7, "writing")
-    with Path(out).open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join([*names, "segment", *also]) + "\n")
-        for seconds, *values, segment in zip(*columns, segments, strict=True):
-            width, torque, *more = [f"{value:.8g}" for value in values]
-            file.write(",".join([f"{seconds:.6f}", width, torque, segment, *more]) + "\n")
-    return {"rows": len(segments)}
-
-
-def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
-    """The sealed recording of a test, when the service did not hear of its end."""
-    from stimrig.api.store.uploads import PREFIX
-
-    progress(0.1, "looking through the recordings")
-    for path in sorted(Path(folder).glob("**/*.h5")):
-        if path.name.startswith(PREFIX):
-            continue  # what somebody sent in is no recording of this rig, whatever test it names
-        try:
-            found = attributes(path, ["test_id", "recording_id", "outcome", "reason"])
-        except identify.IdentifyError:
-            continue
-        if found.pop("test_id") == test_id:
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            return {"found": {**found, "recording_path": str(path), "file_sha256": digest}}
-    return {"found": None}
+    index = np.arange(800)
+    time_s = index / 40.0
+    switching = 200.0 * (index // 13 % 2)
+    width_us = np.select([time_s < 1, time_s < 9], [0.0, switching], np.maximum(0.0, 200 - 40 * abs(time_s - 14)))
+    torque_nm = lfilter([0.05 / 40], [1.0, -0.95], width_us) + 0.03 * np.sin(index * index * 0.7)
+    segment = np.digitize(time_s, [1, 9])
+    return identify.Record.from_arrays(time_s, width_us, torque_nm, segment, segment_names=["rest", "prbs", "ramp"])
 
 
 OWN = (

@@ -12,8 +12,7 @@ import pytest
 from stimrig import identify
 from stimrig.api.errors import ApiError
 from stimrig.api.workers import adaptive_verbs as verbs
-from stimrig.api.workers import live_record
-from stimrig.api.workers.adviser import Adviser
+from stimrig.api.workers.pool import Adviser
 from stimrig.identify.experiments import adaptive
 from stimrig.identify.experiments.adaptive import Decision
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
@@ -57,7 +56,7 @@ class Cell:
 
 def test_times_are_those_of_the_samples_that_waited_nowhere() -> None:
     news = Cell(sigmoid(71), 1).news([0.0] * 120, 3.0)
-    time_s = live_record.sample_times(news["host_time_s"], news["counter"])
+    time_s = verbs.sample_times(news["host_time_s"], news["counter"])
     assert np.abs(time_s - 0.0024 - np.arange(4800) / 1600.0).max() < 0.0003
 
 
@@ -68,7 +67,7 @@ def test_lost_samples_and_none_move_nothing() -> None:
     for lost in ((0, 0), (1600, 1900)):
         news = Cell(muscle, 2).news(widths, 2.5, lost)
         news["torque_nm"][100] = None
-        records.append(live_record.record_of(*news.values(), widths, [], segments, PULSE_RATE_HZ))
+        records.append(verbs.record_of(*news.values(), widths, [], segments, PULSE_RATE_HZ))
     whole, holed = records
     assert whole.time_s.size - holed.time_s.size == pytest.approx(300 / 8, abs=2)
     kept = np.isin(whole.time_s, holed.time_s)
@@ -78,16 +77,16 @@ def test_lost_samples_and_none_move_nothing() -> None:
 
 def test_a_late_pulse_is_late_in_the_record() -> None:
     news = Cell(sigmoid(72), 2).news(OPENING, 2.5)
-    record = live_record.record_of(*news.values(), OPENING, [(30, 0.004)], [("opening", 0, len(OPENING))], 40.0)
+    record = verbs.record_of(*news.values(), OPENING, [(30, 0.004)], [("opening", 0, len(OPENING))], 40.0)
     late = (record.time_s >= 30 / 40.0) & (record.time_s < 31 / 40.0)
-    assert late.sum() == live_record.BINS
+    assert late.sum() == verbs.BINS
     assert np.array_equal(record.late_s, np.where(late, 0.004, 0.0))
     assert record.pulses.late_s[30] == 0.004
 
 
 def test_a_slow_cell_keeps_its_samples() -> None:
     time_s = np.arange(300) / 100.0
-    assert live_record.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
+    assert verbs.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
 
 
 @pytest.mark.slow

@@ -16,8 +16,8 @@ from stimrig import identify
 from stimrig.api.charts import model_charts
 from stimrig.api.charts.figure import interpolate
 from stimrig.api.charts.svg import svg, ticks
+from stimrig.api.workers.curves import curves
 from stimrig.api.workers.pool import WORKER
-from stimrig.api.workers.verbs import curves
 from tests.api.conftest import run_service, run_test
 from tests.api.fake_rig import default_widths, muscle
 

@@ -14,7 +14,7 @@ import stimrig
 from stimrig import identify
 from stimrig.api.charts.figure import CHART_CONFIG
 from stimrig.api.web.pages.report_file import comparison_html, improvement_html
-from stimrig.api.workers.verbs import curves, thinned
+from stimrig.api.workers.curves import curves, thinned
 from tests.api.browser import open_tab
 from tests.api.conftest import Service, run_test, shared_service
 from tests.api.test_worker import made_up_csv

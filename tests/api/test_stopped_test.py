@@ -13,7 +13,7 @@ import pytest
 
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts import model_charts
-from stimrig.api.workers.recorded_signals import recorded
+from stimrig.api.workers.curves import recorded
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service
 from tests.api.test_access import signed_in

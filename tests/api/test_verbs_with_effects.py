@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stimrig.api.cli import main
-from stimrig.api.workers import diagnosis_verbs
+from stimrig.api.workers import verbs
 from stimrig.hardware_sim import hidden_records
 from tests.harness import few_effects
 
@@ -69,7 +69,7 @@ def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds
     assert [effect["id"] for effect in fitted["effects"]] == added and "fatigue" in added
     forms = [f"{effect['id']} ({effect['form']})" for effect in fitted["effects"]]
     assert f"structure      {', '.join(forms)}\n" in stimrig("diagnose", data, "--model", held)
-    own = diagnosis_verbs.diagnosis(str(data), lambda *_: None, held.read_text())
+    own = verbs.diagnosis(str(data), lambda *_: None, held.read_text())
     assert [name.partition(":")[0] for name in own["structure"]] == added
     assert own["verdict"] == "nothing_missing" and own["missing"] == []
     tried = {row["effect"] for rows in own["candidates"] for row in rows}

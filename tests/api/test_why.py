@@ -213,7 +213,7 @@ def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, 
 
 def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) -> None:
     from stimrig import identify
-    from stimrig.api.workers import diagnosis_verbs, verbs
+    from stimrig.api.workers import recordings
     from tests.api.fake_rig import write_recording
 
     widths = [200.0 if index >= 40 and index // 20 % 2 else 0.0 for index in range(240)]
@@ -227,7 +227,7 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
             file.attrs["created_utc"] = f"2026-01-01T00:{minute:02d}:00.250Z"
         paths.append(str(path))
     out, exported = tmp_path / "joined.csv", tmp_path / "exported.csv"
-    found = diagnosis_verbs.joined(paths, str(out), lambda *_: None)
+    found = recordings.joined(paths, str(out), lambda *_: None)
     assert found["file_sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
     joined = identify.read(out)
     assert [source.recording_id for source in joined.source.parts] == ["R-early", "R-late"]
@@ -236,9 +236,9 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
     assert joined.parts[0].begun_s == pytest.approx(1767225600.25)
     # Torque that follows at once is no second order: its zero is found to a fiftieth of its 5 N·m.
     assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.1)
-    diagnosis_verbs.joined(paths[::-1], str(exported), lambda *_: None)
+    recordings.joined(paths[::-1], str(exported), lambda *_: None)
     assert exported.read_bytes() == out.read_bytes()
-    verbs.export_csv(str(out), lambda *_: None, str(exported))
+    recordings.export_csv(str(out), lambda *_: None, str(exported))
     assert identify.read(exported).parts == joined.parts
 
 
@@ -352,14 +352,15 @@ def test_two_models_side_by_side(client: httpx.Client, service: Service, model: 
 def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
     from stimrig.api.web.responses.models import ComparisonOut, DiagnosisOut
-    from stimrig.api.workers import diagnosis_verbs
-    from stimrig.api.workers.verbs import comparison, fit
+    from stimrig.api.workers import verbs
+    from stimrig.api.workers.curves import comparison
+    from stimrig.api.workers.verbs import fit
 
     path = str(tmp_path / "record.csv")
     hidden_records.write_csv(hidden_records.generate("asymmetric_relaxation", "middle", 8, rate_hz=200), path)
     told: list[float] = []
     with few_effects.only("asymmetric_relaxation", "fatigue", "recruitment_hysteresis", "potentiation"):
-        found = diagnosis_verbs.diagnosis(path, lambda share, _text="": told.append(share))
+        found = verbs.diagnosis(path, lambda share, _text="": told.append(share))
     DiagnosisOut.model_validate(found)
     assert told == sorted(told) and told[-1] <= 1 and len(told) > 5
     assert found["structure"] == []

@@ -36,7 +36,8 @@ def compare(
     The model runs free: it is given the pulse widths alone, never the measured torque.
     """
     from stimrig.api.web.pages.report_file import comparison_html
-    from stimrig.api.workers.verbs import clean, curves, thinned
+    from stimrig.api.workers.curves import curves, thinned
+    from stimrig.api.workers.json_values import clean
 
     model = load_model(model_json)
     record = load_joined(data, columns)

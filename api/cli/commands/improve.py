@@ -72,8 +72,8 @@ def report(
     import numpy as np
 
     from stimrig.api.web.pages.report_file import improvement_html
-    from stimrig.api.workers.diagnosis_verbs import diagnosed
-    from stimrig.api.workers.verbs import runs, thinned
+    from stimrig.api.workers.curves import runs, thinned
+    from stimrig.api.workers.verbs import diagnosed
 
     before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
     labels = [str(record.segment_names[index]) for index in record.segment]

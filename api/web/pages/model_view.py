@@ -19,7 +19,7 @@ from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Te
 from stimrig.api.web.pages import next_view, starting, trend_view, typed
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.routes import criticism, participants
-from stimrig.api.workers.tracker import FIT_TOGETHER, Job
+from stimrig.api.workers.jobs import FIT_TOGETHER, Job
 
 router = APIRouter(include_in_schema=False)
 TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model",

@@ -28,7 +28,7 @@ def comparison_html(
     document : dict
         MODEL.json.
     curves : dict
-        As `stimrig.api.workers.verbs.curves` gives them.
+        As `stimrig.api.workers.curves.curves` gives them.
     name : str
         What was measured: a file's or a test's name.
     test : dict or None
@@ -74,11 +74,11 @@ def improvement_html(
     name : str
         The record's.
     diagnosis : dict or None
-        As `stimrig.api.workers.diagnosis_verbs.diagnosis` gives it: explanations, parameters, signatures.
+        As `stimrig.api.workers.verbs.diagnosis` gives it: explanations, parameters, signatures.
     before, after : dict or None
         Comparisons of the first model and of the last one with the record.
     segments : list of dict or None
-        The record's, as `stimrig.api.workers.verbs.runs` gives them.
+        The record's, as `stimrig.api.workers.curves.runs` gives them.
     """
     rows = explanation.of_steps(found)
     view = explanation.view(diagnosis, before, []) if diagnosis else None

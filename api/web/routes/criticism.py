@@ -13,7 +13,7 @@ from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.responses.base import answers, published
 from stimrig.api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
-from stimrig.api.workers.tracker import Job
+from stimrig.api.workers.jobs import Job
 
 router = APIRouter(prefix="/v1", tags=["criticism"], responses=PROBLEM)
 LATER: dict[int | str, dict[str, Any]] = {202: {"model": JobOut, "description": "begun; see `Location`"}}

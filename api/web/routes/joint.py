@@ -23,7 +23,7 @@ from stimrig.api.web.responses.joint import AngleOut, JointOverviewOut
 from stimrig.api.web.responses.models import VersionOut
 from stimrig.api.web.routes import participants
 from stimrig.api.web.routes.criticism import LATER, later
-from stimrig.api.workers.tracker import FIT_TOGETHER, Job
+from stimrig.api.workers.jobs import FIT_TOGETHER, Job
 from stimrig.rig.messages import AnglePoseRequest, AngleStatus, Status
 
 router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)

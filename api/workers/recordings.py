@@ -1,4 +1,4 @@
-"""Recordings read as one record: several files of one muscle are the parts of it.
+"""Recordings as files: several read as the parts of one record, joined, written as CSV, found again.
 
 Imported by the worker and the command line only.
 """
@@ -11,9 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from stimrig import identify
-from stimrig.identify.records.join import join
+from stimrig.api.whole_file import sha256_of
+from stimrig.identify.records.cells import quoted
+from stimrig.identify.records.join import join, write_joined
 from stimrig.identify.records.recording import attributes
 
+Progress = Callable[[float, str], None]
 JOINT = ("angle_rad", "velocity_rad_s")
 
 
@@ -95,3 +98,65 @@ def begun(path: Path) -> float | None:
         return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()
     except (identify.IdentifyError, ValueError, OverflowError):
         return None
+
+
+def joined(parts: Sequence[str], out: str, progress: Progress, needs: Sequence[str] = ()) -> dict[str, Any]:
+    """Recordings as the parts of one, written to `out` as CSV that `identify.read` reads; its SHA-256.
+
+    `needs` are columns that each of them must have.
+    """
+    progress(0.1, "joining the recordings")
+    whole = read([Path(part) for part in parts], needs=needs, name=lambda number: f"recording {number + 1}")
+    write_joined(whole, Path(out))
+    return {"file_sha256": sha256_of(Path(out))}
+
+
+def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> dict[str, Any]:
+    """A table or MAT file of another tool as a CSV file in our own layout, by what `--map` says of its columns."""
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data), map=columns)
+    progress(0.7, "writing")
+    write_joined(record, Path(out))
+    return {"notes": list(record.notes), "of": record.source.participant}
+
+
+def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
+    """A recording as a CSV file in the layout that `identify.read` takes in (docs/recording.md's times and widths)."""
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data))
+    if len(record.parts) > 1:
+        progress(0.7, "writing")
+        write_joined(record, Path(out))
+        return {"rows": int(record.time_s.size)}
+    if abs(record.pulse_rate_hz - 40.0) > 1e-6:
+        message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
+        raise identify.BadRecord(message, fix="Take the HDF5 file.")
+    names = ["time_s", "pulse_width_us", "torque_nm"]
+    also = record.columns()
+    columns = [column.tolist() for column in (*(getattr(record, name) for name in names), *also.values())]
+    told = [quoted(name) for name in record.segment_names]
+    segments = [told[index] for index in record.segment.tolist()]
+    progress(0.7, "writing")
+    with Path(out).open("w", encoding="utf-8", newline="") as file:
+        file.write(",".join([*names, "segment", *also]) + "\n")
+        for seconds, *values, segment in zip(*columns, segments, strict=True):
+            width, torque, *more = [f"{value:.8g}" for value in values]
+            file.write(",".join([f"{seconds:.6f}", width, torque, segment, *more]) + "\n")
+    return {"rows": len(segments)}
+
+
+def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
+    """The sealed recording of a test, when the service did not hear of its end."""
+    from stimrig.api.store.uploads import PREFIX
+
+    progress(0.1, "looking through the recordings")
+    for path in sorted(Path(folder).glob("**/*.h5")):
+        if path.name.startswith(PREFIX):
+            continue  # what somebody sent in is no recording of this rig, whatever test it names
+        try:
+            found = attributes(path, ["test_id", "recording_id", "outcome", "reason"])
+        except identify.IdentifyError:
+            continue
+        if found.pop("test_id") == test_id:
+            return {"found": {**found, "recording_path": str(path), "file_sha256": sha256_of(path)}}
+    return {"found": None}

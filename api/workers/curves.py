@@ -1,13 +1,20 @@
-"""A sealed recording of the rig's own as a page draws it: what was measured and what was sent, no model needed."""
+"""What pages draw of a recording, thinned: curves beside a model's, a comparison, a sealed recording as it was made."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stimrig import identify
+from stimrig.api.workers.json_values import clean
+
+Progress = Callable[[float, str], None]
+POINTS = 2400
+"""Most points in a drawn curve: more than a screen has pixels."""
 BINS = 1000
 """Each bin keeps its lowest and its highest torque: no peak is lost."""
 
@@ -17,6 +24,77 @@ NUMBERS = (
 )  # fmt: skip
 ANGLES = ("angle/time_s", "angle/angle_rad")
 """Only of a rig with an angle sensor."""
+
+
+def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
+    """The curves a page draws: measured, predicted, commanded, and the step response."""
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data))
+    progress(0.5, "predicting")
+    return clean(curves(identify.Model.from_json(model_json), record))
+
+
+def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
+    """Measurement against model: identify's comparison, its series thinned."""
+    progress(0.1, "reading the recording")
+    record = identify.read(Path(data))
+    model = identify.Model.from_json(model_json)
+    progress(0.4, "comparing")
+    return thinned(identify.compare(model, record).to_dict())
+
+
+def thinned(found: dict[str, Any]) -> dict[str, Any]:
+    """A comparison whose series hold no more points than a screen shows, five digits each."""
+    series = found.get("series") or {}
+    longest = max((len(values) for values in series.values() if isinstance(values, list)), default=0)
+    pick = slice(None, None, max(1, math.ceil(longest / POINTS)))
+    short = {key: _rounded(values[pick]) if isinstance(values, list) else values for key, values in series.items()}
+    return {**found, "series": short}
+
+
+def _rounded(values: list[Any]) -> list[Any]:
+    return [round(value, 5) if isinstance(value, float) else value for value in values]
+
+
+def curves(model: Any, record: Any) -> dict[str, Any]:
+    """The measured, predicted and commanded curves, thinned to what a screen shows."""
+    predicted = np.asarray(identify.predict(model, record))
+    time_s, torque_nm = np.asarray(record.time_s), np.asarray(record.torque_nm)
+    step = max(1, math.ceil(len(time_s) / POINTS))
+    labels = [str(record.segment_names[index]) for index in record.segment]
+    pick = slice(None, None, step)
+    return {
+        "time_s": time_s[pick].round(5).tolist(),
+        "torque_nm": torque_nm[pick].round(5).tolist(),
+        "predicted_torque_nm": predicted[pick].round(5).tolist(),
+        "pulse_width_us": np.asarray(record.pulse_width_us)[pick].round(2).tolist(),
+        "segments": runs(labels, time_s),
+        "step_response": step_response(model.to_dict()),
+    }
+
+
+def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:
+    """Stretches of rows that carry the same segment's name."""
+    found: list[dict[str, Any]] = []
+    for index, label in enumerate(labels):
+        if not found or found[-1]["name"] != label:
+            found.append({"name": label, "start_s": float(time_s[index])})
+        found[-1]["end_s"] = float(time_s[index])
+    return found
+
+
+def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, list[float]]:
+    """The linear part's answer to a unit step (eq. 2 of the paper: B(q)/A(q)), thinned."""
+    from scipy.signal import lfilter
+
+    linear, rate_hz = document["linear"], float(document["sample_rate_hz"])
+    count = max(2, round(seconds * rate_hz))
+    response = np.asarray(lfilter(linear["b"], linear["a"], np.ones(count)))
+    delay = int(linear.get("delay_samples", 0))
+    # A pulse may act up to a sample before it is written down: then the response begins within itself.
+    response = np.concatenate([np.zeros(max(delay, 0)), response[max(-delay, 0) :]])[:count]
+    pick = slice(None, None, max(1, count // 400))
+    return {"time_s": (np.arange(response.size) / rate_hz)[pick].tolist(), "response": response[pick].round(6).tolist()}
 
 
 def recorded(data: str, progress: Callable[[float, str], None]) -> dict[str, Any]:
