@@ -27,13 +27,13 @@ import psutil
 import pyarrow.parquet as pq
 
 from bench.stamp import written_by
-from stimrig.api.cohort import child
+from stimrig.api.cohort import record
 from stimrig.api.cohort.cluster import Workers, connected
-from stimrig.api.cohort.parts import Results
+from stimrig.api.cohort.computing import Bounds
+from stimrig.api.cohort.results import Results
 from stimrig.api.cohort.run import Run
-from stimrig.api.cohort.sources.addresses import sources_of
+from stimrig.api.cohort.sources import sources_of
 from stimrig.api.cohort.tasks import Task, checked
-from stimrig.api.cohort.worker import Bounds
 from stimrig.api.version import software_version
 from tests.harness.cohort_records import Session, write
 
@@ -121,7 +121,7 @@ def plain(folder: Path, warm: Path, verb: str, processes: int) -> float:
     """The reference, s: the same records computed by bare processes, no Dask, no results written."""
     document = checked(Task(verb, software=software_version())).document()
     jobs, first = ([(str(path), document) for path in sorted(place.rglob("*.h5"))] for place in (folder, warm))
-    with multiprocessing.get_context("spawn").Pool(processes, initializer=child.load) as pool:
+    with multiprocessing.get_context("spawn").Pool(processes, initializer=record.load) as pool:
         pool.starmap(bare, first, chunksize=1)
         began_s = time.perf_counter()
         pool.starmap(bare, jobs, chunksize=1)
@@ -130,7 +130,7 @@ def plain(folder: Path, warm: Path, verb: str, processes: int) -> float:
 
 def bare(file: str, document: dict[str, Any]) -> None:
     """One record of the reference."""
-    row = child.run({"file": file, "name": file, "known": {}, "task": document, "limit_s": 600.0})["row"]
+    row = record.compute(print, file, file, {}, document)["row"]
     assert row["status"] == "ok", row
 
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from stimrig.api.cohort.errors import CohortError
 from stimrig.api.cohort.table import options_of, rows_in, rows_of
-from stimrig.api.cohort.tasks import OPTIONS, differing
+from stimrig.api.cohort.tasks import OPTIONS, CohortError, differing
 
 PROBABILITY = 0.05
 """A probability that moves by no more has not changed."""

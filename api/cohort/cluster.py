@@ -19,7 +19,7 @@ from distributed import Client, LocalCluster
 from distributed.comm.core import CommClosedError
 from distributed.security import Security
 
-from stimrig.api.cohort.errors import SCHEDULER_GONE, CohortError, CutOffError
+from stimrig.api.cohort.tasks import SCHEDULER_GONE, CohortError, CutOffError
 from stimrig.api.version import software_version
 
 CONNECT_S = 15.0

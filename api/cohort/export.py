@@ -1,27 +1,114 @@
-"""An export: each selected record read, written by a writer, and noted as done; what cannot be is told."""
+"""An export: each selected record read, written in a format, and noted as done; what cannot be is told."""
 
 from __future__ import annotations
 
 import hashlib
-import os
+import hmac
 import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import date, datetime, timedelta
 from itertools import chain
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, Protocol
 
-from stimrig.api.cohort.errors import CutOffError
 from stimrig.api.cohort.export_state import State
-from stimrig.api.cohort.handed_on import ERRORS, Days, NoExport, Who, Writer, hidden
-from stimrig.api.cohort.opened import Opened, opened, said_of
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import Entry, Source, SourceError
+from stimrig.api.cohort.tasks import CutOffError
+from stimrig.api.cohort.whole_record import WholeRecord, read_whole, said_of
+from stimrig.api.whole_file import whole_file
 from stimrig.identify.errors import IdentifyError
 from stimrig.identify.records.bounds import LARGEST_FILE_BYTES
 from stimrig.identify.records.cells import lines
+
+UNDATED = "undated"
+ERRORS = "errors.csv"
+
+
+class NoExport(Exception):
+    """A record that cannot be exported: kind and reason, for its line of `errors.csv`."""
+
+    def __init__(self, kind: str, reason: str) -> None:
+        super().__init__(reason)
+        self.kind, self.reason = kind, reason
+
+
+@dataclass(frozen=True)
+class Days:
+    """What becomes of dates: kept, moved by some days, or left out."""
+
+    hide: bool = False
+    shift_days: int = 0
+
+    @property
+    def kept(self) -> bool:
+        """Whether they are as they were."""
+        return not self.hide and not self.shift_days
+
+    def begun(self, utc: str | None) -> str | None:
+        """A time (ISO 8601) as it may be told."""
+        if self.hide or not utc:
+            return None
+        try:
+            return (datetime.fromisoformat(utc) + timedelta(days=self.shift_days)).isoformat()
+        except (ValueError, OverflowError):
+            return None
+
+    def session(self, day: str | None, participant: str, salt: str) -> str:
+        """Label of a session: its day in digits, or what stands for it."""
+        if not day:
+            return UNDATED
+        if self.hide:
+            return "s" + hmac.new(salt.encode(), f"{participant}\0{day}".encode(), hashlib.sha256).hexdigest()[:10]
+        return (date.fromisoformat(day) + timedelta(days=self.shift_days)).strftime("%Y%m%d")
+
+
+@dataclass(frozen=True)
+class Who:
+    """Whose record it is, and how it is called.
+
+    Attributes
+    ----------
+    key : str
+        Letters and digits that no other record has: it names files.
+    """
+
+    participant: str
+    label: str
+    session: str
+    record_id: str
+    key: str
+    begun_utc: str | None
+
+
+Put = Callable[[str], Any]
+"""Gives a file to write at a place, which takes it as a whole or not at all."""
+
+
+class Writer(Protocol):
+    """A format: a module."""
+
+    NAME: str
+
+    def write(self, record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
+        """Write a record's files; its row for `finish`. Raises NoExport."""
+        ...
+
+    def finish(self, state: State, put: Put) -> None:
+        """Write what is made of all records."""
+        ...
+
+
+def hidden(record: WholeRecord, days: Days) -> WholeRecord:
+    """The record without what would tell the days that are not to be told."""
+    if days.kept:
+        return record
+    told = {"address", "name", "origin", "reason", "configuration", "events", "laid", "day", "begun_utc", "test_id"}
+    return replace(record, about={key: value for key, value in record.about.items() if key not in told}, notes=())
+
 
 UNKNOWN = "unknown"
 
@@ -138,7 +225,7 @@ class Export:
         if self.selection(said_of(content, path, entry.known)) is False:
             self.tally.left_out += 1
             return
-        record = opened(content, path, entry.known, self.columns)
+        record = read_whole(content, path, entry.known, self.columns)
         if self.selection(record.about) is False:
             self.tally.left_out += 1
             return
@@ -153,7 +240,7 @@ class Export:
             (self.state.folder / place).unlink(missing_ok=True)
         self.tally.written += 1
 
-    def _who(self, record: Opened) -> Who:
+    def _who(self, record: WholeRecord) -> Who:
         code = record.about.get("participant") or UNKNOWN
         try:
             label = self.state.label(code)
@@ -172,17 +259,10 @@ class Export:
     def put(self, place: str) -> Iterator[IO[bytes]]:
         """A file in the export: written aside, and renamed when it is whole."""
         target = self.state.folder / place
-        aside = self.state.place / f"{secrets.token_hex(4)}.part"
-        try:
-            with aside.open("wb") as file:
-                yield file
-                file.flush()
-                os.fsync(file.fileno())
+        with whole_file(target, self.state.place / f"{secrets.token_hex(4)}.part") as file:
+            yield file
             target.parent.mkdir(parents=True, exist_ok=True)
-            aside.replace(target)
-            self._places.append(place)
-        finally:
-            aside.unlink(missing_ok=True)
+        self._places.append(place)
 
     def _write_errors(self) -> None:
         with self.put(ERRORS) as file:

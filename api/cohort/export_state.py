@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.tasks import CohortError
 
 FOLDER = ".stimrig-export"
 TABLES = """

@@ -10,19 +10,56 @@ from __future__ import annotations
 
 import ast
 import operator
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import date
+from typing import Any, Literal
 
-from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.fields import FIELDS, Known, as_day
+from stimrig.api.cohort.tasks import CohortError
+
+Type = Literal["text", "number", "day"]
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field: its type, and what it says, for messages and docs."""
+
+    type: Type
+    says: str
+
+
+FIELDS: dict[str, Field] = {
+    "participant": Field("text", "code of the participant"),
+    "day": Field("day", "day of the session (UTC), as 2026-01-31"),
+    "kind": Field("text", "kind of test"),
+    "rig": Field("text", "id of the rig, where a centre knows it"),
+    "name": Field("text", "name of the file, or id at a centre"),
+    "origin": Field("text", "the DATA it was found in"),
+    "record_id": Field("text", "id of the recording"),
+    "test_id": Field("text", "id of the test"),
+    "outcome": Field("text", "completed, stopped or fault"),
+    "duration_s": Field("number", "from the first sample to the last, s"),
+    "rate_hz": Field("number", "samples a second"),
+    "bytes": Field("number", "size of the file"),
+}
+"""Every field that `--select` may name. A field is absent from a mapping as long as it is unknown, and None where the
+record says nothing of it."""
+
+Known = Mapping[str, Any]
+
+
+def as_day(value: str) -> str | None:
+    """A day as `YYYY-MM-DD`, of a day or a time in ISO 8601; None where it is none."""
+    try:
+        return date.fromisoformat(value[:10]).isoformat()
+    except ValueError:
+        return None
+
 
 LONGEST = 2000
 """Characters."""
 DEEPEST = 50
 """Levels of the parsed expression."""
-ORDERED: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
-    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge,
-}  # fmt: skip
 MIRRORED: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE, ast.Eq: ast.Eq, ast.NotEq: ast.NotEq,
 }  # fmt: skip
@@ -132,20 +169,8 @@ def _joined(tests: list[Test], every: bool) -> Test:
 
 def _comparison(node: ast.Compare) -> Test:
     field, kind, value = _sides(node)
-    if kind in ORDERED:
-        compare = ORDERED[kind]
-        return _of(field, lambda given: given is not None and compare(given, value))
-    if kind in (ast.Eq, ast.NotEq):
-        wanted = kind is ast.Eq
-        return _of(field, lambda given: (given == value) is wanted)
-    wanted = kind in (ast.In, Contains)
-    if kind in (Contains, ContainsNot):
-        return _of(field, lambda given: (given is not None and value in given) is wanted)
-    return _of(field, lambda given: (given in value) is wanted)
-
-
-def _of(field: str, test: Callable[[Any], bool]) -> Test:
-    return lambda known: test(known[field]) if field in known else None
+    compare = TESTS[kind]
+    return lambda known: compare(known[field], value) if field in known else None
 
 
 class Contains(ast.cmpop):
@@ -154,6 +179,19 @@ class Contains(ast.cmpop):
 
 class ContainsNot(ast.cmpop):
     """A text not within a field's."""
+
+
+def _ordered(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:
+    return lambda given, value: given is not None and compare(given, value)
+
+
+TESTS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
+    ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: _ordered(operator.lt), ast.LtE: _ordered(operator.le),
+    ast.Gt: _ordered(operator.gt), ast.GtE: _ordered(operator.ge), ast.In: lambda given, value: given in value,
+    ast.NotIn: lambda given, value: given not in value, Contains: _ordered(lambda given, value: value in given),
+    ContainsNot: lambda given, value: given is None or value not in given,
+}  # fmt: skip
+"""What each comparison asks of a field's value."""
 
 
 def _sides(node: ast.Compare) -> tuple[str, type[ast.cmpop], Any]:

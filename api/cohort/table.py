@@ -14,9 +14,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from stimrig.api.cohort.answers import OF_EFFECT, OF_STEP
-from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.worker import COPY, LEFT_OUT, digest
+from stimrig.api.cohort.computing import COPY, LEFT_OUT, digest
+from stimrig.api.cohort.record import OF_EFFECT, OF_STEP
+from stimrig.api.cohort.tasks import CohortError
 
 FORMAT = "stimrig-cohort"
 FORMAT_VERSION = "1"

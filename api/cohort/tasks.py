@@ -1,4 +1,4 @@
-"""What is done with a record: the verb and its options, and what identifies a run by them."""
+"""What is done with a record: the verb and its options; and what ends a run. What ends one record only is its row."""
 
 from __future__ import annotations
 
@@ -6,8 +6,29 @@ import json
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from stimrig.api.cohort.errors import CohortError
+from stimrig.api.errors import ApiError
 from stimrig.identify.errors import IdentifyError
+
+GOES_ON = "What is done is kept; the same command goes on."
+SCHEDULER_GONE = f"the scheduler is gone. {GOES_ON}"
+
+
+class CohortError(ApiError):
+    """The run cannot begin: wrong input, a scheduler that is not there, results of other options.
+
+    Parameters
+    ----------
+    message : str
+        One line: the place, what is wrong, what to do.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(422, "cohort", message)
+
+
+class CutOffError(CohortError):
+    """The run began and cannot go on; what was done is kept, and the same command goes on with it."""
+
 
 AUTO, METHOD = "auto", "maximum-likelihood"
 

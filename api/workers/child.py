@@ -52,9 +52,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--reads", type=Path, action="append", default=[])
     parser.add_argument("--writes", type=Path, action="append", default=[])
     parser.add_argument("--verbs", default=VERBS, help="module with a table of what can be called")
-    parser.add_argument(
-        "--memory", type=int, help="bytes beyond what the verbs' libraries take, loaded first"
-    )
+    parser.add_argument("--memory", type=int, help="bytes beyond what the verbs' libraries take, loaded first")
     parser.add_argument("--nice", type=int, default=5, help="the rig's sender goes first")
     parser.add_argument("--idle-s", type=float, help="end after so long without a call")
     return parser.parse_args()

@@ -18,9 +18,10 @@ from hypothesis import strategies as st
 
 from stimrig import identify
 from stimrig.api.cli import main
-from stimrig.api.cohort import bids, dictionary
+from stimrig.api.cohort import bids, parquet
 from stimrig.api.models import inverted
 from stimrig.api.web.routes import trend
+from stimrig.api.workers import recordings
 from stimrig.identify.records import cells
 from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.record import Record, Source
@@ -133,7 +134,7 @@ def test_an_export(tmp_path: Path) -> None:
     assert "broken" in " ".join(texts_of(tmp_path / "out" / "errors.csv", "address"))
     (tmp_path / "errors.csv").write_text("".join(cells.lines([("address", "kind", "reason"), ("=a", "+b", "-c")])))
     assert texts_of(tmp_path / "errors.csv", "address", "kind", "reason") == {"'=a", "'+b", "'-c"}
-    (tmp_path / "dictionary.csv").write_text(dictionary.as_csv())
+    (tmp_path / "dictionary.csv").write_text(parquet.as_csv())
     texts_of(tmp_path / "dictionary.csv")
     assert list(bids.tsv(["=a"], [{"=a": -1.5}, {"=a": "-x"}]))[1:] == ["-1.5\n", "'-x\n"]
 

@@ -122,13 +122,12 @@ def run(
     """One run."""
     need_extra()
     from stimrig.api.cohort import cluster
-    from stimrig.api.cohort.errors import CutOffError
-    from stimrig.api.cohort.parts import Results as Table
+    from stimrig.api.cohort.computing import Bounds
+    from stimrig.api.cohort.results import Results as Table
     from stimrig.api.cohort.run import Run
     from stimrig.api.cohort.select import Selection
-    from stimrig.api.cohort.sources.addresses import sources_of
-    from stimrig.api.cohort.tasks import Task, checked
-    from stimrig.api.cohort.worker import Bounds
+    from stimrig.api.cohort.sources import sources_of
+    from stimrig.api.cohort.tasks import CutOffError, Task, checked
     from stimrig.api.version import software_version
 
     given = (verb, Selection(select).text, method, names(effects), tuple(columns or ()), software_version())
@@ -188,17 +187,17 @@ def figures(
 ) -> None:
     """Draw a cohort: effects by prevalence, parameters over sessions, repeatability, errors by reason."""
     need_extra()
-    from stimrig.api.cohort import drawn, page
-    from stimrig.api.cohort.gathered import gather
+    from stimrig.api.cohort.figures import page, repeats
+    from stimrig.api.cohort.statistics import read_statistics
 
-    found = gather(results)
-    write(html, page.html(found, results.name))
+    found = read_statistics(results)
+    write(html, page(found, results.name))
     of_what, total, counts = found.prevalence()
     if as_json:
         say_json({
             "output": str(html), "records": found.records, "ok": found.ok, "errors": dict(found.errors),
             "participants": len(found.people), "verdicts": dict(found.verdicts), "counted": of_what, "of": total,
-            "effects": dict(counts), "repeatability": drawn.repeats(found),
+            "effects": dict(counts), "repeatability": repeats(found),
         })  # fmt: skip
         return
     say(f"{found.records} records, {found.ok} with a result, {len(found.people)} participants", f"written to {html}")

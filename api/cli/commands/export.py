@@ -31,13 +31,12 @@ def export(
     if no_dates and shift_days:
         raise InputError("give --no-dates or --shift-days, not both.")
     from stimrig.api.cohort import bids as bids_files
-    from stimrig.api.cohort import parquet_files
-    from stimrig.api.cohort.errors import CutOffError
-    from stimrig.api.cohort.export import Export
+    from stimrig.api.cohort import parquet as parquet_files
+    from stimrig.api.cohort.export import ERRORS, Days, Export
     from stimrig.api.cohort.export_state import State
-    from stimrig.api.cohort.handed_on import ERRORS, Days
     from stimrig.api.cohort.select import Selection
-    from stimrig.api.cohort.sources.addresses import sources_of
+    from stimrig.api.cohort.sources import sources_of
+    from stimrig.api.cohort.tasks import CutOffError
     from stimrig.api.progress_bar import progress_bar
 
     selection, sources, mapped = Selection(select), sources_of(data, token), columns or []

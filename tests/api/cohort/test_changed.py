@@ -12,9 +12,8 @@ import pytest
 from stimrig.api.cli.commands.cohort import changed_lines
 from stimrig.api.cohort import changed
 from stimrig.api.cohort.changed import compared
-from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.parts import Results
-from stimrig.api.cohort.tasks import Task
+from stimrig.api.cohort.results import Results
+from stimrig.api.cohort.tasks import CohortError, Task
 
 
 def row(name: str, **more: Any) -> dict[str, Any]:

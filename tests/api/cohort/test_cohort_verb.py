@@ -21,7 +21,7 @@ import pytest
 from stimrig.api import schemas
 from stimrig.api.cli import main
 from stimrig.api.cohort import cluster
-from stimrig.api.cohort.fields import FIELDS
+from stimrig.api.cohort.select import FIELDS
 from tests.harness.cohort_records import cohort
 
 PATIENCE_S = 240.0

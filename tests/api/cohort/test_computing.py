@@ -15,11 +15,10 @@ from typing import Any
 
 import pytest
 
-from stimrig.api.cohort import parent
-from stimrig.api.cohort.parent import Computing
+from stimrig.api.cohort import computing as own
+from stimrig.api.cohort.computing import Bounds, Computing, Done, run_parcel, run_record
 from stimrig.api.cohort.sources import Entry
 from stimrig.api.cohort.tasks import Task
-from stimrig.api.cohort.worker import Bounds, Done, run_parcel, run_record
 from stimrig.api.version import software_version
 from tests.harness.cohort_records import Session, write
 from tests.harness.hostile_shapes import SECRET, hdf5_shapes
@@ -204,21 +203,21 @@ def test_no_other_worker_takes_away_a_folder_that_is_being_made(
 
     def tidied_before(file: Any, how: int) -> None:
         monkeypatch.setattr(fcntl, "flock", take_lock)
-        parent.tidy()  # another worker starts just then
+        own.tidy()  # another worker starts just then
         take_lock(file, how)
 
     monkeypatch.setattr(fcntl, "flock", tidied_before)
     worker = Computing(MEMORY)
-    assert [file.name for place in tmp_path.iterdir() for file in place.iterdir()] == [parent.LOCK]
+    assert [file.name for place in tmp_path.iterdir() for file in place.iterdir()] == [own.LOCK]
     worker.close()
     assert list(tmp_path.iterdir()) == []
 
 
 EVIL = """
-import sys
+import json, sys
 print('{"ready": true, "left_open": {}}', flush=True)
-for number, line in enumerate(sys.stdin):
-    print(sys.argv[1].replace("'", '"'), flush=True)
+for line in sys.stdin:
+    print(sys.argv[1].replace("'", '"').replace("CALL", json.loads(line)["call"]), flush=True)
 """
 
 
@@ -228,12 +227,12 @@ for number, line in enumerate(sys.stdin):
         "no JSON",
         "{}",
         "[1]",
-        "{'row': 3}",
-        "{'row': {'status': 'copy'}}",
+        "{'call': 'CALL', 'result': {'row': 3}}",
+        "{'call': 'CALL', 'result': {'row': {'status': 'copy'}}}",
         "[" * 100_000,
         "x" * 17_000_000,
         "\\xff",
-        "{'row': {'status': 'ok', 'notes': " + "[" * 700 + "]" * 700 + "}}",
+        "{'call': 'CALL', 'result': {'row': {'status': 'ok', 'notes': " + "[" * 700 + "]" * 700 + "}}}",
     ],
     ids=lambda said: said[:20],
 )
@@ -242,7 +241,7 @@ def test_a_process_that_was_taken_over_cannot_end_a_run(
 ) -> None:
     script = tmp_path / "evil.py"
     script.write_text(EVIL.replace("sys.argv[1]", repr(said)))
-    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
     computing = Computing(MEMORY)
     try:
         found = row(computing, b"")
@@ -253,33 +252,35 @@ def test_a_process_that_was_taken_over_cannot_end_a_run(
 
 def test_a_second_answer_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     twice = """
-import sys
+import json, sys
 print('{"ready": true, "left_open": {}}', flush=True)
 for number, line in enumerate(sys.stdin):
-    print('{"row": {"status": "ok", "participant": "P%d"}}\\n' % number * 2, end="", flush=True)
+    answer = {"status": "ok", "participant": f"P{number}"}
+    print((json.dumps({"call": json.loads(line)["call"], "result": {"row": answer}}) + "\\n") * 2, end="", flush=True)
 """
     script = tmp_path / "twice.py"
     script.write_text(twice)
-    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
     computing = Computing(MEMORY)
     try:
         found = [row(computing, b"")["participant"] for _ in range(3)]
-        assert found == ["P0"] * 3, "a fresh process each time, for the one before said what nobody asked"
+        assert found == ["P0", "P1", "P2"]
     finally:
         computing.close()
 
 
 def test_a_process_has_no_say_in_which_record_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    forged = '{"row": {"status": "ok", "sha256": "x", "address": "x", "other_version": "9", "software": "9"}}'
+    row = '{"status": "ok", "sha256": "x", "address": "x", "other_version": "9", "software": "9"}'
+    forged = f'{{"call": "CALL", "result": {{"row": {row}}}}}'
     script = tmp_path / "evil.py"
     script.write_text(EVIL.replace("sys.argv[1]", repr(forged)))
-    monkeypatch.setattr(parent, "CHILD", (sys.executable, str(script)))
+    monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
     try:
         found = of_worker(b"abc", Entry("address", "a", "a"))
         assert found["address"] == "address" and found["software"] == software_version()
         assert found["sha256"] == hashlib.sha256(b"abc").hexdigest()
     finally:
-        parent.close_all()
+        own.close_all()
 
 
 class Given:

@@ -21,14 +21,13 @@ import pytest
 from stimrig import identify
 from stimrig.api import schemas
 from stimrig.api.cli import main
-from stimrig.api.cohort import parquet_files
-from stimrig.api.cohort.errors import CohortError, CutOffError
-from stimrig.api.cohort.export import Export
+from stimrig.api.cohort import parquet as parquet_files
+from stimrig.api.cohort.export import Days, Export, Writer
 from stimrig.api.cohort.export_state import FOLDER, State
-from stimrig.api.cohort.handed_on import Days, Writer
-from stimrig.api.cohort.parquet_files import STATUS
+from stimrig.api.cohort.parquet import STATUS
 from stimrig.api.cohort.select import Selection
-from stimrig.api.cohort.sources.addresses import sources_of
+from stimrig.api.cohort.sources import sources_of
+from stimrig.api.cohort.tasks import CohortError, CutOffError
 from stimrig.rig import archive, assembly, journal
 from tests.harness.cohort_records import Session, broken, write
 from tests.rig.fakes import VirtualRig

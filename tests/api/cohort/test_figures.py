@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from stimrig.api.cohort import drawn, page
-from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.gathered import gather, wilson
+from stimrig.api.cohort import figures
+from stimrig.api.cohort.statistics import read_statistics, wilson
+from stimrig.api.cohort.tasks import CohortError
 from tests.api.cohort.test_changed import failed, row, written
 
 
@@ -33,10 +33,10 @@ def results(tmp_path: Path) -> Path:
 
 
 def test_effects_are_counted_over_people(results: Path) -> None:
-    found = gather(results)
+    found = read_statistics(results)
     assert (found.records, found.ok) == (15, 12)
     assert found.prevalence() == ("participants", 6, [("fatigue", 2)])  # the third is tired as often as not
-    figure = drawn.prevalence(found)
+    figure = figures.prevalence(found)
     assert figure is not None
     trace = figure["data"][0]
     low, high = wilson(2, 6)
@@ -47,27 +47,27 @@ def test_effects_are_counted_over_people(results: Path) -> None:
 
 def test_without_codes_records_are_counted(tmp_path: Path) -> None:
     rows = [session(0, 0, tired=True) | {"participant": None}, session(1, 0)]
-    assert gather(written(tmp_path / "r.parquet", *rows)).prevalence() == ("records", 2, [("fatigue", 1)])
+    assert read_statistics(written(tmp_path / "r.parquet", *rows)).prevalence() == ("records", 2, [("fatigue", 1)])
 
 
 def test_every_axis_has_its_unit(results: Path) -> None:
-    found = gather(results)
+    found = read_statistics(results)
     titles = {}
-    for key in drawn.shown_parameters(found):
-        figure = drawn.over_sessions(found, key)
+    for key in figures.ranked_parameters(found):
+        figure = figures.over_sessions(found, key)
         assert figure is not None
         assert "date, UTC" in figure["layout"]["xaxis"]["title"]["text"]
         titles[key[1]] = figure["layout"]["yaxis"]["title"]["text"]
         assert len(figure["data"]) == 6 and all(len(trace["x"]) == 2 for trace in figure["data"])
     assert titles == {"plateau_nm": "plateau (N·m)", "damping": "damping (1)"}
-    shares, reasons = drawn.prevalence(found), drawn.errors(found)
+    shares, reasons = figures.prevalence(found), figures.errors(found)
     assert shares is not None and "%" in shares["layout"]["xaxis"]["title"]["text"]
     assert reasons is not None and "number, of 15" in reasons["layout"]["xaxis"]["title"]["text"]
     assert dict(zip(reasons["data"][0]["y"], reasons["data"][0]["x"], strict=True)) == {"timeout": 2, "bad record": 1}
 
 
 def test_repeatability_is_that_of_the_sessions(results: Path) -> None:
-    (plateau,) = [one for one in drawn.repeats(gather(results)) if one["parameter"] == "plateau"]
+    (plateau,) = [one for one in figures.repeats(read_statistics(results)) if one["parameter"] == "plateau"]
     assert plateau["within_sd"] == pytest.approx(0.1 / 2**0.5)
     assert plateau["icc"] == pytest.approx(1.0, abs=1e-4)
     assert (plateau["participants"], plateau["sessions"], plateau["few"]) == (6, 12, False)
@@ -82,32 +82,32 @@ def test_parameters_are_those_of_effects_that_count_each_form_by_itself(tmp_path
         return {**session(0, week), "effects": [effect], "parameters": [reach]}
 
     rows = [made(0, "gain", 0.9), made(1, "two_curves", 0.9), made(2, "gain", 0.45), made(3, "gain", None)]
-    found = gather(written(tmp_path / "r.parquet", *rows))
+    found = read_statistics(written(tmp_path / "r.parquet", *rows))
     gain, curves = (("recruitment_hysteresis (" + form + ")", "reach_us") for form in ("gain", "two_curves"))
     assert {key: list(series.value) for key, series in found.series.items()} == {gain: [70.0, 73.0], curves: [71.0]}
-    assert drawn.title_of(curves) == "recruitment hysteresis (two curves): reach"
-    assert [one["between_sd"] for one in drawn.repeats(found)] == [None], "of one person"
+    assert figures.title_of(curves) == "recruitment hysteresis (two curves): reach"
+    assert [one["between_sd"] for one in figures.repeats(found)] == [None], "of one person"
 
 
 def test_the_page_stands_alone_and_a_code_is_never_a_link(results: Path, tmp_path: Path) -> None:
-    text = page.html(gather(results), "<b>r</b>.parquet")
+    text = figures.page(read_statistics(results), "<b>r</b>.parquet")
     assert "<b>r</b>" not in text and "ICC" in text and text.count("<h2>") == 4
     assert "sendDataToCloud" not in text.split("Plotly.newPlot")[-1]
     bad = [{**session(0, week), "participant": '<a href="x">'} for week in range(2)]
-    drawing = drawn.over_sessions(gather(written(tmp_path / "bad.parquet", *bad)), ("model", "plateau_nm"))
+    drawing = figures.over_sessions(read_statistics(written(tmp_path / "bad.parquet", *bad)), ("model", "plateau_nm"))
     assert drawing is not None and "<" not in drawing["data"][0]["name"]
 
 
 def test_too_few_is_said(tmp_path: Path) -> None:
-    found = gather(written(tmp_path / "r.parquet", session(0, 0, tired=True)))
-    text = page.html(found, "r.parquet")
-    assert page.NOTHING in text and "Only 1 participants" in text and drawn.repeats(found) == []
-    none = page.html(gather(written(tmp_path / "e.parquet", failed("x"))), "e.parquet")
+    found = read_statistics(written(tmp_path / "r.parquet", session(0, 0, tired=True)))
+    text = figures.page(found, "r.parquet")
+    assert figures.NOTHING in text and "Only 1 participants" in text and figures.repeats(found) == []
+    none = figures.page(read_statistics(written(tmp_path / "e.parquet", failed("x"))), "e.parquet")
     assert "No effect was found" in none
 
 
 def test_no_results_are_one_line(tmp_path: Path) -> None:
     with pytest.raises(CohortError, match="no such file"):
-        gather(tmp_path / "nowhere.parquet")
+        read_statistics(tmp_path / "nowhere.parquet")
     with pytest.raises(CohortError, match="no record"):
-        gather(written(tmp_path / "r.parquet"))
+        read_statistics(written(tmp_path / "r.parquet"))

@@ -12,14 +12,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from stimrig.api.cohort import parts
+from stimrig.api.cohort import results as parts
 from stimrig.api.cohort import table as read_tables
-from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.parts import Results
+from stimrig.api.cohort.computing import COPY, LEFT_OUT
+from stimrig.api.cohort.results import Results
 from stimrig.api.cohort.sources import Entry
 from stimrig.api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, options_of, table_of
-from stimrig.api.cohort.tasks import Task
-from stimrig.api.cohort.worker import COPY, LEFT_OUT
+from stimrig.api.cohort.tasks import CohortError, Task
 
 TASK = Task("fit", software="1.0")
 

@@ -16,23 +16,20 @@ from distributed import Client, LocalCluster
 from distributed.scheduler import KilledWorker
 
 from stimrig.api.cli.commands.cohort import duration, words
-from stimrig.api.cohort import flight, worker
+from stimrig.api.cohort import computing, run
 from stimrig.api.cohort.cluster import check_versions
-from stimrig.api.cohort.errors import CohortError, CutOffError
-from stimrig.api.cohort.flight import LARGEST_PARCEL, Flight
-from stimrig.api.cohort.parent import close_all
-from stimrig.api.cohort.parts import Results
-from stimrig.api.cohort.run import AHEAD, Run, Tally
+from stimrig.api.cohort.computing import close_all
+from stimrig.api.cohort.results import Results
+from stimrig.api.cohort.run import AHEAD, LARGEST_PARCEL, Parcels, Run, Tally
 from stimrig.api.cohort.select import Selection
-from stimrig.api.cohort.sources import Entry, Source
-from stimrig.api.cohort.sources.addresses import sources_of
-from stimrig.api.cohort.tasks import Task, checked
+from stimrig.api.cohort.sources import Entry, Source, sources_of
+from stimrig.api.cohort.tasks import CohortError, CutOffError, Task, checked
 from stimrig.api.version import software_version
 from tests.harness.cohort_records import broken, cohort
 
 pytestmark = pytest.mark.slow
 
-BOUNDS = worker.Bounds(300.0, 10**9, 500)
+BOUNDS = computing.Bounds(300.0, 10**9, 500)
 LANES = 2
 OF_THE_RUN = ("computed_utc", "took_s", "processor_s", "worker_memory_mb")
 
@@ -75,11 +72,11 @@ def read(output: Path) -> list[dict[str, Any]]:
 
 
 def test_a_mixed_folder_gives_a_row_for_each_file(client: Client, folder: Path, tmp_path: Path) -> None:
-    run, tally = go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
+    done, tally = go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
     rows = read(tmp_path / "r.parquet")
     assert Counter(row["status"] for row in rows) == {"ok": 12, "error": 10}
     assert (tally.ok, tally.error, tally.copies) == (12, 10, 0)
-    assert run.flight.most <= AHEAD * LANES * LARGEST_PARCEL
+    assert done.parcels.most <= AHEAD * LANES * LARGEST_PARCEL
     for row in rows:
         assert row["software"] == software_version() and row["verb"] == "fit" and row["address"] and row["took_s"] >= 0
         if row["status"] == "error":
@@ -162,16 +159,16 @@ class Endless:
             )
 
     def open(self, _entry: Entry, _most_bytes: int) -> bytes:
-        raise worker.SourceError("it is not there")
+        raise computing.SourceError("it is not there")
 
 
 def test_a_long_list_is_never_held_at_once(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flight, "PARCEL_S", 60.0)  # however busy the machine is
+    monkeypatch.setattr(run, "PARCEL_S", 60.0)  # however busy the machine is
     source = Endless(300)
     ahead: list[int] = []
-    run, tally = go(client, [source], tmp_path / "r.parquet", tell=lambda one: ahead.append(source.listed - one.now))
+    done, tally = go(client, [source], tmp_path / "r.parquet", tell=lambda one: ahead.append(source.listed - one.now))
     assert tally.error == 300 and {row["error_kind"] for row in read(tmp_path / "r.parquet")} == {"unreadable"}
-    assert max(run.flight.most, *ahead) <= AHEAD * LANES * LARGEST_PARCEL
+    assert max(done.parcels.most, *ahead) <= AHEAD * LANES * LARGEST_PARCEL
     assert max(ahead) > AHEAD * LANES, "records that come back at once travel together"
 
 
@@ -180,7 +177,7 @@ def test_a_records_row_is_the_same_whatever_travelled_beside_it(
 ) -> None:
     found = []
     for most in (1, LARGEST_PARCEL):
-        monkeypatch.setattr(flight, "LARGEST_PARCEL", most)
+        monkeypatch.setattr(run, "LARGEST_PARCEL", most)
         go(client, sources_of([str(folder)]), tmp_path / f"{most}.parquet")
         rows = sorted(read(tmp_path / f"{most}.parquet"), key=lambda row: row["address"])
         found.append([{name: value for name, value in row.items() if name not in OF_THE_RUN} for row in rows])
@@ -188,32 +185,32 @@ def test_a_records_row_is_the_same_whatever_travelled_beside_it(
 
 
 def test_long_records_travel_alone(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flight, "PARCEL_S", 0.0)
-    run, tally = go(client, [Endless(30)], tmp_path / "r.parquet")
-    assert run.flight.size == 1 and tally.error == 30 and len(read(tmp_path / "r.parquet")) == 30
+    monkeypatch.setattr(run, "PARCEL_S", 0.0)
+    done, tally = go(client, [Endless(30)], tmp_path / "r.parquet")
+    assert done.parcels.size == 1 and tally.error == 30 and len(read(tmp_path / "r.parquet")) == 30
 
 
 def sent(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The keys of the records of each parcel, as they are sent."""
     parcels: list[list[str]] = []
-    send = Flight.send
+    send = Parcels.send
 
-    def noted(self: Flight, records: list[worker.Record], tries: int = 1) -> None:
+    def noted(self: Parcels, records: list[computing.Record], tries: int = 1) -> None:
         parcels.append([entry.key for _, entry, _ in records])
         send(self, records, tries)
 
-    monkeypatch.setattr(Flight, "send", noted)
+    monkeypatch.setattr(Parcels, "send", noted)
     return parcels
 
 
 def test_what_was_not_begun_is_sent_again(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     parcels = sent(monkeypatch)
 
-    def impatient(records: list[Any], task: Task, bounds: worker.Bounds, _patience_s: float) -> worker.Done:
-        return worker.run_parcel(records, task, bounds, 0.0 if len(records) > 3 else 60.0)
+    def impatient(records: list[Any], task: Task, bounds: computing.Bounds, _patience_s: float) -> computing.Done:
+        return computing.run_parcel(records, task, bounds, 0.0 if len(records) > 3 else 60.0)
 
-    monkeypatch.setattr(flight, "run_parcel", impatient)
-    monkeypatch.setattr(flight, "PARCEL_S", 60.0)
+    monkeypatch.setattr(run, "run_parcel", impatient)
+    monkeypatch.setattr(run, "PARCEL_S", 60.0)
     _, tally = go(client, [Endless(100)], tmp_path / "r.parquet")
     names = [row["name"] for row in read(tmp_path / "r.parquet")]
     assert (
@@ -228,13 +225,13 @@ def test_of_a_parcel_with_which_workers_are_lost_only_the_culprit_is(
 ) -> None:
     parcels = sent(monkeypatch)
 
-    def deadly(records: list[Any], *more: Any) -> worker.Done:
+    def deadly(records: list[Any], *more: Any) -> computing.Done:
         if any(entry.key == "17" for _, entry, _ in records):
             raise KilledWorker("it", SimpleNamespace(address="tcp://gone"), 0)  # pyright: ignore[reportArgumentType]
-        return worker.run_parcel(records, *more)
+        return computing.run_parcel(records, *more)
 
-    monkeypatch.setattr(flight, "run_parcel", deadly)
-    monkeypatch.setattr(flight, "PARCEL_S", 60.0)
+    monkeypatch.setattr(run, "run_parcel", deadly)
+    monkeypatch.setattr(run, "PARCEL_S", 60.0)
     go(client, [Endless(40)], tmp_path / "r.parquet")
     kinds = {row["name"]: row["error_kind"] for row in read(tmp_path / "r.parquet")}
     assert len(kinds) == 40 and [name for name, kind in kinds.items() if kind == "killed"] == ["17"]
@@ -259,7 +256,7 @@ def test_a_place_that_goes_while_it_is_listed_ends_the_run_and_keeps_what_is_don
 def test_a_worker_of_another_version_ends_the_run(
     client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "software_version", lambda: "9.9")
+    monkeypatch.setattr(computing, "software_version", lambda: "9.9")
     with pytest.raises(CohortError, match=r"a worker has stimrig 9\.9"):
         go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
 
@@ -278,7 +275,7 @@ def broken_worker(*_: object) -> dict[str, Any]:
 def test_a_worker_that_cannot_compute_ends_the_run(
     client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(flight, "run_parcel", broken_worker)
+    monkeypatch.setattr(run, "run_parcel", broken_worker)
     with pytest.raises(CutOffError, match="No space left"):
         go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.fields import FIELDS
-from stimrig.api.cohort.select import Selection
+from stimrig.api.cohort.select import FIELDS, Selection
+from stimrig.api.cohort.tasks import CohortError
 
 RECORD = {
     "participant": "P001", "day": "2026-03-01", "kind": "pre-session", "rig": None, "name": "a calib.h5",

@@ -15,13 +15,9 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from stimrig.api.cohort.errors import CohortError
 from stimrig.api.cohort.select import Selection
-from stimrig.api.cohort.sources import Entry, Source, SourceError
-from stimrig.api.cohort.sources.addresses import sources_of
-from stimrig.api.cohort.sources.bucket import Bucket
-from stimrig.api.cohort.sources.centre import Centre
-from stimrig.api.cohort.sources.folder import Folder
+from stimrig.api.cohort.sources import Bucket, Centre, Entry, Folder, Source, SourceError, sources_of
+from stimrig.api.cohort.tasks import CohortError
 
 MOST = 1000
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stimrig.api.cohort.gathered import repeatability, wilson
+from stimrig.api.cohort.statistics import repeatability, wilson
 
 
 def test_the_interval_of_a_share() -> None:

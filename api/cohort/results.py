@@ -7,23 +7,22 @@ them, with the rows of an earlier output, into one file that takes the output's 
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import json
-import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Self
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from stimrig.api.cohort import table
-from stimrig.api.cohort.errors import CohortError, CutOffError
+from stimrig.api.cohort.computing import COPY, LEFT_OUT, digest
 from stimrig.api.cohort.sources import Entry
-from stimrig.api.cohort.tasks import Task, differing
-from stimrig.api.cohort.worker import COPY, LEFT_OUT, digest
+from stimrig.api.cohort.tasks import CohortError, CutOffError, Task, differing
+from stimrig.api.whole_file import whole_file
 
 ROWS_A_PART = 500
 MOST_ALIKE = 1000
@@ -139,8 +138,9 @@ class Results:
         for place, options in ((self.output, before), (about, _stored(about))):
             if options is not None and (differs := differing(options, self.task.document())):
                 raise CohortError(f"{place}: made with other options ({differs}). Give another -o, or remove it.")
-        _whole(about, json.dumps(self.task.document()).encode())
-        for part in self.folder.glob("*.new"):
+        with whole_file(about) as file:
+            file.write(json.dumps(self.task.document()).encode())
+        for part in self.folder.glob(".*.new"):
             part.unlink()  # half-written by a run that was cut off
         parts = self._parts()
         self._next = 1 + max((int(part.stem) for part in parts), default=-1)
@@ -172,12 +172,8 @@ class Results:
         """
         if not self.waiting:
             return
-        sink = pa.BufferOutputStream()
-        pq.write_table(table.table_of(self.waiting), sink, compression="zstd")
-        try:
-            _whole(self.folder / f"{self._next:08d}.parquet", sink.getvalue().to_pybytes())
-        except OSError as error:
-            raise CutOffError(f"{self.folder}: {error.strerror}. Make room; the same command goes on.") from None
+        with self._kept(self.folder), whole_file(self.folder / f"{self._next:08d}.parquet") as file:
+            pq.write_table(table.table_of(self.waiting), file, compression="zstd")
         self._next += 1
         self.waiting = []
 
@@ -192,21 +188,25 @@ class Results:
         self.flush()
         files = [*([self.output] if self.output.exists() else []), *self._parts()]
         kept, counts = table.kept_rows(files)
-        target = self.output.with_name(f".{self.output.name}.new")
         options = json.dumps(self.task.document())
         about = {"format": table.FORMAT, "format_version": table.FORMAT_VERSION, "options": options}
-        try:
-            with pq.ParquetWriter(target, table.SCHEMA.with_metadata(about), compression="zstd") as writer:
-                for group in table.groups(files, kept):
-                    writer.write_table(group)
-            with target.open("rb") as file:
-                os.fsync(file.fileno())
-            target.replace(self.output)
-        except OSError as error:
-            target.unlink(missing_ok=True)
-            raise CutOffError(f"{self.output}: {error.strerror}. Make room; the same command goes on.") from None
+        with (
+            self._kept(self.output),
+            whole_file(self.output) as file,
+            pq.ParquetWriter(file, table.SCHEMA.with_metadata(about), compression="zstd") as writer,
+        ):
+            for group in table.groups(files, kept):
+                writer.write_table(group)
         shutil.rmtree(self.folder, ignore_errors=True)
         return counts
+
+    @contextmanager
+    def _kept(self, place: Path) -> Iterator[None]:
+        """Around what is written: a disk that does not take it ends the run, and the parts stay. Raises CutOffError."""
+        try:
+            yield
+        except OSError as error:
+            raise CutOffError(f"{place}: {error.strerror}. Make room; the same command goes on.") from None
 
 
 def _stored(about: Path) -> dict[str, Any] | None:
@@ -217,19 +217,3 @@ def _stored(about: Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError, TypeError):
         raise CohortError(f"{about}: cannot be read. Remove the folder {about.parent} to begin anew.") from None
-
-
-def _whole(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, and to the disk."""
-    new = path.with_name(path.name + ".new")
-    with new.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
-    with contextlib.suppress(OSError):
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)

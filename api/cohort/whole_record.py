@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig import identify
-from stimrig.api.cohort.child import SAID, about
-from stimrig.api.cohort.fields import Known
+from stimrig.api.cohort.record import SAID, about
+from stimrig.api.cohort.select import Known
 from stimrig.identify.records import HDF5_MAGIC
 from stimrig.identify.records.hdf5 import StrictFile
 
@@ -32,7 +32,7 @@ NO_SYNC = 255
 
 
 @dataclass
-class Opened:
+class WholeRecord:
     """One record.
 
     Attributes
@@ -67,7 +67,9 @@ class Opened:
         return float(len(steps) / np.sum(steps))
 
 
-def opened(content: bytes, path: Path, known: Mapping[str, Any], columns: Sequence[str] | None = None) -> Opened:
+def read_whole(
+    content: bytes, path: Path, known: Mapping[str, Any], columns: Sequence[str] | None = None
+) -> WholeRecord:
     """Read a record whose bytes lie at `path`, too.
 
     Raises
@@ -86,7 +88,7 @@ def opened(content: bytes, path: Path, known: Mapping[str, Any], columns: Sequen
         "bytes": len(content),
         "format": "sealed recording" if sealed else "table",
     }
-    found = Opened(hashlib.sha256(content).hexdigest(), said, {}, notes=tuple(record.notes))
+    found = WholeRecord(hashlib.sha256(content).hexdigest(), said, {}, notes=tuple(record.notes))
     if sealed:
         _sealed(found, record, content, path)
     else:
@@ -102,7 +104,7 @@ def said_of(content: bytes, path: Path, known: Known) -> dict[str, Any]:
     return {**said, **{name: said.get(name) for name in SAID}}
 
 
-def _sealed(found: Opened, record: Any, content: bytes, path: Path) -> None:
+def _sealed(found: WholeRecord, record: Any, content: bytes, path: Path) -> None:
     """Everything that the file holds; what `identify` made of it beside the samples that it took."""
     file = StrictFile(content, str(path))
     found.about |= {name: number for name in NUMBERS if np.isfinite(number := file.number(name, np.nan))}
@@ -135,7 +137,7 @@ def _sealed(found: Opened, record: Any, content: bytes, path: Path) -> None:
     found.about["segment_names"] = list(names)
 
 
-def _table(found: Opened, record: Any) -> None:
+def _table(found: WholeRecord, record: Any) -> None:
     size = len(record.time_s)
     found.samples = {
         "time_s": record.time_s,

@@ -12,9 +12,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from stimrig.api.cohort.answers import MODEL
-from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.record import MODEL
 from stimrig.api.cohort.table import options_of, rows_of
+from stimrig.api.cohort.tasks import CohortError
 
 PROBABLE = 0.5
 """An effect that a diagnosis found missing counts from this probability on."""
@@ -113,7 +113,7 @@ class Series:
 
 
 @dataclass
-class Gathered:
+class Statistics:
     """Counts and series of one table of results."""
 
     options: dict[str, Any]
@@ -150,7 +150,7 @@ class Gathered:
         return "participants", len(self.people_records), counts.most_common()
 
 
-def gather(file: Path) -> Gathered:
+def read_statistics(file: Path) -> Statistics:
     """Read a table of results.
 
     Raises
@@ -158,7 +158,7 @@ def gather(file: Path) -> Gathered:
     CohortError
         It is none, or empty.
     """
-    found = Gathered(options_of(file))
+    found = Statistics(options_of(file))
     numbers: dict[str, int] = {}
     for row in rows_of(file, COLUMNS):
         found.records += 1
@@ -172,7 +172,7 @@ def gather(file: Path) -> Gathered:
     return found
 
 
-def _take(found: Gathered, row: Mapping[str, Any], numbers: dict[str, int]) -> None:
+def _take(found: Statistics, row: Mapping[str, Any], numbers: dict[str, int]) -> None:
     """One record with a result."""
     who = row["participant"]
     found.verdicts[row["verdict"] or "none"] += 1
