@@ -43,7 +43,7 @@ class Entry:
     sha256 : str
         Of the content, where the listing says it.
     known : dict
-        Fields (`stimrig.api.cohort.fields`) that are known without reading the record.
+        Fields (`stimrig.api.cohort.select`) that are known without reading the record.
     """
 
     address: str

@@ -38,7 +38,7 @@ class WholeRecord:
     Attributes
     ----------
     about : dict
-        Fields of `stimrig.api.cohort.fields` and attributes of the recording.
+        Fields of `stimrig.api.cohort.select` and attributes of the recording.
     samples : dict of ndarray, each of shape (N,)
         All torque samples, those outside of every segment, too; a column that the record lacks is not there.
     pulses : dict of ndarray, each of shape (P,)
