@@ -40,7 +40,6 @@ BEAT_PERIOD_S = 0.5
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the rig; returns the exit code."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.DEBUG if options.verbose else logging.INFO, handlers=[_handler()], force=True)
     try:

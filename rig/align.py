@@ -61,7 +61,6 @@ class Line:
     error_s: float
 
     def at(self, cell_s: Array) -> Array:
-        """Times on the test's clock, s."""
         return self.offset_s + self.centre_s + self.rate * (cell_s - self.centre_s)
 
 

@@ -159,7 +159,6 @@ def _by_arrival(host_s: Array, sensor_s: Array) -> tuple[Line, float, Method]:
 
 
 def _chained(first: Line, then: Line) -> Line:
-    """The line that leads through both."""
     end_s = float(then.at(first.at(np.array([first.centre_s])))[0])
     return Line(end_s - first.centre_s, first.rate * then.rate, first.centre_s, 0.0)
 

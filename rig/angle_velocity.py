@@ -22,13 +22,7 @@ LONGEST_GAP_S = 0.05
 
 
 class LiveSlope:
-    """Slopes of the newest samples, by nothing that comes after them.
-
-    Parameters
-    ----------
-    rate_hz
-        Samples per second.
-    """
+    """Slopes of the newest samples, by nothing that comes after them."""
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz

@@ -120,7 +120,6 @@ def _text(value: str) -> str:
 
 
 def place(recording: Recording, folder: Path) -> Path:
-    """Path of its sealed file: named by time and test."""
     stamp = recording.attributes["created_utc"].replace("-", "").replace(":", "")[:15]
     return folder / f"{stamp}Z_{recording.attributes['test_id']}.h5"
 

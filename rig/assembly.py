@@ -190,7 +190,6 @@ def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) ->
 
 
 def _sample_rate(contents: JournalContents) -> float:
-    """Torque samples per second, measured."""
     blocks = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE and len(p)]
     return (len(blocks) > 1 and align.counted_rate_hz(np.concatenate(blocks))) or 1.0
 
@@ -227,7 +226,6 @@ class _Pulses:
         self._intended, self._mentioned = np.zeros(n, bool), np.zeros(n, bool)
 
     def take(self, contents: JournalContents) -> None:
-        """Read all blocks, in order."""
         for kind, payload in contents.blocks:
             if kind not in (Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED):
                 continue
@@ -250,7 +248,6 @@ class _Pulses:
     def columns(
         self, rate_hz: float, played_s: float, blocks_missing: bool, notes: list[str]
     ) -> dict[str, NDArray[Any]]:
-        """The datasets of `/pulses`, up to the end of the test."""
         n = len(self._planned)
         reached = int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n))
         self._without_intent(notes)
@@ -316,7 +313,6 @@ def _aligned(
 
 
 def _torque(of: Reference, end_s: float) -> dict[str, NDArray[Any]]:
-    """The datasets of `/torque`, of the test alone."""
     counter = of.samples["counter"].astype(np.int64)
     inside = np.flatnonzero((of.time_s >= 0) & (of.time_s < end_s))
     steps = np.diff(counter)
@@ -343,7 +339,6 @@ def read_intents(contents: JournalContents) -> list[Intent]:
 
 
 def laid_blocks(contents: JournalContents) -> list[LaidBlock]:
-    """Segments that were laid after the start, in order."""
     return [LaidBlock.of_bytes(payload) for kind, payload in contents.blocks if kind == Kind.LAID]
 
 

@@ -20,7 +20,6 @@ PR_SET_PDEATHSIG = 1
 
 
 def main() -> int:
-    """Answer requests until standard input ends."""
     _modest()
     from stimrig.rig.control.replies import serve  # after the limits are set: importing numpy takes time
 

@@ -47,7 +47,6 @@ class LimitSettings(_Table):
     rest_between_trains_s: float | None = Field(None, ge=0)
 
     def table(self) -> dict[str, Limit]:
-        """The hard limits, tightened."""
         table = limits.HARD_LIMITS
         for name, value in self.model_dump(exclude_none=True).items():
             if name.startswith("rest_"):

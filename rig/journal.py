@@ -88,7 +88,6 @@ class LaidBlock:
     pulse_width_us: NDArray[np.float64]
 
     def described(self) -> dict[str, Any]:
-        """All but the widths."""
         return {**self.segment._asdict(), "sequence": self.sequence, "settings": self.settings, "time_s": self.time_s}
 
     def to_bytes(self) -> bytes:
@@ -98,7 +97,6 @@ class LaidBlock:
 
     @staticmethod
     def of_bytes(payload: bytes) -> LaidBlock:
-        """The block of a payload."""
         start = _LENGTH.size + _LENGTH.unpack_from(payload)[0]
         content = json.loads(payload[_LENGTH.size : start])
         segment = Segment(content["name"], content["start"], content["end"], content["by"])
@@ -110,11 +108,6 @@ class Journal:
     """One test's journal, open for appending.
 
     After the first failure every further `append` raises: a journal with a gap must not look complete.
-
-    Parameters
-    ----------
-    log
-        A new file.
 
     Raises
     ------
@@ -152,7 +145,6 @@ class Journal:
         self._written(self._log.sync)
 
     def append_json(self, kind: Kind, content: dict[str, Any]) -> None:
-        """Write one block of JSON."""
         self.append(kind, json.dumps(content).encode())
 
     def sync(self) -> None:

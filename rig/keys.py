@@ -33,13 +33,6 @@ class StopKey:
     """While entered, `on_key` is called for each key, without waiting for Enter; Ctrl-C and Ctrl-Z keep their meaning.
 
     Keys are read in a thread of their own, which calls it: nothing that the program waits for delays a stop.
-
-    Parameters
-    ----------
-    fd
-        The terminal.
-    ours
-        Whether its keys are meant for this process; asked before each access.
     """
 
     def __init__(self, on_key: Callable[[], object], fd: int = 0, ours: Callable[[int], bool] = in_front) -> None:
@@ -49,7 +42,6 @@ class StopKey:
 
     @property
     def watched(self) -> bool:
-        """Whether a terminal is being watched for keys."""
         return self._thread is not None
 
     def __enter__(self) -> Self:

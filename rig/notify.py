@@ -12,13 +12,7 @@ from collections.abc import Mapping
 
 
 class Notifier:
-    """Sends messages to the service manager that started this process; never blocks, never raises.
-
-    Parameters
-    ----------
-    environment
-        Where NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID are looked for.
-    """
+    """Sends messages to the service manager that started this process; never blocks, never raises."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")

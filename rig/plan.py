@@ -86,7 +86,6 @@ class PlannedTest:
 
     @property
     def charge_uc(self) -> float:
-        """Charge of one phase summed over the pulses, µC."""
         return sequences.dose_uc(self.pulse_width_us, self.plan.profile.current_ma)
 
     @property
@@ -188,7 +187,6 @@ def build_pieces(chosen: Sequence[SegmentPlan], plan: TestPlan, longest: Limit, 
 
 @contextlib.contextmanager
 def _named(number: int, segment: SegmentPlan) -> Iterator[None]:
-    """Add the segment's number and name to a PlanError."""
     try:
         yield
     except PlanError as error:

@@ -76,7 +76,6 @@ def segments(protocol_id: str, max_pulse_width_us: float) -> list[SegmentPlan]:
 
 
 def described() -> dict[str, str]:
-    """What each protocol is, by id."""
     words = {name: inspect.getdoc(protocol) or "" for name, protocol in LIBRARY.items()}
     return {name: " ".join(doc.partition("\n\n")[0].split()) for name, doc in words.items()}
 

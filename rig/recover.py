@@ -25,7 +25,6 @@ UNKNOWN_END = "recovered by hand; the journal does not say how the test ended"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Recover one journal; the exit code."""
     parser = argparse.ArgumentParser(prog="python -m stimrig.rig.recover", description="Seal a journal by hand.")
     parser.add_argument("journal", type=Path, metavar="JOURNAL")
     parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", help="default: recordings/ of its data folder")

@@ -44,12 +44,10 @@ class Laid:
         return len(self.pulse_width_us)
 
     def cut(self, end: int) -> Laid:
-        """The part before pulse `end`."""
         kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
         return Laid(self.pulse_width_us[:end], self.jumps[:end], tuple(kept))
 
     def with_piece(self, piece: Piece, by: jn.LaidBy) -> Laid:
-        """It, and a piece after it."""
         end = len(self) + len(piece.pulse_width_us)
         added = jn.Segment(piece.of.name, len(self), end, by)
         return Laid(
@@ -89,7 +87,6 @@ class Score:
 
     @property
     def duration_s(self) -> float:
-        """Length of what is laid, s."""
         return len(self.laid) / self.plan.pulse_rate_hz
 
     def segment_at(self, time_s: float) -> str | None:
@@ -98,7 +95,6 @@ class Score:
         return next((s.name for s in self.laid.segments if s.start <= index < s.end), None)
 
     def segments(self) -> list[LaidSegment]:
-        """All that are laid, for clients."""
         rate_hz = self.plan.pulse_rate_hz
         return [
             LaidSegment(name=s.name, start_s=s.start / rate_hz, end_s=s.end / rate_hz, by=s.by)

@@ -29,7 +29,6 @@ class Pulse:
 
     @property
     def charge_uc(self) -> float:
-        """Charge of one phase, µC."""
         return self.pulse_width_us * self.current_ma * 1e-3
 
 

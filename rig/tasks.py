@@ -38,7 +38,6 @@ class Signal:
         """Whether anybody ever waited for it."""
 
     def is_set(self) -> bool:
-        """Whether it is set."""
         return self._set
 
     def set(self) -> None:
@@ -88,7 +87,6 @@ class Task(Generic[T]):
 
     @property
     def result(self) -> T:
-        """What it returned; raises what it raised."""
         assert self.done.is_set(), f"{self.name} has not ended"
         if self.error is not None:
             raise self.error
@@ -101,15 +99,7 @@ def _suspend() -> Generator[None]:
 
 
 class Tasks:
-    """All tasks of one rig.
-
-    Parameters
-    ----------
-    clock
-        The rig's.
-    worker
-        Runs what takes long.
-    """
+    """All tasks of one rig."""
 
     def __init__(self, clock: Clock, worker: Worker) -> None:
         self.clock = clock

@@ -140,7 +140,6 @@ class Trial:
         return Trial("ready", "")
 
     def calibrated(self) -> Trial:
-        """The calibration is closed."""
         self._only("calibrating")
         return Trial("ready", "")
 

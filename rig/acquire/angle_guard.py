@@ -72,7 +72,6 @@ class AngleGuard:
             self._receiver.write_to(journal, self._wrong, on_fault if self.needed else self._note, on_fault)
 
     def release(self) -> Recorded | None:
-        """Stop recording; returns the counts, None without a sensor."""
         return None if self._receiver is None else self._receiver.release()
 
     def fresh(self) -> bool:
@@ -192,7 +191,6 @@ def _unreliable(samples: NDArray[Any]) -> str | None:
 
 
 def _worded(receiver: AngleReceiver) -> str:
-    """Why a sensor gives nothing."""
     found = receiver.problem or "angle sensor: no angle arrives; check its cable and supply"
     return found if found.startswith("angle sensor") else f"angle sensor: {found}"
 
@@ -205,7 +203,6 @@ def outside(angle_rad: float, bound: Limit) -> str:
 
 
 def degrees(angle_rad: float, digits: int = 1) -> str:
-    """An angle for people."""
     return f"{math.degrees(angle_rad):.{digits}f}°"
 
 

@@ -33,13 +33,7 @@ RECENT_S = 1.0
 
 
 class AngleReceiver(Stream):
-    """The angle sensor's, which opens it, too.
-
-    Parameters
-    ----------
-    sensor
-        Not opened yet.
-    """
+    """The angle sensor's, which opens it, too."""
 
     def __init__(self, sensor: AngleSensor, tasks: Tasks) -> None:
         super().__init__(NAME, sensor, tasks, self._gone)

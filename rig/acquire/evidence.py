@@ -78,7 +78,6 @@ async def watch_decay(
 
 
 def _near_rest(at_stop_nm: float | None, above_nm: float, now_nm: float) -> str:
-    """What the torque shows, in words."""
     if at_stop_nm is None:
         return f"torque is near rest, {now_nm:.2f} N·m; its value at the stop is unknown"
     if above_nm <= NEAR_REST_NM:

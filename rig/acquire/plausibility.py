@@ -31,17 +31,7 @@ BIN_S = 0.1
 
 
 class RateCheck:
-    """The rate of one test's samples.
-
-    Parameters
-    ----------
-    name
-        Of the device, for messages.
-    rate_hz
-        Nominal.
-    speed
-        Rig seconds per real second.
-    """
+    """The rate of one test's samples."""
 
     def __init__(self, name: str, rate_hz: float, speed: float) -> None:
         self._name, self._rate_hz = name, rate_hz

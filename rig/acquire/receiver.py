@@ -46,15 +46,7 @@ RANGE_MEAN_S = 0.01
 
 
 class Receiver(Stream):
-    """The load cell's.
-
-    Parameters
-    ----------
-    cell
-        Not open yet.
-    on_lost
-        Called once, with the reason, when the cell is gone.
-    """
+    """The load cell's."""
 
     def __init__(self, cell: LoadCell, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
         super().__init__("load cell", cell, tasks, on_lost)

@@ -179,12 +179,10 @@ class TestRun:
 
     @property
     def sent(self) -> int:
-        """Number of pulses sent so far."""
         return len(self.gate.lateness_s)
 
     @property
     def begun(self) -> bool:
-        """Whether a pulse was sent."""
         return self.t0_s is not None and self.sent > 0
 
     @property

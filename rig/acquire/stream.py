@@ -86,17 +86,7 @@ def steps_from(before: float, values: NDArray[Any]) -> NDArray[Any]:
 
 
 class Stream:
-    """Base of the receivers.
-
-    Parameters
-    ----------
-    name
-        Of the device, for messages.
-    source
-        A device that is not open yet.
-    on_lost
-        Called once, with the reason, when the device is gone.
-    """
+    """Base of the receivers."""
 
     def __init__(self, name: str, source: Sensor, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
         self._name, self._source, self._on_lost = name, source, on_lost
@@ -138,7 +128,6 @@ class Stream:
         return self._watch is not None and not self._watch.done.is_set()
 
     async def close(self) -> None:
-        """Close the device."""
         self._closing.set()
         await self._ended()
         await self._source.close()
@@ -226,7 +215,6 @@ class Stream:
         return replace(self.counts)
 
     def _write(self, kind: Kind, samples: NDArray[Any]) -> None:
-        """Write samples to the journal while a test runs."""
         if self._journal is not None:
             self.counts.samples += len(samples)
             try:

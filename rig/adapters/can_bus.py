@@ -24,13 +24,7 @@ from stimrig.rig.machine import Frame, Listener
 
 
 class ReadAhead:
-    """Reads whatever waits at once and hands it out; everything else is the port's own.
-
-    Parameters
-    ----------
-    port
-        An open `serial.Serial`, or what behaves like one.
-    """
+    """Reads whatever waits at once and hands it out; everything else is the port's own."""
 
     def __init__(self, port: Any) -> None:
         self._port = port
@@ -39,7 +33,6 @@ class ReadAhead:
 
     @property
     def in_waiting(self) -> int:
-        """Number of bytes that can be read without waiting."""
         return len(self._bytes) - self._given or self._port.in_waiting
 
     def read(self, size: int = 1) -> bytes:
@@ -57,7 +50,6 @@ class ReadAhead:
 
     @property
     def write_timeout(self) -> float | None:
-        """Seconds that a write may take; None: no limit."""
         return self._port.write_timeout
 
     @write_timeout.setter
@@ -265,7 +257,6 @@ def place_of(arguments: dict[str, Any]) -> str:
 
 
 def _key(arguments: dict[str, Any]) -> tuple[str, ...]:
-    """What tells one adapter from another."""
     return tuple(str(arguments.get(name, "")) for name in ("interface", "channel", "host", "port"))
 
 

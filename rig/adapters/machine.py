@@ -34,13 +34,7 @@ LONGEST_WAIT_S = 3600.0
 
 
 class Driver:
-    """Owns the thread. `post` and `ask` may be called from any thread.
-
-    Parameters
-    ----------
-    clock
-        The rig's.
-    """
+    """Owns the thread. `post` and `ask` may be called from any thread."""
 
     def __init__(self, clock: Clock) -> None:
         self.tasks = Tasks(clock, self._work)
@@ -156,7 +150,6 @@ class LocalMachine:
 
 
 def boot_id() -> str:
-    """Id of this boot of the machine; empty if the system has none."""
     try:
         return BOOT_ID.read_text("ascii").strip()
     except (OSError, ValueError):

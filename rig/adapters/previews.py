@@ -26,15 +26,7 @@ MAX_REPLY_BYTES = 8_000_000
 
 
 class Previews:
-    """Sends requests to the builder, and starts it again if it has died or taken too long.
-
-    Parameters
-    ----------
-    table
-        The rig's limits, hard ones narrowed by the rig file.
-    speed
-        Of the rig's clock.
-    """
+    """Sends requests to the builder, and starts it again if it has died or taken too long."""
 
     def __init__(self, table: dict[str, Limit], speed: float) -> None:
         rows = {name: asdict(row) for name, row in table.items()}
@@ -74,7 +66,6 @@ class Previews:
             self._waiting -= 1
 
     async def close(self) -> None:
-        """End the builder."""
         process, self._process = self._process, None
         if process is not None:
             with contextlib.suppress(ProcessLookupError):

@@ -84,7 +84,6 @@ class Server:
         self._keep(self._loop.create_task(self._previews.warm()))
 
     async def close(self) -> None:
-        """Stop listening and close all connections."""
         if self._server is not None:
             self._server.close()
         if self._stop_server is not None:

@@ -28,13 +28,7 @@ MOST_AT_ONCE = 600
 
 
 class Connections:
-    """The connections of one socket, silent and active ones.
-
-    Parameters
-    ----------
-    max_silent, max_active
-        Number of each kind that is kept.
-    """
+    """The connections of one socket, silent and active ones."""
 
     def __init__(self, max_silent: int, max_active: int) -> None:
         self._most = {False: max_silent, True: max_active}
@@ -44,16 +38,13 @@ class Connections:
         return sum(len(members) for members in self._members.values())
 
     def enter(self, transport: asyncio.BaseTransport) -> None:
-        """Add a new connection."""
         self._put(transport, spoken=False)
 
     def spoke(self, transport: asyncio.BaseTransport) -> None:
-        """Note that it sent a complete request."""
         self.leave(transport)
         self._put(transport, spoken=True)
 
     def leave(self, transport: asyncio.BaseTransport) -> None:
-        """Remove a closed connection."""
         for members in self._members.values():
             members.pop(transport, None)
 
@@ -76,13 +67,7 @@ UNREADABLE = "a stop that could not be read"
 
 
 class StopServer:
-    """Serves the stop socket.
-
-    Parameters
-    ----------
-    stop
-        Stops the rig (reason, by) and waits for the evidence.
-    """
+    """Serves the stop socket."""
 
     def __init__(self, stop: Stop) -> None:
         self._stop = stop
@@ -104,7 +89,6 @@ class StopServer:
             ) from None
 
     def close(self) -> None:
-        """Stop listening."""
         if self._thread.is_alive():
             asyncio.run_coroutine_threadsafe(self._end(), self._loop).result()
             self._loop.call_soon_threadsafe(self._loop.stop)

@@ -50,13 +50,7 @@ ROUNDED = 1e-9
 
 
 class AngleCalibrating:
-    """The calibration of a rig's angle sensor, and the first pose of the next one.
-
-    Parameters
-    ----------
-    sensor
-        Its settings; None: the rig has none.
-    """
+    """The calibration of a rig's angle sensor, and the first pose of the next one."""
 
     def __init__(self, folder: Path, sensor: DeviceSettings | None, machine: Machine) -> None:
         self._file = SmallFile(folder / "angle-calibration.json", "angle_pose", machine)
@@ -67,7 +61,6 @@ class AngleCalibrating:
         self.calibration: AngleCalibration | None = None
 
     async def recall(self) -> None:
-        """Read the calibration that was stored for this sensor."""
         try:
             content = await self._file.read() if self._sensor else None
             if content is None:
@@ -209,13 +202,7 @@ def _moved(samples: NDArray[Any], part_s: float) -> float:
 
 
 class Joint:
-    """The joint's angle as the rig's sensor gives it.
-
-    Parameters
-    ----------
-    bound
-        The angles that this rig allows.
-    """
+    """The joint's angle as the rig's sensor gives it."""
 
     def __init__(self, config: RigConfig, machine: Machine, pair: Pair, bound: Limit) -> None:
         self.poses = AngleCalibrating(config.data_dir, config.angle_sensor, machine)
@@ -223,7 +210,6 @@ class Joint:
         self._pair, self._bound, self._tasks = pair, bound, machine.tasks
 
     async def recall(self) -> None:
-        """Read the calibration that was stored."""
         await self.poses.recall()
         self._pair.rescale(self.poses.scale)
 
@@ -234,7 +220,6 @@ class Joint:
         return None if found is None else found.set_at_utc
 
     def status(self) -> AngleStatus:
-        """For clients."""
         if not self._present:
             return AngleStatus()
         angle, poses = self._pair.angle, self.poses

@@ -29,17 +29,7 @@ log = logging.getLogger("rig")
 
 
 class Calibrations:
-    """Opens, plays step by step, marks and closes a calibration. Every answer but that of `finish` is the status.
-
-    Parameters
-    ----------
-    table
-        The rig's limits.
-    angle
-        What a journal says of the angle sensor.
-    publish
-        Tells the status to everybody.
-    """
+    """Opens, plays step by step, marks and closes a calibration. Every answer but that of `finish` is the status."""
 
     def __init__(
         self, state: State, pair: Pair, player: Player, rest: Rest, store: RecordingStore, result: Result,

@@ -251,7 +251,6 @@ class Calibration:
         )
 
     def status(self) -> CalibrationStatus:
-        """Its progress, for clients."""
         request, ceiling = self.request, self._ceiling()
         return CalibrationStatus(
             calibration_id=request.calibration_id,

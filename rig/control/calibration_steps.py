@@ -65,7 +65,6 @@ class StepRule:
         return width_us + step_us
 
     def fine(self, width_us: float) -> float:
-        """Width of a train that is one fine step wider."""
         return width_us + self.fine_us if width_us else min(self.fine_us, self.first_us)
 
     def down(self, width_us: float, below_us: float | None) -> float:

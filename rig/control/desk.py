@@ -36,7 +36,6 @@ _DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
 
 
 def read(line: bytes) -> Any:
-    """The request of a line of JSON. Raises ValidationError."""
     return _REQUEST.validate_json(line)
 
 

@@ -61,7 +61,6 @@ def _idle() -> dict[str, Any]:
 
 
 def _of_run(run: TestRun, now_s: float, samples: bool) -> dict[str, Any]:
-    """What the test has sent, and what is laid of it."""
     rate_hz, laid = run.plan.pulse_rate_hz, run.score.laid
     reached = 0 if run.t0_s is None else int(np.floor((now_s - run.t0_s) * rate_hz)) + 1
     pulses = range(run.told_pulses, max(run.told_pulses, min(reached, len(laid))))

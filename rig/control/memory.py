@@ -44,7 +44,6 @@ class SmallFile:
         await self._put(json.dumps(content).encode())
 
     async def remove(self) -> None:
-        """Also where there is none. Raises RigError."""
         await self._put(None)
 
     async def _put(self, data: bytes | None) -> None:
@@ -195,7 +194,6 @@ class Result:
             )
 
     async def recall(self) -> None:
-        """Read what the process before kept."""
         try:
             content = await self._file.read()
             self._kept = None if content is None else Calibrated.model_validate(content)

@@ -24,11 +24,6 @@ class Pair:
     sensor of a rig that has one.
 
     The angle sensor may be missing: it opens itself, and a test that needs it finds out.
-
-    Parameters
-    ----------
-    on_fault, on_lost
-        Called with the reason.
     """
 
     def __init__(
@@ -49,7 +44,6 @@ class Pair:
 
     @property
     def identity(self) -> dict[str, dict[str, Any]]:
-        """What each device says that it is."""
         return self._identity if self.angle is None else {**self._identity, "angle_sensor": self.angle.identity}
 
     async def connect(self) -> None:

@@ -54,7 +54,6 @@ def invalid_request(number: int, error: ValidationError) -> Reply:
 
 
 def to_line(message: BaseModel) -> bytes:
-    """One line of JSON."""
     return message.model_dump_json().encode() + b"\n"
 
 
@@ -73,7 +72,6 @@ def previewed(
 
 
 def answer(line: bytes, table: dict[str, Limit], unix_s: float, speed: float, angle_set_at_utc: str | None) -> Reply:
-    """The reply to one request."""
     try:
         request = PreviewRequest.model_validate_json(line)
         body = previewed(request, table, unix_s, speed, angle_set_at_utc).model_dump(mode="json")

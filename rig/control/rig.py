@@ -74,7 +74,6 @@ class Rig:
 
     @property
     def latch(self) -> str:
-        """See `State.latch`."""
         return self.state.latch
 
     @property
@@ -83,7 +82,6 @@ class Rig:
         return self.player.finished
 
     def status(self) -> Status:
-        """State, devices and limits now."""
         trial, run, receiver = self.state.trial, self.player.run, self.pair.receiver
         calibration = self.state.calibration
         cell = dict(self.pair.identity["load_cell"])
@@ -231,7 +229,6 @@ class Rig:
         return self.status()
 
     async def library(self) -> Sequences:
-        """All sequences and protocols that a plan may name."""
         return await self._tasks.work(plan.library)
 
     async def stop(self, reason: str, by: str, latch_idle: bool = True) -> StopEvidence:
@@ -315,12 +312,10 @@ class Rig:
         return bool(found)
 
     def fault(self, reason: str) -> None:
-        """A device reports a fault."""
         log.error("%s", reason)
         self.player.end("fault", reason)
 
     def _lost(self, reason: str) -> None:
-        """A device is gone."""
         log.error("%s", reason)
         self.player.end("fault", reason, latch_idle=False)
         self.state.change(self.state.trial.disconnected(reason))

@@ -35,7 +35,6 @@ class RecordingStore:
         self.recordings = config.data_dir / "recordings"
 
     def make_folders(self) -> None:
-        """Create what is missing. Raises OSError."""
         for folder in (self.journals, self.recordings):
             self._disk.make_folder(folder)
 
@@ -101,7 +100,6 @@ class RecordingStore:
             raise JournalError(f"journal {path}: {error.strerror}; free some disk space or correct data_dir") from None
 
     def finish(self, path: Path, test_id: str, result: RunResult) -> FinishedEvent:
-        """Seal a test that has just ended."""
         return self._seal(path, test_id, result.outcome, result.reason, result.summary, result.last_sample_unix_s)
 
     def recover(self, reason: str) -> list[FinishedEvent]:
@@ -163,7 +161,6 @@ class RecordingStore:
 
 
 def software() -> str:
-    """Name and version of this program, for recordings."""
     try:
         return f"stimrig {version('stimrig')}"
     except PackageNotFoundError:

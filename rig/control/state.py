@@ -85,7 +85,6 @@ class State:
         raise LatchChangedError("the rig was stopped while this waited; look at the participant, then ask again")
 
     def change(self, trial: Trial) -> None:
-        """From now on this is the state."""
         if trial.told not in ("", self.trial.told):
             self._stops += 1
         changed = trial != self.trial or self._published != self.latch

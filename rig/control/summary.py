@@ -68,7 +68,6 @@ def _most(one: NDArray[Any], other: NDArray[Any], unknown: float) -> float:
 
 
 def _of_torque(time_s: NDArray[Any], torque_nm: NDArray[Any], pulses_s: NDArray[Any]) -> dict[str, float]:
-    """Torque-time since the first pulse, and the peak."""
     known = np.isfinite(torque_nm)
     time_s, torque_nm = time_s[known], torque_nm[known]
     peak_nm = float(np.abs(torque_nm).max()) if len(torque_nm) else 0.0

@@ -123,7 +123,6 @@ class AngleSensor(Sensor, Protocol):
 
 @cache
 def library(kind: Kind) -> dict[str, ModuleType]:
-    """Device modules of a kind, by id."""
     names = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
     modules = {name: importlib.import_module(f"{__name__}.{name}") for name in names}
     return {name: module for name, module in modules.items() if kind == module.KIND}

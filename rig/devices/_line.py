@@ -203,7 +203,6 @@ class LineStimulator(Generic[S]):
         self._line.close()
 
     async def _identity(self) -> tuple[str, str]:
-        """Serial number and firmware."""
         raise NotImplementedError
 
     def _take(self, packet: Packet, time_s: float) -> None:
@@ -218,5 +217,4 @@ class LineStimulator(Generic[S]):
 
 
 def in_words(command: IntEnum) -> str:
-    """The name of a command for messages."""
     return command.name.lower().replace("_", " ")

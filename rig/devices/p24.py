@@ -60,7 +60,6 @@ LEVELS = {0: "not initialised", 1: "low level initialised", 2: "mid level initia
 
 
 def result_text(result: int) -> str:
-    """Words for a result byte, with the number if it is unknown."""
     return RESULTS.get(result, f"error {result}")
 
 

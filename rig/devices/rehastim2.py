@@ -71,7 +71,6 @@ def result_of(data: bytes) -> int:
 
 
 def result_text(result: int) -> str:
-    """Words for a result, with the number if it is unknown."""
     return RESULTS.get(result, f"error {result}")
 
 

@@ -16,7 +16,6 @@ MAX_MEMORY_BYTES = 2 << 30
 
 
 def main() -> int:
-    """Stream until asked to end; the exit code."""
     _modest()
     from stimrig.rig.lsl_outlets.streaming import main as stream  # after that: importing numpy takes time
 

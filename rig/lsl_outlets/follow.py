@@ -74,7 +74,6 @@ class Tail:
         return (here.st_dev, here.st_ino) != (there.st_dev, there.st_ino)
 
     def close(self) -> None:
-        """Let it go."""
         os.close(self._fd)
 
 

@@ -55,15 +55,7 @@ class _Pulse:
 
 
 class LiveAlignment:
-    """Grows with the test.
-
-    Parameters
-    ----------
-    sample_rate_hz
-        Nominal rate of the cell.
-    speed
-        Rig seconds per real second.
-    """
+    """Grows with the test."""
 
     def __init__(self, sample_rate_hz: float, speed: float = 1.0) -> None:
         self._rate_hz, self._speed = sample_rate_hz, speed
@@ -81,7 +73,6 @@ class LiveAlignment:
         return cell_s
 
     def update(self) -> None:
-        """Fit the line anew."""
         cell_s, samples = (np.concatenate(parts) for parts in zip(*self._taken, strict=True))
         self._taken = [(cell_s, samples)]
         host_s, sync = samples["host_time_s"], samples["sync"]

@@ -55,19 +55,7 @@ def clock_offset_s(lsl: Any) -> float:
 
 
 class Outlets:
-    """Torque, pulses and marks.
-
-    Parameters
-    ----------
-    lsl
-        What `library` gave.
-    sample_rate_hz
-        Nominal rate of the cell in samples per real second; 0: not known.
-    devices
-        Load cell and stimulator, as the rig file names them.
-    name
-        The streams' names begin so.
-    """
+    """Torque, pulses and marks."""
 
     def __init__(self, lsl: Any, sample_rate_hz: float, devices: dict[str, str], name: str = "stimrig") -> None:
         self._lsl, self._name, self._devices = lsl, name, devices
@@ -77,7 +65,6 @@ class Outlets:
 
     @property
     def names(self) -> list[str]:
-        """The streams' names."""
         return [f"{self._name}-{part}" for part in ("torque", "pulses", "tests")]
 
     def push(self, batch: Batch) -> None:
@@ -131,19 +118,7 @@ READS_AT_END = 400
 
 
 class Streaming:
-    """Follows one test after another and sends what they hold.
-
-    Parameters
-    ----------
-    folder
-        Data folder of the rig.
-    streams
-        Where it goes.
-    offset_s
-        LSL's clock minus the monotonic clock, s.
-    sample_rate_hz, speed
-        By the rig file; the journal says both again.
-    """
+    """Follows one test after another and sends what they hold."""
 
     def __init__(self, folder: Path, streams: Outlets, offset_s: float, sample_rate_hz: float, speed: float) -> None:
         self._journals = Journals(folder / "journals")
@@ -181,7 +156,6 @@ class Streaming:
         return bool(blocks)
 
     def close(self) -> None:
-        """Send what is left."""
         for _ in range(READS_AT_END):  # a rig that goes on writes faster than this could come to an end
             if self._tail is None or not self.tick():
                 break
@@ -235,7 +209,6 @@ class Streaming:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Stream until asked to end; the exit code."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s lsl: %(message)s", stream=sys.stderr, force=True)
     try:

@@ -49,7 +49,6 @@ class Sequence(Protocol):
 
 @cache
 def library() -> dict[str, Sequence]:
-    """Every sequence by its id, in alphabetical order."""
     names = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_"))
     return {name: cast(Sequence, importlib.import_module(f"{__name__}.{name}")) for name in names}
 
@@ -114,7 +113,6 @@ def jumps(sequence_id: str, settings: dict[str, Any]) -> bool:
 
 
 def pulse_count(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> int:
-    """Number of pulses that `build` would return, without building them."""
     checked: Any = settings_of(sequence_id, settings)
     count = getattr(find(sequence_id), "pulse_count", None)
     return pulses_in(checked.duration_s, pulse_rate_hz) if count is None else count(checked, pulse_rate_hz)

@@ -32,7 +32,6 @@ class Settings(SequenceSettings):
 
 
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
-    """Widths in µs, shape (duration × rate,)."""
     rng = np.random.default_rng(settings.seed)
     total = pulses_in(settings.duration_s, pulse_rate_hz)
     shortest = max(1, pulses_in(settings.min_hold_s, pulse_rate_hz))

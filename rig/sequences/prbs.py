@@ -52,7 +52,6 @@ def shift_register(bits: int, chips: int, seed: int = 1) -> NDArray[np.uint8]:
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
     del pulse_rate_hz
     return (settings.chips or 2**settings.bits - 1) * settings.clock_pulses
 

@@ -16,7 +16,6 @@ class Settings(SequenceSettings):
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
     return pulses_in(settings.up_s, pulse_rate_hz) + pulses_in(settings.down_s, pulse_rate_hz)
 
 

@@ -14,5 +14,4 @@ class Settings(SequenceSettings):
 
 
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
-    """Zeros, shape (duration × rate,)."""
     return np.zeros(pulses_in(settings.duration_s, pulse_rate_hz))

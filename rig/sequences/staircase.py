@@ -19,13 +19,11 @@ class Settings(SequenceSettings):
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
     steps = 2 * settings.levels if settings.down else settings.levels
     return steps * pulses_in(settings.hold_s, pulse_rate_hz)
 
 
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
-    """Widths in µs, shape (steps × hold × rate,)."""
     up = np.arange(1, settings.levels + 1) / settings.levels
     shape = np.concatenate([up, up[-2::-1], [0.0]]) if settings.down else up
     return np.repeat(shape * settings.max_pulse_width_us, pulses_in(settings.hold_s, pulse_rate_hz))

@@ -19,13 +19,11 @@ class Settings(SequenceSettings):
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
     on, off = pulses_in(settings.on_s, pulse_rate_hz), pulses_in(settings.off_s, pulse_rate_hz)
     return settings.repeats * (on + off)
 
 
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
-    """Widths in µs, shape (repeats × (on + off) × rate,)."""
     on = np.full(pulses_in(settings.on_s, pulse_rate_hz), settings.max_pulse_width_us)
     off = np.zeros(pulses_in(settings.off_s, pulse_rate_hz))
     return np.tile(np.concatenate([on, off]), settings.repeats)

@@ -18,12 +18,10 @@ class Settings(SequenceSettings):
 
 
 def pulse_count(settings: Settings, pulse_rate_hz: float) -> int:
-    """Pulses, those of width 0 included."""
     del pulse_rate_hz
     return len(settings.pulse_width_us)
 
 
 def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64]:
-    """The list as it is, shape (n,)."""
     del pulse_rate_hz
     return np.asarray(settings.pulse_width_us, dtype=np.float64)

@@ -148,7 +148,6 @@ class SampleFrame:
 
     @property
     def frame_id(self) -> int:
-        """Arbitration id of the frames to decode."""
         return self.message.frame_id
 
     @property
@@ -158,7 +157,6 @@ class SampleFrame:
 
     @property
     def samples_per_frame(self) -> int:
-        """Number of samples per frame."""
         return len(self._signals)
 
     def decode_all(self, frames: Iterable[Frame]) -> tuple[list[tuple[Frame, FrameSamples]], int]:

@@ -84,7 +84,6 @@ class Framing:
 
     @property
     def min_frame_bytes(self) -> int:
-        """Length of the shortest frame."""
         return self.header_bytes + SHORTEST_BODY_BYTES + 1
 
     def encode(self, packet: Packet) -> bytes:
@@ -119,7 +118,6 @@ class Framing:
         return bytes(byte ^ KEY for byte in head[1::2])
 
     def reader(self) -> FrameReader:
-        """A new reader of a stream of these frames."""
         return FrameReader(self)
 
 
