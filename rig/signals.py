@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,8 +95,8 @@ class AngleScale:
     direction: int = 1
     radians_per_unit: float = 1.0
 
-    def angle_rad(self, raw: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The joint's angles, rad, shape of `raw`."""
+    def angle_rad(self, raw: Any) -> Any:
+        """The joint's angle, or angles, rad."""
         return self.direction * self.radians_per_unit * (raw - self.offset)
 
 

@@ -18,9 +18,8 @@ from pydantic import ValidationError
 
 from stimrig.rig.adapters.previews import Previews
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connections, StopServer
-from stimrig.rig.control import desk
 from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
-from stimrig.rig.control.rig import Rig
+from stimrig.rig.control.rig import Rig, obey, read_request
 from stimrig.rig.errors import BusyError, ConfigError, PlanError, RigError
 from stimrig.rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, StopRequest, stop_socket
 
@@ -161,7 +160,7 @@ class Server:
                 _write(writer, await self._preview(line, writer))
                 return
             self._refuse_long(line, kind)
-            request = desk.read(line)
+            request = read_request(line)
         except RigError as error:
             _write(writer, to_line(refusal(id_of(line[:200]), error)))
             return
@@ -187,7 +186,7 @@ class Server:
             await self._answer(to_line(request), writer, crowded=False)
             return
         rig = self.rig
-        reply = await asyncio.wrap_future(self._ask(lambda: desk.obey(rig, request)))
+        reply = await asyncio.wrap_future(self._ask(lambda: obey(rig, request)))
         _write(writer, to_line(reply))
         if request.kind == "subscribe" and reply.ok:
             self._subscribers[writer] = request.samples

@@ -45,7 +45,7 @@ _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
 
 
 class Player:
-    """Plays planned and admitted tests, one at a time. What is asked while one plays waits for no start and no re-arm."""
+    """Plays planned and admitted tests, one at a time. What is asked meanwhile waits for no start and no re-arm."""
 
     def __init__(
         self, state: State, pair: Pair, rest: Rest, store: RecordingStore, machine: Machine, watch: Watch,

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from typing import Any
+
+from pydantic import BaseModel, TypeAdapter
 
 from stimrig.rig import limits, plan
 from stimrig.rig.config import RigConfig
@@ -15,9 +18,10 @@ from stimrig.rig.control.live import finite, live_event
 from stimrig.rig.control.memory import Latch, Rest, Result
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
+from stimrig.rig.control.replies import internal_error, refusal
 from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
-from stimrig.rig.errors import ConfigError, DeviceError, LatchChangedError, PlanError
+from stimrig.rig.errors import ConfigError, DeviceError, LatchChangedError, PlanError, RigError
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
     PASSIVE,
@@ -25,6 +29,8 @@ from stimrig.rig.messages import (
     Event,
     FinishedEvent,
     LiveEvent,
+    Reply,
+    Request,
     Sequences,
     StateEvent,
     Status,
@@ -322,3 +328,41 @@ class Rig:
 
     def _tell(self) -> None:
         self._publish(StateEvent(status=self.status()))
+
+
+_REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
+
+_DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
+    "start": lambda rig, asked: rig.start(asked.plan, asked.key),
+    "stop": lambda rig, asked: rig.stop(asked.reason, asked.by),
+    "withdraw": lambda rig, asked: rig.player.withdraw(asked),
+    "extend": lambda rig, asked: rig.player.extend(asked),
+    "enough": lambda rig, asked: rig.player.enough(asked),
+    "sequences": lambda rig, _: rig.library(),
+    "rearm": lambda rig, asked: rig.rearm(asked.by, asked.latch),
+    "calibrate-start": lambda rig, asked: rig.calibrations.start(asked),
+    "calibrate-step": lambda rig, asked: rig.calibrations.step(asked),
+    "calibrate-mark": lambda rig, asked: rig.calibrations.mark(asked),
+    "calibrate-finish": lambda rig, asked: rig.calibrations.finish(asked),
+    "calibrate-stored": lambda rig, asked: rig.calibrations.stored(asked.calibration_id),
+    "angle_pose": Rig.angle_pose,
+}
+"""What has no answer of its own, and all others, are answered by the status."""
+
+
+def read_request(line: bytes) -> Any:
+    return _REQUEST.validate_json(line)
+
+
+async def obey(rig: Rig, request: Any) -> Reply:
+    """Obey a request; errors become part of the reply."""
+    try:
+        do = _DO.get(request.kind)
+        answer = None if do is None else await do(rig, request)
+        body = (rig.status() if answer is None else answer).model_dump(mode="json")
+    except RigError as error:
+        return refusal(request.id, error)
+    except Exception as error:
+        log.exception("request %s failed", request.kind)
+        return internal_error(request.id, error)
+    return Reply(id=request.id, ok=True, body=body)

@@ -6,23 +6,19 @@ It shares the load cell's adapter where that is the same one, so each adapter is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Literal, Self
 
-import numpy as np
 from pydantic import Field
 
 from stimrig.rig.devices import DeviceSettings
+from stimrig.rig.devices._can import CanSensor, FrameSamples, SampleFrame
 from stimrig.rig.errors import DeviceError
-from stimrig.rig.machine import Bus, Frame, Listener, Machine
+from stimrig.rig.machine import Frame, Machine
 from stimrig.rig.signals import ANGLE_SAMPLE, AngleScale, Block
-from stimrig.rig.wire import dbc
 
 KIND = "angle_sensor"
-
-NAME = "angle sensor"
-GATHER_S = 0.01
-"""Real seconds: a block is returned at most this long after its first sample arrived."""
 OF_THE_CELL = "dbc", "message", "counter", "sample_rate_hz"
 """Settings that the load cell's replace where the angle stands in its frame, unless the rig file gives them."""
 
@@ -54,39 +50,29 @@ class Settings(DeviceSettings):
         return self.model_copy(update=taken)
 
 
-class CanAngleSensor:
-    """Driver of one sensor; see `stimrig.rig.devices.AngleSensor` for what the methods promise."""
+class CanAngleSensor(CanSensor):
+    """Driver of one sensor; see `rig.devices.AngleSensor` for what the methods promise."""
+
+    name, dtype, gather_s = "angle sensor", ANGLE_SAMPLE, 0.01
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
-        self._settings, self._machine = settings, machine
-        with dbc.of_table(KIND):
-            self._frame = dbc.SampleFrame(
-                settings.dbc, settings.message, [settings.signal], settings.counter, settings.fault, "fault"
-            )
-        self.sample_rate_hz, self.counter_modulus = settings.sample_rate_hz, self._frame.counter_modulus
+        self._settings = settings
+        frame = partial(
+            SampleFrame, settings.dbc, settings.message, [settings.signal], settings.counter, settings.fault, "fault"
+        )
+        super().__init__(KIND, frame, settings.sample_rate_hz, machine)
         self.scale = AngleScale(settings.offset, settings.direction, settings.radians_per_unit)
         self.of_the_cell = settings.of_the_cell
         self.on_the_cells_bus = False
-        self._bus: Bus | None = None
-        self._listener: Listener | None = None
 
     async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
-        arguments, frame_id = self._settings.bus, self._frame.frame_id
-        bus = self._machine.shared_bus(arguments, NAME)
+        bus = self._machine.shared_bus(self._settings.bus, self.name)
         self.on_the_cells_bus = bus is not None
         if bus is None:
             if self.of_the_cell:
                 raise DeviceError(f"{KIND}.of_the_cell: the load cell's bus is not open")
-            bus = await self._machine.tasks.work(self._machine.open_bus, arguments, NAME)
-        self._bus, self._listener = bus, Listener(*self._frame.identifier, self.decode, on_block, on_lost, GATHER_S)
-        bus.listen(self._listener)
-        return {
-            "device": "can_angle_sensor",
-            "bus": bus.place,
-            "frame_id": f"0x{frame_id:X}",
-            "message": self._frame.message.name,
-            "sample_rate_hz": self.sample_rate_hz,
-        }
+            bus = await self._machine.tasks.work(self._machine.open_bus, self._settings.bus, self.name)
+        return self._listen("can_angle_sensor", bus, on_block, on_lost)
 
     async def close(self) -> None:
         bus, self._bus = self._bus, None
@@ -97,15 +83,9 @@ class CanAngleSensor:
         else:
             await self._machine.tasks.work(bus.close)
 
-    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> Block:
-        """The samples of frames, in their order; damaged ones are counted. Pure."""
-        rows: list[tuple[float, float, float, float, int, int]] = []
-        readable, unreadable = self._frame.decode_all(frames)
-        for frame, found in readable:
-            rows.append((frame.host_time_s, frame.stamp_s, found.values[0], math.nan, found.counter, found.flag))
-        samples = np.array(rows, dtype=ANGLE_SAMPLE)
-        samples["angle_rad"] = self.scale.angle_rad(samples["raw"])
-        return Block(samples, damaged + unreadable, errors)
+    def _rows(self, frame: Frame, found: FrameSamples) -> Iterator[tuple[float, ...]]:
+        raw = found.values[0]
+        yield frame.host_time_s, frame.stamp_s, raw, self.scale.angle_rad(raw), found.counter, found.flag
 
 
 create = CanAngleSensor

@@ -7,30 +7,26 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from stimrig.rig.devices import DeviceSettings
+from stimrig.rig.devices._can import CELL_FAULT, PACKAGED, CanSensor, FrameSamples, SampleFrame
 from stimrig.rig.errors import DeviceError
-from stimrig.rig.machine import Bus, Frame, Listener, Machine
+from stimrig.rig.machine import Frame, Machine
 from stimrig.rig.signals import SAMPLE, Block
-from stimrig.rig.wire import dbc
-from stimrig.rig.wire.dbc import CELL_FAULT
 
 KIND = "load_cell"
-
-GATHER_S = 0.005
-"""Real seconds: a block is returned at most this long after its first sample arrived."""
 
 _FRAME = re.compile(r"^([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})$")
 
 
 class Settings(DeviceSettings):
     bus: dict[str, Any] = Field(description="keyword arguments of can.Bus: interface, channel, bitrate, host, port …")
-    dbc: str = Field(dbc.PACKAGED, description="path of a DBC file, or torque_default")
+    dbc: str = Field(PACKAGED, description="path of a DBC file, or torque_default")
     message: str | None = Field(None, description="message with the torque; default: the first one that has the signal")
     signal: str | list[str] = Field("Torque_Nm", description="torque signal; a list if a frame has several samples")
     scale_nm: float = Field(1.0, description="N·m per unit of the signal; a negative value reverses the sign")
@@ -67,39 +63,31 @@ def message_of(frame: str) -> tuple[int, bytes, bool]:
     return int(identifier, 16), bytes.fromhex(data), len(identifier) == 8
 
 
-class CanLoadCell:
-    """Driver of one cell; see `stimrig.rig.devices.LoadCell` for what the methods promise."""
+class CanLoadCell(CanSensor):
+    """Driver of one cell."""
+
+    name, dtype, gather_s = "load cell", SAMPLE, 0.005
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
-        self._machine = machine
         names = [settings.signal] if isinstance(settings.signal, str) else settings.signal
-        with dbc.of_table(KIND):
-            self._frame = dbc.SampleFrame(
-                settings.dbc, settings.message, names, settings.counter, settings.sync, fault=settings.fault
-            )
-        self.sample_rate_hz = settings.sample_rate_hz
-        self.counter_modulus = self._frame.counter_modulus * self._frame.samples_per_frame
-        self._bus: Bus | None = None
+        frame = partial(
+            SampleFrame, settings.dbc, settings.message, names, settings.counter, settings.sync, fault=settings.fault
+        )
+        super().__init__(KIND, frame, settings.sample_rate_hz, machine)
 
     async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         work = self._machine.tasks.work
-        bus = self._bus = await work(self._machine.open_bus, self._settings.bus, "load cell")
-        listener = Listener(*self._frame.identifier, self.decode, on_block, on_lost, GATHER_S)
-        bus.listen(listener)
+        bus = await work(self._machine.open_bus, self._settings.bus, self.name)
+        identity = self._listen("can_load_cell", bus, on_block, on_lost)
         try:
             await work(bus.send, [message_of(frame) for frame in self._settings.start_frames])
         except DeviceError:
-            bus.leave(listener)  # it is told by what is raised, not by a loss as well
+            assert self._listener is not None
+            bus.leave(self._listener)  # it is told by what is raised, not by a loss as well
             await self.close()
             raise
-        return {
-            "device": "can_load_cell",
-            "bus": bus.place,
-            "frame_id": f"0x{self._frame.frame_id:X}",
-            "message": self._frame.message.name,
-            "sample_rate_hz": self.sample_rate_hz,
-        }
+        return identity
 
     async def close(self) -> None:
         bus, self._bus = self._bus, None
@@ -110,17 +98,12 @@ class CanLoadCell:
             await work(bus.send, [message_of(frame) for frame in self._settings.stop_frames])
         await work(bus.close)
 
-    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> Block:
-        """The samples of frames, in their order; damaged ones are counted. Pure."""
-        rows: list[tuple[float, float, float, int, int]] = []
-        readable, unreadable = self._frame.decode_all(frames)
-        for frame, found in readable:
-            n = len(found.values)
-            for i, value in enumerate(found.values):
-                counter = found.counter * n + i if found.counter >= 0 else -1
-                stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
-                rows.append((frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag))
-        return Block(np.array(rows, dtype=SAMPLE), damaged + unreadable, errors)
+    def _rows(self, frame: Frame, found: FrameSamples) -> Iterator[tuple[float, ...]]:
+        n = len(found.values)
+        for i, value in enumerate(found.values):
+            counter = found.counter * n + i if found.counter >= 0 else -1
+            stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
+            yield frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag
 
 
 create = CanLoadCell

@@ -14,11 +14,10 @@ from enum import IntEnum
 
 from pydantic import Field
 
-from stimrig.rig.devices._line import LineSettings, LineStimulator, in_words
+from stimrig.rig.devices._line import Framing, LineSettings, LineStimulator, Packet, in_words
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
 from stimrig.rig.signals import Ack
-from stimrig.rig.wire.framing import Framing, Packet
 
 KIND = "stimulator"
 

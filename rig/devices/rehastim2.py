@@ -16,13 +16,12 @@ from typing import Any
 
 from pydantic import Field
 
-from stimrig.rig.devices._line import LineSettings, LineStimulator
+from stimrig.rig.devices._line import Framing, LineSettings, LineStimulator, Packet
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
 from stimrig.rig.machine import Machine
 from stimrig.rig.signals import Ack
 from stimrig.rig.tasks import Signal
-from stimrig.rig.wire.framing import Framing, Packet
 
 KIND = "stimulator"
 

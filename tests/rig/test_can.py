@@ -24,12 +24,12 @@ from stimrig.rig.adapters import can_bus
 from stimrig.rig.adapters.can_bus import CanBus, ReadAhead
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.devices import can_angle_sensor, can_load_cell
+from stimrig.rig.devices._can import CELL_FAULT, PACKAGED, SampleFrame
 from stimrig.rig.devices.can_angle_sensor import CanAngleSensor
 from stimrig.rig.devices.can_load_cell import CanLoadCell
 from stimrig.rig.errors import ConfigError, DeviceError, WireError
 from stimrig.rig.machine import Frame
 from stimrig.rig.signals import AngleScale
-from stimrig.rig.wire.dbc import CELL_FAULT, PACKAGED, SampleFrame
 from tests.rig.test_config import GOOD, load
 from tests.simulator.virtual_time import VirtualMachine
 
@@ -46,7 +46,7 @@ BO_ 610 Value: 8 Cell
 
 def test_the_default_frame():
     frame = SampleFrame(PACKAGED, None, ["Torque_Nm"], "Counter", "Sync")
-    assert (frame.frame_id, frame.counter_modulus, frame.samples_per_frame) == (0x181, 65536, 1)
+    assert (frame.message.frame_id, frame.counter_modulus, frame.samples_per_frame) == (0x181, 65536, 1)
     got = frame.decode(struct.pack("<fHBB", -3.25, 65535, 1, 0))
     assert (got.values, got.counter, got.flag) == ((-3.25,), 65535, 1)
     assert frame.decode(struct.pack("<fHBB", 0, 0, 2, 0)).flag == 0
@@ -62,7 +62,7 @@ def test_several_samples_of_big_endian_counts(tmp_path: Path):
     path = tmp_path / "counts.dbc"
     path.write_text(COUNTS)
     frame = SampleFrame(str(path), "Value", ["First", "Second", "Third"], "Index", None)
-    assert (frame.frame_id, frame.counter_modulus, frame.samples_per_frame) == (610, 256, 3)
+    assert (frame.message.frame_id, frame.counter_modulus, frame.samples_per_frame) == (610, 256, 3)
     got = frame.decode(struct.pack(">hhhBB", 100, -200, 300, 9, 0))
     assert got.values == pytest.approx((1.0, -2.0, 3.0))
     assert (got.counter, got.flag) == (9, 255)
@@ -81,7 +81,7 @@ def test_a_value_that_has_a_word_is_no_reading(tmp_path: Path):
 
 
 def test_a_float_has_no_words(tmp_path: Path):
-    packaged = resources.files("stimrig.rig.wire").joinpath(f"{PACKAGED}.dbc").read_text("utf-8")
+    packaged = resources.files("stimrig.rig.devices").joinpath(f"{PACKAGED}.dbc").read_text("utf-8")
     path = tmp_path / "float.dbc"
     path.write_text(packaged + 'VAL_ 385 Torque_Nm 0 "rest" ;\n')
     with pytest.raises(ConfigError, match="Torque_Nm: a floating-point signal has no words"):
@@ -105,7 +105,7 @@ def test_a_file_that_is_no_dbc(tmp_path: Path):
 def test_counts_like_those_of_a_gsv_4():
     for n in (1, 2, 4):
         frame = SampleFrame("counts_be16", None, [f"Torque{i + 1}_Nm" for i in range(n)], None, None)
-        assert (frame.frame_id, frame.samples_per_frame, frame.counter_modulus) == (610, n, 0)
+        assert (frame.message.frame_id, frame.samples_per_frame, frame.counter_modulus) == (610, n, 0)
         data = b"".join(counts.to_bytes(2, "big") for counts in (32768, 65535, 1, 32768 + 655)[:n])
         found = frame.decode(data)
         assert found.values == pytest.approx((0.0, 50.0, -50.0, 655 * 50 / 32767)[:n], abs=1e-6)

@@ -15,8 +15,8 @@ from stimrig.hardware_sim.stimulators import sciencemode2 as emulated2
 from stimrig.hardware_sim.stimulators import sciencemode4 as emulated4
 from stimrig.hardware_sim.stimulators.framing import Packet
 from stimrig.rig.devices import p24, rehastim2
+from stimrig.rig.devices._line import Packet as RigsPacket
 from stimrig.rig.errors import WireError
-from stimrig.rig.wire.framing import Packet as RigsPacket
 
 FRAMES_2 = {
     "InitAck": ("f0 81 7f 81 56 00 02 00 0f", Packet(0, 2, b"\x00")),

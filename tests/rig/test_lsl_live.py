@@ -12,9 +12,8 @@ import pytest
 from stimrig.rig import assembly, journal
 from stimrig.rig.errors import RecordingError
 from stimrig.rig.journal import Kind
-from stimrig.rig.lsl_outlets.follow import Journals, Tail, refuse_locking
 from stimrig.rig.lsl_outlets.live_test import MARGIN_S, Batch, LiveTest
-from stimrig.rig.lsl_outlets.streaming import Streaming
+from stimrig.rig.lsl_outlets.streaming import Journals, Streaming, Tail, refuse_locking
 from stimrig.rig.signals import SAMPLE
 from tests.rig.fakes import VirtualRig, journal_at
 
@@ -260,7 +259,7 @@ def test_a_tail_knows_when_its_journal_was_sealed_and_takes_no_lock(tmp_path: Pa
 
 
 def test_where_a_reader_could_hold_up_the_writer_nothing_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("stimrig.rig.lsl_outlets.follow.FREE_TO_READ", {1: "none"})
+    monkeypatch.setattr("stimrig.rig.lsl_outlets.streaming.FREE_TO_READ", {1: "none"})
     with pytest.raises(RecordingError, match="may hold up the rig"):
         refuse_locking(tmp_path)
     with pytest.raises(RecordingError, match="nowhere"):

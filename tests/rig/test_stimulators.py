@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig.rig.devices import p24, rehastim2
+from stimrig.rig.devices._line import Packet
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.machine import Told
-from stimrig.rig.wire.framing import Packet
 from tests.rig.test_framing import FRAMES_4
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 

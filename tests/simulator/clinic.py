@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from stimrig.rig.control import desk
 from stimrig.rig.control.replies import id_of, invalid_request, to_line
-from stimrig.rig.control.rig import Rig
+from stimrig.rig.control.rig import Rig, obey, read_request
 from stimrig.rig.messages import (
     EnoughRequest,
     Event,
@@ -178,7 +177,7 @@ class Clinic:
 async def answer(rig: Rig, line: bytes) -> Reply:
     """Obey a line of JSON, as the server does."""
     try:
-        request = desk.read(line)
+        request = read_request(line)
     except ValidationError as error:
         return invalid_request(id_of(line), error)
-    return await desk.obey(rig, request)
+    return await obey(rig, request)

@@ -1,23 +1,24 @@
-"""Decodes samples from CAN frames by a DBC file, so that a new sensor needs a description, not a driver."""
+"""What drivers of sensors on a CAN bus share: samples are decoded by a DBC file, so a new one needs a description."""
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import cast
+from typing import Any, ClassVar, cast
 
 import cantools
+import numpy as np
 from cantools.database import Database
 from cantools.database.can import Message
 from cantools.database.namedsignalvalue import NamedSignalValue
 
 from stimrig.rig.errors import ConfigError, WireError
-from stimrig.rig.machine import Frame
+from stimrig.rig.machine import Bus, Frame, Listener, Machine
+from stimrig.rig.signals import Block
 
 CELL_FAULT = "Cell_Fault"
 """A cell's own fault, in the descriptions that have it."""
@@ -35,7 +36,7 @@ def load(dbc: str) -> Database:
     """
     try:
         if "/" not in dbc and not dbc.endswith(".dbc"):
-            text = resources.files("stimrig.rig.wire").joinpath(f"{dbc}.dbc").read_text("utf-8")
+            text = resources.files("stimrig.rig.devices").joinpath(f"{dbc}.dbc").read_text("utf-8")
         else:
             text = Path(dbc).read_text("cp1252")
         database = cantools.database.load_string(text, "dbc")
@@ -65,15 +66,6 @@ def _measured(value: float | NamedSignalValue) -> float:
 def _raw(value: float | NamedSignalValue) -> float:
     """Of a counter or a status word, also where the description has a word for it."""
     return value.value if isinstance(value, NamedSignalValue) else value
-
-
-@contextlib.contextmanager
-def of_table(name: str) -> Iterator[None]:
-    """Begin a ConfigError with its table in the rig file."""
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError(f"{name}.{error}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,15 +139,6 @@ class SampleFrame:
             self.counter_modulus = 1 << found.get_signal_by_name(self._counter).length
 
     @property
-    def frame_id(self) -> int:
-        return self.message.frame_id
-
-    @property
-    def identifier(self) -> tuple[int, bool]:
-        """Arbitration id, and whether it has 29 bits."""
-        return self.message.frame_id, self.message.is_extended_frame
-
-    @property
     def samples_per_frame(self) -> int:
         return len(self._signals)
 
@@ -192,3 +175,59 @@ class SampleFrame:
             )
         except Exception as error:
             raise WireError(f"frame {data.hex(' ')} does not fit {self.message.name}: {error}") from None
+
+
+class CanSensor:
+    """Base of the drivers of sensors on a CAN bus; see `rig.devices.Sensor` for what the methods promise.
+
+    Parameters
+    ----------
+    table
+        In the rig file; begins the words of a ConfigError.
+    frame
+        Makes the decoder of its frames.
+    """
+
+    name: ClassVar[str]
+    """For messages."""
+    dtype: ClassVar[np.dtype[Any]]
+    gather_s: ClassVar[float]
+    """Real seconds: a block is returned at most this long after its first sample arrived."""
+
+    def __init__(self, table: str, frame: Callable[[], SampleFrame], sample_rate_hz: float, machine: Machine) -> None:
+        try:
+            self._frame = frame()
+        except ConfigError as error:
+            raise ConfigError(f"{table}.{error}") from None
+        self._machine, self.sample_rate_hz = machine, sample_rate_hz
+        self.counter_modulus = self._frame.counter_modulus * self._frame.samples_per_frame
+        self._bus: Bus | None = None
+        self._listener: Listener | None = None
+
+    def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> Block:
+        """The samples of frames, in their order; damaged ones are counted. Pure."""
+        readable, unreadable = self._frame.decode_all(frames)
+        rows = [row for frame, found in readable for row in self._rows(frame, found)]
+        return Block(np.array(rows, dtype=self.dtype), damaged + unreadable, errors)
+
+    def _rows(self, frame: Frame, found: FrameSamples) -> Iterable[tuple[float, ...]]:
+        """The samples of a frame."""
+        raise NotImplementedError
+
+    def _listen(
+        self, device: str, bus: Bus, on_block: Callable[[Block], None], on_lost: Callable[[str], None]
+    ) -> dict[str, Any]:
+        """Take the bus's frames from now on; the identity to display."""
+        message = self._frame.message
+        self._bus = bus
+        self._listener = Listener(
+            message.frame_id, message.is_extended_frame, self.decode, on_block, on_lost, self.gather_s
+        )
+        bus.listen(self._listener)
+        return {
+            "device": device,
+            "bus": bus.place,
+            "frame_id": f"0x{message.frame_id:X}",
+            "message": message.name,
+            "sample_rate_hz": self.sample_rate_hz,
+        }

@@ -1,1 +1,0 @@
-"""Encoders and decoders of the wire protocols. Pure: no port is opened here."""
