@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import shutil
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -18,7 +15,6 @@ from typing import Annotated, Any, ClassVar
 from fastapi import Depends, Request
 from pydantic import Field
 from pydantic_settings import SettingsConfigDict
-from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api import owner_only
 from stimrig.api.centre import check, warnings
@@ -29,16 +25,11 @@ from stimrig.api.centre.rigs import Rigs
 from stimrig.api.centre.spool import Spool
 from stimrig.api.clock import Clock, set_zone
 from stimrig.api.errors import ApiError, SettingsError
-from stimrig.api.models.registry import Versions
-from stimrig.api.people.accounts import People
-from stimrig.api.people.auth import Auth
-from stimrig.api.people.idle_lock import FLUSH_S, IdleLock
-from stimrig.api.people.pace import Guesses
 from stimrig.api.settings import ServerSettings
 from stimrig.api.store import Store
-from stimrig.api.store.holds import shared_secret as shared
+from stimrig.api.store.holds import shared_secret
+from stimrig.api.web.dependencies import Parts
 
-log = logging.getLogger("stimrig.centre")
 MOST_DOWNLOADS, MOST_PUTS, MOST_PUTS_OF_A_RIG = 4, 8, 3
 
 
@@ -78,42 +69,32 @@ class CentreSettings(ServerSettings):
         return self.data_dir / "spool"
 
 
-@dataclass
-class Context:
+class Context(Parts):
     """Everything a route of the centre may need."""
 
-    settings: CentreSettings
-    clock: Clock
-    store: Store
-    auth: Auth
-    people: People
-    rigs: Rigs
-    ingest: Ingest
-    heads: Heads
-    bucket: Bucket
-    spool: Spool
-    versions: Versions
-    """Of no use here but to the guard of controllers' keys, which open nothing at a centre."""
-    drawn_token: str | None = None
-    downloads: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(MOST_DOWNLOADS))
-    """So many files are read from the bucket at the same time."""
-    bucket_threads: ThreadPoolExecutor = field(
-        default_factory=lambda: ThreadPoolExecutor(MOST_DOWNLOADS + MOST_PUTS, "bucket")
-    )
-    """For the bucket alone: one that does not answer keeps neither pages nor items waiting."""
-    puts: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(MOST_PUTS))
-    """So many pieces of files are taken at the same time."""
-    putting: Counter[int] = field(default_factory=Counter)
-    """Of each rig, how many are on their way."""
-    started_s: float = field(default_factory=time.monotonic)
-    waiting_warnings: int = 0
-    """As many as were there when they were counted last: for the bar of pages, and for nothing else."""
-    tasks: list[asyncio.Task[None]] = field(default_factory=list)
+    forgiven = (*Parts.forgiven, BucketError)
 
-    async def open(self) -> None:
-        """Begin to look after what nobody asks for."""
-        every = ((FLUSH_S, self.auth.idle.flush), (check.EVERY_S, lambda: check.look(self.spool)))
-        self.tasks = [asyncio.create_task(_again(every_s, what)) for every_s, what in every]
+    def __init__(self, settings: CentreSettings, clock: Clock, store: Store, bucket: Bucket) -> None:
+        super().__init__(settings, clock, store)
+        self.settings, self.bucket = settings, bucket
+        self.rigs = Rigs(store, clock, self.guesses)
+        self.ingest = Ingest(store, clock, int(settings.max_file_mb * 1e6))
+        self.heads = Heads(store, shared_secret(store, "receipts"))
+        self.spool = Spool(settings.spool_dir, store, clock, bucket)
+        self.downloads = asyncio.Semaphore(MOST_DOWNLOADS)
+        """So many files are read from the bucket at the same time."""
+        self.bucket_threads = ThreadPoolExecutor(MOST_DOWNLOADS + MOST_PUTS, "bucket")
+        """For the bucket alone: one that does not answer keeps neither pages nor items waiting."""
+        self.puts = asyncio.Semaphore(MOST_PUTS)
+        """So many pieces of files are taken at the same time."""
+        self.putting: Counter[int] = Counter()
+        """Of each rig, how many are on their way."""
+        self.waiting_warnings = 0
+        """As many as were there when they were counted last: for the bar of pages, and for nothing else."""
+
+    def regular(self) -> list[tuple[float, Callable[[], object]]]:
+        """As `Parts`; and files are looked through."""
+        return [*super().regular(), (check.EVERY_S, lambda: check.look(self.spool))]
 
     @contextlib.contextmanager
     def one_more_of(self, rig_id: int) -> Iterator[None]:
@@ -142,22 +123,8 @@ class Context:
 
     async def close(self) -> None:
         """Let everything go."""
-        for task in self.tasks:
-            task.cancel()
-        with contextlib.suppress(SQLAlchemyError):
-            await asyncio.to_thread(self.auth.idle.flush)
         self.bucket_threads.shutdown(wait=False, cancel_futures=True)
-        self.people.close()
-        self.store.close()
-
-
-async def _again(every_s: float, what) -> None:
-    while True:
-        await asyncio.sleep(every_s)
-        try:
-            await asyncio.to_thread(what)
-        except (SQLAlchemyError, OSError, BucketError):  # the next time has it all
-            log.exception("what the centre looks after by itself could not be done")
+        await super().close()
 
 
 def build(settings: CentreSettings, clock: Clock | None = None) -> Context:
@@ -182,15 +149,7 @@ def build(settings: CentreSettings, clock: Clock | None = None) -> Context:
     if settings.time_zone:
         set_zone(settings.time_zone)
     bucket = ready_bucket(settings)
-    store = opened(settings)
-    guesses = Guesses(clock)
-    auth = Auth(store, clock, guesses, IdleLock(store, clock, settings.idle_lock_min), settings.session_hours)
-    drawn = auth.first_administrator(settings.admin_token.get_secret_value() if settings.admin_token else None)
-    return Context(
-        settings, clock, store, auth, People(store, clock, auth, guesses), Rigs(store, clock, guesses),
-        Ingest(store, clock, int(settings.max_file_mb * 1e6)), Heads(store, shared(store, "receipts")), bucket,
-        Spool(settings.spool_dir, store, clock, bucket), Versions(store, clock), drawn,
-    )  # fmt: skip
+    return Context(settings, clock, opened(settings), bucket)
 
 
 def ready_bucket(settings: CentreSettings) -> Bucket:

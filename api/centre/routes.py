@@ -6,7 +6,6 @@ import asyncio
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
@@ -35,6 +34,7 @@ from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.store.centre_tables import CentreModel, CentreRecording, CentreRig
 from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
 from stimrig.api.web.responses.base import answers
+from stimrig.api.web.routes.operation import Figures
 
 operation = APIRouter(tags=["operation"])
 v1 = APIRouter(prefix="/v1", responses=PROBLEM)
@@ -58,39 +58,32 @@ def health(context: Ctx) -> dict[str, Any]:
 @operation.get("/metrics", response_class=PlainTextResponse)
 def metrics(context: Ctx) -> Response:
     """Figures in Prometheus' text format."""
-    return Response(generate_latest(_Figures(context)), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    return Response(generate_latest(Figures(lambda: figures(context))), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
-@dataclass
-class _Figures:
-    """The centre's figures, read when they are asked for."""
-
-    context: Context
-
-    def collect(self) -> Iterator[Metric]:
-        """One family after the other."""
-        context = self.context
-        rigs = [row for row in context.rigs.all() if row.revoked_utc is None]
-        now_s = context.clock.unix_s()
-        unseen = GaugeMetricFamily("stimrig_centre_rig_unseen_seconds", "Since the rig was seen", labels=["rig"])
-        waiting = GaugeMetricFamily("stimrig_centre_rig_waiting_files", "Files that wait there", labels=["rig"])
-        for row in rigs:
-            unseen.add_metric([row.name], now_s - unix_of(row.seen_utc) if row.seen_utc else -1.0)
-            waiting.add_metric([row.name], row.waiting_files or 0)
-        yield from (unseen, waiting)
-        for name, words, value in (
-            ("stimrig_centre_up_seconds", "Time since start", time.monotonic() - context.started_s),
-            ("stimrig_centre_rigs", "Rigs that have a key", len(rigs)),
-            ("stimrig_centre_recordings", "Recordings that rigs told of", sum(row.recordings for row in rigs)),
-            ("stimrig_centre_warnings", "Warnings that nobody has acknowledged", warnings.open_count(context.store)),
-            ("stimrig_centre_bucket_ok", "1 where the bucket can be used", float(context.bucket.trouble is None)),
-            (
-                "stimrig_centre_free_disk_bytes",
-                "Free where files come in",
-                shutil.disk_usage(context.settings.data_dir).free,
-            ),
-        ):
-            yield GaugeMetricFamily(name, words, value)
+def figures(context: Context) -> Iterator[Metric]:
+    """The centre's figures, one family after the other."""
+    rigs = [row for row in context.rigs.all() if row.revoked_utc is None]
+    now_s = context.clock.unix_s()
+    unseen = GaugeMetricFamily("stimrig_centre_rig_unseen_seconds", "Since the rig was seen", labels=["rig"])
+    waiting = GaugeMetricFamily("stimrig_centre_rig_waiting_files", "Files that wait there", labels=["rig"])
+    for row in rigs:
+        unseen.add_metric([row.name], now_s - unix_of(row.seen_utc) if row.seen_utc else -1.0)
+        waiting.add_metric([row.name], row.waiting_files or 0)
+    yield from (unseen, waiting)
+    for name, words, value in (
+        ("stimrig_centre_up_seconds", "Time since start", time.monotonic() - context.started_s),
+        ("stimrig_centre_rigs", "Rigs that have a key", len(rigs)),
+        ("stimrig_centre_recordings", "Recordings that rigs told of", sum(row.recordings for row in rigs)),
+        ("stimrig_centre_warnings", "Warnings that nobody has acknowledged", warnings.open_count(context.store)),
+        ("stimrig_centre_bucket_ok", "1 where the bucket can be used", float(context.bucket.trouble is None)),
+        (
+            "stimrig_centre_free_disk_bytes",
+            "Free where files come in",
+            shutil.disk_usage(context.settings.data_dir).free,
+        ),
+    ):
+        yield GaugeMetricFamily(name, words, value)
 
 
 @v1.get("/participants", tags=["participants"], **answers(ParticipantsOut))

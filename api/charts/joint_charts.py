@@ -16,7 +16,7 @@ from stimrig.api.charts.figure import axis, filled, line, role
 from stimrig.api.language import _
 
 STILL_RAD_S, FAST_RAD_S = 0.15, 0.7
-"""The ways to move, as the coverage of the guided tests divides them (`api.sessions.coverage`)."""
+"""The ways to move, as the coverage of the guided tests divides them (`api.sessions.joint_plan`)."""
 NEAR_RAD = math.radians(3) + 1e-9
 """An angle counts as seen if the joint was this near to it: the table is finer than any movement."""
 

@@ -36,7 +36,7 @@ SENTENCES = (
 )  # fmt: skip
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {
-    "app.py", "openapi.py", "dependencies.py", "server.py", "static.py", "schemas.py", "own_file.py",
+    "app.py", "openapi.py", "dependencies.py", "server.py", "static.py", "operation.py", "own_file.py",
     "confinement.py", "child.py", "_can.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""

@@ -6,30 +6,17 @@ import asyncio
 import logging
 import math
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.sessions import coverage, joint_plan, profiles
-from stimrig.api.sessions.coverage import Coverage
-from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Layout
+from stimrig.api.sessions import joint_plan, profiles
+from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Coverage, Layout
 from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, SERVICE, Planned, Watched, Watcher, begun
 from stimrig.api.sessions.requests import AngleIn, TestIn
-from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Test
-from stimrig.rig.messages import (
-    SAFE_END_S,
-    AdaptivePlan,
-    AnglePlan,
-    EnoughRequest,
-    FinishedEvent,
-    LiveEvent,
-    PreviewRequest,
-    SegmentPlan,
-    TestPlan,
-)
+from stimrig.rig import messages
 
 SAME_ANGLE_RAD = math.radians(2.5)
 """A held test was at an angle that is listed where it is as near as this: half of the steps of the list."""
@@ -47,7 +34,7 @@ class JointTests(Watched):
 
     # ---- before ----------------------------------------------------------------------------------------------
 
-    async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:
+    async def planned(self, body: TestIn, plan: messages.TestPlan, preview_s: float) -> Planned:
         """The plan of a guided test.
 
         Raises
@@ -59,7 +46,7 @@ class JointTests(Watched):
         range_rad = self.range_of(plan)
         asked, longest_s = body.angle or AngleIn(), body.max_duration_s
         shared = await self._layout(plan, range_rad, longest_s, preview_s)
-        angle = AnglePlan(range_rad=range_rad, tolerance_rad=asked.tolerance_rad)
+        angle = messages.AnglePlan(range_rad=range_rad, tolerance_rad=asked.tolerance_rad)
         told = {
             "kind": plan.kind, "doses": shared.doses, "known": shared.known, "longest_s": None, "target_rad": None,
             "tolerance_rad": asked.tolerance_rad,
@@ -71,33 +58,33 @@ class JointTests(Watched):
         else:
             angle.still_s = joint_plan.STILL_S[plan.kind] if asked.still_s is None else asked.still_s
             bounds = self._bounds(body, plan, shared)
-            quiet_s = bounds.max_duration_s - SAFE_END_S
+            quiet_s = bounds.max_duration_s - messages.SAFE_END_S
             segments = shared.moving if plan.kind == MOVING else joint_plan.passive(quiet_s, plan.pulse_rate_hz)
             told["longest_s"] = bounds.max_duration_s
-        chosen = [SegmentPlan(**segment) for segment in segments]
+        chosen = [messages.SegmentPlan(**segment) for segment in segments]
         plan = plan.model_copy(update={"segments": chosen, "angle": angle, "adaptive": bounds})
         return Planned(plan, {"joint": told})
 
     async def _layout(
-        self, plan: TestPlan, range_rad: tuple[float, float], longest_s: float | None, preview_s: float
+        self, plan: messages.TestPlan, range_rad: tuple[float, float], longest_s: float | None, preview_s: float
     ) -> Layout:
         """What the three tests are, as long as the paper's torque-time allows."""
         paper = plan.model_copy(update={"kind": "pre-session", "segments": None})
-        preview = await self.rig.ask(PreviewRequest(plan=paper, recruitment=None), timeout_s=preview_s)
+        preview = await self.rig.ask(messages.PreviewRequest(plan=paper, recruitment=None), timeout_s=preview_s)
         table = await asyncio.to_thread(self.versions.recruitment, plan.participant)
         curve = joint_plan.curve_of(table, plan.largest_us, plan.profile.motor_pulse_width_us)
-        moving_s = (joint_plan.MOVING_S if longest_s is None else longest_s) - SAFE_END_S
+        moving_s = (joint_plan.MOVING_S if longest_s is None else longest_s) - messages.SAFE_END_S
         return joint_plan.layout(
             range_rad, curve, plan.largest_us, preview["pulse_width_us"], plan.pulse_rate_hz, moving_s
         )
 
-    def _bounds(self, body: TestIn, plan: TestPlan, shared: Layout) -> AdaptivePlan:
+    def _bounds(self, body: TestIn, plan: messages.TestPlan, shared: Layout) -> messages.AdaptivePlan:
         longest_s = {PASSIVE: joint_plan.PASSIVE_S, MOVING: joint_plan.MOVING_S}[plan.kind]
         expected = shared.doses["paper"] if shared.known else AT_STOPPING_TORQUE_S * plan.stopping_torque_nm
         most = body.max_torque_time_nm_s or expected
-        return AdaptivePlan(max_duration_s=body.max_duration_s or longest_s, max_torque_time_nms=most)
+        return messages.AdaptivePlan(max_duration_s=body.max_duration_s or longest_s, max_torque_time_nms=most)
 
-    def _target(self, plan: TestPlan, asked: AngleIn, shared: Layout) -> float:
+    def _target(self, plan: messages.TestPlan, asked: AngleIn, shared: Layout) -> float:
         """The angle to hold: the one that is asked for, or the next that is open."""
         range_rad = plan.profile.angle_range_rad
         assert range_rad is not None
@@ -125,17 +112,17 @@ class JointTests(Watched):
         plan = planned.plan
         if plan.adaptive is None or plan.angle is None:
             return ""
-        cells = coverage.grid(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
+        cells = joint_plan.coverage_grid(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
         self.watch(JointWatcher(plan, Seen(Coverage(cells)), self.rig, self.clock, self.tell_now))
         return secrets.token_urlsafe(24)
 
-    def end_of(self, row: Test, event: FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
+    def end_of(self, row: Test, event: messages.FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
         """A held test has no other end than its outcome; a moving one's levels are as many as its share allows."""
         if row.kind == HELD:
             return event.outcome
         return "torque-time" if row.kind == MOVING and rigs == "plan" else ""
 
-    def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
+    def outcome(self, row: Test, event: messages.FinishedEvent) -> dict[str, Any]:
         """As `Kind`."""
         return {"joint": {**super().outcome(row, event)["joint"], "angle_rad": None, "velocity_rad_s": None}}
 
@@ -171,7 +158,7 @@ class JointTests(Watched):
         )  # fmt: skip
         return self.versions.store.all(Test, *conditions, order=Test.requested_utc.desc())
 
-    async def overview(self, plan: TestPlan, preview_s: float) -> dict[str, Any]:
+    async def overview(self, plan: messages.TestPlan, preview_s: float) -> dict[str, Any]:
         """What is open of today's guided tests, and what they cost beside the paper's test.
 
         Parameters
@@ -222,8 +209,8 @@ class JointWatcher(Watcher):
     told: Seen
     log = logging.getLogger("stimrig.joint")
 
-    def __init__(self, plan: TestPlan, told: Seen, rig: RigClient, clock: Clock, tell: Callable[[], None]) -> None:
-        super().__init__(plan, told, rig, clock, tell)
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
         self._since_s: float | None = None
         self._told_s = -TELL_S
 
@@ -235,7 +222,7 @@ class JointWatcher(Watcher):
         """As `Watcher`."""
         return {**vars(self.told), "coverage": self.told.coverage.document()}
 
-    def hear(self, event: LiveEvent) -> None:
+    def hear(self, event: messages.LiveEvent) -> None:
         """As `Watcher`; where the samples are enough, have the rig end the test well."""
         told = self.told
         told.torque_time_nm_s = event.torque_time_nms
@@ -269,7 +256,7 @@ class JointWatcher(Watcher):
 
     async def _say_enough(self) -> None:
         try:
-            await self.rig.ask(EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
+            await self.rig.ask(messages.EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
         except ApiError as error:  # it has ended by itself, or a person was quicker
             if error.code != "rig-late":
                 self.told.state, self.told.ended = "watching", ""

@@ -89,6 +89,10 @@ class Questions:
         self._all[number] = question
         return f"/participants/{question.participant}/confirm/{number}"
 
+    async def ask_if_doubtful(self, question: Question, who: Principal) -> str:
+        """Do it where nothing deserves a second look, else ask; the address that it leads to."""
+        return self.ask(question, who) if question.warnings else await question.action()
+
     def _forget(self, new: Question) -> None:
         old = [name for name, known in self._all.items() if not (new.asked_s - known.asked_s <= REMEMBERED_S)]
         mine = [name for name, known in self._all.items() if known.asker == new.asker]

@@ -16,21 +16,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, from_rig
-from stimrig.rig.messages import (
-    LONGEST_LINE,
-    Event,
-    FinishedEvent,
-    LiveEvent,
-    PreviewRequest,
-    Reply,
-    StateEvent,
-    Status,
-    StatusRequest,
-    StopRequest,
-    SubscribeRequest,
-    WithdrawRequest,
-    stop_socket,
-)
+from stimrig.rig import messages
 
 log = logging.getLogger("stimrig.rig_client")
 
@@ -39,9 +25,12 @@ RECONNECT_S = 0.25
 STATUS_EVERY_S = 1.0
 MOST_LATCHES = 100
 
+APART = (messages.StopRequest, messages.WithdrawRequest, messages.PreviewRequest)
+"""Asked on connections of their own: the first two wait behind no start, and a preview is long, both ways, while the
+lasting connection carries a test's live signals."""
 M = TypeVar("M", bound=BaseModel)
-AnyEvent = StateEvent | LiveEvent | FinishedEvent
-_events: TypeAdapter[AnyEvent] = TypeAdapter(Event)
+AnyEvent = messages.StateEvent | messages.LiveEvent | messages.FinishedEvent
+_events: TypeAdapter[AnyEvent] = TypeAdapter(messages.Event)
 
 
 class RigClient:
@@ -60,14 +49,14 @@ class RigClient:
         self.patience_s = 5.0
         self.latches: dict[str, dict[str, Any]] = {}
         """Why the rig was stopped, by the version that a re-arm names; as entries of the audit trail are told."""
-        self._status: Status | None = None
+        self._status: messages.Status | None = None
         self.connected = False
         self.listeners: list[Callable[[AnyEvent], None]] = []
         self.link_listeners: list[Callable[[bool], None]] = []
-        self.poll_listeners: list[Callable[[Status], None]] = []
+        self.poll_listeners: list[Callable[[messages.Status], None]] = []
         self._heard_s: float | None = None
         self._numbers = itertools.count(1)
-        self._waiting: dict[int, tuple[Any, asyncio.Future[Reply]]] = {}
+        self._waiting: dict[int, tuple[Any, asyncio.Future[messages.Reply]]] = {}
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -77,12 +66,12 @@ class RigClient:
         return self._status is None or bool(self._status.latch)
 
     @property
-    def status(self) -> Status | None:
+    def status(self) -> messages.Status | None:
         """The newest state."""
         return self._status
 
     @status.setter
-    def status(self, status: Status) -> None:
+    def status(self, status: messages.Status) -> None:
         self._status = status
         if status.latch not in self.latches:
             while len(self.latches) >= MOST_LATCHES:
@@ -107,7 +96,7 @@ class RigClient:
         """Seconds since the rig last spoke; None: never."""
         return None if self._heard_s is None else self.clock.monotonic_s() - self._heard_s
 
-    async def request(self, message: Any, timeout_s: float | None = None) -> Reply:
+    async def request(self, message: Any, timeout_s: float | None = None) -> messages.Reply:
         """Ask the rig; its answer, whatever it is.
 
         Raises
@@ -116,12 +105,10 @@ class RigClient:
             503: no rig, or it does not answer in time. 422: longer than the rig hears out.
         """
         timeout_s = self.patience_s if timeout_s is None else timeout_s
-        if isinstance(message, StopRequest | WithdrawRequest) or self._writer is None:  # neither waits behind a start
-            return await self._request_apart(message, timeout_s)
-        if isinstance(message, PreviewRequest):  # long, both ways: the lasting connection carries a test's live signals
+        if self._writer is None or isinstance(message, APART):
             return await self._request_apart(message, timeout_s)
         message = message.model_copy(update={"id": next(self._numbers)})
-        future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        future: asyncio.Future[messages.Reply] = asyncio.get_running_loop().create_future()
         self._waiting[message.id] = message, future
         try:
             self._writer.write(line_of(message))
@@ -150,23 +137,23 @@ class RigClient:
         except ValidationError as error:
             raise no_rig("It closed the connection, or sent something that is no answer.") from error
 
-    async def fresh_status(self) -> Status:
+    async def fresh_status(self) -> messages.Status:
         """Ask for the state now; the newest that was told, which may have come behind the answer."""
-        answer = await self.ask_for(Status, StatusRequest())
+        answer = await self.ask_for(messages.Status, messages.StatusRequest())
         return self.status or answer
 
-    async def _request_apart(self, message: Any, timeout_s: float) -> Reply:
+    async def _request_apart(self, message: Any, timeout_s: float) -> messages.Reply:
         """Ask on a connection of its own; a stop at the rig's own door for stops, which nothing else can fill."""
         if self.path is None:
             raise no_rig("This service was started without one.")
         request = line_of(message)
         try:
             async with asyncio.timeout(timeout_s):
-                reader, writer = await _opened(self.path, isinstance(message, StopRequest))
+                reader, writer = await _opened(self.path, isinstance(message, messages.StopRequest))
                 try:
                     writer.write(request)
                     line = await reader.readline()
-                    reply = Reply.model_validate_json(line)
+                    reply = messages.Reply.model_validate_json(line)
                     self._take_state(message, reply)
                     return reply
                 finally:
@@ -203,7 +190,7 @@ class RigClient:
 
     async def _listen(self, reader: asyncio.StreamReader) -> None:
         assert self._writer is not None
-        subscription = SubscribeRequest(id=next(self._numbers))
+        subscription = messages.SubscribeRequest(id=next(self._numbers))
         self._writer.write(subscription.model_dump_json().encode() + b"\n")
         poll = asyncio.create_task(self._poll(), name="rig poll")
         try:
@@ -221,7 +208,7 @@ class RigClient:
             try:
                 status = await self.fresh_status()
                 if status.state != before:  # a change that no event told
-                    tell_all(self.listeners, StateEvent(status=status))
+                    tell_all(self.listeners, messages.StateEvent(status=status))
                 tell_all(self.poll_listeners, status)
             except ApiError:
                 continue  # its age tells
@@ -231,13 +218,13 @@ class RigClient:
     def _take(self, message: dict[str, Any], subscription_id: int) -> None:
         if "event" in message:
             event = _events.validate_python(message)
-            if isinstance(event, StateEvent):
+            if isinstance(event, messages.StateEvent):
                 self.status = event.status
             tell_all(self.listeners, event)
             return
-        reply = Reply.model_validate(message)
+        reply = messages.Reply.model_validate(message)
         if reply.id == subscription_id and reply.ok:
-            self.status = Status.model_validate(reply.body)
+            self.status = messages.Status.model_validate(reply.body)
             self.connected = True
             tell_all(self.link_listeners, self.connected)
         asked, future = self._waiting.get(reply.id, (None, None))
@@ -245,18 +232,18 @@ class RigClient:
         if future is not None and not future.done():
             future.set_result(reply)
 
-    def _take_state(self, asked: Any, reply: Reply) -> None:
+    def _take_state(self, asked: Any, reply: messages.Reply) -> None:
         """Keep a state as it is read: who asked for it may come to it after a later one."""
-        if isinstance(asked, StatusRequest) and reply.ok:
+        if isinstance(asked, messages.StatusRequest) and reply.ok:
             with contextlib.suppress(ValidationError):  # `ask_for` says it
-                self.status = Status.model_validate(reply.body)
+                self.status = messages.Status.model_validate(reply.body)
 
 
 async def _opened(path: Path, stops: bool) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     """A connection to the rig; for a stop at the door for stops, or at the other where that one does not open."""
     if stops:
         with contextlib.suppress(OSError):
-            return await asyncio.open_unix_connection(str(stop_socket(path)), limit=LINE_LIMIT)
+            return await asyncio.open_unix_connection(str(messages.stop_socket(path)), limit=LINE_LIMIT)
     return await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
 
 
@@ -272,8 +259,10 @@ def tell_all(listeners: list[Callable[[Any], None]], news: Any) -> None:
 def line_of(message: Any) -> bytes:
     """A request as a line. Raises ApiError (422) where the rig would not hear it out."""
     line = message.model_dump_json().encode() + b"\n"
-    if len(line) > LONGEST_LINE:
-        detail = f"The plan has {len(line)} bytes; the rig takes at most {LONGEST_LINE}. Make the test shorter."
+    if len(line) > messages.LONGEST_LINE:
+        detail = (
+            f"The plan has {len(line)} bytes; the rig takes at most {messages.LONGEST_LINE}. Make the test shorter."
+        )
         raise ApiError(422, "too-long", "The plan is too long", detail)
     return line
 
@@ -284,7 +273,7 @@ def no_rig(detail: str) -> ApiError:
     return ApiError(503, "rig-unreachable", "The rig cannot be reached", f"{words}. Is its process running?")
 
 
-async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[LiveEvent, None]:
+async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[messages.LiveEvent, None]:
     """The live events of a test with all samples, until it has ended.
 
     Raises
@@ -297,12 +286,12 @@ async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[LiveEven
     except OSError as error:
         raise no_rig(str(error)) from error
     try:
-        writer.write(SubscribeRequest(samples=True).model_dump_json().encode() + b"\n")
+        writer.write(messages.SubscribeRequest(samples=True).model_dump_json().encode() + b"\n")
         async for event in _live_events(reader):
             if event.get("test_id") == test_id:
                 if event["event"] == "finished":
                     return
-                yield LiveEvent.model_validate(event)
+                yield messages.LiveEvent.model_validate(event)
         raise no_rig("It closed the connection.")
     except (OSError, ValueError) as error:
         raise no_rig(str(error)) from error

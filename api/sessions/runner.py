@@ -23,30 +23,16 @@ from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned, Tasks
 from stimrig.api.sessions.lifecycle import Follower, Lifecycle
-from stimrig.api.sessions.limits import limits_of
 from stimrig.api.sessions.live import Hub
 from stimrig.api.sessions.playing import Current, Playing, busy, other_than, refuse_archived, rests_of, right_ended
-from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.tables import Participant, Test, Token
 from stimrig.api.workers.pool import Adviser, Pool
-from stimrig.rig.messages import (
-    EnoughRequest,
-    Extended,
-    FinishedEvent,
-    LiveEvent,
-    PreviewRequest,
-    RecruitmentTable,
-    SegmentPlan,
-    StartRequest,
-    Status,
-    StopEvidence,
-    StopRequest,
-    TestPlan,
-)
+from stimrig.rig import messages
 
 log = logging.getLogger("stimrig.trials")
 NOT_CONFIRMED = "The stop is not confirmed"
@@ -181,7 +167,7 @@ class Runner(Playing):
                     raise right_ended()
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.kinds[plan.kind].begin(planned)
-                await self.rig.ask(StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
+                await self.rig.ask(messages.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self.stop_quietly(f"start of {plan.test_id} was not answered")
@@ -209,8 +195,8 @@ class Runner(Playing):
     async def _planned(self, body: TestIn, participant: Participant) -> Planned:
         segments = None
         if body.segments is not None:
-            segments = [SegmentPlan(**segment.model_dump()) for segment in body.segments]
-        plan = TestPlan(
+            segments = [messages.SegmentPlan(**segment.model_dump()) for segment in body.segments]
+        plan = messages.TestPlan(
             test_id=self._new_id(),
             participant=participant.code,
             kind=body.kind,
@@ -225,7 +211,7 @@ class Runner(Playing):
         """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""
         body = TestIn(participant=participant.code)
         limits = limits_of(body, participant.profile)
-        plan = TestPlan(test_id=self._new_id(), participant=participant.code, **limits)
+        plan = messages.TestPlan(test_id=self._new_id(), participant=participant.code, **limits)
         return await self.joint.overview(plan, PREVIEW_S)
 
     def _check_joins(self, body: TestIn) -> None:
@@ -271,16 +257,16 @@ class Runner(Playing):
         planned = await self._planned(body, await self._participant(body))
         return {**await self._previewed(planned.plan), **planned.kept}
 
-    async def _previewed(self, plan: TestPlan) -> dict[str, Any]:
+    async def _previewed(self, plan: messages.TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)
-        return await self.rig.ask(PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
+        return await self.rig.ask(messages.PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
 
-    def _recruitment(self, participant: str) -> RecruitmentTable | None:
+    def _recruitment(self, participant: str) -> messages.RecruitmentTable | None:
         """The approved model's recruitment curve, to estimate the torque-time of a plan with."""
         curve = self.versions.recruitment(participant)
-        return None if curve is None else RecruitmentTable(**curve)
+        return None if curve is None else messages.RecruitmentTable(**curve)
 
-    async def stop(self, reason: str, by: str) -> StopEvidence:
+    async def stop(self, reason: str, by: str) -> messages.StopEvidence:
         """Stop the rig; the audit entry comes after, so that nothing delays the command.
 
         Raises
@@ -291,8 +277,8 @@ class Runner(Playing):
         self._halted_s = self.clock.monotonic_s()
         subject = self.current.test_id if self.current else "rig"
         try:
-            request = StopRequest(reason=reason or "stop pressed", by=by)
-            evidence = await self.rig.ask_for(StopEvidence, request, timeout_s=8.0)
+            request = messages.StopRequest(reason=reason or "stop pressed", by=by)
+            evidence = await self.rig.ask_for(messages.StopEvidence, request, timeout_s=8.0)
         except ApiError as error:
             await self._note(by, "stop failed", subject, detail=error.detail)
             error.title, error.detail = NOT_CONFIRMED, f"{EMERGENCY} {error.title}: {error.detail}"
@@ -303,7 +289,7 @@ class Runner(Playing):
             raise ApiError(503, "stop-not-confirmed", NOT_CONFIRMED, detail, evidence=evidence.model_dump())
         return evidence
 
-    async def enough(self, row: Test, by: str) -> Extended:
+    async def enough(self, row: Test, by: str) -> messages.Extended:
         """End a running test that may be ended early well: enough is known, was seen, or was borne.
 
         Raises
@@ -311,7 +297,7 @@ class Runner(Playing):
         ApiError
             409: it does not run, or is ending; 422: it has a fixed plan.
         """
-        found = await self.rig.ask_for(Extended, EnoughRequest(test_id=row.id, by=by, at_once=True))
+        found = await self.rig.ask_for(messages.Extended, messages.EnoughRequest(test_id=row.id, by=by, at_once=True))
         self.kinds[row.kind].said_enough(row.id)
         return found
 
@@ -331,11 +317,11 @@ class Runner(Playing):
     # ---- what the rig says ----------------------------------------------------------------------------------
 
     def _on_event(self, event: AnyEvent) -> None:
-        if isinstance(event, LiveEvent):
+        if isinstance(event, messages.LiveEvent):
             if self.current is None and event.test_id not in (None, self.hub.test_id):
                 self.hub.begin(event.test_id)  # another service began it
             self.hub.live(event)
-        elif isinstance(event, FinishedEvent):
+        elif isinstance(event, messages.FinishedEvent):
             self._follow(event.test_id, self._finish(event))
         else:
             if event.status.state in HALTED:
@@ -351,7 +337,7 @@ class Runner(Playing):
             current.ending = True
             self._follow(current.test_id, self._recover(current.test_id, "the rig's process ended during the test"))
 
-    def _on_poll(self, status: Status) -> None:
+    def _on_poll(self, status: messages.Status) -> None:
         """A test whose end was lost on the way must not hold the rig for ever."""
         current = self.current
         if current is None or not current.started or current.ending:
@@ -383,7 +369,7 @@ class Runner(Playing):
             self._release(test_id)
             self.announce(test_id)
 
-    async def _finish(self, event: FinishedEvent) -> None:
+    async def _finish(self, event: messages.FinishedEvent) -> None:
         """Take over a finished test: store the recording, identify, store the model."""
         if self.current is not None and self.current.test_id == event.test_id:
             self.current.ending = True

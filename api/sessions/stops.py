@@ -1,4 +1,8 @@
-"""TODO."""
+"""The stop: who may press it from a page, and what presses did, kept for the pages that tell it.
+
+A page that shows the button carries a signed value in its form. It allows a stop and nothing else, and asks neither the
+database nor a session: it outlives sign-out, the session's end, a new password and a revoked token.
+"""
 
 from __future__ import annotations
 

@@ -104,6 +104,7 @@ def _lifespan(context: Any):
 
 
 def routers(*packages: ModuleType) -> list[APIRouter]:
-    """The routers of all files in these packages that have one, by name."""
+    """The routers of all files in these packages: a new file is a new subject."""
     names = [f"{one.__name__}.{info.name}" for one in packages for info in sorted(pkgutil.iter_modules(one.__path__))]
-    return [module.router for name in names if hasattr(module := importlib.import_module(name), "router")]
+    found = [value for name in names for value in vars(importlib.import_module(name)).values()]
+    return [value for value in found if isinstance(value, APIRouter)]

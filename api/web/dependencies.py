@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import shutil
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Concatenate, ParamSpec, TypeVar
 
 from fastapi import Depends, Request, Security
 from sqlalchemy.exc import SQLAlchemyError
@@ -34,46 +35,115 @@ from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.stops import StopLog, StopRights
 from stimrig.api.sessions.trials import Trials
-from stimrig.api.settings import Settings
+from stimrig.api.settings import ServerSettings, Settings
 from stimrig.api.store import Store, holds, uploads
-from stimrig.api.store.holds import Holds, ServiceLock
+from stimrig.api.store.holds import LIMITS_TURN, ServiceLock
 from stimrig.api.store.tables import Model, Recording
-from stimrig.api.web.guards import anyone_even_locked, anyone_signed_in, require
+from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, require
 from stimrig.api.web.openapi import problem
-from stimrig.api.web.stop_guard import Press, anyone_who_may_stop
 from stimrig.api.workers.jobs import Jobs
 from stimrig.api.workers.pool import WORKER, Adviser, Pool
 from stimrig.api.workers.process import Places
 
 log = logging.getLogger("stimrig.api")
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
-@dataclass
-class Context:
-    """Everything a route may need."""
+class Parts:
+    """What a rig's service and a centre both have: a database, people who sign in, work that nobody asks for.
 
-    settings: Settings
-    clock: Clock
-    store: Store
-    auth: Auth
-    people: People
-    stop_rights: StopRights
-    rig: RigClient
-    pool: Pool
-    versions: Versions
-    tracked: TrackedVersions
-    runner: Runner
-    analyses: Analyses
-    trend: Trend
-    jobs: Jobs
-    lock: ServiceLock
-    questions: Questions
-    notes: Notes
-    holds: Holds
-    drawn_token: str | None = None
-    stops: StopLog = field(default_factory=StopLog)
-    started_s: float = field(default_factory=time.monotonic)
-    flushing: asyncio.Task[None] | None = None
+    Parameters
+    ----------
+    settings : ServerSettings
+        Session hours, idle lock, first administrator.
+    store : Store
+        Opened.
+    """
+
+    forgiven: ClassVar[tuple[type[Exception], ...]] = (SQLAlchemyError, OSError)
+    """What may go wrong in regular work: the next time has it all."""
+
+    def __init__(self, settings: ServerSettings, clock: Clock, store: Store) -> None:
+        self.clock, self.store, self.started_s = clock, store, time.monotonic()
+        guesses = self.guesses = Guesses(clock)
+        idle = IdleLock(store, clock, settings.idle_lock_min)
+        self.auth = Auth(store, clock, guesses, idle, settings.session_hours)
+        self.drawn_token = self.auth.first_administrator(
+            settings.admin_token.get_secret_value() if settings.admin_token else None
+        )
+        self.people = People(store, clock, self.auth, guesses)
+        self.versions = Versions(store, clock)
+        self._tasks: list[asyncio.Task[None]] = []
+
+    def regular(self) -> list[tuple[float, Callable[[], object]]]:
+        """What is done again and again, each with its seconds."""
+        return [(FLUSH_S, self.auth.idle.flush)]
+
+    async def open(self) -> None:
+        """Begin with it."""
+        self._tasks = [asyncio.create_task(self._again(every_s, work)) for every_s, work in self.regular()]
+
+    async def _again(self, every_s: float, work: Callable[[], object]) -> None:
+        while True:
+            await asyncio.sleep(every_s)
+            try:
+                await asyncio.to_thread(work)
+            except self.forgiven:
+                log.exception("what is done again and again could not be done")
+
+    async def close(self) -> None:
+        """Let everything go."""
+        for task in self._tasks:
+            task.cancel()
+        with contextlib.suppress(SQLAlchemyError):
+            await asyncio.to_thread(self.auth.idle.flush)
+        self.people.close()
+        self.auth.close()
+        self.store.close()
+
+
+class Context(Parts):
+    """Everything a route of the service may need.
+
+    Parameters
+    ----------
+    worker : tuple of str
+        How to start a worker process.
+    lock : ServiceLock
+        Held; let go at the end.
+    """
+
+    def __init__(self, settings: Settings, clock: Clock, worker: tuple[str, ...], lock: ServiceLock) -> None:
+        make_folders(settings)
+        if settings.time_zone:
+            set_zone(settings.time_zone)
+        store = Store(settings.database)
+        if settings.centre_url is not None:
+            Feed(store, clock)  # hears of all that is written from here on
+        super().__init__(settings, clock, store)
+        self.settings, self.lock = settings, lock
+        rig = self.rig = RigClient(settings.rig_socket, clock)
+        pool = self.pool = Pool(settings.workers, worker, places(settings, store))
+        self.analyses = Analyses(store, clock, pool, self.versions, settings)
+        self.tracked = TrackedVersions(store, clock, self.versions)
+        self.holds = holds.of(store)
+        adviser, tracker = (Adviser(worker, places(settings, store)) for _ in range(2))  # a folder that the pool learns
+        trials = Trials(rig, store, clock, self.tracked, tracker)  # ends no test
+        self.runner = Runner(
+            store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
+            Follower(store, self.holds, settings.rig),
+        )  # fmt: skip
+        self.trend, self.jobs = Trend(store, clock, pool), Jobs(pool)
+        self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
+        stop_key = holds.shared_secret(store, "stop-right", settings.data_dir / "stop-right.key")
+        self.stop_rights = StopRights(stop_key, clock)
+
+    def regular(self) -> list[tuple[float, Callable[[], object]]]:
+        """As `Parts`; the audit trail's head is noted hourly, where there is a file for it."""
+        heads_file = self.settings.heads_file
+        heads = [] if heads_file is None else [(FLUSH_S, lambda: note_hourly(self.store, self.clock, heads_file))]
+        return [*super().regular(), *heads]
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open."""
@@ -85,32 +155,14 @@ class Context:
                 break
             await asyncio.sleep(0.05)
         await self.runner.resume()
-        self.flushing = asyncio.create_task(self._flush())
-
-    async def _flush(self) -> None:
-        while True:
-            await asyncio.sleep(FLUSH_S)
-            try:
-                await asyncio.to_thread(self.auth.idle.flush)
-                if self.settings.heads_file is not None:
-                    await asyncio.to_thread(note_hourly, self.store, self.clock, self.settings.heads_file)
-            except (SQLAlchemyError, OSError):  # the next time has it all
-                log.exception("people's last actions, or the audit trail's head, could not be written down")
+        await super().open()
 
     async def close(self) -> None:
         """Let everything go."""
-        if self.flushing is not None:
-            self.flushing.cancel()
-            with contextlib.suppress(SQLAlchemyError):
-                await asyncio.to_thread(self.auth.idle.flush)
-        await self.runner.close()
-        await self.jobs.close()
-        await self.pool.close()
-        await self.rig.close()
+        for part in (self.runner, self.jobs, self.pool, self.rig):
+            await part.close()
         self.holds.close()
-        self.people.close()
-        self.auth.close()
-        self.store.close()
+        await super().close()
         self.lock.release()
 
 
@@ -128,42 +180,10 @@ def build(
     """
     lock = lock or ServiceLock(settings)
     try:
-        return _build(settings, clock or Clock(), worker, lock)
+        return Context(settings, clock or Clock(), worker, lock)
     except BaseException:
         lock.release()
         raise
-
-
-def _build(settings: Settings, clock: Clock, worker: tuple[str, ...], lock: ServiceLock) -> Context:
-    make_folders(settings)
-    if settings.time_zone:
-        set_zone(settings.time_zone)
-    store = Store(settings.database)
-    if settings.centre_url is not None:
-        Feed(store, clock)
-    guesses = Guesses(clock)
-    idle = IdleLock(store, clock, settings.idle_lock_min)
-    auth = Auth(store, clock, guesses, idle, settings.session_hours)
-    configured = settings.admin_token.get_secret_value() if settings.admin_token else None
-    drawn = auth.first_administrator(configured)
-    rig = RigClient(settings.rig_socket, clock)
-    pool = Pool(settings.workers, worker, places(settings, store))
-    versions = Versions(store, clock)
-    analyses = Analyses(store, clock, pool, versions, settings)
-    adviser = Adviser(worker, places(settings, store))  # its own: a folder that the pool learns ends no test
-    tracked = TrackedVersions(store, clock, versions)
-    trials = Trials(rig, store, clock, tracked, Adviser(worker, places(settings, store)))
-    held = holds.of(store)
-    follower = Follower(store, held, settings.rig)
-    runner = Runner(store, clock, rig, pool, versions, analyses, adviser, trials, settings.recordings_dir, follower)
-    jobs = Jobs(pool)
-    people = People(store, clock, auth, guesses)
-    rights = StopRights(holds.shared_secret(store, "stop-right", settings.data_dir / "stop-right.key"), clock)
-    questions = Questions(clock)
-    return Context(
-        settings, clock, store, auth, people, rights, rig, pool, versions, tracked, runner, analyses,
-        Trend(store, clock, pool), jobs, lock, questions, Notes(store, clock), held, drawn
-    )  # fmt: skip
 
 
 def make_folders(settings: Settings) -> None:
@@ -180,6 +200,19 @@ def places(settings: Settings, store: Store) -> Places:
     reads = {settings.recordings_dir, *(Path(path).parent for path in store.all(Recording.path))}
     reads |= {settings.effects_dir} if settings.effects_dir else set()
     return Places(reads, [settings.exports_dir])
+
+
+def in_limits_turn(
+    change: Callable[Concatenate[Context, P], T],
+) -> Callable[Concatenate[Context, P], Coroutine[Any, Any, T]]:
+    """Do a change in a thread, in turn with all else that changes limits or lets something begin by them."""
+
+    @functools.wraps(change)
+    async def changed(context: Context, /, *given: P.args, **more: P.kwargs) -> T:
+        async with context.holds.turn(LIMITS_TURN):
+            return await asyncio.to_thread(change, context, *given, **more)
+
+    return changed
 
 
 def of(connection: HTTPConnection) -> Context:

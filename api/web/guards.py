@@ -11,22 +11,27 @@ import hmac
 import re
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 from fastapi import Request, Security
 from fastapi.responses import Response
-from fastapi.security import APIKeyCookie, HTTPBearer
+from fastapi.security import APIKeyCookie, APIKeyHeader, HTTPBearer
+from pydantic import ValidationError
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from stimrig.api import decisions
 from stimrig.api.clock import local_day
 from stimrig.api.decisions import MODEL_TAG, OF_RIG, Decision
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, not_answering
 from stimrig.api.models.places import kept, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.people.auth import Principal, Scope, outside
-from stimrig.api.sessions.controller_trials import unapproved
-from stimrig.api.sessions.requests import PARTICIPANT_CODE
+from stimrig.api.sessions.controllers import unapproved
+from stimrig.api.sessions.requests import PARTICIPANT_CODE, StopIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Model, Participant, Recording, Test
 from stimrig.api.web.middleware import PARSED, SAFE_METHODS, STOP, entity_tags, wants_html
@@ -268,3 +273,80 @@ def version_missing(document: str, decision: Decision) -> ApiError:
         "what you did. Nothing was done."
     )
     return ApiError(428, "seen-missing", "Say what this was decided on", detail)
+
+
+FIELD, HEADER = "right", "x-stop-right"
+PATIENCE_S, LONGEST_PATIENCE_S = 0.5, 3.0
+"""A stop waits so long for its body; and so long where nothing but a right in it would allow the stop."""
+DEFAULT_REASON = "stop pressed"
+RIGHT = APIKeyHeader(name="X-Stop-Right", scheme_name="right", auto_error=False, description="a page's right to stop")
+Right = Annotated[object, Security(RIGHT)]
+
+
+@dataclass(frozen=True)
+class Press:
+    """A stop that is allowed: who pressed it, and why; a controller's key is told of no other participant."""
+
+    by: str
+    reason: str
+    by_key: bool = False
+
+
+async def anyone_who_may_stop(request: Request, _token: Token, _session: Session, _right: Right) -> Press:
+    """A dependency for stop: who holds a page's right, or is signed in, be it that the session or token ran out.
+
+    The right is looked at first: it needs no database, and nothing that holds back guesses holds it back.
+    """
+    coming = asyncio.create_task(_stop_sent(request))
+    try:
+        reason, by = await _within(PATIENCE_S, request, coming)
+        if by is not None:
+            return Press(by, reason)
+        try:
+            return await _signed_in(request, reason)
+        except ApiError as error:
+            reason, by = await _within(LONGEST_PATIENCE_S - PATIENCE_S, request, coming)
+            if by is not None:
+                return Press(by, reason)
+            error.title = "Nothing was stopped"
+            error.detail = f"Use the emergency switch on the stimulator now, or sign in and press Stop. {error.detail}"
+            raise
+    finally:
+        coming.cancel()
+
+
+async def _signed_in(request: Request, reason: str) -> Press:
+    """Who is signed in; where the database does not say so at once, who was when it last did. Raises ApiError."""
+    auth = request.app.state.context.auth
+    try:
+        who = await auth.ask_within(request, PATIENCE_S, forgive_age=True, bound=True)
+        return Press(who.name, reason, who.participant is not None)
+    except (TimeoutError, SQLAlchemyError):
+        if (name := auth.seen(request)) is not None:
+            return Press(name, reason, by_key=True)  # whether a key asks is not known: then nobody else is named
+        raise not_answering() from None
+
+
+async def _within(patience_s: float, request: Request, coming: asyncio.Task[tuple[str, str]]) -> tuple[str, str | None]:
+    """The reason, and whose right to stop was sent, as far as they have come in this time."""
+    await asyncio.wait([coming], timeout=patience_s)
+    reason, in_form = coming.result() if coming.done() else (DEFAULT_REASON, "")
+    context, right = request.app.state.context, request.headers.get(HEADER) or in_form
+    current, status = context.runner.current, context.rig.status
+    running = {current.test_id if current else None, status.test_id if status else None}
+    by = context.stop_rights.holder(right, running)
+    if by is not None:
+        request.state.stop_right = right
+    return reason, by
+
+
+async def _stop_sent(request: Request) -> tuple[str, str]:
+    """The body's reason and right; whatever it holds, a stop is a stop."""
+    try:
+        if "form" in request.headers.get("content-type", ""):
+            form = await request.form()
+            return str(form.get("reason") or DEFAULT_REASON)[:200], str(form.get(FIELD) or "")
+        body = await request.body()
+        return StopIn.model_validate_json(body).reason if body.strip() else DEFAULT_REASON, ""
+    except (ValidationError, ValueError, ApiError, HTTPException, ClientDisconnect):
+        return DEFAULT_REASON, ""

@@ -22,7 +22,7 @@ from argon2 import PasswordHasher
 from sqlalchemy import text
 
 from stimrig.api.clock import Clock
-from stimrig.api.people import passwords
+from stimrig.api.people import accounts
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, database
 from stimrig.api.web.app import create_app
@@ -80,7 +80,7 @@ def stub_in_this_process() -> Iterator[None]:
 def quick_passwords() -> Iterator[None]:
     """A password check costs 0.1 s of a processor on purpose; `test_people` looks at the real parameters."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(passwords, "PasswordHasher", partial(PasswordHasher, time_cost=1, memory_cost=64, parallelism=1))
+        patch.setattr(accounts, "PasswordHasher", partial(PasswordHasher, time_cost=1, memory_cost=64, parallelism=1))
         yield
 
 

@@ -42,7 +42,7 @@ def made_up() -> Iterator[None]:
             made.add(message, one)
     names = ("words", "translated")
     modules = [importlib.import_module(f"stimrig.api.language.{name}") for name in names]
-    pages = [importlib.import_module(name) for name in ("stimrig.api.language", "stimrig.api.web.pages.choices")]
+    pages = [importlib.import_module(name) for name in ("stimrig.api.language", "stimrig.api.web.pages.rig_view")]
     with pytest.MonkeyPatch.context() as patch:
         for module in [*modules, *pages]:
             patch.setattr(module, "CODES", ("en", MADE_UP), raising=False)

@@ -11,7 +11,7 @@ import pytest
 from stimrig.api.charts import joint_charts
 from stimrig.api.charts.svg import svg
 from stimrig.api.language import using
-from stimrig.api.sessions import coverage
+from stimrig.api.sessions import joint_plan
 from tests.api import made_up_joint
 from tests.api.browser import open_tab
 from tests.api.conftest import Service, run_test, shared_service
@@ -115,7 +115,7 @@ def test_the_pointer_reads_value_and_band_in_the_pages_language() -> None:
 
 
 def test_ways_to_move_are_those_of_the_guided_tests() -> None:
-    assert (joint_charts.STILL_RAD_S, joint_charts.FAST_RAD_S) == (coverage.SLOW_RAD_S, coverage.FAST_RAD_S)
+    assert (joint_charts.STILL_RAD_S, joint_charts.FAST_RAD_S) == (joint_plan.SLOW_RAD_S, joint_plan.FAST_RAD_S)
 
 
 def test_figures_are_drawn_on_paper_with_every_name(figures: dict[str, Any]) -> None:

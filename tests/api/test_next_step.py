@@ -68,7 +68,7 @@ def test_each_state_has_one_step(so: dict[str, Any], kind: str, words: str, lead
 
 
 def test_the_table_names_every_kind_and_every_state_of_the_rig() -> None:
-    from stimrig.api.web.pages.rig_state import WORDS
+    from stimrig.api.web.pages.render import WORDS
 
     assert {kind for _, kind, _, _ in TABLE} == set(next_view.Kind.__args__)
     for state in WORDS:

@@ -13,8 +13,8 @@ import pytest
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.people.accounts import MOST_STRANGERS, Passwords
 from stimrig.api.people.pace import FORGOTTEN_S, FREE_FOR_A_NAME, FREE_TRIES, LONGEST_WAIT_S, Guesses, Pace, place_of
-from stimrig.api.people.passwords import MOST_STRANGERS, Passwords
 from tests.api.conftest import TOKEN, Service, SetClock, run_test
 from tests.api.test_people import PASSWORD, standing_still
 

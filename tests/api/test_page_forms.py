@@ -98,7 +98,9 @@ def test_no_field_is_forgotten() -> None:
     text = "".join(path.read_text("utf-8") for path in (folder / "templates").glob("*.html"))
     asked = set(re.findall(r'<(?:input|select|textarea)[^>]*\bname="(\w+)"', text))
     asked |= {
-        name for path in folder.glob("*.py") for name in re.findall(r"(\w+): Annotated\[.*Form\(", path.read_text())
+        name
+        for path in folder.glob("*.py")
+        for name in re.findall(r"(\w+): (?:Text|Annotated\[.*Form\()", path.read_text())
     }
     assert asked - {"model"} <= set(NAMES), asked - set(NAMES)
 

@@ -245,8 +245,8 @@ def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Servic
 
 
 def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stimrig.api.web.stop_guard.PATIENCE_S", 0.01)
-    monkeypatch.setattr("stimrig.api.web.stop_guard.LONGEST_PATIENCE_S", 60.0, raising=False)
+    monkeypatch.setattr("stimrig.api.web.guards.PATIENCE_S", 0.01)
+    monkeypatch.setattr("stimrig.api.web.guards.LONGEST_PATIENCE_S", 60.0, raising=False)
     right = service.app.state.context.stop_rights.give("Ada", None)
     with slow_form(service, f"right={right}", f"Cookie: {cookie_name(service)}=ended\r\n") as connection:
         connection.sendall(right[-1:].encode())
@@ -255,7 +255,7 @@ def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, mon
 
 
 def test_a_stop_that_is_allowed_anyway_waits_for_no_form(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stimrig.api.web.stop_guard.LONGEST_PATIENCE_S", 60.0)
+    monkeypatch.setattr("stimrig.api.web.guards.LONGEST_PATIENCE_S", 60.0)
     with slow_form(service, "reason=x", f"Authorization: Bearer {TOKEN}\r\n") as connection:
         assert connection.recv(12) == b"HTTP/1.1 200"
 

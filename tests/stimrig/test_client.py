@@ -10,7 +10,7 @@ import pytest
 from stimrig import Client, errors
 from stimrig.api.client.documents import Job, Participant, SessionTest, Version
 from stimrig.api.web.responses.models import JobOut, VersionOut
-from stimrig.api.web.responses.participants import ParticipantOut
+from stimrig.api.web.responses.people import ParticipantOut
 from stimrig.api.web.responses.rig import TestOut
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
 

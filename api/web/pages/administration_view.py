@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
 from stimrig.api.language import lazy
@@ -17,7 +17,8 @@ from stimrig.api.web.dependencies import Administrator, Context, Ctx
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.render import page
-from stimrig.api.web.routes import people, tokens
+from stimrig.api.web.pages.typed import Text
+from stimrig.api.web.routes import people
 
 router = APIRouter(include_in_schema=False, prefix="/administration")
 NEWEST = 60
@@ -48,7 +49,7 @@ async def shown(request: Request, context: Context, key: dict[str, Any] | None =
         entries = context.store.all(AuditEntry, order=AuditEntry.seq)
         return {
             "users": [{**user, "role": role_of(user["scopes"])} for user in context.people.documents()],
-            "tokens": [token for token in tokens.list_tokens(context, None) if token["origin"] == "issued"],  # pyright: ignore[reportArgumentType]
+            "tokens": [token for token in people.list_tokens(context, None) if token["origin"] == "issued"],  # pyright: ignore[reportArgumentType]
             "entries": entries[: -NEWEST - 1 : -1],
             "count": len(entries),
             "stands": receipts.of_folder(entries, context.settings.data_dir),
@@ -70,8 +71,8 @@ def role_of(scopes: list[str]) -> str:
 
 @router.post("/users")
 async def add_user(
-    context: Ctx, who: Administrator, name: Annotated[str, Form()] = "", role: Annotated[str, Form()] = "",
-    password: Annotated[str, Form()] = "",
+    context: Ctx, who: Administrator, name: Text = "", role: Text = "",
+    password: Text = "",
 ) -> Response:  # fmt: skip
     """A new person."""
     body = typed.checked(people.UserIn, name=name.strip(), password=password, scopes=ROLES.get(role, []))
@@ -80,7 +81,7 @@ async def add_user(
 
 
 @router.post("/users/{name}/password")
-async def set_password(context: Ctx, who: Administrator, name: str, password: Annotated[str, Form()] = "") -> Response:
+async def set_password(context: Ctx, who: Administrator, name: str, password: Text = "") -> Response:
     """A new password."""
     body = typed.checked(people.PasswordIn, password=password)
     return await people.with_new_password(context, who, name, body.password, back())
@@ -95,8 +96,8 @@ async def remove(context: Ctx, who: Administrator, name: str) -> Response:
 
 @router.post("/keys")
 async def make_key(
-    request: Request, context: Ctx, who: Administrator, name: Annotated[str, Form()] = "",
-    days: Annotated[str, Form()] = "30",
+    request: Request, context: Ctx, who: Administrator, name: Text = "",
+    days: Text = "30",
 ) -> Response:  # fmt: skip
     """A key for a controller; its text is shown on the answering page only."""
     body = typed.checked(people.KeyIn, name=name.strip(), days=typed.whole(days))
@@ -107,7 +108,7 @@ async def make_key(
 @router.post("/tokens/{token_id}/revoke")
 async def revoke(context: Ctx, who: Administrator, token_id: str) -> Response:
     """It opens nothing any more."""
-    await asyncio.to_thread(tokens.revoke_token, context, who, token_id)
+    await asyncio.to_thread(people.revoke_token, context, who, token_id)
     return back()
 
 

@@ -16,7 +16,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.language import lazy
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
+from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
@@ -107,7 +107,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     body = typed.checked(CalibrationIn, **values, large_steps=True)
 
     async def open_it() -> str:
-        await calibration.begin(context, code, body, who.name)
+        await calibration.begin_calibration(context, who, code, Response(), body)
         return address(code)
 
     await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
@@ -147,34 +147,33 @@ def read(
 
 @router.post("/step/{direction}")
 async def step(
-    request: Request, context: Ctx, _who: Tester, code: str, direction: str,
+    request: Request, context: Ctx, who: Tester, code: str, direction: str,
     shown_us: Annotated[float | None, Form()] = None,
 ) -> Response:  # fmt: skip
     """Play one train; the trains that the page knew of and the width on the button say whether both still hold."""
     body = typed.checked(StepIn, direction=direction, shown_us=shown_us)
-    done = calibration.step(context, code, body)
+    done = calibration.play_step(context, who, code, body, Response())
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/mark/{threshold}")
 async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str) -> Response:
     """Mark the last train's width."""
-    wanted = typed.checked(MarkIn, threshold=threshold).threshold
-    done = calibration.mark(context, code, wanted, who.name)
+    done = calibration.set_mark(context, who, code, typed.checked(MarkIn, threshold=threshold), Response())
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/finish")
 async def finish(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Take over what was found."""
-    done = calibration.finish(context, code, False, who.name)
+    done = calibration.finish_calibration(context, who, code)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 
 @router.post("/discard")
 async def discard(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Leave everything as it was; however many trains were sent."""
-    done = calibration.finish(context, code, True, who.name)
+    done = calibration.finish_calibration(context, who, code, FinishIn(discard=True))
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import LOCKED, Principal, Scope
-from stimrig.api.sessions import directory
 from stimrig.api.sessions.requests import ParticipantIn
 from stimrig.api.web.dependencies import Anyone, Context, Ctx, EvenLocked, Tester
 from stimrig.api.web.guards import identified, local, same_origin, set_cookie
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.render import look, page, problem_page
+from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
@@ -46,17 +46,17 @@ class Asked:
 
 
 def _list(context: Context, asked: Asked) -> dict[str, Any]:
-    found = directory.found(context.store, asked.q, asked.archived)
+    found = participants.matching(context.store, asked.q, asked.archived)
     shown = [row for row, _last_utc in (found if asked.all else found[:SHOWN])]
-    count = directory.counts(context.store)
-    rows = directory.listed(context.store, context.versions, shown)
+    count = participants.participant_counts(context.store)
+    rows = participants.list_rows(context.store, context.versions, shown)
     return {"rows": rows, "more": len(found) - len(rows), "count": count}
 
 
 @router.post("/participants")
 async def create_participant(
-    context: Ctx, who: Tester, code: Annotated[str, Form()] = "", side: Annotated[str, Form()] = "",
-    muscle: Annotated[str, Form()] = "", placement: Annotated[str, Form()] = "",
+    context: Ctx, who: Tester, code: Text = "", side: Text = "",
+    muscle: Text = "", placement: Text = "",
 ) -> Response:  # fmt: skip
     """A new participant."""
     said = {"side": side or None, "muscle": muscle.strip() or None, "placement": placement.strip() or None}
@@ -86,8 +86,8 @@ async def sign_in_form(request: Request, context: Ctx, next: str = "/") -> Respo
 @router.post("/sign-in")
 async def sign_in(
     request: Request, context: Ctx,
-    name: Annotated[str, Form()] = "", password: Annotated[str, Form()] = "", token: Annotated[str, Form()] = "",
-    next: Annotated[str, Form()] = "/",
+    name: Text = "", password: Text = "", token: Text = "",
+    next: Text = "/",
 ) -> Response:  # fmt: skip
     """Open a session with name and password, or with a token."""
     address = request.client.host if request.client else ""
@@ -129,8 +129,8 @@ def locked_page(request: Request, who: Principal, next: str, problem: ApiError |
 
 @router.post("/unlock")
 async def unlock(
-    request: Request, context: Ctx, who: EvenLocked, secret: Annotated[str, Form()] = "",
-    next: Annotated[str, Form()] = "/",
+    request: Request, context: Ctx, who: EvenLocked, secret: Text = "",
+    next: Text = "/",
 ) -> Response:  # fmt: skip
     """Go on, by the password of who is signed in, or by the token that opened the session."""
     try:
@@ -141,7 +141,7 @@ async def unlock(
 
 
 @router.post("/lock")
-async def lock(context: Ctx, who: Anyone, next: Annotated[str, Form()] = "/") -> Response:
+async def lock(context: Ctx, who: Anyone, next: Text = "/") -> Response:
     """Lock it now."""
     if who.page_session is not None:
         await asyncio.to_thread(context.auth.idle.lock, who.page_session.hash, who.name)

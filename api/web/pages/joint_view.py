@@ -145,7 +145,7 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
         return await sensor_page(request, context, text, str(error), again=first)
     body = typed.checked(PoseIn, angle_rad=angle_rad, first=first)
     try:
-        await joint.take_pose(context, body, who.name)
+        await joint.pose(context, who, body)
     except ChangedError:  # it has a page of its own
         raise
     except ApiError as error:

@@ -13,7 +13,7 @@ from stimrig.api.language import _, lazy
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store.tables import OPEN_STATES, Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
-from stimrig.api.web.pages import rig_state, starting
+from stimrig.api.web.pages import render, starting
 from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
@@ -185,7 +185,7 @@ async def key(context: Ctx, _who: Tester, code: str) -> dict[str, str]:
 def step(context: Context, row: Participant) -> Step:
     """The participant's next step now."""
     standing = starting.calibrated(context, row)
-    state, current = rig_state.state_of(context), context.runner.current
+    state, current = render.state_of(context), context.runner.current
     opened = context.rig.status.calibration if context.rig.status else None
     holder = current.participant if current else opened.participant if opened else ""
     test = _last_test(context, row.code)

@@ -6,22 +6,33 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, File, Form, Request, UploadFile
-from fastapi.responses import RedirectResponse, Response
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from markupsafe import Markup
+from pydantic import StringConstraints
 from starlette.datastructures import FormData
 
-from stimrig.api.errors import ApiError
-from stimrig.api.people import controller_keys
+from stimrig.api.charts import trend_charts
+from stimrig.api.clock import unix_of
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.language import _, clock, lazy, ngettext
+from stimrig.api.models.places import site_of
+from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import profiles
+from stimrig.api.sessions import controllers, profiles
+from stimrig.api.sessions.controllers import PlanIn, plan_within
+from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
-from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, TargetIn, TestIn
+from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MuscleIn, NoteIn, TargetIn, TestIn
 from stimrig.api.store import seen
-from stimrig.api.store.tables import Participant, Test
-from stimrig.api.web.dependencies import Context, Ctx, Tester
-from stimrig.api.web.pages import limits_form, next_view, starting, trials_view, typed
+from stimrig.api.store.tables import Participant, Recording, Test
+from stimrig.api.web.dependencies import Approver, Context, Ctx, Tester
+from stimrig.api.web.guards import local
+from stimrig.api.web.pages import limits_form, next_view, render, starting, typed
+from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.limits_form import LimitsForm
-from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.render import page, signed
+from stimrig.api.web.pages.starting import site_words
+from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import participants, recordings
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
@@ -55,7 +66,7 @@ async def shown(
             "fields": limits_form.fields(context.rig.status),
             "tests": [context.runner.document(test) for test in history],
             "models": context.versions.of(code),
-            "keys": controller_keys.of(context.auth, code),
+            "keys": controllers.keys_of(context.auth, code),
             "made": made,
             "trials": trials_of(context, who, code),
             "sensor": limits_form.has_sensor(context.rig.status),
@@ -66,8 +77,8 @@ async def shown(
 
 def trials_of(context: Context, who: Principal, code: str) -> Markup | None:
     """The card of the trials; empty before the first one, None where no model may be tracked."""
-    found = trials_view.card(context, code)
-    return None if found is None else Markup(trials_view.drawn(context, who, code, found))
+    found = trials_card(context, code)
+    return None if found is None else Markup(trials_html(context, who, code, found))
 
 
 @router.post("/profile")
@@ -108,9 +119,7 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
         return await on()
 
     doubts = [*profiles.jumps(row.profile, new), *_lost(context, voids)]
-    if not doubts:
-        return RedirectResponse(await save(), 303)
-    return RedirectResponse(context.questions.ask(_question(row, new, doubts, save), who), 303)
+    return RedirectResponse(await context.questions.ask_if_doubtful(_question(row, new, doubts, save), who), 303)
 
 
 def _question(row: Participant, new: dict[str, Any], doubts: list[str], save: Any) -> Question:
@@ -184,7 +193,7 @@ async def answer(context: Ctx, who: Tester, code: str, number: str) -> Response:
 
 @router.post("/recordings")
 async def upload(
-    context: Ctx, who: Tester, code: str, file: Annotated[UploadFile, File()], of: Annotated[str, Form()] = ""
+    context: Ctx, who: Tester, code: str, file: Annotated[UploadFile, File()], of: Text = ""
 ) -> Response:  # fmt: skip
     """A recording of another tool, CSV or HDF5; leads to the model made from it."""
     await asyncio.to_thread(participants.find, context, code)
@@ -193,3 +202,182 @@ async def upload(
         raise ApiError(422, "empty", "No file came", "Go back and choose a CSV file or a sealed recording (HDF5).")
     _row, model, _warnings = await recordings.take_in(context, code, data, who, of=of)
     return RedirectResponse(f"/models/{model.id}", 303)
+
+
+class KeyFor(PlanIn):
+    """A key's name and plan."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,60}$")]
+
+
+@router.post("/keys")
+async def make_key(
+    request: Request, context: Ctx, who: Approver, code: str, name: Text = "", current_ma: Text = "",
+    max_pulse_width_us: Text = "", max_duration_s: Text = "", trials: Text = "",
+) -> Response:  # fmt: skip
+    """A key that ends with its day; its text is shown on the answering page only."""
+    row = await asyncio.to_thread(participants.find, context, code)
+    controllers.refuse_maker_without(who)
+    refuse_archived(row)
+    about = (seen.participant(code), seen.decisions(code))
+    await asyncio.to_thread(context.store.refuse_changed, *about)
+    asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
+    numbers = {field: typed.wanted(text, lambda why, field=field: f"{field}: {why}.") for field, text in asked.items()}
+    body = typed.checked(KeyFor, name=name.strip(), trials=typed.whole(trials), **numbers)
+    plan = plan_within(PlanIn(**body.model_dump(exclude={"name"})), row)
+    text, made = await asyncio.to_thread(
+        controllers.make_key, context.auth, body.name, code, plan, who.name, who.token_hash
+    )
+    return await shown(request, context, who, code, made={"text": text, "name": made.name})
+
+
+@router.post("/keys/{key_id}/revoke")
+async def revoke_key(context: Ctx, who: Tester, code: str, key_id: str) -> Response:
+    """It opens nothing any more."""
+    if not await asyncio.to_thread(controllers.revoke_key, context.auth, code, key_id, who.name):
+        raise NotFoundError("key", key_id, "The participant's page lists them.")
+    return RedirectResponse(f"/participants/{code}#keys", 303)
+
+
+environment.globals["note_kinds"] = {
+    "spasm": lazy("Spasm"), "posture": lazy("Posture"), "electrodes": lazy("Electrodes"), "side": lazy("Side"),
+    "medication": lazy("Medication"), "other": lazy("Other"),
+}  # fmt: skip
+environment.globals["muscles"] = ("biceps brachii", "triceps brachii")
+"""Offered where a muscle is typed; any other may be."""
+
+
+@router.post("/notes")
+async def write_note(
+    context: Ctx, who: Tester, code: str, kind: Text = "", text: Text = "",
+    test_id: Text = "", at: Text = "", now: Text = "",
+    back: Text = "",
+) -> Response:  # fmt: skip
+    """A note; `now` where the test stands, else at the time that was typed, else on the whole of it."""
+    if not kind:
+        detail = "Choose what the note is about, then write it down. Nothing was written."
+        raise ApiError(422, "invalid-input", "The note has no kind", detail)
+    at_s = None
+    if at.strip() and not now:
+        try:
+            at_s = typed.number(at)
+        except ValueError as error:
+            raise ApiError(422, "invalid-input", _("This time cannot be used"), str(error)) from None
+    fields = {"kind": kind, "text": text, "test_id": test_id or None, "at_s": at_s, "now": bool(now and test_id)}
+    await participants.write_note(context, who, code, typed.checked(NoteIn, **fields))
+    return RedirectResponse(local(back or f"/participants/{code}") + "#notes", 303)
+
+
+@router.post("/notes/{note_id}/strike")
+async def strike_note(context: Ctx, who: Tester, code: str, note_id: str, back: Text = "") -> Response:
+    """Mark a note as wrong."""
+    await asyncio.to_thread(context.notes.strike, code, note_id, who.name)
+    return RedirectResponse(local(back or f"/participants/{code}") + "#notes", 303)
+
+
+@router.post("/archive")
+async def put_away(context: Ctx, who: Tester, code: str) -> Response:
+    """Into the archive."""
+    await participants.put_archived(context, code, True, who.name)
+    return RedirectResponse("/", 303)
+
+
+@router.post("/unarchive")
+async def take_out(context: Ctx, who: Tester, code: str) -> Response:
+    """Out of the archive."""
+    await participants.put_archived(context, code, False, who.name)
+    return RedirectResponse(f"/participants/{code}", 303)
+
+
+@router.post("/muscle")
+async def set_muscle(
+    context: Ctx, who: Tester, code: str, side: Text = "",
+    name: Annotated[str, Form(alias="muscle")] = "", placement: Text = "",
+) -> Response:  # fmt: skip
+    """Say the site; asked about where calibration, approved model or keys would be lost."""
+    body = typed.checked(MuscleIn, side=side or None, muscle=name.strip() or None, placement=placement.strip() or None)
+    row = await asyncio.to_thread(participants.find, context, code)
+
+    async def save() -> str:
+        await participants.change_site(context, code, body, who.name, voids=True)
+        return f"/participants/{code}"
+
+    await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
+    before, after = site_words(site_of(row)), site_words(participants.site_in(body))
+    warnings = []
+    if participants.loses_calibration(row, body):
+        warnings += [_("The calibration is lost with it: its thresholds were found at %(muscle)s.", muscle=before)]
+    if before != after and await asyncio.to_thread(context.versions.approved, code) is not None:
+        warnings += [_("The approved model and its keys are of %(muscle)s. Here there is none.", muscle=before)]
+    question = Question(
+        participant=code,
+        title=_("Change side and muscle of %(code)s?", code=code),
+        button=_("Yes, it is %(muscle)s", muscle=after),
+        action=save,
+        rows=[Row(_("Side and muscle"), after, before)],
+        warnings=warnings,
+    )
+    return RedirectResponse(await context.questions.ask_if_doubtful(question, who), 303)
+
+
+trials_router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
+
+
+@trials_router.get("/trials")
+async def trials(context: Ctx, who: Tester, code: str) -> Response:
+    """The card by itself, for the script that renews it; empty where there is nothing to tell."""
+
+    def gather() -> str:
+        participants.find(context, code)
+        seen.looked.set(context.store.seen(context.clock))
+        found = trials_card(context, code)
+        return "" if found is None else trials_html(context, who, code, found)
+
+    return HTMLResponse(await asyncio.to_thread(gather))
+
+
+def trials_html(context: Context, who: Principal, code: str, found: dict[str, Any]) -> str:
+    """The card as HTML."""
+    values = {"code": code, "ready": render.rig_now(context, who)["ready"], "signed": signed(who)}
+    return environment.get_template("trials.html").render(trials=found, **values)
+
+
+def trials_card(context: Context, code: str) -> dict[str, Any] | None:
+    """What the card shows; None where no model may be tracked today."""
+    approval = context.tracked.allowing(code)
+    try:
+        told = context.tracked.document(code) if approval is not None else None
+    except ApiError:  # the model is damaged: its own page says so
+        return None
+    if approval is None or told is None:
+        return None
+    model = context.versions.get(approval.model_id)
+    recording: Recording = context.store.get(Recording, model.recording_id)
+    bounds = Limits(**(approval.tracking or {})).bounds(told["threshold_us"])
+    return {
+        **told,
+        "panels": trend_charts.trial_panels(told["trials"], bounds) if told["trials"] else [],
+        "sentences": sentences(told["trials"], recording.created_utc),
+        "age": served_age(context, told),
+        "rows": [trial_row(trial) for trial in reversed(told["trials"])],
+        "asks": told["ask"],
+    }
+
+
+def served_age(context: Context, told: dict[str, Any]) -> str:
+    """Since when that is known which the controller gets."""
+    minutes = int(max(0.0, context.clock.unix_s() - unix_of(told["served_utc"])) // 60)
+    ago = ngettext("%(num)s minute ago", "%(num)s minutes ago", minutes) if minutes else _("just now")
+    if not told["served_trial"]:
+        return _("The controller gets the approved model.")
+    time = clock(told["served_utc"])
+    return _(
+        "The controller gets the model as of trial %(number)s, %(time)s (%(ago)s).",
+        number=told["served_trial"], time=time, ago=ago,
+    )  # fmt: skip
+
+
+def trial_row(trial: dict[str, Any]) -> dict[str, Any]:
+    """A trial in the table."""
+    cells = [trend_charts.trial_words(trial, name) for name in trend_charts.TRIAL_FIGURES]
+    return {**trial, "cells": cells, "words": str(OUTCOMES[trial["outcome"]])}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,16 +18,20 @@ from sqlalchemy.exc import SQLAlchemyError
 from stimrig.api import language
 from stimrig.api.clock import zone_name
 from stimrig.api.errors import ApiError
+from stimrig.api.language import clock, lazy
 from stimrig.api.people.auth import LOCKED, Principal, Scope
+from stimrig.api.sessions.joint_plan import PASSIVE
 from stimrig.api.store import seen
 from stimrig.api.web.dependencies import Context
-from stimrig.api.web.pages import changes, choices, rig_state
+from stimrig.api.web.pages import changes
 from stimrig.api.web.pages.changes import Again
 from stimrig.api.web.pages.environment import environment
 
-environment.filters["what_to_check"] = rig_state.what_to_check
-environment.globals["colours_media"] = choices.MEDIA
-
+COLOURS = "stimrig_colours"
+"""The choice; it says nothing about who chose. `colours.js` writes it, too: then no page has to be loaded again."""
+MEDIA = {"light": "not all", "dark": "screen", "system": "screen and (prefers-color-scheme: dark)"}
+"""For which media `dark.css` holds. Never for print."""
+environment.globals["colours_media"] = MEDIA
 LOOK_S = 1.0
 
 
@@ -51,7 +57,7 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     bar = {**face.bar(request, looking, principal), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
     shown["signed"] = signed(principal)
-    shown["colours"] = choices.colours(request)
+    shown["colours"] = chosen_colours(request)
     html = face.environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
 
@@ -114,7 +120,7 @@ def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
         "rig": context.rig.status,
         "connected": context.rig.connected,
         "current": context.runner.current,
-        "now": rig_state.now(context, principal),
+        "now": rig_now(context, principal),
         "may_rearm": principal is not None and principal.may(Scope.REARM),
     }
 
@@ -156,3 +162,103 @@ def back_from(path: str) -> tuple[str, str] | None:
     if len(parts) < 3 or parts[0] not in BACK:
         return None
     return f"/{parts[0]}/{quote(parts[1])}", BACK[parts[0]]
+
+
+SILENT_S = 1.6
+"""The rig answers once a second and sends its torque more often. After such a silence its state is unknown."""
+TORQUE_OLD_S = 1.0
+"""An older torque is not shown as the torque of now."""
+
+WORDS: dict[str, tuple[Any, Any]] = {
+    "ready": (lazy("No stimulation"), lazy("ready")),
+    "calibrating": (lazy("No stimulation"), lazy("a calibration is open")),
+    "arming": (lazy("Stimulating"), lazy("begins")),
+    "running": (lazy("Stimulating"), ""),
+    PASSIVE: (lazy("No stimulation"), lazy("passive movement")),
+    "stopping": (lazy("Stopping"), lazy("not confirmed yet")),
+    "sealing": (lazy("No stimulation"), lazy("saving the recording")),
+    "latched": (lazy("Stopped"), lazy("needs re-arm")),
+    "uncertain": (lazy("Restarted"), lazy("needs re-arm")),
+    "disconnected": (lazy("Disconnected"), lazy("see below what to check")),
+    "unreachable": (lazy("Unknown"), lazy("the rig cannot be reached")),
+    "silent": (lazy("Unknown"), lazy("the rig does not answer")),
+}
+"""For each state: whether stimulation is on, and one more thing to know."""
+
+
+def state_of(context: Context) -> str:
+    """The rig's state as far as it is known now."""
+    rig = context.rig
+    if not rig.connected or rig.status is None:
+        return "unreachable"
+    if rig.age_s is None or not (rig.age_s <= SILENT_S):
+        return "silent"
+    return rig.status.state
+
+
+def plays_passive(context: Context) -> bool:
+    """Whether what the rig plays is a passive test, in which it refuses every pulse."""
+    status, current = context.rig.status, context.runner.current
+    return current is not None and current.kind == PASSIVE and status is not None and status.test_id == current.test_id
+
+
+def torque_now(context: Context) -> tuple[float | None, float | None]:
+    """The newest torque (N·m) and its age (s); no torque where it is old or no number, no age where none ever came."""
+    torque_nm, age_s = context.runner.hub.torque()
+    status = context.rig.status
+    known = status is not None and status.torque_nm is not None and age_s is not None and age_s <= TORQUE_OLD_S
+    return (torque_nm if known else None), age_s
+
+
+def rig_now(context: Context, principal: Principal | None) -> dict[str, Any]:
+    """What the rig does now. Without a sign-in: the state only, nothing about a participant."""
+    state = state_of(context)
+    if state in ("arming", "running") and plays_passive(context):
+        state = PASSIVE
+    flow, more = WORDS[state]
+    torque_nm, age_s = torque_now(context)
+    shown: dict[str, Any] = {
+        "state": state,
+        "flow": str(flow),
+        "more": str(more),
+        "at": clock(context.clock.utc()),
+        "emulated": context.settings.emulated,
+        "ready": state == "ready",
+    }
+    if principal is None:
+        return shown
+    current, status = context.runner.current, context.rig.status
+    angle_rad = context.runner.hub.angle()
+    return {
+        **shown,
+        "torque_nm": torque_nm,
+        "torque_age_s": age_s,
+        "test": {"id": current.test_id, "participant": current.participant} if current else None,
+        "notice": notice_key(context, state),
+        "sensor": status is not None and status.angle.present,
+        "angle_deg": None if angle_rad is None else round(math.degrees(angle_rad), 1),
+    }
+
+
+def notice_key(context: Context, state: str) -> str:
+    """A key that changes when the notice changes."""
+    told = f"{status.latch} {status.reason}" if (status := context.rig.status) else ""
+    return hashlib.sha256(f"{state} {told}".encode()).hexdigest()[:12]
+
+
+def what_to_check(reason: str) -> str:
+    """What a person should check before pressing *Reconnect*."""
+    if reason.startswith(("load cell", "load_cell")):
+        return "Check the cable and the power of the load cell. Then press Reconnect."
+    if reason.startswith("stimulator"):
+        return "Check the cable of the stimulator, and that it is switched on. Then press Reconnect."
+    return "Check cables and power of the stimulator and the load cell. Then press Reconnect."
+
+
+environment.filters["what_to_check"] = what_to_check
+
+
+def chosen_colours(request: Request) -> str:
+    """The colours that were chosen, else as the system is set."""
+    kept = request.cookies.get(COLOURS, "")
+    return kept if kept in MEDIA else "system"

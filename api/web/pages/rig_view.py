@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Collection
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.errors import ApiError
+from stimrig.api.language import CODES
 from stimrig.api.people.auth import LOCKED
 from stimrig.api.web.dependencies import Anyone, Ctx, Rearmer
-from stimrig.api.web.guards import local
-from stimrig.api.web.pages import rig_state
-from stimrig.api.web.pages.render import fragment, look, page
-from stimrig.api.web.routes.rig import rearm_rig
+from stimrig.api.web.guards import local, same_origin
+from stimrig.api.web.middleware import LANGUAGE_COOKIE
+from stimrig.api.web.pages import render
+from stimrig.api.web.pages.render import COLOURS, MEDIA, fragment, look, page
+from stimrig.api.web.pages.typed import Text
+from stimrig.api.web.routes.rig import rearm as rearm_rig
 
 router = APIRouter(include_in_schema=False)
 
@@ -29,7 +32,7 @@ async def rig_now(request: Request, context: Ctx) -> Response:
         locked = error.code == LOCKED[0]
     except SQLAlchemyError:
         pass
-    return JSONResponse({**rig_state.now(context, principal), "signed_in": principal is not None, "locked": locked})
+    return JSONResponse({**render.rig_now(context, principal), "signed_in": principal is not None, "locked": locked})
 
 
 @router.post("/rig/acted")
@@ -59,7 +62,35 @@ async def stopped(request: Request, context: Ctx, key: str) -> Response:
 
 
 @router.post("/rearm")
-async def rearm(context: Ctx, who: Rearmer, back: Annotated[str, Form()] = "/") -> Response:
+async def rearm(context: Ctx, who: Rearmer, back: Text = "/") -> Response:
     """A person has looked, and lets the rig work again."""
-    await rearm_rig(context, who.name)
+    await rearm_rig(context, who)
+    return RedirectResponse(local(back), 303)
+
+
+KEPT_S = 365 * 24 * 3600
+
+
+@router.post("/language")
+async def choose_language(request: Request, context: Ctx, language: Text = "", back: Text = "/") -> Response:
+    """Write the pages in this language from now on."""
+    answer = _back(request, language, CODES, back, ("no-such-language", "There is no such language"))
+    secure = context.settings.secure_cookies
+    answer.set_cookie(LANGUAGE_COOKIE, language, KEPT_S, httponly=True, samesite="lax", secure=secure)
+    return answer
+
+
+@router.post("/colours")
+async def choose_colours(request: Request, colours: Text = "", back: Text = "/") -> Response:
+    """Show the pages in these colours from now on."""
+    answer = _back(request, colours, MEDIA, back, ("no-such-colours", "There are no such colours"))
+    answer.set_cookie(COLOURS, colours, KEPT_S, samesite="lax")
+    return answer
+
+
+def _back(request: Request, chosen: str, known: Collection[str], back: str, none_such: tuple[str, str]) -> Response:
+    """To the page that it was chosen on. Raises ApiError (422) where there is no such thing."""
+    same_origin(request)
+    if chosen not in known:
+        raise ApiError(422, *none_such, f"Take one of {', '.join(known)}.")
     return RedirectResponse(local(back), 303)

@@ -10,12 +10,15 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from decimal import Decimal
-from typing import Any
+from typing import Annotated, Any
 
+from fastapi import Form
 from pydantic import ValidationError
 
 from stimrig.api.errors import ApiError
 
+Text = Annotated[str, Form()]
+"""A field of a form as it was typed."""
 PLAIN = re.compile(r"(0|[1-9][0-9]{0,4})(?:[.,]([0-9]{1,2}))?")
 NAMES = {"scopes": "role", "effects": "effect"}
 """What a field is called on the page, where that is another name."""

@@ -15,10 +15,13 @@ from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, plain, translated
 from stimrig.api.models import stored_model
+from stimrig.api.sessions.requests import RanByIn
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import Context, Ctx, LiveReader, Tester
+from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.model_view import measurement
 from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import tests
 from stimrig.rig.messages import Status
 
@@ -67,6 +70,14 @@ async def enough(context: Ctx, who: Tester, test_id: str) -> Response:
         if error.code != "rig-late":
             raise
     return RedirectResponse(f"/tests/{test_id}", 303)
+
+
+@router.post("/tests/{test_id}/ran-by")
+async def set_ran_by(context: Ctx, who: Tester, test_id: str, ran_by: Text = "") -> Response:
+    """Say who ran a test at the rig."""
+    body = typed.checked(RanByIn, ran_by=ran_by.strip() or None)
+    await asyncio.to_thread(tests.set_ran_by, context, who, test_id, body)
+    return RedirectResponse(f"/tests/{test_id}#notes", 303)
 
 
 def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:

@@ -20,41 +20,11 @@ from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from stimrig.api.web.responses.base import answers
-from stimrig.api.web.responses.participants import CalibratedOut, CalibrationOut
+from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
 from stimrig.api.web.routes import participants
-from stimrig.rig.messages import (
-    Calibrated,
-    CalibrateFinishRequest,
-    CalibrateMarkRequest,
-    CalibrateStartRequest,
-    CalibrateStepRequest,
-    CalibrateStoredRequest,
-    CalibrationResult,
-    CalibrationStatus,
-    Profile,
-    Status,
-)
+from stimrig.rig import messages
 
 router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibration"], responses=PROBLEM)
-
-
-async def begin(context: Context, code: str, body: CalibrationIn, by: str) -> dict[str, Any]:
-    """Open a calibration; nothing is sent yet. What is not asked for is the participant's own, so never wider.
-
-    It is bound to the limits that it is begun with: the place in the audit trail at which it began ends its id, and so
-    is kept by the rig, which may outlive this service.
-    """
-    async with context.holds.turn(LIMITS_TURN):
-        row = await asyncio.to_thread(participants.find, context, code)
-        refuse_archived(row)
-        context.runner.refuse_second()
-        asked = settings(body, row.profile)
-        identity = await asyncio.to_thread(_write_begin, context, by, code, asked)
-        last = Profile.model_validate(row.profile) if body.large_steps else None
-        await context.rig.ask(
-            CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **asked)
-        )
-        return await standing(context, code)
 
 
 def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any]) -> str:
@@ -82,24 +52,6 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
         if asked[name] is None:
             raise ApiError(422, "no-limits", "The participant has no limits", f"Send {name}; {name} is not known yet.")
     return asked
-
-
-async def step(context: Context, code: str, body: StepIn) -> dict[str, Any]:
-    """Play one train. Looking and playing are one turn: of two presses on the same sight one plays."""
-    async with context.holds.turn(LIMITS_TURN):
-        check_seen(await sound(context, code))
-        await context.rig.ask(CalibrateStepRequest(direction=body.direction, shown_us=body.shown_us))
-    return await standing(context, code)
-
-
-async def mark(context: Context, code: str, threshold: Any, by: str) -> dict[str, Any]:
-    """Mark the last train's width; no train comes between looking and marking."""
-    async with context.holds.turn(LIMITS_TURN):
-        found = await sound(context, code)
-        check_seen(found)
-        await context.rig.ask(CalibrateMarkRequest(threshold=threshold))
-    await asyncio.to_thread(note, context, by, f"mark {threshold}", code, pulse_width_us=found["pulse_width_us"])
-    return await standing(context, code)
 
 
 def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
@@ -134,31 +86,7 @@ def another_train() -> ApiError:
     return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
 
 
-async def finish(context: Context, code: str, discard: bool, by: str) -> dict[str, Any]:
-    """Close it; unless discarded, what it found is the participant's profile for the day.
-
-    The rig keeps what was found until it is stored here: where that fails, finishing again stores it.
-    """
-    async with context.holds.turn(LIMITS_TURN):
-        waits = await _waiting(context, code)
-        if waits is None:
-            found = await (standing if discard else sound)(context, code)
-            check_seen(found, any_train=discard)
-            identity = str(found["calibration_id"])
-        else:
-            identity = waits.calibration_id
-            if (sent := seen.sent.get()) and sent.partition(".")[0] != identity:
-                raise another_calibration(waits.by)
-        request = CalibrateFinishRequest(by=by, discard=discard, calibration_id=identity)
-        result = await context.rig.ask_for(CalibrationResult, request)
-        profile = await asyncio.to_thread(_store, context, code, result, by, identity)
-        with contextlib.suppress(ApiError):  # it is stored, whatever the rig says now
-            await context.rig.ask(CalibrateStoredRequest(calibration_id=identity))
-            await context.rig.fresh_status()
-    return {"profile": profile, "recordings": result.recordings}
-
-
-async def _waiting(context: Context, code: str) -> Calibrated | None:
+async def _waiting(context: Context, code: str) -> messages.Calibrated | None:
     """A calibration of this participant that is closed, and was not stored."""
     status = await context.rig.fresh_status()
     waits = status.calibrated
@@ -173,7 +101,7 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
     ApiError
         404: none is open for this participant.
     """
-    status: Status = await context.rig.fresh_status()
+    status: messages.Status = await context.rig.fresh_status()
     found = status.calibration
     if found is None or found.participant != code:
         ended = f" The rig is {status.state}: {status.reason}." if status.state == "latched" else ""
@@ -192,7 +120,7 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
     }
 
 
-def outdated(context: Context, code: str, found: CalibrationStatus) -> str:
+def outdated(context: Context, code: str, found: messages.CalibrationStatus) -> str:
     """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
     with context.store.read() as session:
         begun = _begun(session, found.calibration_id)
@@ -237,7 +165,7 @@ def note(context: Context, by: str, action: str, code: str, **detail: Any) -> No
 
 
 def _store(
-    context: Context, code: str, result: CalibrationResult, by: str, identity: str
+    context: Context, code: str, result: messages.CalibrationResult, by: str, identity: str
 ) -> dict[str, Any] | None:  # fmt: skip
     """What was found is the profile, if nothing of that was changed since; what a calibration does not look for (the
     rest between tests) stays. Storing it again changes nothing."""
@@ -263,7 +191,21 @@ async def begin_calibration(
     context: Ctx, who: Tester, code: str, response: Response, body: CalibrationIn | None = None
 ) -> dict[str, Any]:  # fmt: skip
     """Open a guided calibration: nothing is sent until a step is asked for."""
-    return tagged(response, await begin(context, code, body or CalibrationIn.model_validate({}), who.name))
+    # What is not asked for is the participant's own, so never wider. It is bound to the limits that it is begun with:
+    # the place in the audit trail at which it began ends its id, and so is kept by the rig, which may outlive this
+    # service.
+    body = body or CalibrationIn.model_validate({})
+    async with context.holds.turn(LIMITS_TURN):
+        row = await asyncio.to_thread(participants.find, context, code)
+        refuse_archived(row)
+        context.runner.refuse_second()
+        asked = settings(body, row.profile)
+        identity = await asyncio.to_thread(_write_begin, context, who.name, code, asked)
+        last = messages.Profile.model_validate(row.profile) if body.large_steps else None
+        await context.rig.ask(
+            messages.CalibrateStartRequest(calibration_id=identity, participant=code, by=who.name, last=last, **asked)
+        )
+        return tagged(response, await standing(context, code))
 
 
 @router.get("", **answers(CalibrationOut))
@@ -284,16 +226,43 @@ async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, respons
 
     It is over when `playing` is false again.
     """
-    return tagged(response, await step(context, code, body))
+    async with context.holds.turn(LIMITS_TURN):  # of two presses on the same sight one plays
+        check_seen(await sound(context, code))
+        await context.rig.ask(messages.CalibrateStepRequest(direction=body.direction, shown_us=body.shown_us))
+    return tagged(response, await standing(context, code))
 
 
 @router.post("/mark", **answers(CalibrationOut))
 async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response: Response) -> dict[str, Any]:
     """Mark the last train's width as a threshold; marking again replaces."""
-    return tagged(response, await mark(context, code, body.threshold, who.name))
+    async with context.holds.turn(LIMITS_TURN):  # no train comes between looking and marking
+        found = await sound(context, code)
+        check_seen(found)
+        await context.rig.ask(messages.CalibrateMarkRequest(threshold=body.threshold))
+    width_us = found["pulse_width_us"]
+    await asyncio.to_thread(note, context, who.name, f"mark {body.threshold}", code, pulse_width_us=width_us)
+    return tagged(response, await standing(context, code))
 
 
 @router.post("/finish", **answers(CalibratedOut))
 async def finish_calibration(context: Ctx, who: Tester, code: str, body: FinishIn | None = None) -> dict[str, Any]:
     """Close it: the profile holds until the end of the day; `discard` leaves the old one."""
-    return await finish(context, code, bool(body and body.discard), who.name)
+    # The rig keeps what was found until it is stored here: where that fails, finishing again stores it.
+    discard = bool(body and body.discard)
+    async with context.holds.turn(LIMITS_TURN):
+        waits = await _waiting(context, code)
+        if waits is None:
+            found = await (standing if discard else sound)(context, code)
+            check_seen(found, any_train=discard)
+            identity = str(found["calibration_id"])
+        else:
+            identity = waits.calibration_id
+            if (sent := seen.sent.get()) and sent.partition(".")[0] != identity:
+                raise another_calibration(waits.by)
+        request = messages.CalibrateFinishRequest(by=who.name, discard=discard, calibration_id=identity)
+        result = await context.rig.ask_for(messages.CalibrationResult, request)
+        profile = await asyncio.to_thread(_store, context, code, result, who.name, identity)
+        with contextlib.suppress(ApiError):  # it is stored, whatever the rig says now
+            await context.rig.ask(messages.CalibrateStoredRequest(calibration_id=identity))
+            await context.rig.fresh_status()
+    return {"profile": profile, "recordings": result.recordings}

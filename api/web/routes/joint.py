@@ -19,8 +19,8 @@ from stimrig.api.store.seen import Seen
 from stimrig.api.store.tables import Model, Participant
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
 from stimrig.api.web.responses.base import answers
-from stimrig.api.web.responses.joint import AngleOut, JointOverviewOut
 from stimrig.api.web.responses.models import VersionOut
+from stimrig.api.web.responses.rig import AngleOut, JointOverviewOut
 from stimrig.api.web.routes import participants
 from stimrig.api.web.routes.criticism import LATER, later
 from stimrig.api.workers.jobs import FIT_TOGETHER, Job
@@ -58,42 +58,6 @@ class TogetherIn(Body):
     effects: Annotated[list[EffectId], Field(max_length=20)] = Field(
         default=list(together.JOINT_EFFECTS), description="of the model; needs the joint's angle in each recording"
     )
-
-
-async def take_pose(context: Context, body: PoseIn, by: str) -> AngleStatus:
-    """Tell the rig a pose; the second one completes a calibration.
-
-    Raises
-    ------
-    ApiError
-        409: no sensor, a test runs, or the joint moved; 422: the poses are too near to one another.
-    """
-    sensor(context)
-
-    def write(action: str, *about: seen.About, **detail: Any) -> Seen:
-        with context.store.write() as session:
-            if about:
-                seen.check(session, *about)
-            now = context.clock.utc()
-            audit.write(session, now, by, action, "rig", **detail)
-            return seen.newest(session, local_day(now))
-
-    taken = {"angle_rad": round(body.angle_rad, 4)}
-    async with context.holds.turn(LIMITS_TURN):  # no other pose comes between looking and taking it
-        before = context.rig.status.angle.calibration if context.rig.status else None
-        # before the rig is told: of one whose answer is lost nobody knows whether it was taken
-        await asyncio.to_thread(write, seen.POSES[0], seen.poses(), **taken)
-        try:
-            pose = AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first)
-            status = await context.rig.ask_for(Status, pose)
-        except ApiError as error:
-            place = await asyncio.to_thread(write, "pose not taken", **taken, why=error.detail)
-            seen.shown.set(place)  # who is told of the refusal has seen it
-            raise
-        context.rig.status = status
-        if (done := status.angle.calibration) is not None and done != before:
-            await asyncio.to_thread(write, seen.POSES[1], **done.model_dump(exclude={"by"}))
-    return status.angle
 
 
 def sensor(context: Context) -> AngleStatus:
@@ -135,7 +99,32 @@ async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str,
 @router.post("/rig/angle/pose", **answers(AngleOut))
 async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
     """Tell the angle that a goniometer shows, at two poses at least 0.5 rad apart; a third one begins anew."""
-    return (await take_pose(context, body, who.name)).model_dump()
+    sensor(context)
+
+    def write(action: str, *about: seen.About, **detail: Any) -> Seen:
+        with context.store.write() as session:
+            if about:
+                seen.check(session, *about)
+            now = context.clock.utc()
+            audit.write(session, now, who.name, action, "rig", **detail)
+            return seen.newest(session, local_day(now))
+
+    taken = {"angle_rad": round(body.angle_rad, 4)}
+    async with context.holds.turn(LIMITS_TURN):  # no other pose comes between looking and taking it
+        before = context.rig.status.angle.calibration if context.rig.status else None
+        # before the rig is told: of one whose answer is lost nobody knows whether it was taken
+        await asyncio.to_thread(write, seen.POSES[0], seen.poses(), **taken)
+        try:
+            pose = AnglePoseRequest(angle_rad=body.angle_rad, by=who.name, first=body.first)
+            status = await context.rig.ask_for(Status, pose)
+        except ApiError as error:
+            place = await asyncio.to_thread(write, "pose not taken", **taken, why=error.detail)
+            seen.shown.set(place)  # who is told of the refusal has seen it
+            raise
+        context.rig.status = status
+        if (done := status.angle.calibration) is not None and done != before:
+            await asyncio.to_thread(write, seen.POSES[1], **done.model_dump(exclude={"by"}))
+    return status.angle.model_dump()
 
 
 @router.get("/participants/{code}/joint", **answers(JointOverviewOut))

@@ -13,8 +13,7 @@ from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
 from stimrig.api.models.tracking import Limits
-from stimrig.api.sessions.limits import tighter
-from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn
+from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn, tighter
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Model, Participant
 from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader, Version

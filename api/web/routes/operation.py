@@ -5,21 +5,23 @@ from __future__ import annotations
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from fastapi import APIRouter
-from fastapi.responses import PlainTextResponse, Response
+from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from prometheus_client import generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from sqlalchemy import func, select, text
 
+from stimrig.api import schemas
+from stimrig.api.errors import NotFoundError
 from stimrig.api.outbox import status
 from stimrig.api.store.tables import AuditEntry, Model, Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.openapi import problem
+from stimrig.api.web.responses.base import SchemaOut, SchemasOut, answers
 from stimrig.api.web.responses.rig import HealthOut
 
 router = APIRouter(tags=["operation"])
@@ -48,43 +50,50 @@ def health(context: Ctx) -> dict[str, Any]:
 @router.get("/metrics", response_class=PlainTextResponse)
 def metrics(context: Ctx) -> Response:
     """Figures in Prometheus' text format."""
-    return Response(generate_latest(_Figures(context)), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    return Response(generate_latest(Figures(lambda: figures(context))), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
-@dataclass
-class _Figures:
-    """The service's figures, read when they are asked for."""
+class Figures:
+    """Figures that are read when they are asked for.
 
-    context: Context
+    Parameters
+    ----------
+    collect : callable
+        Gives one family after the other.
+    """
 
-    def collect(self) -> Iterator[Metric]:
-        """One family after the other."""
-        context, rig, newest = self.context, self.context.rig, self.context.runner.hub.newest
-        tests = GaugeMetricFamily("stimrig_tests", "Tests by state", labels=["state"])
-        for state, count in sorted(Counter(row.state for row in context.store.all(Test)).items()):
-            tests.add_metric([state], count)
-        yield tests
-        for name, words, value in (
-            ("stimrig_up_seconds", "Time since start", time.monotonic() - context.started_s),
-            ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
-            ("stimrig_rig_age_seconds", "Time since the rig spoke", -1.0 if rig.age_s is None else rig.age_s),
-            ("stimrig_models", "Model versions", len(context.store.all(Model.id))),
-            ("stimrig_approved_models", "Participants with one approved today", _approved(context)),
-            ("stimrig_audit_entries", "Entries of the audit trail", _audit_entries(context)),
-            ("stimrig_free_disk_bytes", "Free where the data lie", shutil.disk_usage(context.settings.data_dir).free),
-            ("stimrig_live_listeners", "Open live channels", context.runner.hub.listeners),
-            ("stimrig_lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
-            ("stimrig_dropped_pulses", "Dropped in it", newest.dropped_pulses if newest else 0),
-            ("stimrig_jobs_queued", "Analyses waiting", len(context.pool.queue)),
-        ):
-            yield GaugeMetricFamily(name, words, value)
-        for name, words, value in (
-            ("stimrig_jobs_done_total", "Analyses done", context.pool.done_count),
-            ("stimrig_jobs_failed_total", "Analyses failed", context.pool.failed_count),
-            ("stimrig_jobs_busy_seconds_total", "Time in analyses", context.pool.busy_s),
-        ):
-            yield CounterMetricFamily(name, words, value)
-        yield from _centre(context)
+    def __init__(self, collect: Callable[[], Iterator[Metric]]) -> None:
+        self.collect = collect
+
+
+def figures(context: Context) -> Iterator[Metric]:
+    """The service's figures, one family after the other."""
+    rig, newest = context.rig, context.runner.hub.newest
+    tests = GaugeMetricFamily("stimrig_tests", "Tests by state", labels=["state"])
+    for state, count in sorted(Counter(row.state for row in context.store.all(Test)).items()):
+        tests.add_metric([state], count)
+    yield tests
+    for name, words, value in (
+        ("stimrig_up_seconds", "Time since start", time.monotonic() - context.started_s),
+        ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
+        ("stimrig_rig_age_seconds", "Time since the rig spoke", -1.0 if rig.age_s is None else rig.age_s),
+        ("stimrig_models", "Model versions", len(context.store.all(Model.id))),
+        ("stimrig_approved_models", "Participants with one approved today", _approved(context)),
+        ("stimrig_audit_entries", "Entries of the audit trail", _audit_entries(context)),
+        ("stimrig_free_disk_bytes", "Free where the data lie", shutil.disk_usage(context.settings.data_dir).free),
+        ("stimrig_live_listeners", "Open live channels", context.runner.hub.listeners),
+        ("stimrig_lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
+        ("stimrig_dropped_pulses", "Dropped in it", newest.dropped_pulses if newest else 0),
+        ("stimrig_jobs_queued", "Analyses waiting", len(context.pool.queue)),
+    ):
+        yield GaugeMetricFamily(name, words, value)
+    for name, words, value in (
+        ("stimrig_jobs_done_total", "Analyses done", context.pool.done_count),
+        ("stimrig_jobs_failed_total", "Analyses failed", context.pool.failed_count),
+        ("stimrig_jobs_busy_seconds_total", "Time in analyses", context.pool.busy_s),
+    ):
+        yield CounterMetricFamily(name, words, value)
+    yield from _centre(context)
 
 
 def _centre(context: Context) -> Iterator[Metric]:
@@ -111,3 +120,31 @@ def _approved(context: Context) -> int:
 def _audit_entries(context: Context) -> int:
     with context.store.read() as session:
         return session.scalar(select(func.max(AuditEntry.seq))) or 0
+
+
+schemas_router = APIRouter(prefix="/v1/schemas", tags=["schemas"])
+ONE_SCHEMA: dict[int | str, dict[str, Any]] = {
+    200: {"model": SchemaOut, "description": "the schema"},
+    404: problem("no schema of this name"),
+}
+
+
+class SchemaResponse(JSONResponse):
+    """An answer that says that it is a schema."""
+
+    media_type = "application/schema+json"
+
+
+@schemas_router.get("", **answers(SchemasOut))
+def published() -> dict[str, Any]:
+    """The schemas there are, by name, with their ids; an id ends in the version."""
+    return {"schemas": {name: schemas.load(name)["$id"] for name in schemas.NAMES}}
+
+
+@schemas_router.get("/{name}", response_class=SchemaResponse, response_model=None, responses=ONE_SCHEMA)
+def schema(name: str) -> JSONResponse:
+    """One schema, by its name or by the verb that prints it."""
+    try:
+        return SchemaResponse(schemas.load(name))
+    except KeyError:
+        raise NotFoundError("schema", name, f"There are {', '.join(schemas.NAMES)}.") from None

@@ -1,24 +1,31 @@
-"""Participants: codes and a profile of limits, no names."""
+"""Participants: codes and a profile of limits, no names; their site, the archive, notes.
+
+Models, approvals and keys belong to one site. In the archive participants who do not come any more are out of the way,
+and nothing of theirs is deleted.
+"""
 
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
+from sqlalchemy import Row, func, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.sessions import directory, profiles
-from stimrig.api.sessions.requests import ParticipantIn, ProfileIn
-from stimrig.api.store import audit, seen
-from stimrig.api.store.holds import LIMITS_TURN
+from stimrig.api.models.places import Site, in_words, site_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.sessions import notes, profiles
+from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
+from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.seen import Seen
-from stimrig.api.store.tables import Participant, Test
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from stimrig.api.store.tables import Approval, Model, Participant, Test
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester, in_limits_turn
 from stimrig.api.web.responses.base import answers
-from stimrig.api.web.responses.participants import ChangedOut, ParticipantOut
+from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 from stimrig.api.web.responses.rig import TestOut
 from stimrig.rig.messages import Status
 
@@ -60,9 +67,10 @@ def within(session: Session, code: str) -> Participant:
     return row
 
 
-async def change_profile(
+@in_limits_turn
+def change_profile(
     context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False
-) -> tuple[Participant, Seen]:  # fmt: skip
+) -> tuple[Participant, Seen]:
     """New limits for a participant: those that are asked for, the rest stays; and the place in the trail.
 
     Raises
@@ -71,13 +79,6 @@ async def change_profile(
         404 no such participant; 422 beyond what the rig takes, or the first ones are not whole; 409 changed meanwhile,
         or the calibration would be lost, and that was not allowed.
     """
-    async with context.holds.turn(LIMITS_TURN):
-        return await asyncio.to_thread(_change, context, code, asked, by, may_void)
-
-
-def _change(
-    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool
-) -> tuple[Participant, Seen]:  # fmt: skip
     with context.store.write() as session:
         row = within(session, code)
         poses = [] if asked.get(profiles.RANGE) is None else [seen.poses()]
@@ -155,7 +156,7 @@ def list_participants(
     archived: Annotated[bool | None, Query(description="only those that are archived, or that are not")] = None,
 ) -> list[dict[str, Any]]:
     """All participants, or those that are looked for; who was last tested, or made, comes first."""
-    return [row.as_dict() for row, _last_utc in directory.found(context.store, q, archived)]
+    return [row.as_dict() for row, _last_utc in matching(context.store, q, archived)]
 
 
 @router.get("/{code}", **answers(ParticipantOut))
@@ -192,3 +193,195 @@ def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
     find(context, code)
     rows = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc())
     return [context.runner.document(row) for row in rows]
+
+
+def loses_calibration(row: Participant, body: MuscleIn) -> bool:
+    """Whether a calibration is lost: it was found at another site than the new one."""
+    found = any(row.profile.get(name) is not None for name in profiles.FOUND)
+    pairs = zip(site_of(row), site_in(body), strict=True)
+    return found and any(before is not None and before != after for before, after in pairs)
+
+
+def site_in(body: MuscleIn) -> Site:
+    """The site that is asked for."""
+    return body.side, body.muscle, body.placement
+
+
+@in_limits_turn
+def change_site(context: Context, code: str, body: MuscleIn, by: str, voids: bool = False) -> Participant:
+    """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
+
+    Raises
+    ------
+    ApiError
+        404 no such participant; 409 a test or calibration of it is under way, or the calibration would be lost and
+        that was not allowed.
+    """
+    refuse_busy(context, code)
+    now = context.clock.utc()
+    with context.store.write() as session:
+        row = within(session, code)
+        seen.check(session, seen.participant(code))
+        lost = loses_calibration(row, body)
+        if lost and not voids:
+            detail = (
+                f"The thresholds of {code} were found at {in_words(site_of(row))}. To change it and make the "
+                "calibration invalid: ?void_calibration=true."
+            )
+            raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
+        if site_of(row) != site_in(body):
+            row.side, row.muscle, row.placement = site_in(body)
+            row.profile = {**row.profile, **dict.fromkeys(profiles.FOUND)} if lost else row.profile
+            audit.write(session, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
+    return row
+
+
+@router.put("/{code}/muscle", **answers(ParticipantOut))
+async def set_muscle(
+    context: Ctx,
+    who: Tester,
+    code: str,
+    body: MuscleIn,
+    void_calibration: Annotated[bool, Query(description="the change may void the calibration of the day")] = False,
+) -> dict[str, Any]:
+    """Say the site. Another one than before voids the calibration: 409, unless allowed.
+
+    A model belongs to the site at which it was measured: at another one there is no approved model, and no key of a
+    controller, until it has its own. Tests keep the site that they were begun with.
+    """
+    return (await change_site(context, code, body, who.name, void_calibration)).as_dict()
+
+
+def refuse_busy(context: Context, code: str) -> None:
+    """409 while the rig works with this participant."""
+    current, status = context.runner.current, context.rig.status
+    calibration = status.calibration if status else None
+    if current is not None and current.participant == code:
+        detail = f"{current.test_id} of {code} runs. Wait for its end, or stop it; then do it again."
+        raise ApiError(409, "participant-busy", "A test of this participant runs", detail)
+    if calibration is not None and calibration.participant == code:
+        detail = f"A calibration of {code} is open. Finish or discard it; then do it again."
+        raise ApiError(409, "participant-busy", "A calibration of this participant is open", detail)
+
+
+@in_limits_turn
+def put_archived(context: Context, code: str, archived: bool, by: str) -> Participant:
+    """Put a participant into the archive, or take it out; doing it again changes nothing. Raises as `change_site`."""
+    if archived:
+        refuse_busy(context, code)
+    now = context.clock.utc()
+    with context.store.write() as session:
+        row = within(session, code)
+        seen.check(session, seen.participant(code))
+        if archived != (row.archived_utc is not None):
+            row.archived_utc = now if archived else None
+            audit.write(session, now, by, "archive" if archived else "unarchive", code)
+    return row
+
+
+@router.post("/{code}/archive", **answers(ParticipantOut))
+async def archive(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
+    """Put it into the archive: it is listed no more by default, and no test of it starts."""
+    return (await put_archived(context, code, True, who.name)).as_dict()
+
+
+@router.post("/{code}/unarchive", **answers(ParticipantOut))
+async def unarchive(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
+    """Take it out of the archive."""
+    return (await put_archived(context, code, False, who.name)).as_dict()
+
+
+notes_router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)
+
+
+@notes_router.get("", **answers(list[NoteOut]))
+def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> list[dict[str, Any]]:
+    """A participant's notes, newest first, the struck ones among them."""
+    response.headers["ETag"] = context.store.etag(context.clock, f"/v1/participants/{code}/notes", notes.about(code))
+    find(context, code)
+    return [note.as_dict() for note in context.notes.of(code)]
+
+
+@notes_router.post("", status_code=201, **answers(NoteOut, 201, "written"))
+async def write_note(context: Ctx, who: Tester, code: str, body: NoteIn) -> dict[str, Any]:
+    """Write a note on the participant's session, on a test (`test_id`), or at a time in it (`at_s`, or `now`)."""
+    position = context.runner.hub.position(body.test_id) if body.test_id else None  # a note that is made now is there
+    now_s = position[0] if position and context.runner.plays(body.test_id) else None
+    return (await asyncio.to_thread(context.notes.add, code, body, who.name, now_s)).as_dict()
+
+
+@notes_router.post("/{note_id}/strike", **answers(NoteOut))
+def strike_note(context: Ctx, who: Tester, code: str, note_id: str) -> dict[str, Any]:
+    """Mark a note as wrong: it stays readable, with who struck it."""
+    return context.notes.strike(code, note_id, who.name).as_dict()
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A participant in the list: its last test, its newest model, and what the controller gets."""
+
+    participant: Participant
+    last: Any
+    newest: dict[str, Any] | None
+    approved: Approval | None
+
+
+def matching(store: Store, q: str = "", archived: bool | None = None) -> list[tuple[Participant, str]]:
+    """Participants whose code holds `q`, each with the time at which it was last tested, or made.
+
+    Parameters
+    ----------
+    store : Store
+        Holds them.
+    q : str
+        A part of the code, in any case; empty: all.
+    archived : bool or None
+        Only those that are archived, or that are not.
+    """
+    last = select(Test.participant, func.max(Test.requested_utc).label("utc")).group_by(Test.participant).subquery()
+    newest = func.coalesce(last.c.utc, Participant.created_utc)
+    query = select(Participant, newest).outerjoin(last, last.c.participant == Participant.code)
+    if q.strip():
+        query = query.where(Participant.code.icontains(q.strip(), autoescape=True))
+    if archived is not None:
+        query = query.where(Participant.archived_utc.is_not(None) if archived else Participant.archived_utc.is_(None))
+    with store.read() as session:
+        rows = session.execute(query.order_by(newest.desc(), Participant.code)).all()
+    return [(row[0], row[1]) for row in rows]
+
+
+def participant_counts(store: Store) -> dict[str, int]:
+    """How many participants there are, and how many of them are archived."""
+    query = select(func.count(), func.count(Participant.archived_utc)).select_from(Participant)
+    with store.read() as session:
+        total, archived = session.execute(query).one()
+    return {"all": total, "archived": archived}
+
+
+def list_rows(store: Store, versions: Versions, participants: list[Participant]) -> list[Listed]:
+    """What the list says of each; no plans of tests and no models are read for it."""
+    codes = [row.code for row in participants]
+    tests = _newest_rows(store, Test, Test.requested_utc, codes, Test.state, Test.requested_utc)
+    models = _newest_rows(store, Model, Model.created_utc, codes, Model.fit)
+    approved = versions.all_approved(codes)
+    rows = []
+    for row in participants:
+        model = models.get(row.code)
+        newest = {"id": model.id, **_judged_fit(model, versions)} if model else None
+        rows.append(Listed(row, tests.get(row.code), newest, approved.get(row.code)))
+    return rows
+
+
+def _newest_rows(store: Store, table: Any, at_utc: Any, codes: list[str], *columns: Any) -> dict[str, Any]:
+    """The newest row of each participant in a table, by its time: these columns of it."""
+    newest = select(table.participant, func.max(at_utc).label("utc")).where(table.participant.in_(codes))
+    last = newest.group_by(table.participant).subquery()
+    query = select(table.id, table.participant, *columns)
+    query = query.join(last, (table.participant == last.c.participant) & (at_utc == last.c.utc))
+    with store.read() as session:
+        return {row.participant: row for row in session.execute(query)}
+
+
+def _judged_fit(model: Row[Any], versions: Versions) -> dict[str, Any]:
+    """Figures and verdict; models from before the verdict was kept beside them are read for it."""
+    return model.fit if "verdict" in model.fit else {**model.fit, **versions.quality(versions.get(model.id))}

@@ -13,10 +13,10 @@ from stimrig.api.sessions.requests import StopIn, TestIn
 from stimrig.api.sessions.stops import StopResult
 from stimrig.api.store import audit, seen
 from stimrig.api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
+from stimrig.api.web.guards import Press
 from stimrig.api.web.middleware import wants_html
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
-from stimrig.api.web.stop_guard import Press
 from stimrig.rig.messages import RearmRequest, SequencesRequest, StopEvidence
 
 router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
@@ -81,19 +81,22 @@ async def stop_on_page(request: Request, context: Context, press: Press) -> Resp
     return RedirectResponse(f"/stopped/{context.stops.keep(told)}", 303)
 
 
-async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
-    """A person has looked and lets the rig work again."""
+@router.post("/rearm", **answers(RigOut))
+async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
+    """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
 
+    A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
+    """
     latch = seen.sent.get()
 
     def note(action: str, **detail: Any) -> None:
         with context.store.write() as session:
-            audit.write(session, context.clock.utc(), by, action, "rig", **detail)
+            audit.write(session, context.clock.utc(), who.name, action, "rig", **detail)
 
     shown = context.rig.latches.get(latch)
     await asyncio.to_thread(note, "re-arm", reason=shown and shown["detail"]["reason"])
     try:
-        await context.rig.ask(RearmRequest(by=by, latch=latch))
+        await context.rig.ask(RearmRequest(by=who.name, latch=latch))
     except ApiError as error:
         await asyncio.to_thread(note, "re-arm refused", why=error.detail)
         if error.code != "rig-latch-changed":
@@ -104,15 +107,6 @@ async def rearm_rig(context: Context, by: str) -> dict[str, Any]:
         raise told from error
     await context.rig.fresh_status()
     return rig_state(context)
-
-
-@router.post("/rearm", **answers(RigOut))
-async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
-    """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
-
-    A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
-    """
-    return await rearm_rig(context, who.name)
 
 
 @router.post("/preview", **answers(PreviewOut))

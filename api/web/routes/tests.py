@@ -15,7 +15,7 @@ from stimrig.api import language
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.people.auth import Principal, Scope
-from stimrig.api.sessions import controller_trials
+from stimrig.api.sessions import controllers
 from stimrig.api.sessions.playing import other_than
 from stimrig.api.sessions.requests import RanByIn, TestIn
 from stimrig.api.store import audit, seen
@@ -47,7 +47,7 @@ def find(context: Context, test_id: str) -> Test:
 @router.post("", status_code=202, **answers(TestOut, 202, "begun; see `Location`"))
 async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
-    row = await controller_trials.start(context.runner, context.holds.turn(KEY_TURN), context.store, who, body)
+    row = await controllers.start(context.runner, context.holds.turn(KEY_TURN), context.store, who, body)
     response.headers["Location"] = f"/v1/tests/{row.id}"
     return context.runner.document(row)
 
@@ -69,19 +69,14 @@ def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -
 @router.put("/{test_id}/ran-by", **answers(TestOut))
 def set_ran_by(context: Ctx, who: Tester, test_id: str, body: RanByIn) -> dict[str, Any]:
     """Say who ran a test at the rig, where that was not who asked for it."""
-    return context.runner.document(change_ran_by(context, test_id, body, who.name))
-
-
-def change_ran_by(context: Context, test_id: str, body: RanByIn, by: str) -> Test:
-    """Write down who ran a test; 404 where there is none."""
     with context.store.write() as session:
         row = session.get(Test, test_id)
         if row is None:
             raise NotFoundError("test", test_id, "GET /v1/tests lists them.")
         seen.check(session, seen.of(test_id, RAN_BY))
         row.ran_by = other_than(row.requested_by, body.ran_by)
-        audit.write(session, context.clock.utc(), by, RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
-    return row
+        audit.write(session, context.clock.utc(), who.name, RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
+    return context.runner.document(row)
 
 
 @router.post("/{test_id}/keep-plain", **answers(TestOut))

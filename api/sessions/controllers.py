@@ -1,24 +1,27 @@
-"""Trials that a controller's key may play: within the plan that a person set when the key was made."""
+"""Controllers: keys bound to one participant, one day and a plan of trials; the trials that a key may play."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import secrets
 from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat
+from sqlalchemy import select
 
 from stimrig.api.decisions import MODEL_TAG
 from stimrig.api.errors import ApiError
 from stimrig.api.models.places import site_of
-from stimrig.api.people.auth import Principal, outside
+from stimrig.api.people.auth import Auth, Principal, Scope, outside
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store import Store, seen
+from stimrig.api.store.hashes import digest
 from stimrig.api.store.holds import Turn
-from stimrig.api.store.tables import Participant, Test
+from stimrig.api.store.tables import Participant, Test, Token
 
 LONGEST_S = 300.0
 HALTED = "The rig is stopped. A person looks at participant and rig and re-arms it."
@@ -79,7 +82,7 @@ async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: 
             body = await _within_plan(runner, store, who, body)
             return await runner.start(body, who.name, holder=who.token_hash)
         except seen.ChangedError:
-            raise changed() from None
+            raise trial_overtaken() from None
         except ApiError as error:
             if error.code not in NEUTRAL:
                 raise
@@ -133,7 +136,7 @@ def _refuse_other_model(runner: Runner, participant: str) -> None:
     """The trial was computed with the model that is served now: the approved one, or what was tracked from it."""
     served = [runner.versions.served(participant), runner.trials.tracked.served(participant)]
     if seen.sent.get() not in [one.etag.strip('"') for one in served if one is not None]:
-        raise changed()
+        raise trial_overtaken()
 
 
 def _refuse_other_rate(runner: Runner, body: TestIn) -> None:
@@ -156,7 +159,7 @@ def unapproved(participant: str) -> ApiError:
     return ApiError(409, "no-approved-model", "No approved model", detail)
 
 
-def changed() -> ApiError:
+def trial_overtaken() -> ApiError:
     """409: the trial was planned on what is no longer so; a key learns no more of it."""
     detail = "Fetch the model anew, compute the trial with it, and send its ETag as If-Match."
     return ApiError(409, "changed-meanwhile", "What the trial was planned with was changed", detail)
@@ -165,3 +168,61 @@ def changed() -> ApiError:
 def beyond(why: str) -> ApiError:
     """403: not within the plan."""
     return ApiError(403, "beyond-plan", "Not within the plan of this key", f"{why}.")
+
+
+KEY_SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
+"""Of these only what `stimrig.api.web.guards` opens."""
+
+
+def refuse_maker_without(maker: Principal) -> None:
+    """403 to whoever lacks a scope that a key holds: it may do nothing that its maker may not."""
+    lacking = [str(scope) for scope in KEY_SCOPES if not maker.may(scope)]
+    if lacking:
+        who = maker.name
+        detail = f"A key holds {', '.join(KEY_SCOPES)}. Who makes one holds them all; {who} lacks {', '.join(lacking)}."
+        raise ApiError(403, "forbidden", "Not allowed", detail)
+
+
+def make_key(
+    auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str, made_by: str | None = None
+) -> tuple[str, Token]:
+    """A key that ends with its day: its text, shown this once, and its row.
+
+    Parameters
+    ----------
+    name : str
+        What people call the controller; the row's name is made unique, since tests are counted by it.
+    participant : str
+        The only one that it opens.
+    plan : dict
+        `current_ma`, `max_pulse_width_us`, `max_duration_s`, `trials`.
+    by : str
+        Who makes it.
+    made_by : str, optional
+        Hash of that one's token: once it is revoked or has expired, the key opens nothing.
+    """
+    text = f"stimrig_{secrets.token_urlsafe(32)}"
+    own = f"{name} ({digest(text)[:6]})"
+    until = auth.clock.end_of_day_utc()
+    auth.issue(own, KEY_SCOPES, by, text=text, expires_utc=until, participant=participant, plan=plan, made_by=made_by)
+    return text, auth.store.get(Token, digest(text))
+
+
+def keys_of(auth: Auth, participant: str) -> list[dict[str, Any]]:
+    """Today's keys of a participant, newest first; `id` is for `revoke`, `state` says whether it opens anything."""
+    with auth.store.read() as session:
+        today = Token.created_utc >= auth.clock.start_of_day_utc()
+        of_participant = select(Token).where(Token.participant == participant, today)
+        rows = list(session.scalars(of_participant.order_by(Token.created_utc.desc())))
+    return [{"id": row.hash[:16], "state": _key_state(auth, row), **row.as_dict()} for row in rows]
+
+
+def _key_state(auth: Auth, row: Token) -> str:
+    if row.revoked or auth.fallen(row):
+        return "revoked"
+    return "expired" if row.expires_utc is not None and row.expires_utc <= auth.clock.utc() else "valid"
+
+
+def revoke_key(auth: Auth, participant: str, token_id: str, by: str) -> bool:
+    """Revoke a key of a participant; False where there is none of that id."""
+    return token_id in {row["id"] for row in keys_of(auth, participant)} and auth.revoke(token_id, by)
