@@ -17,9 +17,9 @@ import httpx
 import pytest
 
 from stimrig.api.errors import ApiError
-from stimrig.api.sessions.rig_client import LONGEST_LINE, line_of
+from stimrig.api.sessions.rig_client import line_of
 from stimrig.api.web import middleware, server
-from stimrig.rig.messages import PreviewRequest, Profile, SegmentPlan, TestPlan
+from stimrig.rig.messages import LONGEST_LINE, PreviewRequest, Profile, SegmentPlan, TestPlan
 from tests.api.conftest import Server, Service, soon
 from tests.api.test_stop_right import stops_noted
 

@@ -174,8 +174,11 @@ def test_limits_that_were_typed_go_with_start(tab: httpx.Client, client: httpx.C
     assert "Start now: 9.5 mA, 300 µs" in page and limits(client)["current_ma"] == 9.5
     asked = send(tab, f"{PAGE}/tests", current_ma="19")
     assert "rises from 9.5 to 19 mA" in tab.get(asked.headers["location"]).text and service.rig.starts == 0
-    page = tab.get(yes(tab, asked).headers["location"]).text
+    asked = yes(tab, asked)
+    page = tab.get(asked.headers["location"]).text
     assert "Start now: 19 mA, 300 µs" in page and limits(client)["current_ma"] == 19 and service.rig.starts == 0
+    assert yes(tab, asked).headers["location"].startswith("/tests/"), "what was set on the way is not out of date"
+    assert service.rig.last_plan.profile.current_ma == 19
 
 
 def test_a_form_gone_stale_is_refused_with_both_values(tab: httpx.Client, client: httpx.Client) -> None:

@@ -23,7 +23,7 @@ from stimrig.rig.messages import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
 from tests.api.fake_arm import still
 from tests.api.test_access import csrf, signed_in
-from tests.api.test_forms import fields, yes
+from tests.api.test_forms import fields
 from tests.api.test_overtaken import TRIAL, key_of
 
 HTML = {"Accept": "text/html"}
@@ -83,22 +83,16 @@ def test_a_withdrawal_that_the_rig_does_not_take_is_repeated_and_stops_meanwhile
     assert approved and failed
 
 
-def test_a_token_that_was_renewed_under_its_name_starts_tests(service: Service, client: httpx.Client) -> None:
-    client.post("/v1/participants", json={"code": "P017"})
-    service.token("lab", "run-test", "read-live")
-    old = next(token["id"] for token in client.get("/v1/tokens").json() if token["name"] == "lab")
-    client.delete(f"/v1/tokens/{old}")
-    lab = service.client(service.token("lab", "run-test", "read-live"))
-    assert lab.post("/v1/tests", json={"participant": "P017"}).status_code == 202
-
-
-def test_limits_that_were_typed_and_a_start_are_one_way(
-    service: Service, client: httpx.Client, participant: str
+@pytest.mark.parametrize("same_text", [True, False])
+def test_a_token_that_came_back_starts_tests(
+    service: Service, client: httpx.Client, participant: str, same_text: bool
 ) -> None:
-    with signed_in(service) as tab:
-        asked = tab.post(f"{PAGE}/tests", data={**fields(tab), "current_ma": "19"})
-        assert yes(tab, asked).headers["location"].startswith("/tests/")
-    assert service.rig.last_plan.profile.current_ma == 19
+    """Its revocation stays in the trail, newer than what was read of the participant."""
+    text, auth = service.token("lab", "run-test", "read-live"), service.app.state.context.auth
+    (known,) = [row for row in service.app.state.context.store.all(Token) if row.name == "lab"]
+    assert auth.revoke(known.hash[:16], "somebody")
+    again = auth.issue("lab", [Scope.RUN_TEST, Scope.READ_LIVE], "somebody", text=text if same_text else None)
+    assert service.client(again).post("/v1/tests", json={"participant": participant}).status_code == 202
 
 
 def test_a_form_that_comes_back_for_want_of_something_is_as_old_as_it_was(
@@ -268,12 +262,25 @@ def test_a_models_version_is_a_controllers_only(
     assert approved and service.rig.starts == 1
 
 
-def test_a_trial_ends_with_the_day_of_its_key(
-    service: Service, client: httpx.Client, participant: str, approved: str
+@pytest.mark.parametrize("how", ["its day", "its right, while the store cannot be read", "set muscle", "archive"])
+def test_a_trial_that_plays_ends_with(
+    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
+    """With the day of its key, its right, or what another service does to the participant."""
     playing(service, client, participant)
-    clock = service.app.state.context.clock
-    service.app.state.context.runner.clock = Tomorrow(clock)
+    context = service.app.state.context
+
+    def gone(_: object) -> list[Any]:
+        raise OSError("the disk is gone")
+
+    if how == "its day":
+        context.runner.clock = Tomorrow(context.clock)
+    elif how.startswith("its right"):
+        monkeypatch.setattr(context.runner, "overtaking", gone)
+        context.runner.current.until_utc = "2026-01-01T00:00:00.000Z"
+    else:
+        with context.store.write() as session:
+            audit.write(session, context.clock.utc(), "somebody elsewhere", how, participant)
     soon(lambda: service.rig.withdrawn)
     assert [request.begun for request in service.rig.withdrawn] == [True] and approved
 
@@ -351,43 +358,6 @@ def test_a_trial_ends_with_its_makers_token_and_a_programs_test_does_not(
         asyncio.run_coroutine_threadsafe(context.runner.look_again(), context.rig._task.get_loop()).result(20)
     assert len(service.rig.withdrawn) == told == by_key, "once, and not again"
     assert service.rig.starts == starts + 1 and approved
-
-
-def test_a_trial_ends_with_its_right_also_while_the_store_cannot_be_read(
-    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    playing(service, client, participant)
-    runner = service.app.state.context.runner
-
-    def gone(_: object) -> list[Any]:
-        raise OSError("the disk is gone")
-
-    monkeypatch.setattr(runner, "overtaking", gone)
-    runner.current.until_utc = "2026-01-01T00:00:00.000Z"
-    soon(lambda: service.rig.withdrawn)
-    assert [request.begun for request in service.rig.withdrawn] == [True] and approved
-
-
-def test_a_token_that_came_back_starts_tests(service: Service, client: httpx.Client, participant: str) -> None:
-    """With the same text: its revocation stays in the trail, newer than what was read of the participant."""
-    text = service.token("lab", "run-test", "read-live")
-    auth = service.app.state.context.auth
-    (known,) = [row for row in service.app.state.context.store.all(Token) if row.name == "lab"]
-    assert auth.revoke(known.hash[:16], "somebody")
-    auth.issue("lab", [Scope.RUN_TEST, Scope.READ_LIVE], "somebody", text=text)
-    assert service.client(text).post("/v1/tests", json={"participant": participant}).status_code == 202
-
-
-@pytest.mark.parametrize("action", ["set muscle", "archive"])
-def test_what_another_service_does_to_a_participant_ends_a_trial(
-    service: Service, client: httpx.Client, participant: str, approved: str, action: str
-) -> None:
-    playing(service, client, participant)
-    store, now = service.app.state.context.store, service.app.state.context.clock.utc()
-    with store.write() as session:
-        audit.write(session, now, "somebody elsewhere", action, participant)
-    soon(lambda: service.rig.withdrawn)
-    assert [request.begun for request in service.rig.withdrawn] == [True] and approved
 
 
 def test_what_was_seen_before_midnight_is_not_decided_after_it(
