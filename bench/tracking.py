@@ -27,8 +27,8 @@ from bench.tracking_cases import CASES, NOTHING, PEAK_SHARE, patient
 from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
 from stimrig import identify
+from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.offline import simulate
-from stimrig.hardware_sim.patients import registry
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 
@@ -41,7 +41,7 @@ class Person:
     """A muscle on its own clock, and the noise of its sensor."""
 
     def __init__(self, seed: int, case: str) -> None:
-        self.muscle = registry.make("changing", patient(seed, case))
+        self.muscle = patients.make("changing", patient(seed, case))
         self.rng = np.random.default_rng([seed, 15])
         self.now_s = 0.0
 

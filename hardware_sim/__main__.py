@@ -12,10 +12,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim import options as command_line
 from stimrig.hardware_sim.emulator import Emulator
 from stimrig.hardware_sim.errors import FaultError, HardwareSimError
-from stimrig.hardware_sim.factory import HIDDEN, hidden_patients, make_devices
+from stimrig.hardware_sim.factory import HIDDEN, make_devices
 
 PROG = "stimrig emulate"
 FASTEST_AT_PRIORITY = 5.0
@@ -29,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return done.code if isinstance(done.code, int) else 2
     try:
         if options.reveal is not None:
-            print(json.dumps(hidden_patients().reveal(options.reveal, moving=options.arm is not None)))
+            print(json.dumps(hidden.reveal(options.reveal, moving=options.arm is not None)))
             return 0
         patient = options.patient if options.hidden is None else f"{HIDDEN}{options.hidden}"
         settings = command_line.settings(options, patient)

@@ -10,47 +10,41 @@ from __future__ import annotations
 import json
 import math
 import socket
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.errors import ArmError, FaultError, HardwareSimError
-from stimrig.hardware_sim.reactor import Reactor
-from stimrig.hardware_sim.wall_clock import WallClock
+from stimrig.hardware_sim.ports import Reactor
+from stimrig.hardware_sim.timeline import WallClock
 
 LONGEST_LINE = 65536
 SEND_TIMEOUT_S = 1.0
 
 
-class Controlled(Protocol):
-    """What the control line reads and changes."""
-
-    devices: Devices
-    clock: WallClock
-
-    def catch_up(self) -> None:
-        """Simulate everything up to the present."""
-        ...
-
-    def state(self) -> dict[str, Any]:
-        """The present state, as plain values."""
-        ...
-
-
 class Control:
-    """Answers any number of clients, in the emulator's own thread."""
+    """Answers any number of clients, in the emulator's own thread; `catch_up` simulates up to the present first."""
 
-    def __init__(self, reactor: Reactor, path: Path, emulator: Controlled) -> None:
+    def __init__(
+        self,
+        reactor: Reactor,
+        path: Path,
+        devices: Devices,
+        clock: WallClock,
+        catch_up: Callable[[], None],
+        state: Callable[[], dict[str, Any]],
+    ) -> None:
         self.path = path
-        self._reactor, self._emulator, self._devices = reactor, emulator, emulator.devices
+        self._reactor, self._devices, self._clock, self._catch_up = reactor, devices, clock, catch_up
         self._clients: dict[socket.socket, bytes] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(path))
         self._listener.listen()
         self._listener.setblocking(False)
         reactor.add(self._listener, self._accept)
-        self._commands = {
-            "state": self._state,
+        self._commands: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+            "state": lambda _request: state(),
             "pulses": self._pulses,
             "faults": self._faults,
             "fault": self._fault,
@@ -74,20 +68,17 @@ class Control:
         if command not in self._commands:
             known = ", ".join(self._commands)
             return {"ok": False, "error": f"unknown command {command!r}; there are {known}"}
-        self._emulator.catch_up()
+        self._catch_up()
         try:
             return {"ok": True, **self._commands[command](request)}
         except HardwareSimError as error:
             return {"ok": False, "error": str(error)}
 
-    def _state(self, _request: dict[str, Any]) -> dict[str, Any]:
-        return self._emulator.state()
-
     def _pulses(self, request: dict[str, Any]) -> dict[str, Any]:
         since = request.get("since", 0)
         pulses = self._devices.electrodes.pulses(since if isinstance(since, int) and since >= 0 else 0)
         for pulse in pulses:
-            pulse["monotonic_s"] = self._emulator.clock.monotonic_s(pulse["time_s"])
+            pulse["monotonic_s"] = self._clock.monotonic_s(pulse["time_s"])
         return {"pulses": pulses}
 
     def _faults(self, _request: dict[str, Any]) -> dict[str, Any]:
@@ -104,7 +95,7 @@ class Control:
         time_s = self._devices.timeline.now_s
         return {
             "time_s": time_s,
-            "monotonic_s": self._emulator.clock.monotonic_s(time_s),
+            "monotonic_s": self._clock.monotonic_s(time_s),
             "active": self._devices.faults.active(),
             "pulses_received": len(self._devices.electrodes.log),
         }
@@ -114,7 +105,7 @@ class Control:
         if limb is None:
             raise ArmError("this rig has no arm; start it with --arm")
         limb.move(str(request.pop("mode", "")), request, time_s)
-        return {"time_s": time_s, "monotonic_s": self._emulator.clock.monotonic_s(time_s), **limb.state()}
+        return {"time_s": time_s, "monotonic_s": self._clock.monotonic_s(time_s), **limb.state()}
 
     def _accept(self) -> None:
         try:

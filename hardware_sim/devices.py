@@ -11,21 +11,19 @@ import random
 from collections.abc import Callable
 from typing import Any
 
-from stimrig.hardware_sim import stimulators
-from stimrig.hardware_sim.angle_sensors import mounted
+from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.limb import Limb
 from stimrig.hardware_sim.electrodes import Electrodes
-from stimrig.hardware_sim.errors import SettingsError
 from stimrig.hardware_sim.faults.registry import Faults
-from stimrig.hardware_sim.load_cells import cells
-from stimrig.hardware_sim.load_cells.frames import CellProtocol, Frame
+from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.patients.muscle import Muscle
-from stimrig.hardware_sim.sampling import Noise, take_in_order
-from stimrig.hardware_sim.scan import pick
+from stimrig.hardware_sim.sampling import take_in_order
 from stimrig.hardware_sim.settings import Settings
-from stimrig.hardware_sim.stimulators.board import Board, FirmwareProtocol
+from stimrig.hardware_sim.stimulators import STIMULATORS
+from stimrig.hardware_sim.stimulators.board import Board, Firmware
+from stimrig.hardware_sim.tables import pick
 from stimrig.hardware_sim.timeline import Timeline
 
 
@@ -61,10 +59,12 @@ class Devices:
         self.timeline = Timeline()
         self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
         muscle = self.limb or muscle
-        self.encoder = mounted.encoder(self.limb.angle_deg, settings) if self.limb else None
-        read_angle = self.encoder.read if self.encoder and settings.angle == "in-cell" else None
-        self.load_cell = _make_load_cell(muscle, settings, epoch_us, read_angle)
-        self.angle_sensor = mounted.own_sensor(self.encoder, self.load_cell.add_frame, settings, epoch_us)
+        self.encoder = Encoder(self.limb.angle_deg, settings) if self.limb else None
+        own = settings.angle == "own"
+        self.load_cell = LoadCell(muscle, settings, epoch_us, self.encoder.read if self.encoder and not own else None)
+        self.angle_sensor = (
+            AngleSensor(self.encoder, self.load_cell.add_frame, settings, epoch_us) if self.encoder and own else None
+        )
         self.timeline.followers.append(self._sample_until)
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
         self.stimulator_plugged = self.cell_plugged = True
@@ -74,7 +74,7 @@ class Devices:
         self._bytes: list[tuple[float, bytes]] = []
         self._frames: list[Frame] = []
         self.board = Board(self.timeline, self.electrodes, self._write, self._count_unread_bytes)
-        self.firmware: FirmwareProtocol = pick(stimulators, "Firmware", settings.stimulator, "stimulator")(self.board)
+        self.firmware: Firmware = pick(STIMULATORS, "stimulator", settings.stimulator)(self.board)
         self.faults = Faults(self)
 
     def received(self, time_s: float, data: bytes) -> None:
@@ -111,27 +111,16 @@ class Devices:
         taken, self._frames = self._frames, []
         return taken
 
-    def plug_stimulator(self) -> None:
-        """Connect the stimulator."""
-        self.stimulator_plugged = True
-        self.on_stimulator_cable(True)
+    def plug_stimulator(self, plugged: bool = True) -> None:
+        """Connect the stimulator, or pull its cable; the device itself goes on."""
+        self.stimulator_plugged = plugged
+        self.on_stimulator_cable(plugged)
 
-    def unplug_stimulator(self) -> None:
-        """Pull the stimulator's cable; the device itself goes on."""
-        self.stimulator_plugged = False
-        self.on_stimulator_cable(False)
-
-    def plug_cell(self) -> None:
-        """Connect the adapter of load cell and angle sensor."""
+    def plug_cell(self, plugged: bool = True) -> None:
+        """Connect the adapter of load cell and angle sensor, or pull it; the sensors go on."""
         self._collect_frames()
-        self.cell_plugged = True
-        self.on_cell_cable(True)
-
-    def unplug_cell(self) -> None:
-        """Pull the adapter; the sensors go on."""
-        self._collect_frames()
-        self.cell_plugged = False
-        self.on_cell_cable(False)
+        self.cell_plugged = plugged
+        self.on_cell_cable(plugged)
 
     def power_cycle(self) -> None:
         """Power lost and back now, for all devices: what they have not sent is lost, and they start anew.
@@ -139,7 +128,7 @@ class Devices:
         The muscle, the electrodes' log, the cables and the faults that are on stay as they are.
         """
         self.firmware.reset()
-        self.load_cell.restart(_make_cell(self.settings))
+        self.load_cell.restart()
         if self.angle_sensor is not None:
             self.angle_sensor.counter = 0
         self._bytes.clear()
@@ -179,35 +168,3 @@ class Devices:
         frames = self.load_cell.take_frames()
         if self.cell_plugged:
             self._frames += frames
-
-
-def _make_load_cell(muscle: Muscle, settings: Settings, epoch_us: int, read_angle: Any) -> LoadCell:
-    return LoadCell(
-        muscle,
-        _make_cell(settings),
-        Noise(settings.noise_nm, settings.noise_seed),
-        settings.rate_hz,
-        offset_nm=settings.torque_offset_nm,
-        clock_ppm=settings.clock_ppm,
-        jitter_s=settings.clock_jitter_us * 1e-6,
-        has_sync=settings.sync,
-        epoch_us=epoch_us,
-        read_angle=read_angle,
-    )
-
-
-def _make_cell(settings: Settings) -> CellProtocol:
-    """The cell's electronics.
-
-    Raises
-    ------
-    SettingsError
-        It has no frame of so many samples.
-    """
-    kind = pick(cells, "Cell", settings.cell, "load cell")
-    if settings.samples_per_frame not in kind.layouts:
-        takes = " or ".join(map(str, kind.layouts))
-        raise SettingsError(
-            f"--samples-per-frame must be {takes} with --cell {settings.cell}, not {settings.samples_per_frame}"
-        )
-    return kind(settings.samples_per_frame)

@@ -10,15 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from stimrig.hardware_sim.angle_sensors import mounted
+from stimrig.hardware_sim import angle_sensor
 from stimrig.hardware_sim.control import Control
 from stimrig.hardware_sim.devices import Devices
-from stimrig.hardware_sim.load_cells import transports
-from stimrig.hardware_sim.load_cells.frames import TransportProtocol
-from stimrig.hardware_sim.pseudo_terminal import PseudoTerminal
-from stimrig.hardware_sim.reactor import Reactor
-from stimrig.hardware_sim.scan import pick
-from stimrig.hardware_sim.wall_clock import WallClock
+from stimrig.hardware_sim.load_cells import TRANSPORTS
+from stimrig.hardware_sim.ports import PseudoTerminal, Reactor
+from stimrig.hardware_sim.tables import pick
+from stimrig.hardware_sim.timeline import WallClock
 
 TICK_S = 0.0025
 """How often frames are delivered, in real time: four at a time at 1600 samples/s."""
@@ -34,16 +32,17 @@ class Emulator:
 
     def __init__(self, devices: Devices) -> None:
         self.devices = devices
-        self._transport_class = pick(transports, "Transport", devices.settings.transport, "transport")
+        self._transport_class = pick(TRANSPORTS, "transport", devices.settings.transport)
         self._reactor = Reactor()
         self._folder = Path(tempfile.mkdtemp(prefix="stimrig-emulator-"))
         devices.unread_bytes = lambda: self.port.unread_bytes()
-        devices.on_stimulator_cable = lambda plugged: self._plug_stimulator() if plugged else self._unplug_stimulator()
-        devices.on_cell_cable = lambda plugged: self._plug_cell() if plugged else self._unplug_cell()
-        self._plug_stimulator()
-        self._plug_cell()
-        self._control = Control(self._reactor, self._folder / "control", self)
+        devices.on_stimulator_cable = self._plug_stimulator
+        devices.on_cell_cable = self._plug_cell
+        self._plug_stimulator(True)
+        self._plug_cell(True)
         self.clock = WallClock(devices.settings.speed)
+        path = self._folder / "control"
+        self._control = Control(self._reactor, path, devices, self.clock, self.catch_up, self.state)
 
     def ready(self) -> dict[str, Any]:
         """What the host needs to know: the line printed once the devices answer."""
@@ -65,7 +64,7 @@ class Emulator:
             "noise_nm": settings.noise_nm,
             "noise_seed": settings.noise_seed,
             "sync": settings.sync and cell.has_sync,
-            **({"arm": limb.mode, "angle_sensor": mounted.described(settings)} if limb else {}),
+            **({"arm": limb.mode, "angle_sensor": angle_sensor.describe(settings)} if limb else {}),
         }
 
     def run(self, stopping: Callable[[], bool]) -> None:
@@ -91,8 +90,8 @@ class Emulator:
     def close(self) -> None:
         """Unplug both devices and remove all files."""
         self._control.close()
-        self._unplug_stimulator()
-        self._unplug_cell()
+        self._plug_stimulator(False)
+        self._plug_cell(False)
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def state(self) -> dict[str, Any]:
@@ -108,29 +107,27 @@ class Emulator:
             "can": self.transport.can,
         }
 
-    def _plug_stimulator(self) -> None:
-        """Make a port for the stimulator and a link to it."""
-        self.port = PseudoTerminal()
-        self._reactor.add(self.port, self._read)
+    def _plug_stimulator(self, plugged: bool) -> None:
+        """Make a port for the stimulator and a link to it, or remove it once what was written has gone through."""
+        if plugged:
+            self.port = PseudoTerminal()
+            self._reactor.add(self.port, self._read)
+        else:
+            self._write()
+            if self.port.is_open:
+                self._reactor.remove(self.port)
+                self.port.close()
         self._link.unlink(missing_ok=True)
-        self._link.symlink_to(self.port.path)
+        if plugged:
+            self._link.symlink_to(self.port.path)
 
-    def _unplug_stimulator(self) -> None:
-        """Remove the stimulator's port, once what was written before has gone through."""
-        self._write()
-        if self.port.is_open:
-            self._reactor.remove(self.port)
-            self.port.close()
-        self._link.unlink(missing_ok=True)
-
-    def _plug_cell(self) -> None:
-        """Make the cell's adapter, on a new port."""
-        self.transport: TransportProtocol = self._transport_class(self._reactor, self._receive_frame)
-
-    def _unplug_cell(self) -> None:
-        """Remove the cell's adapter, once the frames sent before have gone through."""
-        self._deliver()
-        self.transport.close()
+    def _plug_cell(self, plugged: bool) -> None:
+        """Make the cell's adapter, on a new port, or remove it once the frames sent before have gone through."""
+        if plugged:
+            self.transport = self._transport_class(self._reactor, self._receive_frame)
+        else:
+            self._deliver()
+            self.transport.close()
 
     @property
     def _link(self) -> Path:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+from stimrig.hardware_sim import hidden, patients
 from stimrig.hardware_sim.arm import description as arms
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.tissue import bare
 from stimrig.hardware_sim.devices import Devices
-from stimrig.hardware_sim.errors import ArmError, PatientError
-from stimrig.hardware_sim.patients import registry
+from stimrig.hardware_sim.errors import ArmError
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.settings import Settings
 
@@ -44,28 +42,8 @@ def make_devices(
         Patient, arm or a setting cannot be used.
     """
     seed = _hidden_seed(settings.patient)
-    muscle = _muscle(settings.patient) if seed is None else hidden_patients().make(seed, moving=arm is not None)
+    muscle = _muscle(settings.patient) if seed is None else hidden.make(seed, moving=arm is not None)
     return Devices(muscle, settings, None if arm is None else _arm(arm, arm_laws, seed), epoch_us)
-
-
-def hidden_patients() -> Any:
-    """The module that makes hidden patients and reveals what they hide.
-
-    Raises
-    ------
-    PatientError
-        This installation has none.
-    """
-    module = "stimrig.hardware_sim.hidden"
-    try:
-        hidden = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name != module:
-            raise
-        hidden = None
-    if not hasattr(hidden, "make"):
-        raise PatientError("hidden patients are not part of this installation; use --patient")
-    return hidden
 
 
 def _hidden_seed(patient: str) -> int | None:
@@ -76,11 +54,10 @@ def _hidden_seed(patient: str) -> int | None:
 
 
 def _muscle(patient: str) -> Muscle:
-    if patient not in registry.names() and (
-        Path(patient).suffix.lower() in {".toml", ".json"} or Path(patient).exists()
-    ):
-        return registry.from_file(Path(patient))
-    return registry.make(patient)
+    file = Path(patient)
+    if patient not in patients.PATIENTS and (file.suffix.lower() in {".toml", ".json"} or file.exists()):
+        return patients.from_file(file)
+    return patients.make(patient)
 
 
 def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:
@@ -90,5 +67,5 @@ def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:
     if laws:
         raise ArmError("--arm-law: what the arm of a hidden patient does is hidden, too")
     if text == DESIGN:
-        return Arm("waves", hidden_patients().movement(hidden_seed), bare())
+        return Arm("waves", hidden.movement(hidden_seed), bare())
     return replace(arms.read(text), tissue=bare())

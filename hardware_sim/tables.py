@@ -1,13 +1,16 @@
-"""Tables of a TOML or JSON file, as patients and arms are described."""
+"""Tables: those of TOML and JSON files, which describe patients and arms, and those of kinds of devices by name."""
 
 from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from stimrig.hardware_sim.errors import HardwareSimError
+from stimrig.hardware_sim.errors import HardwareSimError, SettingsError
+
+Kind = TypeVar("Kind")
 
 
 def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[str, Any]:
@@ -31,3 +34,16 @@ def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[st
     if not isinstance(described, dict):
         raise error(f"{path}: must hold {holds}")
     return described
+
+
+def pick(kinds: Mapping[str, Kind], what: str, name: str) -> Kind:
+    """The one of this name.
+
+    Raises
+    ------
+    SettingsError
+        There is none; the message lists all.
+    """
+    if name not in kinds:
+        raise SettingsError(f"unknown {what} '{name}'; there are {', '.join(kinds)}")
+    return kinds[name]

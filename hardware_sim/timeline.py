@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import time
 from collections.abc import Callable
 
 
@@ -19,9 +20,12 @@ class Event:
         self.time_s = time_s
         self.action: Callable[[], None] | None = action
 
-    def cancel(self) -> None:
-        """Do nothing when the time comes."""
-        self.action = None
+
+def cancel(*events: Event | None) -> None:
+    """Do nothing of these when their time comes."""
+    for event in events:
+        if event is not None:
+            event.action = None
 
 
 class Timeline:
@@ -70,3 +74,19 @@ class Timeline:
             for follow in self.followers:
                 follow(time_s)
             self.now_s = time_s
+
+
+class WallClock:
+    """Seconds since the start on the machine's monotonic clock, `speed` times faster."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.speed = speed
+        self._start_s = time.monotonic()
+
+    def now_s(self) -> float:
+        """Emulated seconds since the start."""
+        return (time.monotonic() - self._start_s) * self.speed
+
+    def monotonic_s(self, time_s: float) -> float:
+        """The machine's monotonic time at an emulated time."""
+        return self._start_s + time_s / self.speed

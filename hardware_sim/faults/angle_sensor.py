@@ -8,41 +8,42 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from stimrig.hardware_sim.angle_sensors.encoder import AngleHook, Encoder
-from stimrig.hardware_sim.angle_sensors.sensor import AngleSensor
+from stimrig.hardware_sim.angle_sensor import AngleHook, AngleSensor, Encoder
 from stimrig.hardware_sim.errors import FaultError
-from stimrig.hardware_sim.faults.registry import Undo, fault, hooked, replaced
-from stimrig.hardware_sim.faults.target import Target
+from stimrig.hardware_sim.faults.registry import (
+    Target,
+    Undo,
+    at_another_rate,
+    check_not_negative,
+    fault,
+    frames_sometimes,
+    hooked,
+    replaced,
+    sometimes,
+    stuck,
+)
 
 
 @fault
 def angle_stuck(target: Target) -> Undo:
     """The reading stays at its present value, without noise; the counter goes on."""
-    first: list[float] = []
-
-    def hold(raw_deg: float, _time_s: float) -> float:
-        if not first:
-            first.append(raw_deg)
-        return first[0]
-
-    return _reading(target, hold)
+    return _reading(target, stuck())
 
 
 @fault
 def angle_silent(target: Target) -> Undo:
     """No angle frame comes any more; the sensor counts on, and the cell's frames come."""
-    return hooked(_sensor(target).frame_hooks, lambda _frame: ())
+    return hooked(lambda _frame: (), _sensor(target).frame_hooks)
 
 
 @fault
 def angle_unplugged(target: Target) -> Undo:
     """The sensor's cable is pulled. When undone, it starts anew and counts from 0."""
-    sensor = _sensor(target)
-    unhook = hooked(sensor.frame_hooks, lambda _frame: ())
+    unhook = angle_silent(target)
 
     def plug() -> None:
         unhook()
-        sensor.counter = 0
+        _sensor(target).counter = 0
 
     return plug
 
@@ -50,19 +51,14 @@ def angle_unplugged(target: Target) -> Undo:
 @fault
 def angle_jump(target: Target, step_deg: float = 20.0, probability: float = 0.02) -> Undo:
     """Single readings are off by `step_deg`, at random up or down."""
-
-    def jump(raw_deg: float, _time_s: float) -> float:
-        if target.random.random() >= probability:
-            return raw_deg
-        return raw_deg + target.random.choice((-step_deg, step_deg))
-
-    return _reading(target, jump)
+    off = lambda raw_deg: raw_deg + target.random.choice((-step_deg, step_deg))  # noqa: E731
+    return _reading(target, sometimes(target, probability, off))
 
 
 @fault
 def angle_nan(target: Target, probability: float = 1.0) -> Undo:
     """The reading is not a number (in the cell's frame: its lowest count)."""
-    return _reading(target, lambda raw_deg, _: math.nan if target.random.random() < probability else raw_deg)
+    return _reading(target, sometimes(target, probability, lambda _raw_deg: math.nan))
 
 
 @fault
@@ -74,7 +70,7 @@ def angle_offset_step(target: Target, step_deg: float = 10.0) -> Undo:
 @fault
 def angle_reversed(target: Target, about_present: bool = True) -> Undo:
     """The reading goes the other way, from where it is (without a jump), or about its own zero."""
-    pivot_deg = [] if about_present else [_encoder(target).mounting.offset_deg]
+    pivot_deg = [] if about_present else [_encoder(target).settings.angle_offset_deg]
 
     def turn(raw_deg: float, _time_s: float) -> float:
         if not pivot_deg:
@@ -93,8 +89,7 @@ def angle_noise_burst(target: Target, sd_deg: float = 2.0) -> Undo:
 @fault
 def angle_delayed(target: Target, delay_s: float = 0.1) -> Undo:
     """The reading is `delay_s` old, by a filter in the sensor; counter and stamp do not know."""
-    if not 0.0 <= delay_s < math.inf:
-        raise FaultError(f"setting 'delay_s' of fault 'angle_delayed' must be a number from 0 on, not {delay_s:g}")
+    check_not_negative("angle_delayed", "delay_s", delay_s)
     waiting: deque[tuple[float, float]] = deque()
 
     def delay(raw_deg: float, time_s: float) -> float:
@@ -115,15 +110,13 @@ def angle_fault_bit(target: Target) -> Undo:
 @fault
 def angle_frames_lost(target: Target, probability: float = 0.1) -> Undo:
     """Angle frames are lost at random."""
-    return hooked(_sensor(target).frame_hooks, lambda frame: () if target.random.random() < probability else (frame,))
+    return hooked(frames_sometimes(target, probability, lambda _frame: ()), _sensor(target).frame_hooks)
 
 
 @fault
 def angle_frames_repeated(target: Target, probability: float = 0.1) -> Undo:
     """Angle frames come twice at random."""
-    return hooked(
-        _sensor(target).frame_hooks, lambda frame: (frame, frame) if target.random.random() < probability else (frame,)
-    )
+    return hooked(frames_sometimes(target, probability, lambda frame: (frame, frame)), _sensor(target).frame_hooks)
 
 
 @fault
@@ -139,12 +132,11 @@ def angle_rate_off(target: Target, percent: float = 5.0) -> Undo:
     clock = _sensor(target).clock
     if not -100.0 < percent < math.inf:
         raise FaultError(f"setting 'percent' of fault 'angle_rate_off' must be above -100, not {percent:g}")
-    clock.set_rate_factor(1.0 + percent / 100.0)
-    return lambda: clock.set_rate_factor(1.0)
+    return at_another_rate(clock, percent)
 
 
 def _reading(target: Target, hook: AngleHook) -> Undo:
-    return hooked(_encoder(target).hooks, hook)
+    return hooked(hook, _encoder(target).hooks)
 
 
 def _encoder(target: Target) -> Encoder:

@@ -6,9 +6,17 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from stimrig.hardware_sim.errors import FaultError
-from stimrig.hardware_sim.faults.registry import Undo, fault, hooked
-from stimrig.hardware_sim.faults.target import Target
+from stimrig.hardware_sim.faults.registry import (
+    Target,
+    Undo,
+    at_another_rate,
+    check_not_negative,
+    fault,
+    frames_sometimes,
+    hooked,
+    sometimes,
+    stuck,
+)
 from stimrig.hardware_sim.load_cells.frames import Frame
 
 BUS_OFF_CLASS, BUS_ERROR_CLASS = 0x20000040, 0x20000080
@@ -18,13 +26,13 @@ BUS_OFF_CLASS, BUS_ERROR_CLASS = 0x20000040, 0x20000080
 @fault
 def cell_silent(target: Target) -> Undo:
     """No frame comes any more; the connection stays."""
-    return hooked(target.load_cell.frame_hooks, lambda _frame: ())
+    return hooked(lambda _frame: (), target.load_cell.frame_hooks)
 
 
 @fault
 def cell_unplugged(target: Target) -> Undo:
     """The adapter is pulled. When undone, it is back under another port, and clients must connect again."""
-    target.unplug_cell()
+    target.plug_cell(False)
     return target.plug_cell
 
 
@@ -53,7 +61,7 @@ def frames_out_of_order(target: Target, probability: float = 0.1) -> Undo:
             return ()
         return (frame,)
 
-    return hooked(target.load_cell.frame_hooks, swap)
+    return hooked(swap, target.load_cell.frame_hooks)
 
 
 @fault
@@ -67,47 +75,38 @@ def frames_corrupt(target: Target, probability: float = 0.1) -> Undo:
         data[target.random.randrange(len(data))] ^= 1 << target.random.randrange(8)
         return (frame._replace(data=bytes(data)),)
 
-    return hooked(target.load_cell.frame_hooks, flip)
+    return hooked(flip, target.load_cell.frame_hooks)
 
 
 @fault
 def torque_stuck(target: Target) -> Undo:
     """The reading stays at its present value, without noise; the counter goes on."""
-    first: list[float] = []
-
-    def hold(torque_nm: float) -> float:
-        if not first:
-            first.append(torque_nm)
-        return first[0]
-
-    return hooked(target.load_cell.torque_hooks, hold)
+    return hooked(stuck(), target.load_cell.torque_hooks)
 
 
 @fault
 def torque_nan(target: Target, probability: float = 1.0) -> Undo:
     """The reading is not a number."""
-    return hooked(
-        target.load_cell.torque_hooks,
-        lambda torque_nm: math.nan if target.random.random() < probability else torque_nm,
-    )
+    return hooked(sometimes(target, probability, lambda _torque_nm: math.nan), target.load_cell.torque_hooks)
 
 
 @fault
 def torque_sign_flipped(target: Target) -> Undo:
     """The cell is mounted the other way round."""
-    return hooked(target.load_cell.torque_hooks, lambda torque_nm: -torque_nm)
+    return hooked(lambda torque_nm, _time_s: -torque_nm, target.load_cell.torque_hooks)
 
 
 @fault
 def torque_saturated(target: Target, limit_nm: float = 3.0) -> Undo:
     """The amplifier saturates at ± `limit_nm`."""
-    return hooked(target.load_cell.torque_hooks, lambda torque_nm: min(max(torque_nm, -limit_nm), limit_nm))
+    limited = lambda torque_nm, _time_s: min(max(torque_nm, -limit_nm), limit_nm)  # noqa: E731
+    return hooked(limited, target.load_cell.torque_hooks)
 
 
 @fault
 def torque_step(target: Target, step_nm: float = 40.0) -> Undo:
     """The reading jumps: a knock on the fixture, or a spasm above the limit."""
-    return hooked(target.load_cell.torque_hooks, lambda torque_nm: torque_nm + step_nm)
+    return hooked(lambda torque_nm, _time_s: torque_nm + step_nm, target.load_cell.torque_hooks)
 
 
 @fault
@@ -136,14 +135,13 @@ def counter_jump(target: Target, step: int = 1000) -> Undo:
 @fault
 def rate_off(target: Target, percent: float = 5.0) -> Undo:
     """The cell samples faster than nominal, or slower if `percent` is negative."""
-    target.load_cell.clock.set_rate_factor(1.0 + percent / 100.0)
-    return lambda: target.load_cell.clock.set_rate_factor(1.0)
+    return at_another_rate(target.load_cell.clock, percent)
 
 
 @fault
 def clock_jitter(target: Target, sd_us: float = 100.0) -> Undo:
     """Each sample is taken off its time at random, never by more than 0.45 of a period."""
-    _check_not_negative("clock_jitter", "sd_us", sd_us)
+    check_not_negative("clock_jitter", "sd_us", sd_us)
     before_s = target.load_cell.clock.jitter_s
     target.load_cell.clock.set_jitter(sd_us * 1e-6)
     return lambda: target.load_cell.clock.set_jitter(before_s)
@@ -152,7 +150,7 @@ def clock_jitter(target: Target, sd_us: float = 100.0) -> Undo:
 @fault
 def delivery_jitter(target: Target, largest_s: float = 0.02) -> Undo:
     """A busy adapter: frames come up to `largest_s` late at random, in order and with their own time stamps."""
-    _check_not_negative("delivery_jitter", "largest_s", largest_s)
+    check_not_negative("delivery_jitter", "largest_s", largest_s)
     waiting: deque[Frame] = deque()
     last_s = 0.0
 
@@ -180,25 +178,9 @@ def delivery_jitter(target: Target, largest_s: float = 0.02) -> Undo:
 
 def _hooked_on_bus(target: Target, change: Callable[[Frame], Iterable[Frame]]) -> Undo:
     """Act on all frames of the bus: the cell's and those of an angle sensor."""
-    undo = [hooked(target.load_cell.frame_hooks, change)]
-    if target.angle_sensor is not None:
-        undo.append(hooked(target.angle_sensor.frame_hooks, change))
-
-    def unhook() -> None:
-        for take_out in undo:
-            take_out()
-
-    return unhook
+    sensors = [target.load_cell, *([target.angle_sensor] if target.angle_sensor else [])]
+    return hooked(change, *(sensor.frame_hooks for sensor in sensors))
 
 
 def _frame_fault(target: Target, probability: float, change: Callable[[Frame], Iterable[Frame]]) -> Undo:
-    """Send `change(frame)` instead of a frame, with this probability."""
-    return hooked(
-        target.load_cell.frame_hooks,
-        lambda frame: change(frame) if target.random.random() < probability else (frame,),
-    )
-
-
-def _check_not_negative(fault_name: str, setting: str, value: float) -> None:
-    if not 0 <= value < math.inf:
-        raise FaultError(f"setting '{setting}' of fault '{fault_name}' must be a number from 0 on, not {value:g}")
+    return hooked(frames_sometimes(target, probability, change), target.load_cell.frame_hooks)

@@ -8,18 +8,45 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import math
 import pkgutil
-from collections.abc import Callable
-from typing import Any, TypeVar
+import random
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol, TypeVar
 
 from stimrig.hardware_sim import faults
+from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.errors import FaultError
-from stimrig.hardware_sim.faults.target import Target
+from stimrig.hardware_sim.load_cells.frames import Frame
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.stimulators.board import Board, Firmware
+from stimrig.hardware_sim.timeline import Timeline
 
 Undo = Callable[[], None]
 Make = TypeVar("Make", bound=Callable[..., Undo])
 Hook = TypeVar("Hook")
 _FAULTS: dict[str, Callable[..., Undo]] = {}
+
+
+class Target(Protocol):
+    """The emulated devices and their cables; `random` gives every random number that a fault needs.
+
+    The encoder is there where the rig has an arm, the angle sensor where the angle comes in frames of its own.
+    """
+
+    random: random.Random
+    timeline: Timeline
+    board: Board
+    firmware: Firmware
+    load_cell: LoadCell
+    encoder: Encoder | None
+    angle_sensor: AngleSensor | None
+
+    def plug_stimulator(self, plugged: bool = True) -> None:
+        """Connect the stimulator, or pull its cable."""
+
+    def plug_cell(self, plugged: bool = True) -> None:
+        """Connect the load cell's adapter, or pull it."""
 
 
 def fault(make: Make) -> Make:
@@ -35,10 +62,16 @@ def library() -> dict[str, Callable[..., Undo]]:
     return dict(sorted(_FAULTS.items()))
 
 
-def hooked(hooks: list[Hook], hook: Hook) -> Undo:
-    """Add `hook` to `hooks`; the result removes it."""
-    hooks.append(hook)
-    return lambda: hooks.remove(hook)
+def hooked(hook: Hook, *places: list[Hook]) -> Undo:
+    """Add `hook` to the hooks at these places; the result removes it."""
+    for hooks in places:
+        hooks.append(hook)
+
+    def unhook() -> None:
+        for hooks in places:
+            hooks.remove(hook)
+
+    return unhook
 
 
 def replaced(owner: object, attribute: str, value: object) -> Undo:
@@ -46,6 +79,42 @@ def replaced(owner: object, attribute: str, value: object) -> Undo:
     before = getattr(owner, attribute)
     setattr(owner, attribute, value)
     return lambda: setattr(owner, attribute, before)
+
+
+def sometimes(
+    target: Target, probability: float, change: Callable[[Any], Any], keep: Callable[[Any], Any] = lambda what: what
+) -> Any:
+    """A hook that gives `change(what)` with this probability, else `keep(what)`."""
+    return lambda what, *_: change(what) if target.random.random() < probability else keep(what)
+
+
+def frames_sometimes(target: Target, probability: float, change: Callable[[Frame], Iterable[Frame]]) -> Any:
+    """A hook that sends `change(frame)` instead of a frame with this probability."""
+    return sometimes(target, probability, change, lambda frame: (frame,))
+
+
+def stuck() -> Callable[[float, float], float]:
+    """A hook that holds the first reading."""
+    first: list[float] = []
+
+    def hold(reading: float, _time_s: float) -> float:
+        if not first:
+            first.append(reading)
+        return first[0]
+
+    return hold
+
+
+def at_another_rate(clock: Any, percent: float) -> Undo:
+    """Sample by `percent` faster than nominal."""
+    clock.set_rate_factor(1.0 + percent / 100.0)
+    return lambda: clock.set_rate_factor(1.0)
+
+
+def check_not_negative(fault_name: str, setting: str, value: float) -> None:
+    """Refuse a setting of a fault that is no number from 0 on."""
+    if not 0 <= value < math.inf:
+        raise FaultError(f"setting '{setting}' of fault '{fault_name}' must be a number from 0 on, not {value:g}")
 
 
 class Faults:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from stimrig.hardware_sim.faults.registry import Undo, fault, hooked, replaced
-from stimrig.hardware_sim.faults.target import Target
+from stimrig.hardware_sim.faults.registry import Target, Undo, fault, hooked, replaced, sometimes
 
 HALF_A_FRAME = bytes.fromhex("f0815581")
 
@@ -13,14 +12,14 @@ def stimulator_unplugged(target: Target, mid_frame: bool = True) -> Undo:
     """The cable is pulled after half a frame was sent. When undone, the port is back under another name."""
     if mid_frame:
         target.board.write(HALF_A_FRAME)
-    target.unplug_stimulator()
+    target.plug_stimulator(False)
     return target.plug_stimulator
 
 
 @fault
 def no_ack(target: Target) -> Undo:
     """The stimulator obeys but answers nothing."""
-    return hooked(target.board.outgoing, lambda _frame: None)
+    return hooked(lambda _frame: None, target.board.outgoing)
 
 
 @fault
@@ -30,7 +29,7 @@ def late_ack(target: Target, delay_s: float = 0.2) -> Undo:
     def delay(frame: bytes) -> None:
         target.timeline.after(delay_s, lambda: target.board.write(frame))
 
-    return hooked(target.board.outgoing, delay)
+    return hooked(delay, target.board.outgoing)
 
 
 @fault
@@ -39,9 +38,9 @@ def line_stalled(target: Target, to_device: bool = True, to_host: bool = True) -
     commands, answers = bytearray(), bytearray()
     undo = []
     if to_device:
-        undo.append(hooked(target.board.incoming, lambda data: commands.extend(data)))
+        undo.append(hooked(lambda data: commands.extend(data), target.board.incoming))
     if to_host:
-        undo.append(hooked(target.board.outgoing, lambda data: answers.extend(data)))
+        undo.append(hooked(lambda data: answers.extend(data), target.board.outgoing))
 
     def deliver() -> None:
         for take_out in undo:
@@ -57,19 +56,19 @@ def line_stalled(target: Target, to_device: bool = True, to_host: bool = True) -
 @fault
 def frames_doubled(target: Target, probability: float = 1.0) -> Undo:
     """What the host sends arrives twice, with this probability for each piece read."""
-    return hooked(target.board.incoming, lambda data: data * 2 if target.random.random() < probability else data)
+    return hooked(sometimes(target, probability, lambda data: data * 2), target.board.incoming)
 
 
 @fault
 def corrupt_answers(target: Target, probability: float = 1.0) -> Undo:
     """One byte of an answer is changed, with this probability."""
-    return hooked(target.board.outgoing, lambda frame: _corrupted(target, frame, probability))
+    return hooked(lambda frame: _corrupted(target, frame, probability), target.board.outgoing)
 
 
 @fault
 def corrupt_commands(target: Target, probability: float = 1.0) -> Undo:
     """One byte of what the host sends is changed, with this probability for each piece read."""
-    return hooked(target.board.incoming, lambda data: _corrupted(target, data, probability))
+    return hooked(lambda data: _corrupted(target, data, probability), target.board.incoming)
 
 
 @fault

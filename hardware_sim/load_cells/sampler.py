@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import chain, repeat
 
-from stimrig.hardware_sim.load_cells.frames import AngleReading, CellProtocol, Frame, Sample
+from stimrig.hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.load_cells.cells import CELLS, Cell
+from stimrig.hardware_sim.load_cells.frames import AngleReading, Frame, Sample
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.sampling import Noise, SampleClock
+from stimrig.hardware_sim.settings import Settings
+from stimrig.hardware_sim.tables import pick
 
-TorqueHook = Callable[[float], float]
+TorqueHook = Callable[[float, float], float]
 FrameHook = Callable[[Frame], Iterable[Frame]]
 JITTER_SEED = 0x7177E2
 
@@ -17,22 +21,16 @@ JITTER_SEED = 0x7177E2
 class LoadCell:
     """Advances the muscle and turns its torque into frames.
 
-    Faults act on `torque_hooks` and `frame_hooks`. A torque hook changes a reading; a frame hook takes a frame and
-    returns those that are sent instead. A muscle may have a method `converted_nm(reading_nm, time_s)`: the last stage
-    of its cell, which comes after noise and offset (a converter that clips). `read_angle(time_s)` is there where the
-    cell's electronics read a joint angle too; it is read after the torque.
+    Faults act on `torque_hooks` and `frame_hooks`. A torque hook changes a reading at a time; a frame hook takes a
+    frame and returns those that are sent instead. A muscle may have a method `converted_nm(reading_nm, time_s)`: the
+    last stage of its cell, which comes after noise and offset (a converter that clips). `read_angle(time_s)` is there
+    where the cell's electronics read a joint angle too; it is read after the torque.
     """
 
     def __init__(
         self,
         muscle: Muscle,
-        cell: CellProtocol,
-        noise: Noise,
-        rate_hz: float,
-        offset_nm: float = 0.0,
-        clock_ppm: float = 0.0,
-        jitter_s: float = 0.0,
-        has_sync: bool = True,
+        settings: Settings,
         epoch_us: int = 0,
         read_angle: Callable[[float], AngleReading] | None = None,
     ) -> None:
@@ -40,20 +38,20 @@ class LoadCell:
         self.frame_hooks: list[FrameHook] = []
         self.counter = 0
         self.torque_nm = 0.0
-        self.clock = SampleClock(rate_hz, clock_ppm, jitter_s, JITTER_SEED, epoch_us)
-        self.cell = cell
-        self._muscle, self._noise = muscle, noise
+        jitter_s = settings.clock_jitter_us * 1e-6
+        self.clock = SampleClock(settings.rate_hz, settings.clock_ppm, jitter_s, JITTER_SEED, epoch_us)
+        self.cell = _make_cell(settings)
+        self._muscle, self._settings, self._noise = muscle, settings, Noise(settings.noise_nm, settings.noise_seed)
         self._converted_nm: Callable[[float, float], float] | None = getattr(muscle, "converted_nm", None)
         self._read_angle = read_angle
         self._one_by_one = self._converted_nm is not None or read_angle is not None
-        self._offset_nm, self._has_sync = offset_nm, has_sync
         self._sync = False
         self._held: list[Sample] = []
         self._frames: list[Frame] = []
 
     def raise_sync(self) -> None:
         """The stimulator's sync line: seen in the first sample from now on."""
-        self._sync = self._has_sync
+        self._sync = self._settings.sync
 
     def produce(self, until_s: float) -> None:
         """Take all samples that are due before `until_s`, in emulated seconds."""
@@ -63,9 +61,9 @@ class LoadCell:
         elif times_s := self.clock.take(until_s):
             self._read(times_s)
 
-    def restart(self, cell: CellProtocol) -> None:
+    def restart(self) -> None:
         """Power lost and back, with electronics as they are from power-on: what has not been taken is lost."""
-        self.cell, self.counter, self._sync = cell, 0, False
+        self.cell, self.counter, self._sync = _make_cell(self._settings), 0, False
         self._held.clear()
         self._frames.clear()
 
@@ -93,11 +91,12 @@ class LoadCell:
         torques_nm = list(map(self._muscle.torque_nm, times_s))
         self.torque_nm = torques_nm[-1]
         noise_nm = self._noise.take(len(times_s))
-        readings_nm = [nm + self._offset_nm + more for nm, more in zip(torques_nm, noise_nm, strict=True)]
+        offset_nm = self._settings.torque_offset_nm
+        readings_nm = [nm + offset_nm + more for nm, more in zip(torques_nm, noise_nm, strict=True)]
         if self._converted_nm is not None:
             readings_nm = [self._converted_nm(readings_nm[0], times_s[0])]
         for hook in self.torque_hooks:
-            readings_nm = [hook(readings_nm[0])]
+            readings_nm = [hook(readings_nm[0], times_s[0])]
         angle = self._read_angle(times_s[0]) if self._read_angle else None
         counters = range(self.counter, self.counter + len(times_s))
         syncs = chain((self._sync,), repeat(False))
@@ -107,7 +106,7 @@ class LoadCell:
 
     def _send(self, samples: Iterable[Sample]) -> None:
         """Frames of these samples; a cell that does not run throws them away."""
-        if not self.cell.running():
+        if not self.cell.running:
             self._held.clear()
             return
         frames, held, full = [], self._held, self.cell.samples_per_frame
@@ -119,3 +118,20 @@ class LoadCell:
         for hook in self.frame_hooks:
             frames = [changed for one in frames for changed in hook(one)]
         self._frames += frames
+
+
+def _make_cell(settings: Settings) -> Cell:
+    """The cell's electronics.
+
+    Raises
+    ------
+    SettingsError
+        It has no frame of so many samples.
+    """
+    kind = pick(CELLS, "load cell", settings.cell)
+    if settings.samples_per_frame not in kind.layouts:
+        takes = " or ".join(map(str, kind.layouts))
+        raise SettingsError(
+            f"--samples-per-frame must be {takes} with --cell {settings.cell}, not {settings.samples_per_frame}"
+        )
+    return kind(settings.samples_per_frame)

@@ -94,6 +94,3 @@ class CalciumMuscle:
         decay = half * half
         self._calcium = decay * (self._calcium + self._release * dt / tau_c)
         self._release *= decay
-
-
-make = CalciumMuscle

@@ -1,8 +1,8 @@
 """A muscle that changes over a session: it tires, warms up, slows; its threshold drifts; it cramps, or its owner helps.
 
 Recruitment is the share of nerve fibres whose threshold a pulse exceeds, with Weibull-distributed thresholds:
-f(u) = F (1 - exp(-((u - θ) / λ)^k)) above θ; then 2nd-order dynamics (`held`). Widths are scaled by charge. All changes
-are in use or time:
+f(u) = F (1 - exp(-((u - θ) / λ)^k)) above θ; then 2nd-order dynamics (`HeldPulses`). Widths are scaled by charge. All
+changes are in use or time:
 
 - A *store* s fills with use and empties at rest: s' = r v (1 - s) - s / τ (after Riener's fatigue, 1996). A fibre tires
   by the pulses that excite it, and those of low threshold are excited by most. So v = a (1 + h) / (a + h), a = f / F
@@ -22,7 +22,7 @@ import math
 from dataclasses import dataclass
 
 from stimrig.hardware_sim.errors import PatientError
-from stimrig.hardware_sim.patients.held import HeldPulses
+from stimrig.hardware_sim.patients.muscle import HeldPulses
 
 PAUSE_S = 5.0
 """A pause as long begins a new contraction."""
@@ -201,6 +201,3 @@ def _bump(share: float) -> float:
 
 def _smooth(level: float) -> float:
     return math.sin(0.5 * math.pi * level) ** 2 if level > 0.0 else 0.0
-
-
-make = ChangingMuscle

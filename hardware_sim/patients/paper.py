@@ -2,8 +2,8 @@
 
 f(u) = a1 (exp(a2 u) - 1) / (exp(a2 u) + a3), eq. (35), and G: T² y'' + 2 ζ T y' + y = f, unit gain at DC.
 
-The paper's input is a continuous pulse width, but a muscle gets pulses: see `held`. The paper gives f at one current.
-At another the width is scaled by charge: width × current / nominal current.
+The paper's input is a continuous pulse width, but a muscle gets pulses: see `HeldPulses`. The paper gives f at one
+current. At another the width is scaled by charge: width × current / nominal current.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from stimrig.hardware_sim.patients.held import HeldPulses
+from stimrig.hardware_sim.patients.muscle import HeldPulses
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,3 @@ class PaperMuscle(HeldPulses):
     def drive_nm(self, time_s: float, width_us: float, current_ma: float) -> float:  # noqa: ARG002
         """As `recruitment_nm`: this muscle does not change."""
         return self.recruitment_nm(width_us, current_ma)
-
-
-make = PaperMuscle

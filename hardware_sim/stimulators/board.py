@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 from stimrig.hardware_sim.electrodes import Electrodes
 from stimrig.hardware_sim.timeline import Timeline
@@ -44,17 +46,33 @@ class Board:
             self.write(sent)
 
 
-class FirmwareProtocol(Protocol):
-    """What every stimulator's firmware offers; its constructor takes the `Board`."""
+class Firmware(ABC):
+    """What every stimulator's firmware offers, by the commands that it takes."""
 
+    device: ClassVar[str]
+
+    def __init__(self, board: Board) -> None:
+        self._board = board
+        self.commands: Counter[int] = Counter()
+        """How often each came."""
+
+    @abstractmethod
     def received(self, data: bytes) -> None:
         """Bytes from the host, at the timeline's time."""
-        ...
 
+    @abstractmethod
     def reset(self) -> None:
-        """Power lost and back: no stimulation, nothing initialised."""
-        ...
+        """Power lost and back: no stimulation, nothing initialised, commands forgotten."""
 
+    @abstractmethod
     def state(self) -> dict[str, Any]:
         """For the control line: at least `mode` and `high_voltage_on`."""
-        ...
+
+    def _describe(self, mode: str, high_voltage_on: bool, corrupt_frames: int) -> dict[str, Any]:
+        return {
+            "device": self.device,
+            "mode": mode,
+            "high_voltage_on": high_voltage_on,
+            "corrupt_frames": corrupt_frames,
+            "commands": {str(command): count for command, count in sorted(self.commands.items())},
+        }

@@ -5,15 +5,14 @@ Low level: the host sends one LLChannelConfig per pulse. Silence means no stimul
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 from stimrig.hardware_sim.stimulators import sciencemode4
-from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.board import Board, Firmware
 from stimrig.hardware_sim.stimulators.framing import Packet
-from stimrig.hardware_sim.stimulators.p24_mid_level import MidLevel
-from stimrig.hardware_sim.stimulators.p24_points import (
+from stimrig.hardware_sim.stimulators.p24_mid_level import (
     ELECTRODE,
     ELECTRODE_DETECTION_MA,
     HIGH_VOLTAGE,
@@ -22,10 +21,11 @@ from stimrig.hardware_sim.stimulators.p24_points import (
     OK,
     PARAMETER,
     TRANSFER,
+    MidLevel,
     parse_points,
     within_limits,
 )
-from stimrig.hardware_sim.timeline import Event
+from stimrig.hardware_sim.timeline import Event, cancel
 
 LL_INIT, LL_CHANNEL_CONFIG, LL_STOP = 0, 2, 4
 ML_INIT, ML_UPDATE, ML_STOP, ML_GET_CURRENT_DATA = 30, 32, 34, 36
@@ -40,18 +40,19 @@ LOAD_KILOOHM = 1.0
 SOURCE_VOLT = 150.0
 
 
-class Firmware:
+class P24(Firmware):
     """The P24's state machine; commands are done one after another, in the order they came."""
 
+    device = "P24"
+
     def __init__(self, board: Board) -> None:
-        self._board = board
+        super().__init__(board)
         self._decoder = sciencemode4.Decoder()
         self._queue: deque[Packet] = deque()
         self._doing: Event | None = None
         self._level = NO_LEVEL
         self._source = self._measurement = 0
         self._mid_level = MidLevel(board)
-        self.commands: Counter[int] = Counter()
         self._handlers: dict[int, Callable[[Packet], None]] = {
             LL_INIT: self._ll_init,
             LL_CHANNEL_CONFIG: self._ll_channel_config,
@@ -91,20 +92,13 @@ class Firmware:
     def reset(self) -> None:
         """Power lost and back: no stimulation, nothing initialised, commands forgotten."""
         self._queue.clear()
-        if self._doing is not None:
-            self._doing.cancel()
-            self._doing = None
+        cancel(self._doing)
+        self._doing = None
         self._end_levels()
 
     def state(self) -> dict[str, Any]:
         """For the control line."""
-        return {
-            "device": "P24",
-            "mode": MODES[self.level],
-            "high_voltage_on": self.high_voltage_on,
-            "corrupt_frames": self._decoder.corrupt_frames,
-            "commands": {str(command): count for command, count in sorted(self.commands.items())},
-        }
+        return self._describe(MODES[self.level], self.high_voltage_on, self._decoder.corrupt_frames)
 
     def _work(self) -> None:
         while self._queue and self._doing is None:

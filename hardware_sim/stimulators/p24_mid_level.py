@@ -1,4 +1,4 @@
-"""The P24's mid level: the device repeats each channel's pulse by itself until the host changes or stops it.
+"""The P24's pulses, and its mid level: the device repeats each channel's pulse until the host changes or stops it.
 
 The host must send MLGetCurrentData at least every 2 s; silence stops the stimulation. A real device may accept other
 commands as a sign of life. This one does not, so that a driver that works here works there.
@@ -6,26 +6,37 @@ commands as a sign of life. This one does not, so that a driver that works here 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from stimrig.hardware_sim.electrodes import Point
 from stimrig.hardware_sim.stimulators.board import Board
-from stimrig.hardware_sim.stimulators.p24_points import (
-    ELECTRODE,
-    ELECTRODE_DETECTION_MA,
-    OK,
-    PARAMETER,
-    POINT_BYTES,
-    parse_points,
-    within_limits,
-)
-from stimrig.hardware_sim.timeline import Event
+from stimrig.hardware_sim.timeline import Event, cancel
 
+OK, TRANSFER, PARAMETER, NOT_INITIALISED, HIGH_VOLTAGE = 0, 1, 2, 7, 8
+ELECTRODE, INVALID_COMMAND = 10, 11
+ELECTRODE_DETECTION_MA = 15.0
+LARGEST_CURRENT_MA = 130.0
+POINT_BYTES = 4
 CHANNELS = 8
 SILENCE_S = 2.0
 ALL_ERRORS = 4
 SHORTEST_PERIOD_S = 0.0005
 ELECTRODE_NIBBLE = 1
+
+
+def parse_points(data: bytes, count: int) -> list[Point] | None:
+    """`count` points of u32 big endian, µs << 20 | (2·mA + 300) << 10; None if the length differs."""
+    if len(data) != count * POINT_BYTES:
+        return None
+    words = (int.from_bytes(data[i : i + POINT_BYTES], "big") for i in range(0, len(data), POINT_BYTES))
+    return [(word >> 20, ((word >> 10 & 0x3FF) - 300) / 2) for word in words]
+
+
+def within_limits(points: Sequence[Point]) -> bool:
+    """Whether the device accepts this shape: currents within ±130 mA and some duration."""
+    currents_fit = all(-LARGEST_CURRENT_MA <= current <= LARGEST_CURRENT_MA for _, current in points)
+    return currents_fit and sum(width for width, _ in points) > 0
 
 
 @dataclass
@@ -63,13 +74,9 @@ class MidLevel:
 
     def stop(self) -> None:
         """No pulse after this."""
-        for channel in self._channels.values():
-            if channel.next_pulse is not None:
-                channel.next_pulse.cancel()
+        cancel(self._silence, *(channel.next_pulse for channel in self._channels.values()))
         self._channels.clear()
-        if self._silence is not None:
-            self._silence.cancel()
-            self._silence = None
+        self._silence = None
 
     def update(self, data: bytes) -> int:
         """MLUpdate: set each channel in the mask, stop the others; returns the result code."""
@@ -103,8 +110,7 @@ class MidLevel:
         return bytes((result, ALL_ERRORS, active)) + nibbles.to_bytes(4, "little")
 
     def _alive(self) -> None:
-        if self._silence is not None:
-            self._silence.cancel()
+        cancel(self._silence)
         self._silence = self._board.timeline.after(SILENCE_S, self.stop)
 
     def _schedule(self, number: int, channel: Channel, time_s: float) -> None:
@@ -127,9 +133,7 @@ class MidLevel:
         self._schedule(number, channel, time_s + channel.period_s)
 
     def _end(self, number: int) -> None:
-        channel = self._channels.pop(number)
-        if channel.next_pulse is not None:
-            channel.next_pulse.cancel()
+        cancel(self._channels.pop(number).next_pulse)
 
 
 def _parse_update(data: bytes) -> dict[int, Channel] | None:

@@ -12,12 +12,11 @@ are rounded down to a multiple of 2 mA.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 from stimrig.hardware_sim.stimulators import sciencemode2
-from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.board import Board, Firmware
 from stimrig.hardware_sim.stimulators.framing import Packet
 from stimrig.hardware_sim.stimulators.rehastim2_channels import (
     CHANNELS,
@@ -31,7 +30,7 @@ from stimrig.hardware_sim.stimulators.rehastim2_channels import (
     parse_pulse,
     parse_start,
 )
-from stimrig.hardware_sim.timeline import Event
+from stimrig.hardware_sim.timeline import Event, cancel
 
 INIT, INIT_ACK, UNKNOWN_COMMAND, WATCHDOG = 1, 2, 3, 4
 GET_MODE, INIT_CHANNEL_LIST, START, STOP, SINGLE_PULSE, STIMULATION_ERROR = 10, 30, 32, 34, 36, 38
@@ -43,11 +42,13 @@ NOT_CONNECTED, START_MODE, INITIALISED, STARTED = -1, 0, 1, 2
 MODES = {NOT_CONNECTED: "none", START_MODE: "start", INITIALISED: "initialised", STARTED: "started"}
 
 
-class Firmware:
+class RehaStim2(Firmware):
     """The RehaStim 2's state machine; each command is executed and acknowledged when it arrives."""
 
+    device = "RehaStim 2"
+
     def __init__(self, board: Board) -> None:
-        self._board = board
+        super().__init__(board)
         self._channels = ChannelList(board, self._stimulation_failed)
         self._handlers: dict[int, Callable[[Packet], None]] = {
             WATCHDOG: lambda _packet: None,
@@ -57,7 +58,6 @@ class Firmware:
             STOP: self._stop,
             SINGLE_PULSE: self._single_pulse,
         }
-        self.commands: Counter[int] = Counter()
         self._offer: Event | None = None
         self._watchdog: Event | None = None
         self.reset()
@@ -83,20 +83,13 @@ class Firmware:
 
     def state(self) -> dict[str, Any]:
         """For the control line."""
-        return {
-            "device": "RehaStim 2",
-            "mode": MODES[self._mode],
-            "high_voltage_on": self._mode == STARTED,
-            "corrupt_frames": self._decoder.corrupt_frames,
-            "commands": {str(command): count for command, count in sorted(self.commands.items())},
-        }
+        return self._describe(MODES[self._mode], self._mode == STARTED, self._decoder.corrupt_frames)
 
     def _connect(self, packet: Packet) -> None:
         """Accept an InitAck if it answers an Init that was sent since the connection was lost."""
         if self._mode != NOT_CONNECTED or packet.number not in self._offered or packet.data != bytes((OK,)):
             return
-        if self._offer is not None:
-            self._offer.cancel()
+        cancel(self._offer)
         self._mode = START_MODE
         self._alive()
 
@@ -104,9 +97,7 @@ class Firmware:
         self._channels.stop()
         self._mode = NOT_CONNECTED
         self._offered: set[int] = set()
-        for event in (self._offer, self._watchdog):
-            if event is not None:
-                event.cancel()
+        cancel(self._offer, self._watchdog)
         self._offer = self._board.timeline.after(INIT_PERIOD_S, self._offer_connection)
 
     def _offer_connection(self) -> None:
@@ -116,8 +107,7 @@ class Firmware:
         self._offer = self._board.timeline.after(INIT_PERIOD_S, self._offer_connection)
 
     def _alive(self) -> None:
-        if self._watchdog is not None:
-            self._watchdog.cancel()
+        cancel(self._watchdog)
         self._watchdog = self._board.timeline.after(WATCHDOG_S, self._disconnect)
 
     def _obey(self, packet: Packet) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from stimrig.hardware_sim.electrodes import Point
 from stimrig.hardware_sim.stimulators.board import Board
-from stimrig.hardware_sim.timeline import Event
+from stimrig.hardware_sim.timeline import Event, cancel
 
 OK, PARAMETER = 0, -2
 NO_ERROR, EMERGENCY_SWITCH, ELECTRODE, MODULE = 0, -1, -2, -3
@@ -131,9 +131,7 @@ class ChannelList:
 
     def stop(self) -> None:
         """No pulse after this."""
-        for event in (self._next_group, *self._rest):
-            if event is not None:
-                event.cancel()
+        cancel(self._next_group, *self._rest)
         self._next_group = None
         self._rest.clear()
         self._pulses = {}

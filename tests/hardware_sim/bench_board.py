@@ -6,9 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 from stimrig.hardware_sim.electrodes import Electrodes, Point
-from stimrig.hardware_sim.stimulators import p24, sciencemode4
+from stimrig.hardware_sim.stimulators import sciencemode4
 from stimrig.hardware_sim.stimulators.board import Board
 from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.p24 import P24
 from stimrig.hardware_sim.timeline import Timeline
 
 LL_INIT, LL_CONFIG, LL_STOP = 0, 2, 4
@@ -27,7 +28,7 @@ class NotingMuscle:
 
 
 class Bench:
-    def __init__(self, firmware: Callable[[Board], Any] = p24.Firmware, wire: Any = sciencemode4) -> None:
+    def __init__(self, firmware: Callable[[Board], Any] = P24, wire: Any = sciencemode4) -> None:
         self.timeline = Timeline()
         self.muscle = NotingMuscle()
         self.syncs: list[float] = []

@@ -13,12 +13,12 @@ import pytest
 import serial
 
 from stimrig.hardware_sim.__main__ import main
-from stimrig.hardware_sim.angle_sensors.encoder import Encoder, Mounting
-from stimrig.hardware_sim.angle_sensors.sensor import AngleSensor
-from stimrig.hardware_sim.load_cells.cells import plain, with_angle
+from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
+from stimrig.hardware_sim.load_cells.cells import WithAngle
 from stimrig.hardware_sim.load_cells.frames import AngleReading, Frame, Sample
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
-from stimrig.hardware_sim.sampling import Noise, take_in_order
+from stimrig.hardware_sim.sampling import take_in_order
+from stimrig.hardware_sim.settings import Settings
 from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 from tests.hardware_sim.test_load_cells import Ramp, listen
 from tests.hardware_sim.test_pairs import p24
@@ -27,12 +27,15 @@ OWN, IN_CELL = struct.Struct("<fHBB"), struct.Struct("<fhBB")
 
 
 def encoder(angle_deg: Any = lambda time_s: 10.0 * time_s, seed: int = 0, **mounting: Any) -> Encoder:
-    return Encoder(angle_deg, Mounting(**{"noise_deg": 0.0, **mounting}), seed)
+    settings = {f"angle_{name}": value for name, value in {"noise_deg": 0.0, **mounting}.items()}
+    return Encoder(angle_deg, Settings(**settings, noise_seed=seed))
 
 
-def sensor(read: Encoder, until_s: float, **clock: Any) -> list[Frame]:
+def sensor(read: Encoder, until_s: float, first: int = 0, **clock: Any) -> list[Frame]:
     sent: list[Frame] = []
-    take_in_order([AngleSensor(read, sent.append, **clock)], until_s)
+    made = AngleSensor(read, sent.append, Settings(**clock))
+    made.counter = first
+    take_in_order([made], until_s)
     return sent
 
 
@@ -74,14 +77,10 @@ class TestOwnFrames:
         assert [each.data[4:] for each in sensor(read, 0.011)] == [b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0"]
 
     def test_its_counter_wraps(self) -> None:
-        sent: list[Frame] = []
-        made = AngleSensor(encoder(), sent.append)
-        made.counter = 65535
-        take_in_order([made], 0.006)
-        assert [OWN.unpack(frame.data)[1] for frame in sent] == [65535, 0]
+        assert [OWN.unpack(frame.data)[1] for frame in sensor(encoder(), 0.006, first=65535)] == [65535, 0]
 
     def test_its_clock_drifts_and_does_not_know(self) -> None:
-        frames = sensor(encoder(lambda time_s: time_s, bits=20), 100.0, rate_hz=200.0, clock_ppm=-500.0)
+        frames = sensor(encoder(lambda time_s: time_s, bits=20), 100.0, angle_clock_ppm=-500.0)
         assert len(frames) == pytest.approx(20_000 * (1 - 500e-6), abs=1)
         stamps_s = np.array([frame.time_us for frame in frames]) * 1e-6
         assert np.diff(stamps_s) == pytest.approx(np.full(stamps_s.size - 1, 0.005), abs=2e-6)
@@ -89,7 +88,7 @@ class TestOwnFrames:
         assert np.polyfit(true_s, stamps_s, 1)[0] == pytest.approx(1 - 500e-6, abs=2e-6)
 
     def test_jitter_of_its_samples(self) -> None:
-        frames = sensor(encoder(lambda time_s: 100.0 * time_s, bits=20), 10.0, jitter_s=2e-4)
+        frames = sensor(encoder(lambda time_s: 100.0 * time_s, bits=20), 10.0, angle_jitter_us=200.0)
         off_s = np.array([OWN.unpack(frame.data)[0] for frame in frames]) / 100.0 - 0.005 * np.arange(len(frames))
         assert off_s.std() == pytest.approx(2e-4, rel=0.1)
 
@@ -107,8 +106,9 @@ def test_two_sensors_take_turns_by_their_clocks() -> None:
         read_at_s.append(time_s)
         return time_s
 
-    cell = LoadCell(Watched(), plain.Cell(), Noise(0.0, 0), 1600.0, jitter_s=1e-4)
-    angle = AngleSensor(encoder(angle_deg), cell.add_frame, 333.0, 800.0, 5e-4)
+    settings = Settings(clock_jitter_us=100.0, angle_rate_hz=333.0, angle_clock_ppm=800.0, angle_jitter_us=500.0)
+    cell = LoadCell(Watched(), settings)
+    angle = AngleSensor(encoder(angle_deg), cell.add_frame, settings)
     for until_s in np.cumsum(np.random.default_rng(0).uniform(0, 0.02, 100)):
         take_in_order([cell, angle], until_s)
     assert all(before <= after for before, after in pairwise(read_at_s))
@@ -119,7 +119,7 @@ def test_two_sensors_take_turns_by_their_clocks() -> None:
 
 class TestInTheCellsFrame:
     def encoded(self, angle_deg: float, fault: bool = False, counter: int = 0, sync: bool = False) -> bytes:
-        return with_angle.Cell().encode([Sample(1.5, counter, sync, 0, AngleReading(angle_deg, fault))]).data
+        return WithAngle().encode([Sample(1.5, counter, sync, 0, AngleReading(angle_deg, fault))]).data
 
     def test_bytes(self) -> None:
         assert self.encoded(-12.34, counter=0x1FE, sync=True) == bytes.fromhex("0000c03f") + b"\x2e\xfb\xfe\x01"
@@ -128,11 +128,13 @@ class TestInTheCellsFrame:
     def test_an_angle_has_stops_and_nothing_is_the_lowest_count(self) -> None:
         counts = [IN_CELL.unpack(self.encoded(angle))[1] for angle in (400.0, -400.0, math.nan, math.inf)]
         assert counts == [32767, -32767, -32768, -32768]
-        assert IN_CELL.unpack(with_angle.Cell().encode([Sample(0.0, 0, False, 0)]).data)[1] == -32768
+        assert IN_CELL.unpack(WithAngle().encode([Sample(0.0, 0, False, 0)]).data)[1] == -32768
 
     def test_it_is_read_when_the_torque_is(self) -> None:
         read = encoder(lambda time_s: 100.0 * time_s, bits=20)
-        cell = LoadCell(Ramp(), with_angle.Cell(), Noise(0.0, 0), 400.0, clock_ppm=5000.0, read_angle=read.read)
+        cell = LoadCell(
+            Ramp(), Settings(cell="with_angle", noise_nm=0.0, rate_hz=400.0, clock_ppm=5000.0), read_angle=read.read
+        )
         cell.produce(2.0)
         rows = [IN_CELL.unpack(frame.data) for frame in cell.take_frames()]
         assert len(rows) == pytest.approx(804, abs=1)

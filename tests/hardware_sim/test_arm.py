@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.arm import description
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.laws import LAWS, StandardLinearSolid
@@ -19,7 +20,6 @@ from stimrig.hardware_sim.arm.motion import Begin, Motion
 from stimrig.hardware_sim.arm.movers import MOVERS, make_mover
 from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Mechanics, Tissue, bare, law
 from stimrig.hardware_sim.errors import ArmError
-from stimrig.hardware_sim.patients import registry as patients
 
 STEP_S = 1.0 / 1600.0
 RANGE = np.radians(np.linspace(0.0, 140.0, 71))

@@ -7,9 +7,9 @@ import pytest
 from scipy.signal import lsim
 from scipy.stats import weibull_min
 
+from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.errors import PatientError
 from stimrig.hardware_sim.offline import simulate
-from stimrig.hardware_sim.patients import registry
 from stimrig.hardware_sim.patients.changing import ChangingMuscle, Parameters
 
 PULSES_PER_S = 40
@@ -165,10 +165,10 @@ def test_a_late_pulse_leaves_no_gap_in_torque_or_use() -> None:
 
 def test_a_share_of_one_is_refused() -> None:
     with pytest.raises(PatientError, match="share"):
-        registry.make("changing", {"fatigue_share": 1.0})
+        patients.make("changing", {"fatigue_share": 1.0})
 
 
 def test_a_shift_may_be_negative_and_a_time_may_not() -> None:
-    assert isinstance(registry.make("changing", {"drift_us": -5.0}), ChangingMuscle)
+    assert isinstance(patients.make("changing", {"drift_us": -5.0}), ChangingMuscle)
     with pytest.raises(PatientError, match="above zero"):
-        registry.make("changing", {"spasm_lasts_s": -1.0})
+        patients.make("changing", {"spasm_lasts_s": -1.0})

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from stimrig.hardware_sim.errors import FaultError, SettingsError
-from stimrig.hardware_sim.load_cells.cells import canopen, counts, plain
+from stimrig.hardware_sim.load_cells.cells import CanOpen, Counts, Plain
 from stimrig.hardware_sim.load_cells.frames import Sample
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
-from stimrig.hardware_sim.sampling import Noise
 from stimrig.hardware_sim.settings import Settings
-from tests.hardware_sim.test_load_cells import Ramp
+from tests.hardware_sim.test_load_cells import cell
 from tests.hardware_sim.virtual_host import LAYOUT, VirtualHost
 
 RATE_HZ = 1600.0
@@ -30,10 +29,6 @@ def recorded(made: LoadCell, until_s: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array(times_s), np.array([1e-6 * frame.time_us for frame in frames])
 
 
-def cell(**settings) -> LoadCell:
-    return LoadCell(Ramp(), plain.Cell(), Noise(0.0, 0), RATE_HZ, **settings)
-
-
 @pytest.mark.parametrize("clock_ppm", [-200.0, 200.0])
 def test_a_drifting_clock_is_off_by_its_parts_per_million(clock_ppm: float) -> None:
     times_s, stamps_s = recorded(cell(clock_ppm=clock_ppm), 10.0)
@@ -43,13 +38,13 @@ def test_a_drifting_clock_is_off_by_its_parts_per_million(clock_ppm: float) -> N
 
 
 def test_jitter_moves_each_sample_and_none_overtakes() -> None:
-    times_s, stamps_s = recorded(cell(jitter_s=100e-6), 4.0)
+    times_s, stamps_s = recorded(cell(clock_jitter_us=100.0), 4.0)
     off_s = times_s - PERIOD_S * np.arange(times_s.size)
     assert off_s.std() == pytest.approx(100e-6, rel=0.05)
     assert abs(off_s.mean()) < 5e-6
     assert np.allclose(stamps_s, times_s, atol=2e-6)
     assert abs(np.corrcoef(off_s[1:], off_s[:-1])[0, 1]) < 0.05
-    wild_s, _ = recorded(cell(jitter_s=0.01), 4.0)
+    wild_s, _ = recorded(cell(clock_jitter_us=10_000.0), 4.0)
     assert np.diff(wild_s).min() > 0.05 * PERIOD_S
     assert wild_s.size == pytest.approx(6400, abs=1)
 
@@ -67,9 +62,9 @@ def test_jitter_can_be_switched_and_leaves_the_grid_where_it_was() -> None:
     assert np.abs(off_s).max() < 1e-6
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 50e-6])
-def test_three_samples_a_frame(jitter_s: float) -> None:
-    made = LoadCell(Ramp(), plain.Cell(3), Noise(0.0, 0), RATE_HZ, jitter_s=jitter_s)
+@pytest.mark.parametrize("jitter_us", [0.0, 50.0])
+def test_three_samples_a_frame(jitter_us: float) -> None:
+    made = cell(samples_per_frame=3, clock_jitter_us=jitter_us)
     made.counter = 3 * 65534
     made.produce(8.0)
     frames = made.take_frames()
@@ -78,23 +73,23 @@ def test_three_samples_a_frame(jitter_s: float) -> None:
     values = np.array([row[:3] for row in rows]).ravel() / 500
     assert values == pytest.approx(PERIOD_S * np.arange(values.size), abs=1e-3 + 3 * 50e-6)
     last_s = np.array([frame.time_us for frame in frames]) * 1e-6
-    assert last_s == pytest.approx(PERIOD_S * (3 * np.arange(len(frames)) + 2), abs=1e-6 if not jitter_s else 3e-4)
+    assert last_s == pytest.approx(PERIOD_S * (3 * np.arange(len(frames)) + 2), abs=1e-6 if not jitter_us else 3e-4)
 
 
 def test_packed_values_have_stops_and_a_counter_jump_shows() -> None:
     def frame(*torques_nm: float, counter: int = 0) -> tuple[int, ...]:
         samples = [Sample(t, counter + k, True, 0) for k, t in enumerate(torques_nm)]
-        return PACKED.unpack(plain.Cell(3).encode(samples).data)
+        return PACKED.unpack(Plain(3).encode(samples).data)
 
     assert frame(1.0, -70.0, 70.0) == (500, -32767, 32767, 0)
     assert frame(math.nan, 0.001, 0.0, counter=1003) == (-32767, 0, 0, 335)
-    assert counts.Cell(2).encode([Sample(50.0, 0, False, 1), Sample(-60.0, 1, False, 2)])[1:3] == (b"\xff\xff\0\0", 2)
+    assert Counts(2).encode([Sample(50.0, 0, False, 1), Sample(-60.0, 1, False, 2)])[1:3] == (b"\xff\xff\0\0", 2)
 
 
 def test_what_the_cells_carry() -> None:
-    carried = {made: (made.has_counter, made.has_sync) for made in (plain.Cell(), plain.Cell(3), canopen.Cell())}
+    carried = {made: (made.has_counter, made.has_sync) for made in (Plain(), Plain(3), CanOpen())}
     assert list(carried.values()) == [(True, True), (True, False), (True, True)]
-    assert not counts.Cell().has_counter
+    assert not Counts().has_counter
 
 
 def test_settings_out_of_range() -> None:

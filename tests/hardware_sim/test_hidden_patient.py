@@ -12,9 +12,8 @@ from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.live import HiddenMuscle
 from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario
-from stimrig.hardware_sim.load_cells.cells.plain import Cell
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
-from stimrig.hardware_sim.sampling import Noise
+from stimrig.hardware_sim.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -80,9 +79,9 @@ def test_the_emulated_cell_converts_after_its_noise() -> None:
     scenario = draw_scenario(("sensor_clipping",), "strong", 403)
     muscle = HiddenMuscle(scenario)
     rail = muscle.converted_nm(10.0 * scenario.base.largest_nm, 0.0)
-    cell = LoadCell(muscle, Cell(), Noise(0.05, 1), RATE_HZ)
+    cell = LoadCell(muscle, Settings(noise_nm=0.05, noise_seed=1))
     readings: list[float] = []
-    cell.torque_hooks.append(lambda reading_nm: readings.append(reading_nm) or reading_nm)
+    cell.torque_hooks.append(lambda reading_nm, _: readings.append(reading_nm) or reading_nm)
     for k in range(80):
         muscle.pulse(k * 0.025, scenario.base.largest_width_us, 20.0)
         cell.produce((k + 1) * 0.025)

@@ -12,19 +12,20 @@ import struct
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import can
 import numpy as np
 import pytest
 import serial
 
-from stimrig.hardware_sim.load_cells.cells import canopen, counts, plain
+from stimrig.hardware_sim.load_cells.cells import CanOpen, Counts
 from stimrig.hardware_sim.load_cells.frames import Frame, Sample
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
-from stimrig.hardware_sim.load_cells.transports import slcan, socketcand
-from stimrig.hardware_sim.pseudo_terminal import PseudoTerminal
-from stimrig.hardware_sim.reactor import Reactor
-from stimrig.hardware_sim.sampling import Noise
+from stimrig.hardware_sim.load_cells.slcan import Slcan
+from stimrig.hardware_sim.load_cells.socketcand import QUIET_S, Socketcand
+from stimrig.hardware_sim.ports import PseudoTerminal, Reactor
+from stimrig.hardware_sim.settings import Settings
 from tests.hardware_sim.emulated import emulated
 
 LAYOUT = struct.Struct("<fHBB")
@@ -40,8 +41,8 @@ class Ramp:
         return time_s
 
 
-def cell(noise_nm: float = 0.0, seed: int = 0, **settings) -> LoadCell:
-    return LoadCell(Ramp(), plain.Cell(), Noise(noise_nm, seed), 1600.0, **settings)
+def cell(noise_nm: float = 0.0, **settings: Any) -> LoadCell:
+    return LoadCell(Ramp(), Settings(noise_nm=noise_nm, **settings))
 
 
 def decoded(frames: list[Frame]) -> list[tuple[float, int, int]]:
@@ -72,13 +73,13 @@ class TestSampler:
         assert [n for n, (_, _, status) in enumerate(decoded(made.take_frames())) if status & 1] == [first]
 
     def test_no_sync_line(self) -> None:
-        made = cell(has_sync=False)
+        made = cell(sync=False)
         made.raise_sync()
         made.produce(0.01)
         assert not any(status for _, _, status in decoded(made.take_frames()))
 
     def test_drift_offset_and_noise(self) -> None:
-        made = cell(noise_nm=0.1, seed=5, offset_nm=2.0, clock_ppm=200.0)
+        made = cell(noise_nm=0.1, noise_seed=5, torque_offset_nm=2.0, clock_ppm=200.0)
         made.produce(10.0)
         frames = made.take_frames()
         assert len(frames) == pytest.approx(16003, abs=1)
@@ -91,12 +92,12 @@ class TestSampler:
 
 class TestCells:
     def test_counts_have_stops(self) -> None:
-        frames = [counts.Cell().encode([Sample(t, 0, True, 0)]) for t in (0.0, 50.0, -60.0, 60.0, math.nan)]
+        frames = [Counts().encode([Sample(t, 0, True, 0)]) for t in (0.0, 50.0, -60.0, 60.0, math.nan)]
         assert [int.from_bytes(f.data, "big") for f in frames] == [32768, 65535, 0, 65535, 0]
 
     def test_canopen_sends_between_start_and_stop(self) -> None:
-        made = canopen.Cell()
-        assert not made.running()
+        made = CanOpen()
+        assert not made.running
         told = (
             (b"\x01\x02", False),
             (b"\x01\x01", True),
@@ -106,7 +107,7 @@ class TestCells:
         )
         for message, running in told:
             made.received(0, message)
-            assert made.running() is running
+            assert made.running is running
 
 
 def listen(bus: can.BusABC, number: int) -> list[can.Message]:
@@ -178,7 +179,7 @@ def turning():
 
 
 def test_socketcand_handshake_is_quiet_and_bad_input_is_answered(turning: Turning) -> None:
-    server = socketcand.Transport(turning.reactor, turning.take)
+    server = Socketcand(turning.reactor, turning.take)
     client = socket.create_connection((server.can["host"], server.can["port"]), timeout=20)
 
     def ask(text: bytes) -> bytes:
@@ -195,7 +196,7 @@ def test_socketcand_handshake_is_quiet_and_bad_input_is_answered(turning: Turnin
     with pytest.raises(TimeoutError):
         client.recv(256)
     client.settimeout(20)
-    time.sleep(socketcand.QUIET_S)
+    time.sleep(QUIET_S)
     frames = [Frame(0x181, b"\x01\xab", 1_000_001), Frame(0x18FF0001, b"", 0), Frame(0x20000040, b"", 5, error=True)]
     turning.done(lambda: server.send(frames))
     assert client.recv(256) == (b"< frame 181 1.000001 01AB >< frame 18FF0001 0.000000  >< error 20000040 0.000005 >")
@@ -206,7 +207,7 @@ def test_socketcand_handshake_is_quiet_and_bad_input_is_answered(turning: Turnin
 
 
 def test_slcan_commands(turning: Turning) -> None:
-    adapter = slcan.Transport(turning.reactor, turning.take)
+    adapter = Slcan(turning.reactor, turning.take)
     port = os.open(adapter.can["channel"], os.O_RDWR | os.O_NOCTTY)
 
     def ask(text: bytes) -> bytes:

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import serial
 
+from stimrig.hardware_sim import load_cells, patients
 from stimrig.hardware_sim.offline import simulate
-from stimrig.hardware_sim.patients import registry
-from stimrig.hardware_sim.stimulators import sciencemode2, sciencemode4
+from stimrig.hardware_sim.stimulators import STIMULATORS, sciencemode2, sciencemode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import emulated
 
@@ -80,14 +80,10 @@ CELLS: dict[str, tuple[list[str], int, int, Decode]] = {
 
 
 def test_every_kind_there_is_is_paired() -> None:
-    from stimrig.hardware_sim import stimulators
-    from stimrig.hardware_sim.load_cells import cells, transports
-    from stimrig.hardware_sim.scan import modules_with
-
     assert all(set(names) <= {*sum(PAIRS, ())} for names in (PLAYERS, CELLS))
-    assert set(PLAYERS) == set(modules_with(stimulators, "Firmware"))
-    assert {name.split()[0] for name in CELLS} == set(modules_with(cells, "Cell"))
-    assert set(modules_with(transports, "Transport")) == {"socketcand", "slcan"}
+    assert set(PLAYERS) == set(STIMULATORS)
+    assert {name.split()[0] for name in CELLS} == set(load_cells.CELLS)
+    assert set(load_cells.TRANSPORTS) == {"socketcand", "slcan"}
 
 
 PAIRS = [
@@ -136,7 +132,7 @@ def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None
     assert bool(counters) is rig.ready["has_counter"]
 
     times_s, duration_s = [pulse["time_s"] for pulse in pulses], state["time_s"] + 0.01
-    torque_nm = simulate(registry.make("paper"), times_s, [300.0] * 12, 20.0, 400.0, duration_s)
+    torque_nm = simulate(patients.make("paper"), times_s, [300.0] * 12, 20.0, 400.0, duration_s)
     # without a counter, and over NMT, the first sample's number is known only from its value's later rise
     offsets = range(torque_nm.size - values.size)
     errors_nm = [np.abs(torque_nm[k : k + values.size] - values).max() for k in offsets]

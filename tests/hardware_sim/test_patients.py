@@ -11,9 +11,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
+from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.errors import PatientError
 from stimrig.hardware_sim.offline import simulate
-from stimrig.hardware_sim.patients import registry
 from stimrig.hardware_sim.patients.calcium import CalciumMuscle
 from stimrig.hardware_sim.patients.paper import PaperMuscle
 from stimrig.hardware_sim.patients.paper import Parameters as PaperParameters
@@ -142,9 +142,9 @@ class TestCalcium:
 
 def test_width_zero_is_no_pulse_and_records_repeat() -> None:
     widths = np.array([300.0, 0.0, 300.0, 0.0])
-    for name in registry.names():
-        first = simulate(registry.make(name), train(widths), widths, 20.0, 1600.0, 0.2)
-        sparse = simulate(registry.make(name), train(widths)[::2], widths[::2], 20.0, 1600.0, 0.2)
+    for name in patients.PATIENTS:
+        first = simulate(patients.make(name), train(widths), widths, 20.0, 1600.0, 0.2)
+        sparse = simulate(patients.make(name), train(widths)[::2], widths[::2], 20.0, 1600.0, 0.2)
         np.testing.assert_array_equal(first, sparse)
 
 
@@ -156,7 +156,7 @@ def test_records_refuse_what_is_no_train(times: list[float], widths: list[float]
 
 class TestRegistry:
     def test_all_are_found(self) -> None:
-        assert {"paper", "calcium", "changing"} <= set(registry.names())
+        assert {"paper", "calcium", "changing"} <= set(patients.PATIENTS)
 
     @pytest.mark.parametrize("suffix", [".toml", ".json"])
     def test_file_overrides_by_name(self, tmp_path: Path, suffix: str) -> None:
@@ -165,7 +165,7 @@ class TestRegistry:
             path.write_text('patient = "paper"\n[parameters]\na1 = 2.0\n')
         else:
             path.write_text(json.dumps({"patient": "paper", "parameters": {"a1": 2.0}}))
-        muscle = registry.from_file(path)
+        muscle = patients.from_file(path)
         assert isinstance(muscle, PaperMuscle)
         assert muscle.recruitment_nm(4000.0, 20.0) == pytest.approx(2.0)
 
@@ -186,11 +186,11 @@ class TestRegistry:
         path = tmp_path / "patient.toml"
         path.write_text(text)
         with pytest.raises(PatientError) as caught:
-            registry.from_file(path)
+            patients.from_file(path)
         assert told in str(caught.value)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
 
     def test_a_file_that_is_not_there(self, tmp_path: Path) -> None:
         with pytest.raises(PatientError, match="cannot be read"):
-            registry.from_file(tmp_path / "none.toml")
+            patients.from_file(tmp_path / "none.toml")

@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import pytest
 
-from stimrig.hardware_sim.stimulators import rehastim2, sciencemode2
+from stimrig.hardware_sim.stimulators import sciencemode2
 from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.rehastim2 import RehaStim2
 from stimrig.hardware_sim.stimulators.sciencemode2 import encode
 from tests.hardware_sim.bench_board import Bench
 
@@ -20,7 +21,7 @@ class Host(Bench):
     """A RehaStim 2's, which acknowledges at once."""
 
     def __init__(self) -> None:
-        super().__init__(rehastim2.Firmware, sciencemode2)
+        super().__init__(RehaStim2, sciencemode2)
 
     def packets(self, command: int) -> list[Packet]:
         return [packet for _, packet in self.sent if packet.command == command]

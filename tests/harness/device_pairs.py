@@ -9,21 +9,19 @@ from typing import Any
 import h5py
 import numpy as np
 
-from stimrig.hardware_sim import stimulators
-from stimrig.hardware_sim.load_cells import cells, transports
-from stimrig.hardware_sim.scan import modules_with
+from stimrig.hardware_sim import load_cells, stimulators
 from stimrig.rig import archive
 from tests.harness.processes import Bench, RigClient, control, kill_hard, short_plan
 
 SAME_CLOCK_S = 2e-4
 """Two processes read the same clock; between the device's doing and its answer is at least this."""
 
-STIMULATORS = tuple(modules_with(stimulators, "Firmware"))
-TRANSPORTS = tuple(modules_with(transports, "Transport"))
+STIMULATORS = tuple(stimulators.STIMULATORS)
+TRANSPORTS = tuple(load_cells.TRANSPORTS)
 CELLS = {
     f"{name} x{count}" if count > 1 else name: ("--cell", name, "--samples-per-frame", str(count))
-    for name, module in modules_with(cells, "Cell").items()
-    for count in {module.Cell.layouts[0], module.Cell.layouts[-1]}
+    for name, cell in load_cells.CELLS.items()
+    for count in {cell.layouts[0], cell.layouts[-1]}
 }
 """Every emulated cell with its fewest and its most samples per frame, as options of the emulator."""
 HOLD = [

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.offline import simulate
-from stimrig.hardware_sim.patients import registry
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import registry as effects
 from stimrig.identify.errors import BadModel
@@ -182,7 +182,7 @@ class Person:
     """`stimrig.hardware_sim.patients.changing` on one clock."""
 
     def __init__(self, **changes: float) -> None:
-        self.muscle = registry.make("changing", {"natural_period_s": 0.2, **changes})
+        self.muscle = patients.make("changing", {"natural_period_s": 0.2, **changes})
         self.rng, self.now_s = np.random.default_rng(SEED), 0.0
 
     def play(self, widths_us: np.ndarray, rest_s: float = 0.0) -> Record:

@@ -19,7 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from stimrig.hardware_sim.angle_sensors.sensor import CAN_ID as ANGLE_ID
+from stimrig.hardware_sim.angle_sensor import CAN_ID as ANGLE_ID
 from stimrig.rig import journal
 from stimrig.rig.errors import RecordingError
 from tests.simulator.clinic import Asked

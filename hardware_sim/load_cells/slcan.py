@@ -6,16 +6,16 @@ Accepts S0-S8, s, O, L, C, V, N, F, Z, t and T, and empty lines. Frames pass bet
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from stimrig.hardware_sim.load_cells.frames import LARGEST_STANDARD_ID, Frame, FrameHandler
-from stimrig.hardware_sim.pseudo_terminal import PseudoTerminal
-from stimrig.hardware_sim.reactor import Reactor
+from stimrig.hardware_sim.ports import PseudoTerminal, Reactor
 
 OK, ERROR = b"\r", b"\a"
 LONGEST_LINE = 64
 
 
-class Transport:
+class Slcan:
     """One adapter on one port; it does not know whether a client has the port open."""
 
     def __init__(self, reactor: Reactor, on_frame: FrameHandler) -> None:
@@ -24,7 +24,7 @@ class Transport:
         self._line = b""
         self._open = self._listen_only = False
         reactor.add(self._port, self._read)
-        self.can = {"interface": "slcan", "channel": self._port.path, "sleep_after_open": 0}
+        self.can: dict[str, Any] = {"interface": "slcan", "channel": self._port.path, "sleep_after_open": 0}
 
     @property
     def overruns(self) -> int:

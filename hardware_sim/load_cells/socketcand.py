@@ -9,16 +9,17 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from stimrig.hardware_sim.load_cells.frames import LARGEST_STANDARD_ID, Frame, FrameHandler
-from stimrig.hardware_sim.reactor import Reactor
+from stimrig.hardware_sim.ports import Reactor
 
 CHANNEL = "can0"
 QUIET_S = 0.05
 LARGEST_BACKLOG_BYTES = 1 << 20
 
 
-class Transport:
+class Socketcand:
     """Serves any number of clients, each with the same frames."""
 
     def __init__(self, reactor: Reactor, on_frame: FrameHandler) -> None:
@@ -29,7 +30,7 @@ class Transport:
         self._listener.setblocking(False)
         reactor.add(self._listener, self._accept)
         host, port = self._listener.getsockname()
-        self.can = {"interface": "socketcand", "host": host, "port": port, "channel": CHANNEL}
+        self.can: dict[str, Any] = {"interface": "socketcand", "host": host, "port": port, "channel": CHANNEL}
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Frames to every client in raw mode."""

@@ -1,12 +1,15 @@
-"""An emulated serial port: the master's side of a pseudo-terminal."""
+"""What the emulator has of the operating system: pseudo-terminals as serial ports, and waiting on several at once."""
 
 from __future__ import annotations
 
 import fcntl
 import os
+import select
 import struct
 import termios
 import tty
+from collections.abc import Callable
+from typing import Any
 
 INPUT_SPEED, OUTPUT_SPEED = 4, 5
 """Indices into the result of `tcgetattr`."""
@@ -93,3 +96,29 @@ class PseudoTerminal:
             self.is_open = False
             os.close(self._slave)
             os.close(self._master)
+
+
+class Reactor:
+    """Calls a function for each socket or port that has something to read.
+
+    Its time limit is finer than epoll's millisecond.
+    """
+
+    def __init__(self) -> None:
+        self._readers: dict[int, Callable[[], None]] = {}
+
+    def add(self, source: Any, on_readable: Callable[[], None]) -> None:
+        """Call `on_readable` whenever `source` has something to read."""
+        self._readers[source.fileno()] = on_readable
+
+    def remove(self, source: Any) -> None:
+        """Forget `source`; to be called before it is closed."""
+        self._readers.pop(source.fileno(), None)
+
+    def poll(self, timeout_s: float) -> None:
+        """Wait up to `timeout_s` for something to read, and serve all that have."""
+        readable, _, _ = select.select(list(self._readers), (), (), max(0.0, timeout_s))
+        for descriptor in readable:
+            on_readable = self._readers.get(descriptor)
+            if on_readable is not None:  # an earlier callback may have closed it
+                on_readable()

@@ -1,0 +1,149 @@
+"""The electronics of load cells: how samples become CAN frames, and what starts and stops them.
+
+A cell's constructor takes the number of samples per frame, one of its `layouts`. A frame's time is that of its last
+sample.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Sequence
+
+from stimrig.hardware_sim.load_cells.frames import Frame, Sample
+
+SYNC_BIT, ANGLE_FAULT_BIT = 0x01, 0x02
+TORQUE = struct.Struct("<fHBB")
+"""Little endian: torque in N·m, counter, status, spare."""
+
+
+class Cell:
+    """A cell that sends from power-on and takes no commands."""
+
+    can_id: int
+    layouts: tuple[int, ...] = (1,)
+    has_counter = has_sync = True
+
+    def __init__(self, samples_per_frame: int = 1) -> None:
+        self.samples_per_frame = samples_per_frame
+        self.running = True
+        """Whether it is sending."""
+
+    def encode(self, samples: Sequence[Sample]) -> Frame:
+        """The frame of `samples_per_frame` samples."""
+        return Frame(self.can_id, self.pack(samples), samples[-1].time_us, time_s=samples[-1].time_s)
+
+    def pack(self, samples: Sequence[Sample]) -> bytes:
+        """The data of that frame."""
+        raise NotImplementedError
+
+    def received(self, can_id: int, data: bytes) -> None:
+        """A frame from the host."""
+
+
+class Plain(Cell):
+    """The default: id 0x181, torque in N·m as float32, 16-bit counter, status with the sync line in bit 0.
+
+    With three samples per frame: three int16 counts of 2 mN·m and a 16-bit counter of frames, without the sync line.
+    """
+
+    PACKED = struct.Struct("<hhhH")
+    PACKED_SAMPLES = 3
+    COUNTS_PER_NM = 500
+
+    can_id = 0x181
+    layouts = (1, PACKED_SAMPLES)
+
+    def __init__(self, samples_per_frame: int = 1) -> None:
+        super().__init__(samples_per_frame)
+        self.has_sync = samples_per_frame == 1
+
+    def pack(self, samples: Sequence[Sample]) -> bytes:
+        """Values are limited to full scale; NaN is the lowest count."""
+        last = samples[-1]
+        if len(samples) == 1:
+            return TORQUE.pack(last.torque_nm, last.counter & 0xFFFF, SYNC_BIT if last.sync else 0, 0)
+        counts = (_counts(one.torque_nm, self.COUNTS_PER_NM, nothing=-32767) for one in samples)
+        return self.PACKED.pack(*counts, last.counter // self.PACKED_SAMPLES & 0xFFFF)
+
+
+class Counts(Cell):
+    """Like ME's GSV-4: id 610, big endian, no counter and no sync line; several samples of a frame follow one another.
+
+    16-bit counts in offset binary: 32768 is zero, full scale 50 N·m.
+    """
+
+    ZERO_COUNTS = 32768
+    COUNTS_PER_NM = 32767 / 50.0
+
+    can_id = 610
+    layouts = (1, 2, 3, 4)
+    has_counter = has_sync = False
+
+    def pack(self, samples: Sequence[Sample]) -> bytes:
+        """Values are limited to full scale; NaN is the lowest count."""
+        return b"".join(self._count(sample.torque_nm).to_bytes(2, "big") for sample in samples)
+
+    def _count(self, torque_nm: float) -> int:
+        counts = self.ZERO_COUNTS + round(torque_nm * self.COUNTS_PER_NM) if math.isfinite(torque_nm) else 0
+        return min(max(counts, 0), 0xFFFF)
+
+
+class CanOpen(Cell):
+    """A CANopen cell, node 1: the default's layout in TPDO1 (0x181), sent only after NMT start (000#0100 or 000#0101).
+
+    NMT: 01 start, 02 stop, 80 pre-operational, 81 and 82 reset; node 0 means all (CiA 301).
+    """
+
+    NMT_ID, NODE = 0x000, 1
+    START, LEAVE = 0x01, (0x02, 0x80, 0x81, 0x82)
+
+    can_id = 0x180 + NODE
+
+    def __init__(self, samples_per_frame: int = 1) -> None:
+        super().__init__(samples_per_frame)
+        self.running = False
+
+    def pack(self, samples: Sequence[Sample]) -> bytes:
+        """Of one sample."""
+        sample = samples[0]
+        return TORQUE.pack(sample.torque_nm, sample.counter & 0xFFFF, int(sample.sync), 0)
+
+    def received(self, can_id: int, data: bytes) -> None:
+        """NMT commands for this node or for all."""
+        if can_id == self.NMT_ID and len(data) == 2 and data[1] in (0, self.NODE):
+            if data[0] == self.START:
+                self.running = True
+            elif data[0] in self.LEAVE:
+                self.running = False
+
+
+class WithAngle(Cell):
+    """Its electronics read the joint's angle too: id 0x181, both in one frame and by one clock.
+
+    Little endian: float32 torque in N·m, int16 raw angle in 0.01 degrees, 8-bit counter, status (bit 0 sync, bit 1
+    fault of the angle). The default cell's frame has one free byte only, so that one could not carry the angle.
+    """
+
+    LAYOUT = struct.Struct("<fhBB")
+    COUNTS_PER_DEG = 100
+    NO_ANGLE = -32768
+
+    can_id = 0x181
+
+    def pack(self, samples: Sequence[Sample]) -> bytes:
+        """Of one sample; an angle that is no number is the lowest count."""
+        sample = samples[0]
+        status = (SYNC_BIT if sample.sync else 0) | (ANGLE_FAULT_BIT if sample.angle and sample.angle.fault else 0)
+        angle_deg = sample.angle.angle_deg if sample.angle else math.nan
+        counts = _counts(angle_deg, self.COUNTS_PER_DEG, nothing=self.NO_ANGLE)
+        return self.LAYOUT.pack(sample.torque_nm, counts, sample.counter & 0xFF, status)
+
+
+def _counts(value: float, per_unit: float, nothing: int) -> int:
+    """Signed counts, limited to full scale; `nothing` for what is no number."""
+    return min(max(round(value * per_unit), -32767), 32767) if math.isfinite(value) else nothing
+
+
+CELLS: dict[str, type[Cell]] = {"canopen": CanOpen, "counts": Counts, "plain": Plain, "with_angle": WithAngle}
+"""By name, in alphabetical order."""
