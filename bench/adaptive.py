@@ -27,8 +27,8 @@ from bench.particles import HOLD, Particles
 from stimrig import identify
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import draw_scenario, rng_of
-from stimrig.identify.diagnosis import candidates as workers
 from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.estimation.plain import prepare
 from stimrig.identify.experiments.adaptive import Target

@@ -23,13 +23,13 @@ from typing import Any
 from stimrig import identify
 from stimrig.hardware_sim.hidden.scenario import Scenario
 from stimrig.identify.caution import caution
-from stimrig.identify.diagnosis import candidates
+from stimrig.identify.diagnosis import side_by_side
 from tests.harness.carried_sessions import SESSIONS, muscle, session
 
 
 def one(seed: int) -> list[dict[str, Any]]:
     """What is said of each second session of one muscle."""
-    candidates.WORKERS = 1
+    side_by_side.WORKERS = 1
     of = muscle(seed)
     names = [hidden.effect for hidden in of.hidden]
     try:

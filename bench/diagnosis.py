@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.diagnosis import candidates as workers
 from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.diagnosis.thresholds import STRUCTURE
 from stimrig.identify.effects import registry
 from stimrig.identify.records.join import join

@@ -23,8 +23,8 @@ from stimrig.hardware_sim.hidden.design import Design, make_design
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario, rng_of
 from stimrig.hardware_sim.hidden_records import sampled
-from stimrig.identify.diagnosis import candidates as workers
 from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.fitting import fit
 from stimrig.identify.records.record import Record
 from stimrig.rig import limits, plan, protocols

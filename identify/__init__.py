@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from stimrig.identify.criticism import compare
-    from stimrig.identify.diagnosis import diagnose
+    from stimrig.identify.diagnosis import diagnose, next_experiment
     from stimrig.identify.diagnosis.carrying import carry
-    from stimrig.identify.diagnosis.experiment import Experiment, next_experiment
     from stimrig.identify.diagnosis.improvement import improve
     from stimrig.identify.errors import (
         BadModel,
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
         IdentifyError,
         NotIdentifiable,
     )
+    from stimrig.identify.experiments import Experiment
     from stimrig.identify.fitting import fit
     from stimrig.identify.model import Model
     from stimrig.identify.records import read
@@ -33,11 +33,11 @@ _PLACES = {
     name: f"stimrig.identify.{module}"
     for module, names in {
         "criticism": ("compare",),
-        "diagnosis": ("diagnose",),
+        "diagnosis": ("diagnose", "next_experiment"),
         "diagnosis.carrying": ("carry",),
-        "diagnosis.experiment": ("Experiment", "next_experiment"),
         "diagnosis.improvement": ("improve",),
         "errors": ("BadModel", "BadRecord", "BadRequest", "Cancelled", "IdentifyError", "NotIdentifiable"),
+        "experiments": ("Experiment",),
         "fitting": ("fit",),
         "model": ("Model",),
         "records": ("read",),

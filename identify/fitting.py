@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.diagnosis.candidates import Progress, silent
 from stimrig.identify.diagnosis.improvement import helpful
-from stimrig.identify.diagnosis.search import search_effects
+from stimrig.identify.diagnosis.search import Progress, search_effects, silent
 from stimrig.identify.effects import get
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.effect_fit import effect_names, renewed_curve, with_effects

@@ -34,7 +34,7 @@ _PLACES = {
     "compare": ("stimrig.identify.criticism", "compare"),
     "diagnose": ("stimrig.progress", "diagnose"),
     "improve": ("stimrig.progress", "improve"),
-    "next_experiment": ("stimrig.identify.diagnosis.experiment", "next_experiment"),
+    "next_experiment": ("stimrig.identify.diagnosis", "next_experiment"),
     "effects": ("stimrig.identify.effects", "library"),
     "plot": ("stimrig.api.charts.plot", "plot"),
     "Client": ("stimrig.api.client.rest", "Client"),

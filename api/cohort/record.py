@@ -28,7 +28,7 @@ ABOUT = {
 """Attributes of a sealed recording, and the columns that repeat them."""
 SAID = ("participant", "day", "kind", "rig", "record_id", "test_id", "outcome")
 LIBRARIES = (
-    "stimrig.identify.fitting", "stimrig.identify.diagnosis.experiment", "stimrig.identify.diagnosis.improvement",
+    "stimrig.identify.fitting", "stimrig.identify.diagnosis", "stimrig.identify.diagnosis.improvement",
     "stimrig.identify.records.csv", "stimrig.identify.records.mat", "stimrig.identify.records.recording",
 )  # fmt: skip
 KINDS: tuple[tuple[type[IdentifyError], str], ...] = (
@@ -46,11 +46,11 @@ Row = dict[str, Any]
 
 def load() -> None:
     """Load the libraries, so that what they take is not counted as a record's; one process computes, no copies."""
-    from stimrig.identify.diagnosis import candidates
+    from stimrig.identify.diagnosis import side_by_side
 
     for name in LIBRARIES:
         import_module(name)
-    candidates.WORKERS = 1
+    side_by_side.WORKERS = 1
 
 
 def compute(progress: Callable[..., None], file: str, name: str, known: Row, task: Row) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def _fit(record: Any, task: Task) -> Row:
 
 
 def _diagnose(record: Any, _task: Task) -> Row:
-    from stimrig.identify.diagnosis.experiment import planned
+    from stimrig.identify.diagnosis import planned
 
     found = identify.diagnose(record).to_dict()
     missing = found["missing"]

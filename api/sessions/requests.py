@@ -137,7 +137,7 @@ class SegmentIn(Body):
 
 
 LEAST_PERCENT, MOST_PERCENT = 0.2, 50.0
-"""As `stimrig.identify.experiments.target` has them; named here, too, so that the service need not load it."""
+"""As `stimrig.identify.experiments.knowledge` has them; named here, too, so that the service need not load it."""
 Percent = Annotated[FiniteFloat, Field(ge=LEAST_PERCENT, le=MOST_PERCENT)]
 
 

@@ -41,8 +41,8 @@ def outlook(
     `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
     from stimrig.identify.experiments.adaptive import decide
+    from stimrig.identify.experiments.knowledge import Target
     from stimrig.identify.experiments.reach import reach
-    from stimrig.identify.experiments.target import Target
 
     progress(0.1, "playing the test on a simulated muscle")
     left = {"target": Target(**target), "left_s": playable_s, "left_nm_s": max_torque_time_nm_s}
@@ -86,7 +86,7 @@ def known(models: Sequence[str]) -> dict[str, Any]:
 
 def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any) -> dict[str, Any]:
     """A test begins, within the limits that `Running` has: what was known of another one is forgotten."""
-    from stimrig.identify.experiments.target import Target
+    from stimrig.identify.experiments.knowledge import Target
 
     progress(0.5, "beginning")
     _running.clear()

@@ -132,7 +132,7 @@ def smooth(record: Any, values: Any) -> Any:
 
 def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """The test that separates the first effect with rivals from them; None where no effect has any."""
-    from stimrig.identify.diagnosis.experiment import planned
+    from stimrig.identify.diagnosis import planned
 
     found = planned(missing)
     return found and {**found.to_dict(), "effect": found.rivals[0]}
@@ -184,7 +184,7 @@ def invert(
     """
     from stimrig.identify.inversion import Reference
     from stimrig.identify.inversion import invert as widths_for
-    from stimrig.identify.inversion.table import read_reference
+    from stimrig.identify.inversion.reference import read_reference
 
     progress(0.1, "inverting")
     model = identify.Model.from_json(model_json)

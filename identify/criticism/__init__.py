@@ -1,15 +1,18 @@
-"""Comparison of a model with a measurement: where the error is, and how much of it is noise."""
+"""Comparison of a model with a measurement: where the error is, and how much of it is noise.
+
+The error by segment, level of pulse width, direction, time and frequency, without doubted samples; and its worst
+places, named by segment, pulse width and direction.
+"""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from stimrig.identify.criticism.correlation import correlation_tests
-from stimrig.identify.criticism.shares import error_shares
-from stimrig.identify.criticism.where import worst_places
-from stimrig.identify.dynamics.grid import Grid, make_grid
+from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from stimrig.identify.estimation.quality import range_warnings
@@ -67,7 +70,7 @@ def compare(model: Model, record: Record) -> Comparison:
         noise_sd_nm=noise,
         fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
-        by=error_shares(record, residual, noise, counted),
+        by=_error_shares(record, residual, noise, counted),
         tests=tests,
         where=tuple(places),
         left_out=said,
@@ -166,3 +169,191 @@ def _lost(grid: Grid) -> int:
         return 0
     inside = (known.time_s >= grid.start_s - grid.step_s) & (known.time_s <= grid.record.time_s[-1])
     return int(np.sum(known.lost & inside))
+
+
+# ---- shares of the error ----
+
+LEVELS = 6
+SPANS = 10
+OCTAVES_HZ = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 102.4, 204.8, 409.6, 1000.0)
+Groups = list[tuple[str, np.ndarray]]
+"""Labels and rows, bool, shape (N,)."""
+
+
+def _error_shares(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
+) -> dict[str, list[dict[str, Any]]]:
+    """What `Comparison.by` holds, of the samples that count."""
+    sign = direction_of(record)
+    kinds: dict[str, Groups] = {
+        "segment": [(name, record.segment == i) for i, name in enumerate(record.segment_names)],
+        "level": _levels(record.pulse_width_us),
+        "direction": [("rising", sign > 0), ("falling", sign < 0), ("held", sign == 0)],
+        "time": _spans(record.time_s - record.time_s[0]),
+    }
+    tables = {kind: _table(groups, residual_nm, noise_sd_nm, counted) for kind, groups in kinds.items()}
+    return tables | {"frequency": _by_frequency(record.sample_rate_hz, residual_nm, noise_sd_nm, counted)}
+
+
+def _levels(width_us: np.ndarray) -> Groups:
+    """Zero, then equal ranges up to the largest width."""
+    found = [("0 µs", width_us <= 0)]
+    for low, high in pairwise(np.linspace(0.0, float(width_us.max()), LEVELS + 1)):
+        rows = (width_us > max(low, 0.0)) & (width_us <= high) if high > 0 else np.zeros(width_us.size, bool)
+        found.append((f"{low:.0f}-{high:.0f} µs", rows))
+    return found
+
+
+def _spans(time_s: np.ndarray) -> Groups:
+    """Equal spans from the start."""
+    edges = np.linspace(0.0, time_s[-1] + 1e-9, SPANS + 1)
+    return [(f"{a:.1f}-{b:.1f} s", (time_s >= a) & (time_s < b)) for a, b in pairwise(edges)]
+
+
+def _table(groups: Groups, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray) -> list[dict[str, Any]]:
+    """For each group that counts: number of samples, error, mean, and share of the error above the noise."""
+    parts = [(label, residual_nm[rows & counted]) for label, rows in groups]
+    excess = [max(float(np.sum(values**2) - values.size * noise_sd_nm**2), 0.0) for _, values in parts]
+    total = sum(excess)
+    return [
+        {
+            "label": label,
+            "samples": int(values.size),
+            "rms_nm": float(np.sqrt(np.mean(values**2))),
+            "mean_nm": float(np.mean(values)),
+            "share_of_excess": own / total if total > 0 else 0.0,
+        }
+        for (label, values), own in zip(parts, excess, strict=True)
+        if values.size
+    ]
+
+
+def _by_frequency(
+    rate: float, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
+) -> list[dict[str, Any]]:
+    """By octave: root mean square of the residual and of white noise in each."""
+    longest = max(runs(counted), key=lambda r: r.stop - r.start)
+    values = residual_nm[longest]
+    power = np.abs(np.fft.rfft(values)) ** 2 / values.size**2
+    power[1:] *= 2.0
+    frequency = np.fft.rfftfreq(values.size, 1.0 / rate)
+    rows = []
+    for low, high in pairwise(OCTAVES_HZ):
+        inside = (frequency >= low) & (frequency < high)
+        if not inside.any() or low >= rate / 2:
+            continue
+        noise = noise_sd_nm * float(np.sqrt(inside.sum() / frequency.size))
+        rows.append(
+            {
+                "label": f"{low:g}-{min(high, rate / 2):g} Hz",
+                "from_hz": low,
+                "to_hz": min(high, rate / 2),
+                "rms_nm": float(np.sqrt(power[inside].sum())),
+                "noise_nm": noise,
+            }
+        )
+    excess = [max(row["rms_nm"] ** 2 - row["noise_nm"] ** 2, 0.0) for row in rows]
+    total = sum(excess)
+    for row, value in zip(rows, excess, strict=True):
+        row["share_of_excess"] = value / total if total > 0 else 0.0
+    return rows
+
+
+# ---- the worst places ----
+
+STRETCH_S = 0.5
+MOST = 5
+"""Largest number of places."""
+
+
+def direction_of(record: Record) -> np.ndarray:
+    """+1 where the pulse width rose over the last 0.3 s, -1 where it fell, 0 where it was held; shape (N,)."""
+    u = record.pulse_width_us
+    back = max(round(0.3 * record.sample_rate_hz), 1)
+    change = u - np.r_[np.full(back, u[0]), u[:-back]]
+    level = 0.004 * max(float(u.max()), 1.0)
+    return np.where(change > level, 1, np.where(change < -level, -1, 0))
+
+
+def worst_places(
+    record: Record, residual_nm: np.ndarray, noise_sd_nm: float, *, rows: np.ndarray
+) -> list[dict[str, Any]]:
+    """The stretches with most of the error above the noise, among some rows.
+
+    Returns
+    -------
+    list of dict
+        As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
+    """
+    length = max(round(STRETCH_S * record.sample_rate_hz), 1)
+    rising = direction_of(record)
+    excess_total, pieces = 0.0, []
+    for run in np.split(np.arange(record.time_s.size), np.flatnonzero(np.diff(record.segment)) + 1):
+        for start in range(int(run[0]), int(run[-1]) + 1, length):
+            stop = min(start + length, int(run[-1]) + 1)
+            take = np.arange(start, stop)[rows[start:stop]]
+            if take.size < 2:
+                continue
+            excess = float(np.sum(residual_nm[take] ** 2) - take.size * noise_sd_nm**2)
+            excess_total += max(excess, 0.0)
+            pieces.append([start, stop, excess, int(np.sign(np.sum(rising[take])))])
+    if excess_total <= 0.0:
+        return []
+    merged = sorted(_merge(pieces, record), key=lambda piece: -piece[2])
+    return [
+        _place(record, residual_nm, rows, piece, excess_total)
+        for piece in merged[:MOST]
+        if piece[2] > 0.02 * excess_total
+    ]
+
+
+def _merge(pieces: list[list[Any]], record: Record) -> list[list[Any]]:
+    """Join neighbouring stretches of the same segment and direction, if each has much of the error."""
+    level = 0.3 * max(piece[2] / (piece[1] - piece[0]) for piece in pieces)
+    result: list[list[Any]] = []
+    for piece in pieces:
+        strong = piece[2] / (piece[1] - piece[0]) > level
+        last = result[-1] if result else None
+        if (
+            last is not None
+            and strong
+            and last[4]
+            and last[1] == piece[0]
+            and last[3] == piece[3]
+            and record.segment[last[0]] == record.segment[piece[0]]
+        ):
+            last[1], last[2] = piece[1], last[2] + piece[2]
+        else:
+            result.append([*piece, strong])
+    return result
+
+
+def _place(record: Record, residual_nm: np.ndarray, rows: np.ndarray, piece: list[Any], total: float) -> dict[str, Any]:
+    start, stop, excess, sign = piece[:4]
+    name = record.segment_names[int(record.segment[start])]
+    widths = record.pulse_width_us[start:stop]
+    looked_at = residual_nm[start:stop][rows[start:stop]]
+    error = float(np.mean(looked_at))
+    direction = {1: "rising", -1: "falling", 0: "held"}[sign]
+    share = excess / total
+    return {
+        "segment": name,
+        "start_s": float(record.time_s[start]),
+        "end_s": float(record.time_s[stop - 1]),
+        "pulse_width_us": [float(widths.min()), float(widths.max())],
+        "direction": direction,
+        "share_of_excess": float(share),
+        "mean_error_nm": error,
+        "text": _words(name, widths, direction, error, float(np.sqrt(np.mean(looked_at**2))), share),
+    }
+
+
+def _words(name: str, widths: np.ndarray, direction: str, error: float, size: float, share: float) -> str:
+    low, high = float(widths.min()), float(widths.max())
+    span = f"{low:.0f} µs" if high - low < 0.5 else f"{low:.0f}-{high:.0f} µs"
+    part = name if direction == "held" else f"{direction} {name}"
+    if abs(error) > 0.6 * size:
+        what = f"model too {'low' if error > 0 else 'high'} by {abs(error):.2g} N·m"
+    else:
+        what = f"error of {size:.2g} N·m in both directions"
+    return f"{part}, {span}: {what}, {100 * share:.0f} % of the error above the noise"

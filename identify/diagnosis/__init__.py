@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from stimrig.identify.diagnosis.candidates import Progress
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 from stimrig.identify.diagnosis.result import diagnosis_of
-from stimrig.identify.diagnosis.search import search_effects
+from stimrig.identify.diagnosis.search import Progress, search_effects
 from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.effects import get
 from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.effect_fit import fitted_with
+from stimrig.identify.experiments import NOTHING, Experiment, plan
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Diagnosis
@@ -63,3 +68,46 @@ def structure_of(model: Model | None) -> list[str]:
             fix="Give a model of maximum-likelihood or two-stage.",
         )
     return [f"{effect['id']}:{effect.get('form', '')}" for effect in model.effects]
+
+
+def next_experiment(about: Record | Diagnosis, rivals: Sequence[str] = ()) -> Experiment | None:
+    """The shortest safe test that tells rival effects apart.
+
+    Parameters
+    ----------
+    about : Record or Diagnosis
+        A record on which the rivals cannot be told apart, or what `diagnose` found on one.
+    rivals : sequence of str
+        Ids of effects to tell apart on a record; one alone is told apart from no effect. Without any, the record is
+        diagnosed first: its most probable effect that has rivals, and the first of these.
+
+    Returns
+    -------
+    Experiment or None
+        None if nothing is left to be told apart.
+
+    Raises
+    ------
+    BadRequest
+        An effect is not in the library.
+    """
+    if not rivals:
+        diagnosis = about if isinstance(about, Diagnosis) else diagnose(about)
+        return planned(diagnosis.missing)
+    if isinstance(about, Diagnosis):
+        raise TypeError("rivals are told apart on a record: next_experiment(record, rivals)")
+    names = list(dict.fromkeys(rivals))
+    for name in names:
+        get(name)  # an unknown one is refused before anything is fitted
+    fits = {name: fitted_with(about, [name]) for name in names}
+    if len(names) == 1:
+        fits[NOTHING] = fitted_with(about, [])
+    return plan(about, fits)
+
+
+def planned(missing: Sequence[Mapping[str, Any]]) -> Experiment | None:
+    """The experiment of the first effect with rivals among those that a diagnosis found missing; None without any."""
+    for row in missing:
+        if row["confused_with"] and row["next_experiment_plan"]:
+            return Experiment(rivals=(row["effect"], row["confused_with"][0]), **row["next_experiment_plan"])
+    return None

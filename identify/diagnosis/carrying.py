@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from stimrig.identify.diagnosis.candidates import Progress, silent
-from stimrig.identify.diagnosis.carried_effects import LAST, Judged, Reason, prior, rise, still_needed
+from stimrig.identify.diagnosis.search import LAST, Judged, Progress, Reason, prior, rise, silent, still_needed
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
 from stimrig.identify.effects import get, registry
 from stimrig.identify.estimation.effect_fit import detected_effects, effect_names, renewed_curve
@@ -62,9 +61,11 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     say(0.85, f"{LAST}: bands and tests of the residual")
     last = renewed_curve(last)
     carried_model = finish(METHOD, last, [f"effects carried over: {', '.join(effect_names(last))}"])
-    against = _against(plain, last, raw) or _less_usable(plain_model, carried_model)
+    better, because = _verdict(plain, last, raw)
+    if better and (against := _less_usable(plain_model, carried_model)):
+        better, because = False, against
     say(1.0, "done")
-    return _result(model, [plain_model, carried_model], rows, against is None, against or _better(plain, last, raw))
+    return _result(model, [plain_model, carried_model], rows, better, because)
 
 
 def _refused(model: Model) -> Reason | None:
@@ -92,23 +93,23 @@ def _nothing(judged: list[Judged]) -> Reason:
     return Reason("nothing-needed", "The plain structure is enough for this record.")
 
 
-def _total(plain: Fitted, last: Fitted) -> float:
-    """Log evidence of all carried effects together."""
-    return last.log_evidence - plain.log_evidence + sum(prior(get(name)) for name in effect_names(last))
-
-
-def _in_samples(last: Fitted, raw: Raw) -> bool:
-    """Whether the samples show one of the effects: the log evidence says little of such a one."""
-    return any(effect in effect_names(last) for effect, _, _ in detected_effects(raw))
-
-
-def _against(plain: Fitted, last: Fitted, raw: Raw) -> Reason | None:
-    """What speaks against the carried structure as a whole; None if nothing does."""
-    total = _total(plain, last)
-    if total < FIRST_MARGIN and not _in_samples(last, raw):
+def _verdict(plain: Fitted, last: Fitted, raw: Raw) -> tuple[bool, Reason]:
+    """Whether the carried structure as a whole is better than the plain one, and why."""
+    held = effect_names(last)
+    # The log evidence says little of an effect that the samples show.
+    in_samples = any(effect in held for effect, _, _ in detected_effects(raw))
+    total = last.log_evidence - plain.log_evidence + sum(prior(get(name)) for name in held)
+    if total < FIRST_MARGIN and not in_samples:
         text = f"Together the effects change the log evidence by {total:+.1f}; at least {FIRST_MARGIN:g} is required."
-        return Reason("no-gain", text)
-    return rise(plain, last)
+        return False, Reason("no-gain", text)
+    risen = rise(plain, last)
+    if risen is not None:
+        return False, risen
+    names = "; ".join(get(name).name.lower() for name in held)
+    if in_samples:
+        return True, Reason("better", f"This record asks for: {names}.")
+    text = f"This record asks for: {names}. Log evidence is higher by {total:.0f} than without effects."
+    return True, Reason("better", text)
 
 
 def _less_usable(plain: Model, carried: Model) -> Reason | None:
@@ -117,16 +118,6 @@ def _less_usable(plain: Model, carried: Model) -> Reason | None:
         return None
     words = str(carried.quality.get("words") or "")
     return Reason("not-usable", f"The model with the carried effects is not usable. {words}".strip())
-
-
-def _better(plain: Fitted, last: Fitted, raw: Raw) -> Reason:
-    names = "; ".join(get(name).name.lower() for name in effect_names(last))
-    if _in_samples(last, raw):
-        return Reason("better", f"This record asks for: {names}.")
-    total = _total(plain, last)
-    return Reason(
-        "better", f"This record asks for: {names}. Log evidence is higher by {total:.0f} than without effects."
-    )
 
 
 def _result(model: Model, models: list[Model], judged: list[Judged], better: bool, because: Reason) -> Carried:

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from stimrig.identify.diagnosis import structure_of
-from stimrig.identify.diagnosis.candidates import Progress
-from stimrig.identify.diagnosis.held_out_error import held_out_rise
+from stimrig.identify.diagnosis.residual import held_out_rise
 from stimrig.identify.diagnosis.result import Step, steps
-from stimrig.identify.diagnosis.search import MOST, EffectSearch, search_effects
+from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, search_effects
 from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import get
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.caution import OPEN
-from stimrig.identify.criticism.where import worst_places
+from stimrig.identify.criticism import worst_places
 from stimrig.identify.diagnosis.search import EffectSearch
 from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import get
-from stimrig.identify.estimation.effect_fit import effect_names, knows_joint, renewed_curve
+from stimrig.identify.estimation.effect_fit import Candidate, effect_names, knows_joint, renewed_curve
 from stimrig.identify.estimation.finish import describe_parameters
 from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.joint import Fitted, band_as_effect, predict_fitted
-from stimrig.identify.experiments import plan
+from stimrig.identify.experiments import Experiment, plan
 from stimrig.identify.results import Diagnosis
 from stimrig.identify.summary import probability, sure
 
@@ -31,21 +31,11 @@ STATISTICS = (
 
 @dataclass(frozen=True)
 class Step:
-    """One of the models of a search, each with one effect more than the one before.
+    """One of the models of a search, each with one effect more than the one before."""
 
-    Parameters
-    ----------
-    added : str or None
-        The effect that this model has more than the one before; None for the base.
-    fitted : Fitted
-        The model.
-    statistics : dict
-        See `stimrig.identify.estimation.fit_statistics`.
-    """
-
-    added: str | None
+    added: str | None  # None for the base
     fitted: Fitted
-    statistics: dict[str, Any]
+    statistics: dict[str, Any]  # see `evaluate`
 
 
 def steps(search: EffectSearch) -> list[Step]:
@@ -94,7 +84,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
         unseen=None
         if verdict.held_out_error is None
         else {"rms_nm": verdict.held_out_error.rms_nm, "allowed_nm": verdict.held_out_error.allowed_nm},
-        candidates=tuple(_candidates(search)),
+        candidates=tuple([_candidate(one) for one in tried] for tried in search.rounds),
         notes=tuple(verdict.notes),
         plain=tuple(_plain(search, verdict, base, final, missing, where)),
     )
@@ -128,8 +118,8 @@ def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step
         "held_out_rms_before_nm": before["held_out_rms_nm"],
         "held_out_rms_after_nm": after["held_out_rms_nm"],
         "confused_with": confused,
-        "next_experiment": experiment["text"] if experiment else described.separated_by,
-        "next_experiment_plan": experiment,
+        "next_experiment": experiment.text if experiment else described.separated_by,
+        "next_experiment_plan": experiment and {k: v for k, v in experiment.to_dict().items() if k != "rivals"},
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
         "parameters": dict(list(describe_parameters(fitted, index).items())[:MOST_PARAMETERS]),
@@ -148,16 +138,13 @@ def _close(search: EffectSearch, effect: str) -> set[str]:
     return {name for name in alike if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
 
 
-def _experiment(search: EffectSearch, effect: str, confused: list[str]) -> dict[str, Any] | None:
+def _experiment(search: EffectSearch, effect: str, confused: list[str]) -> Experiment | None:
     """The shortest test that separates an effect from its first rival, both as fitted in the same round."""
     if not confused or effect not in search.added:
         return None
     found = {c.effect.id: c.fitted for c in search.rounds[search.added.index(effect)]}
     rivals = {name: found[name] for name in (effect, confused[0]) if name in found and not get(name).band}
-    if len(rivals) < 2:
-        return None
-    best = plan(search.record, rivals)
-    return {key: best[key] for key in ("segments", "duration_s", "dose", "expected_log_evidence", "decides", "text")}
+    return plan(search.record, rivals) if len(rivals) == 2 else None
 
 
 PARTS = {
@@ -168,20 +155,14 @@ PARTS = {
 }
 
 
-def _candidates(search: EffectSearch) -> list[list[dict[str, Any]]]:
-    return [
-        [
-            {
-                "effect": c.effect.id,
-                "form": c.form.name,
-                "log_evidence_gain": c.gain,
-                "rms_nm": c.fitted.rms_nm,
-                "forms": c.forms,
-            }
-            for c in found
-        ]
-        for found in search.rounds
-    ]
+def _candidate(one: Candidate) -> dict[str, Any]:
+    return {
+        "effect": one.effect.id,
+        "form": one.form.name,
+        "log_evidence_gain": one.gain,
+        "rms_nm": one.fitted.rms_nm,
+        "forms": one.forms,
+    }
 
 
 def _plain(

@@ -1,20 +1,32 @@
-"""The search for effects: a chain of models, each with one effect more, as long as the evidence is sufficient."""
+"""Searches over structures: effects that a record asks for, one after the other; those that it still asks for.
+
+`search_effects` adds effects of the library to a model as long as the evidence is sufficient. `still_needed` adds all
+effects of an earlier model, then drops those that the record does not ask for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.candidates import FREE_GAIN, Progress, scan
-from stimrig.identify.diagnosis.residual_structure import ResidualStructure, quiet_rows, residual_structure
-from stimrig.identify.effects import get, registry
-from stimrig.identify.effects.base import Effect
+from stimrig.identify.diagnosis.residual import (
+    ResidualStructure,
+    held_out_rise,
+    quiet_rows,
+    residual_structure,
+)
+from stimrig.identify.diagnosis.side_by_side import side_by_side
+from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
+from stimrig.identify.effects import Effect, Form, Parameter, Scene, form, get, registry
+from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import (
     BAND_COST,
     Candidate,
+    add_effect,
     detected_effects,
     effect_names,
     fit_form,
@@ -26,64 +38,43 @@ from stimrig.identify.estimation.effect_fit import (
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
 from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
 from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.model import Model
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 
 MOST = 3
 """Effects at most."""
+FORMS = 3
+"""Forms of an effect that are tried beside another effect."""
+LAST = "fitting last session's structure"
+
+Progress = Callable[[float, str], None]
+"""Called with the share done, 0 to 1, and a line of text. It may raise `Cancelled`."""
+
+
+def silent(_share: float, _text: str) -> None:
+    """A `Progress` that tells nobody."""
 
 
 @dataclass
 class EffectSearch:
-    """What was tried on a record, and with what result.
-
-    Parameters
-    ----------
-    record : Record
-        The record, as given.
-    raw : Raw
-        What the samples show before any fit.
-    plain : Fitted
-        The model without effects.
-    base : Fitted
-        The model of the structure that is examined.
-    detected : list of str
-        Effects that the samples show before any fit.
-    with_detected : list of Fitted
-        The base with the first of them, with the first two, ….
-    rounds : list of list of Candidate
-        Candidates of each round, best first; round i starts from chain[i].
-    chain : list of Fitted
-        The base (with what was detected), then with one effect more each time.
-    added : list of str
-        Effects added, in order.
-    margins : list of float
-        Log evidence required in each round.
-    free_gain : list of float
-        Log evidence for a gain that varies without a law, in each round.
-    losses : dict
-        Log evidence lost without each effect, if there are several.
-    quiet : ndarray of bool
-        Intervals in which the muscle rests.
-    residuals : list of ResidualStructure
-        What the residual of each model of the chain shows.
-    """
+    """What was tried on a record, and with what result. Round i starts from chain[i]."""
 
     record: Record
-    raw: Raw
-    plain: Fitted
-    base: Fitted
-    detected: list[str] = field(default_factory=list)
-    with_detected: list[Fitted] = field(default_factory=list)
-    rounds: list[list[Candidate]] = field(default_factory=list)
-    chain: list[Fitted] = field(default_factory=list)
-    added: list[str] = field(default_factory=list)
-    margins: list[float] = field(default_factory=list)
-    free_gain: list[float] = field(default_factory=list)
-    losses: dict[str, float] = field(default_factory=dict)
-    quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
-    residuals: list[ResidualStructure] = field(default_factory=list)
+    raw: Raw  # what the samples show before any fit
+    plain: Fitted  # the model without effects
+    base: Fitted  # the model of the structure that is examined
+    detected: list[str] = field(default_factory=list)  # effects that the samples show before any fit
+    with_detected: list[Fitted] = field(default_factory=list)  # the base with the first of them, with the first two, …
+    rounds: list[list[Candidate]] = field(default_factory=list)  # candidates of each, best first
+    chain: list[Fitted] = field(default_factory=list)  # the base and what was detected, then one effect more each time
+    added: list[str] = field(default_factory=list)  # effects, in order
+    margins: list[float] = field(default_factory=list)  # log evidence required in each round
+    free_gain: list[float] = field(default_factory=list)  # log evidence for a gain that varies without a law
+    losses: dict[str, float] = field(default_factory=dict)  # log evidence lost without each effect, if of several
+    quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # intervals in which the muscle rests
+    residuals: list[ResidualStructure] = field(default_factory=list)  # what that of each model of the chain shows
 
     @property
     def held(self) -> list[str]:
@@ -95,13 +86,18 @@ class EffectSearch:
         """The model with all effects found."""
         return self.chain[-1]
 
+    def append(self, fitted: Fitted, effect: str = "") -> None:
+        """One model more, with an effect more than the last."""
+        self.added += [effect] if effect else []
+        self.chain.append(fitted)
+        self.residuals.append(residual_structure(fitted, self.quiet, self.raw.noise_sd_nm))
+
 
 def search_effects(
     record: Record,
     progress: Progress | None = None,
     *,
     most: int = MOST,
-    effects: Iterable[Effect] | None = None,
     fitted: np.ndarray | None = None,
     structure: Sequence[str] = (),
 ) -> EffectSearch:
@@ -115,87 +111,160 @@ def search_effects(
         Called with the share done and a line of text; it may raise `Cancelled`.
     most : int
         Effects to add at most.
-    effects : iterable of Effect or None
-        Effects to try; the whole library by default.
     fitted : ndarray of bool or None, shape (K,)
         Pulse intervals to fit; by default all that may be fitted.
     structure : sequence of str
         Effects, "id" or "id:form", that the examined model already has.
     """
-    listed = list(registry().values() if effects is None else effects)
     grid, raw = prepare(record)
-    plain_fit = fit_plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
-    base = renewed_curve(with_effects(plain_fit, structure, raw))
-    search = EffectSearch(record, raw, plain_fit, base)
-    start = _with_detected(search, base)
-    search.chain, search.quiet = [start], quiet_rows(start)
-    search.residuals = [residual_structure(start, search.quiet, raw.noise_sd_nm)]
+    plain = fit_plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
+    search = EffectSearch(record, raw, plain, renewed_curve(with_effects(plain, structure, raw)))
+    start = _with_detected(search)
+    search.quiet = quiet_rows(start)
+    search.append(start)
     for number in range(most):
         if number and _exhausted(search):
             break
-        before = search.rounds[0] if search.rounds else None
-        candidates = scan(search.last, listed, progress, (0.1 + 0.3 * number, 0.4 + 0.3 * number), before)
-        candidates = sorted((_discounted(search, c) for c in candidates), key=lambda c: -c.gain)
-        search.rounds.append(candidates)
-        free_gain = try_effect(FREE_GAIN, search.last)
-        search.free_gain.append(free_gain.gain if free_gain else 0.0)
-        search.margins.append(_margin(search, len(search.added)))
-        enough = [c for c in candidates if c.gain >= _margin(search, len(search.added), c)]
-        if not enough:
+        best = _best_of_round(search, progress or silent, number)
+        if best is None:
             break
-        _append(search, enough[0].fitted, enough[0].effect.id)
+        search.append(best.fitted, best.effect.id)
         if number:
             _exchange(search)
     if len(search.added) > 1:
         for effect in search.added:
-            without = without_effect(search.last, effect)
-            search.losses[effect] = search.last.log_evidence - without.log_evidence
+            search.losses[effect] = search.last.log_evidence - without_effect(search.last, effect).log_evidence
     return search
+
+
+def _with_detected(search: EffectSearch) -> Fitted:
+    """The base model with the effects that the samples show beyond doubt."""
+    base = search.base
+    for effect, shown, values in detected_effects(search.raw):
+        if effect not in effect_names(base):
+            base = fit_from(base, effect, shown, values)
+            search.detected.append(effect)
+            search.with_detected.append(base)
+    return base
+
+
+def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> Candidate | None:
+    """The best candidate of a round; None if none gains enough."""
+    before = search.rounds[0] if search.rounds else []
+    tried = _scan(search.last, lambda done, text: progress(0.1 + 0.3 * number + 0.3 * done, text), before)
+    candidates = sorted((_discounted(search, c) for c in tried), key=lambda c: -c.gain)
+    search.rounds.append(candidates)
+    free_gain = try_effect(FREE_GAIN, search.last)
+    search.free_gain.append(free_gain.gain if free_gain else 0.0)
+    search.margins.append(_margin(search, len(search.added)))
+    return next((c for c in candidates if c.gain >= _margin(search, len(search.added), c)), None)
+
+
+# ---- one round: every effect of the library tried on a model -----------------------------------------------------
+
+
+def _scan(base: Fitted, progress: Progress, before: list[Candidate]) -> list[Candidate]:
+    """Add each applicable effect to a model; best first. `before` holds the candidates of an earlier round."""
+    present = effect_names(base)
+    listed = [effect for effect in registry().values() if _applicable(effect, base, present)]
+    # Slow ones first, so that all processes end at about the same time.
+    listed.sort(key=lambda effect: -len(effect.forms))
+    earlier = {candidate.effect.id: candidate for candidate in before}
+
+    def tried(number: int) -> tuple[str, Fitted, float, dict[str, float]] | None:
+        """Without the problem: it holds functions, which cannot be sent between processes."""
+        effect = listed[number]
+        found = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)))
+        return found and (found.form.name, replace(found.fitted, problem=None), found.gain, found.forms)
+
+    found: list[Candidate] = []
+    for done, (number, result) in enumerate(side_by_side(tried, len(listed)), start=1):
+        effect = listed[number]
+        progress(done / len(listed), f"tried {effect.name.lower()}")
+        if result is not None:
+            name, fitted, gain, forms = result
+            added = [] if effect.band else [(effect.id, effect.form(name))]
+            problem = Problem(base.problem.setup, [*base.effects, *added])
+            found.append(Candidate(effect, effect.form(name), replace(fitted, problem=problem), gain, forms))
+    return sorted(found, key=lambda candidate: (-candidate.gain, candidate.effect.id))
+
+
+def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
+    """Whether an effect can be tried: no earlier step looks for it, it is not there, the record has its columns."""
+    record = base.problem.setup.grid.record
+    return not effect.raw and effect.id not in present and all(getattr(record, n) is not None for n in effect.needs)
+
+
+def _likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:
+    """Forms to try beside another effect: those that were best alone; all forms of a chain."""
+    if before is None or effect.band or any(known.grows for known in effect.forms):
+        return list(effect.forms)
+    ranked = sorted(before.forms, key=lambda name: -before.forms[name])
+    return [effect.form(name) for name in ranked[:FORMS]]
+
+
+KNOTS = 36
+
+
+@form(
+    "gain",
+    "w = g(t) f(u), log g linear between knots",
+    *(Parameter(f"log_gain_{i}", "1", -0.45, 0.45, 0.0, (0.0,), about="log gain at a knot") for i in range(KNOTS)),
+)
+def free(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """A gain without a law."""
+    place = np.clip(scene.time_s / max(scene.span_s, 1e-9), 0.0, 1.0) * (KNOTS - 1)
+    first = np.minimum(place.astype(np.int64), KNOTS - 2)
+    part = place - first
+    values = np.concatenate([p[f"log_gain_{i}"] for i in range(KNOTS)], axis=1)
+    return drive * np.exp(values[:, first] * (1.0 - part) + values[:, first + 1] * part)
+
+
+FREE_GAIN = Effect("free_gain", "Gain that varies without a law", (free,), "", (), "", "")
+
+
+# ---- what an effect must gain --------------------------------------------------------------------------------------
 
 
 def seen_at_rest(quiet: np.ndarray, fitted: Fitted, effect: str) -> float:
     """Size of an added torque at rest, divided by its size at work. Efforts come at any time, stimulated or not."""
     setup = fitted.problem.setup
-    form = next(form for name, form in fitted.effects if name == effect)
+    added = dict(fitted.effects)[effect]
     values = {name: np.array([[value]]) for name, value in fitted.parameters_of(effect).items()}
-    torque = np.broadcast_to(form.call(None, values, setup.scene), (1, quiet.size))[0]
-    parts = [
+    torque = np.broadcast_to(added.call(None, values, setup.scene), (1, quiet.size))[0]
+    rest, work = (
         np.mean(torque[rows] ** 2) if np.any(rows) else 0.0 for rows in (setup.fitted & quiet, setup.fitted & ~quiet)
-    ]
-    return float(np.sqrt(parts[0] / max(parts[1], 1e-30)))
+    )
+    return float(np.sqrt(rest / max(work, 1e-30)))
 
 
 def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
     """The candidate with its gain reduced if it is an effort, and reduced more if it is only seen at work."""
-    if candidate.effect.predictable or candidate.effect.band:
+    effect = candidate.effect
+    if effect.predictable or effect.band:
         return candidate
-    seen = candidate.form.stage != "additive" or _at_rest(search, candidate)
-    return replace(
-        candidate, gain=(thresholds.EFFORT_WEIGHT if seen else thresholds.EFFORT_WEIGHT_ONLY_AT_WORK) * candidate.gain
+    at_rest = candidate.form.stage != "additive" or (
+        seen_at_rest(search.quiet, candidate.fitted, effect.id) >= thresholds.SEEN_AT_REST
     )
-
-
-def _at_rest(search: EffectSearch, candidate: Candidate) -> bool:
-    return seen_at_rest(search.quiet, candidate.fitted, candidate.effect.id) >= thresholds.SEEN_AT_REST
+    weight = thresholds.EFFORT_WEIGHT if at_rest else thresholds.EFFORT_WEIGHT_ONLY_AT_WORK
+    return replace(candidate, gain=weight * candidate.gain)
 
 
 def _margin(search: EffectSearch, number: int, candidate: Candidate | None = None) -> float:
     """Log evidence that an effect must gain in a round: more where it may only repair the first one's inexact form."""
     if not number and not search.held:
-        return thresholds.FIRST_MARGIN
-    return max(
-        thresholds.NEXT_MARGIN,
-        (thresholds.NEXT_SHARE if candidate is None else _required_share(search, candidate)) * _first_gain(search),
-    )
+        return FIRST_MARGIN
+    share = thresholds.NEXT_SHARE if candidate is None else _required_share(search, candidate)
+    return max(thresholds.NEXT_MARGIN, share * _first_gain(search))
 
 
 def _first_gain(search: EffectSearch) -> float:
     """Log evidence gained by the first effect, or by those of the structure; 0 for a narrow band, which is noise."""
     if search.held:
-        return (
-            0.0 if any(get(name).band for name in search.held) else search.base.log_evidence - search.plain.log_evidence
-        )
-    return 0.0 if search.rounds[0][0].effect.band else search.rounds[0][0].gain
+        band = any(get(name).band for name in search.held)
+        return 0.0 if band else search.base.log_evidence - search.plain.log_evidence
+    first = search.rounds[0][0]
+    return 0.0 if first.effect.band else first.gain
 
 
 def _required_share(search: EffectSearch, candidate: Candidate) -> float:
@@ -207,20 +276,12 @@ def _required_share(search: EffectSearch, candidate: Candidate) -> float:
         return 0.5 * thresholds.CONFIRMED_SHARE
     if stage in ("gain", "pulse_width") and search.free_gain[-1] > thresholds.FREE_GAIN_CONFIRMS * candidate.gain:
         return thresholds.CONFIRMED_SHARE
-    for name, form in search.last.effects:
-        if name in search.detected:
-            continue
-        if form.stage in thresholds.DYNAMIC and stage in thresholds.DYNAMIC:
-            return thresholds.SIMILAR_SHARE
-        if name in effect.resembles or effect.id in get(name).resembles:
+    for name, own in search.last.effects:
+        both_dynamic = own.stage in thresholds.DYNAMIC and stage in thresholds.DYNAMIC
+        alike = both_dynamic or name in effect.resembles or effect.id in get(name).resembles
+        if alike and name not in search.detected:
             return thresholds.SIMILAR_SHARE
     return thresholds.NEXT_SHARE
-
-
-def _append(search: EffectSearch, fitted: Fitted, effect: str) -> None:
-    search.added.append(effect)
-    search.chain.append(fitted)
-    search.residuals.append(residual_structure(fitted, search.quiet, search.raw.noise_sd_nm))
 
 
 def _exhausted(search: EffectSearch) -> bool:
@@ -232,15 +293,12 @@ def _exhausted(search: EffectSearch) -> bool:
     return left.ideal - last.log_likelihood < least and left.ratio < least
 
 
-def _with_detected(search: EffectSearch, base: Fitted) -> Fitted:
-    """The base model with the effects that the samples show beyond doubt."""
-    for effect, form, values in detected_effects(search.raw):
-        if effect in effect_names(base):
-            continue
-        base = fit_from(base, effect, form, values)
-        search.detected.append(effect)
-        search.with_detected.append(base)
-    return base
+def prior(effect: Effect) -> float:
+    """What is added to a gain of log evidence: the effect's prior odds, and the cost of a narrow band."""
+    return effect.prior - (BAND_COST if effect.band else 0.0)
+
+
+# ---- effects replaced and left out ---------------------------------------------------------------------------------
 
 
 def _exchange(search: EffectSearch) -> None:
@@ -249,20 +307,17 @@ def _exchange(search: EffectSearch) -> None:
     for index, effect in enumerate(list(search.added[:-1])):
         rivals = [c for c in search.rounds[index] if c.effect.id not in search.added][:2]
         without = without_effect(last, effect)
-        if without.log_evidence > search.last.log_evidence - 1.0:
+        if without.log_evidence > last.log_evidence - 1.0:
             search.added.remove(effect)
             _rebuild(search, without)
             return
         for rival in rivals:
-            if rival.gain < 0.5 * search.rounds[index][0].gain:
-                continue
-            if rival.effect.band:
+            if rival.gain < 0.5 * search.rounds[index][0].gain or rival.effect.band:
                 continue
             found = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
-            if found is not None and found.log_evidence > search.last.log_evidence + 2.0:
-                won = found.log_evidence - search.last.log_evidence
+            if found is not None and found.log_evidence > last.log_evidence + 2.0:
                 search.added[index] = rival.effect.id
-                _rebuild(search, found, index, won)
+                _rebuild(search, found, index, found.log_evidence - last.log_evidence)
                 return
 
 
@@ -275,14 +330,12 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
     search.added, search.chain, search.residuals = [], search.chain[:1], search.residuals[:1]
     search.rounds, search.margins, search.free_gain = [], [], search.free_gain[: len(wanted)]
     for number, effect in enumerate(wanted):
-        before = search.last
+        before, described = search.last, get(effect)
         fitted = last if number == len(wanted) - 1 else _part(last, before, [*effect_names(before), effect])
-        known = next((c for c in tried[number] if c.effect.id == effect), None)
-        described = get(effect)
+        known = next((c.forms for c in tried[number] if c.effect.id == effect), {})
         gain = fitted.log_evidence - before.log_evidence + described.prior - (BAND_COST if described.band else 0.0)
-        form = dict(fitted.effects).get(effect, described.forms[0])
-        found = Candidate(described, form, fitted, gain, (known.forms if known else {}) | {form.name: gain})
-        found = _discounted(search, found)
+        own = dict(fitted.effects).get(effect, described.forms[0])
+        found = _discounted(search, Candidate(described, own, fitted, gain, known | {own.name: gain}))
         if fitted is last and found.gain < _margin(search, number, found):
             return  # beside the other effects it no longer gains enough
         # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
@@ -290,12 +343,12 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
         rivals = [replace(c, gain=min(c.gain, most)) for c in tried[number] if c.effect.id != effect]
         search.rounds.append(sorted([found, *rivals], key=lambda c: -c.gain))
         search.margins.append(_margin(search, number))
-        _append(search, fitted, effect)
+        search.append(fitted, effect)
 
 
 def _part(last: Fitted, before: Fitted, kept: list[str]) -> Fitted:
     """The last model with only some of its effects, fitted from their present values."""
-    problem = Problem(last.problem.setup, [(effect, form) for effect, form in last.effects if effect in kept])
+    problem = Problem(last.problem.setup, [(effect, own) for effect, own in last.effects if effect in kept])
     noise = last.noise if any(get(name).band for name in kept) else before.noise
     return solve(problem, start_from(problem, last, {}), noise)
 
@@ -303,8 +356,133 @@ def _part(last: Fitted, before: Fitted, kept: list[str]) -> Fitted:
 def without_effect(fitted: Fitted, effect: str) -> Fitted:
     """The model refitted without one of its effects."""
     noise = fitted.noise
-    others = [(e, f) for e, f in fitted.effects if e != effect]
+    others = [(name, own) for name, own in fitted.effects if name != effect]
     if len(others) == len(fitted.effects):
         noise = NoiseLevel(noise.ar1, noise.share, noise.sd_nm)
     problem = Problem(fitted.problem.setup, others)
     return solve(problem, start_from(problem, fitted, {}), noise)
+
+
+# ---- effects of an earlier model -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why something is so: as a word for programs, and as a sentence."""
+
+    why: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a record says of one carried effect: None if it cannot tell. `gain` is None if it was not compared."""
+
+    effect: Effect
+    needed: bool | None
+    because: Reason
+    gain: float | None = None
+
+
+def still_needed(plain: Fitted, model: Model, raw: Raw, say: Progress) -> tuple[Fitted, dict[str, Judged]]:
+    """The plain model with those effects of an earlier one that the record asks for, and the verdict on each.
+
+    Parameters
+    ----------
+    plain : Fitted
+        The plain structure on the new record.
+    model : Model
+        The earlier model. It lends its effects and their forms.
+    raw : Raw
+        What the samples of the new record show before any fit.
+    say : callable
+        Called with the share done and a line of text.
+    """
+    judged: dict[str, Judged] = {}
+    full = _with_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
+    last = _reduced(full, raw, judged, lambda share, text: say(0.6 + 0.4 * share, text))
+    if residual_structure(last, quiet_rows(last), raw.noise_sd_nm).left:
+        judged = {name: _undecided(verdict) for name, verdict in judged.items()}
+    return last, judged
+
+
+def _with_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
+    """The plain model with all effects of the earlier one that this record can hold; the others are judged.
+
+    The effect that explains most is added first, then the next: a weak one that is fitted alone takes what belongs to
+    the strong one. So the order in which the earlier model lists them does not matter.
+    """
+    fitted, left = plain, {str(entry["id"]): entry for entry in model.effects}
+    while left:
+        names = ", ".join(get(name).name.lower() for name in left)
+        say(1.0 - len(left) / len(model.effects), f"{LAST}: {names}")
+        held: dict[str, Fitted] = {}
+        for name, entry in left.items():
+            try:
+                held[name] = add_effect(fitted, get(name), _form_of(entry), raw)
+            except NotIdentifiable as error:
+                seen = Reason("not-seen", f"{error.message[:1].upper()}{error.message[1:]}.")
+                judged[name] = Judged(get(name), False, seen)
+        if not held:
+            return fitted
+        strongest = max(held, key=lambda name: (held[name].log_evidence, name))
+        fitted = held[strongest]
+        left = {name: entry for name, entry in left.items() if name in held and name != strongest}
+    return fitted
+
+
+def _form_of(entry: Mapping[str, Any]) -> str:
+    """The form to fit; empty (all of them) if they are a chain, whose length depends on the record."""
+    forms, name = get(str(entry["id"])).forms, str(entry.get("form") or "")
+    return name if name in {known.name for known in forms} and not any(known.grows for known in forms) else ""
+
+
+def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
+    """The model without the effects that are not needed: the weakest is dropped, then the others are judged anew."""
+    shown = {effect for effect, _, _ in detected_effects(raw)}
+    last, first_count, tried = full, len(effect_names(full)), set[str]()
+    while held := effect_names(last):
+        say(1.0 - len(held) / (first_count + 1), f"{LAST}: which of its effects are still needed")
+        found = [_judged(get(name), last, name in shown) for name in held]
+        judged.update({verdict.effect.id: verdict for verdict, _ in found})
+        weak = [pair for pair in found if not pair[0].needed]
+        if not weak:
+            break
+        worst, last = min(weak, key=lambda pair: pair[0].gain or 0.0)
+        if worst.effect.id not in tried:
+            tried.add(worst.effect.id)
+            other = try_effect(worst.effect, last)  # in its most likely form, if the evidence asks for that form
+            last = other.fitted if other is not None and other.gain >= FIRST_MARGIN else last
+    return last
+
+
+def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted]:
+    """What the record says of an effect of a model, and the model without it."""
+    if shown:
+        return Judged(effect, True, Reason("in-samples", "The samples show it directly, before any fit.")), fitted
+    without = without_effect(fitted, effect.id)
+    gain = fitted.log_evidence - without.log_evidence + prior(effect)
+    if gain < FIRST_MARGIN:
+        why, words = ("against", "The evidence is against it") if gain <= 0.0 else ("weak", "Too little evidence")
+        text = f"{words}: log evidence changes by {gain:+.1f} with it; at least {FIRST_MARGIN:g} is required."
+        return Judged(effect, False, Reason(why, text), gain), without
+    risen = rise(without, fitted)
+    text = f"Log evidence is higher by {gain:.0f} with it; at least {FIRST_MARGIN:g} is required."
+    return Judged(effect, risen is None, risen or Reason("asked-for", text), gain), without
+
+
+def rise(before: Fitted, after: Fitted) -> Reason | None:
+    """The error on held-out rows as a reason if it rises; else None."""
+    errors = held_out_rise(before, after)
+    if errors is None:
+        return None
+    text = f"The error on held-out rows rises from {errors[0]:.3g} to {errors[1]:.3g} N·m."
+    return Reason("held-out-error", text)
+
+
+def _undecided(verdict: Judged) -> Judged:
+    """The verdict on an effect if something else is missing in the model: it may hide what the effect explains."""
+    if verdict.needed or verdict.gain is None:
+        return verdict
+    text = f"{verdict.because.reason} But something else is missing in the model, so this record cannot tell yet."
+    return replace(verdict, needed=None, because=Reason("undecided", text))

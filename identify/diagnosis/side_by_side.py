@@ -15,12 +15,14 @@ from typing import Any
 
 from numba.core.compiler_lock import global_compiler_lock
 
+WORKERS = min(2, os.cpu_count() or 1)
+"""Processes that share tasks, this one included."""
 ROOM_BYTES = 2**20
 Copy = tuple[Any, Any]
 """A process, and the end of a pipe from which its results come."""
 
 
-def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iterator[tuple[int, Any]]:
+def side_by_side(work: Callable[[int], Any], count: int, processes: int = 0) -> Iterator[tuple[int, Any]]:
     """Yield the number and the result of each task as it is done. Results must be picklable.
 
     A task that fails in a copy, or whose copy ends early, is done again here, so that its error is raised here.
@@ -32,7 +34,7 @@ def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iter
     count : int
         Of tasks, 256 at most: each number is one byte.
     processes : int
-        Processes that share the tasks, this one included.
+        Processes that share the tasks, this one included; 0 for `WORKERS`.
     """
     numbers, put = os.pipe()
     os.write(put, bytes(range(count)))
@@ -40,7 +42,7 @@ def side_by_side(work: Callable[[int], Any], count: int, processes: int) -> Iter
     copies: list[Copy] = []
     waiting = set(range(count))
     try:
-        while len(copies) + 1 < min(processes, count) and (copy := _copy(work, numbers)):
+        while len(copies) + 1 < min(processes or WORKERS, count) and (copy := _copy(work, numbers)):
             copies.append(copy)
         while number := os.read(numbers, 1):
             waiting.discard(number[0])

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.held_out_error import HeldOutError, held_out_error, held_out_rise
-from stimrig.identify.diagnosis.residual_structure import held_readings
+from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, held_out_rise, held_readings
 from stimrig.identify.diagnosis.search import EffectSearch, seen_at_rest
 from stimrig.identify.effects import get
 from stimrig.identify.estimation.effect_fit import Candidate
@@ -16,39 +15,16 @@ from stimrig.identify.estimation.effect_fit import Candidate
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict on a search for effects.
+    """The verdict on a search for effects."""
 
-    Parameters
-    ----------
-    kind : str
-        "effect_missing", "nothing_missing" or "unexplained_structure".
-    found : dict
-        Probability by effect, of those added.
-    rivals : dict
-        For each effect found: the probabilities of all effects tried in the same round.
-    explained : float
-        Share of the explainable log-likelihood that the effects explain.
-    structure : float
-        Log-likelihood by which the residuals at work and at rest still differ.
-    probability : float
-        Of the verdict as a whole.
-    held_out_error : HeldOutError or None
-        Error of the last model on held-out rows; None if they tell nothing.
-    contradicted : bool
-        Whether that error shows that structure is left.
-    notes : list of str
-        Reasons, for people.
-    """
-
-    kind: str
-    found: dict[str, float]
-    rivals: dict[str, dict[str, float]]
-    explained: float
-    structure: float
-    probability: float
-    held_out_error: HeldOutError | None = None
-    contradicted: bool = False
-    notes: list[str] = field(default_factory=list)
+    kind: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
+    found: dict[str, float]  # probability by effect, of those added
+    rivals: dict[str, dict[str, float]]  # for each effect found: probabilities of all effects tried in the same round
+    explained: float  # share of the explainable log-likelihood that the effects explain
+    structure: float  # log-likelihood by which the residuals at work and at rest still differ
+    probability: float  # of the verdict as a whole
+    held_out_error: HeldOutError | None = None  # of the last model; None if held-out rows tell nothing
+    notes: list[str] = field(default_factory=list)  # reasons, for people
 
 
 def shares(candidates: list[Candidate]) -> dict[str, float]:
@@ -159,8 +135,7 @@ def judge(search: EffectSearch) -> Verdict:
     # Naming an effect claims more than naming none, so less error is allowed.
     form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR
     before, after = (held_out_error(fitted, form, last) for fitted in (first, last))
-    contradicted = after is not None and _contradicted(before, after)
-    if after is not None and contradicted:
+    if after is not None and _contradicted(before, after):
         strange = True
         notes.append(
             f"On held-out rows the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
@@ -174,6 +149,4 @@ def judge(search: EffectSearch) -> Verdict:
         kind, probability = "effect_missing", max(found.values())
     else:
         kind, probability = "nothing_missing", _nothing(search.rounds[0] if search.rounds else [])
-    return Verdict(
-        kind, found, rivals, float(explained), float(structure), float(probability), after, contradicted, notes
-    )
+    return Verdict(kind, found, rivals, float(explained), float(structure), float(probability), after, notes)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
@@ -10,72 +11,104 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import get
-from stimrig.identify.errors import BadRequest
-from stimrig.identify.estimation.effect_fit import fitted_with
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.experiments.designs import Design, designs
 from stimrig.identify.noise import whitened
 from stimrig.identify.records.record import Record
+from stimrig.identify.results import Result
 from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.summary import Sheet
 
 ENOUGH = 7.0
 """Expected log evidence that is enough to decide: odds of about 1000 to 1."""
 PER_PULSE = 4
 """Samples per pulse of the simulated test."""
+NOTHING = "nothing"
+"""The name of a model without effects, as a rival."""
 
 
-def next_experiment(record: Record, rivals: Sequence[str]) -> dict[str, Any]:
-    """Find the shortest test that separates rival effects, by simulating each as it was fitted to this record.
+@dataclass(frozen=True, repr=False, eq=False)
+class Experiment(Result):
+    """A test that tells rival effects apart.
+
+    Parameters
+    ----------
+    rivals : tuple of str
+        Ids of the effects.
+    segments : tuple of dict
+        The test: `name`, `sequence` and `settings` of each segment, as `POST /v1/tests` takes them.
+    duration_s : float
+        Duration, s.
+    dose : dict
+        `pulses`, `pulse_width_sum_us` and `torque_time_nm_s`.
+    expected_log_evidence : float
+        How clearly the test is expected to decide: of the pair with the smallest.
+    decides : bool
+        Whether that is enough.
+    text : str
+        The test in one sentence.
+    """
+
+    rivals: tuple[str, ...]
+    segments: tuple[Mapping[str, Any], ...]
+    duration_s: float
+    dose: Mapping[str, float]
+    expected_log_evidence: float
+    decides: bool
+    text: str
+
+    def _sheet(self) -> Sheet:
+        rows = [("test", self.text), ("pulses", f"{self.dose['pulses']:.0f}")]
+        for segment in self.segments:
+            settings = ", ".join(f"{key} {_short(value)}" for key, value in segment["settings"].items())
+            rows.append((str(segment["name"]), f"{segment['sequence']}: {settings}"))
+        return Sheet(f"Next experiment: {' or '.join(self.rivals)}, {self.duration_s:.0f} s", tuple(rows))
+
+
+def _short(value: Any) -> str:
+    return f"{len(value)} values" if isinstance(value, list | tuple) else str(value)
+
+
+def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
+    """The shortest test that separates rivals, each simulated as it was fitted to a record.
 
     Parameters
     ----------
     record : Record
         The record that does not separate the rivals.
-    rivals : sequence of str
-        Ids of effects. A single one is compared with a model without effects.
-
-    Returns
-    -------
-    dict
-        `segments` for the rig (`name`, `sequence`, `settings`), `duration_s`, `dose`, `expected_log_evidence` (of the
-        pair with the smallest), `decides`, `text`, `alternatives` (all designs, best first).
-
-    Raises
-    ------
-    BadRequest
-        An effect is unknown, or none is given.
+    fits : mapping of str to Fitted
+        By effect id, or `NOTHING`.
     """
-    names = list(dict.fromkeys(rivals))
-    if not names:
-        raise BadRequest("no rival was named", place="rivals", fix="Name two effects.")
-    for name in names:
-        get(name)
-    fits = {name: fitted_with(record, [name]) for name in names}
-    if len(names) == 1:
-        fits["nothing"] = fitted_with(record, [])
-    return plan(record, fits)
-
-
-def plan(record: Record, fits: dict[str, Fitted]) -> dict[str, Any]:
-    """As `next_experiment`, for rivals that are already fitted, by name."""
-    names = [name for name in fits if name != "nothing"]
     largest_us = float(record.pulse_width_us.max())
-    rows = [_row(design, record, fits) for design in designs(largest_us)]
-    enough = [row for row in rows if row["expected_log_evidence"] >= ENOUGH]
-    rows.sort(key=lambda row: -row["expected_log_evidence"] / row["duration_s"])
-    best = min(enough, key=lambda row: row["duration_s"]) if enough else rows[0]
-    return best | {
-        "rivals": names,
-        "decides": best["expected_log_evidence"] >= ENOUGH,
-        "text": _text(best, names),
-        "alternatives": [{key: row[key] for key in ("design", "duration_s", "expected_log_evidence")} for row in rows],
-    }
+    rows = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(largest_us)]
+    expected = [expected_log_evidence(width, record, fits) for _, width in rows]
+    enough = [place for place, gain in enumerate(expected) if gain >= ENOUGH]
+    if enough:
+        best = min(enough, key=lambda place: rows[place][1].size)
+    else:
+        best = max(range(len(rows)), key=lambda place: expected[place] / rows[place][1].size)
+    (design, width), gain = rows[best], expected[best]
+    first, duration_s = next(iter(fits.values())), width.size / record.pulse_rate_hz
+    torque_nm = first.physical[first.problem.coefficients] @ first.problem.setup.basis.design(width).T
+    names = tuple(name for name in fits if name != NOTHING)
+    return Experiment(
+        rivals=names,
+        segments=tuple(segment.to_dict() for segment in design.segments),
+        duration_s=duration_s,
+        dose={
+            "pulses": int(np.sum(width > 0)),
+            "pulse_width_sum_us": float(width.sum()),
+            "torque_time_nm_s": float(np.abs(torque_nm).sum() / record.pulse_rate_hz),
+        },
+        expected_log_evidence=gain,
+        decides=gain >= ENOUGH,
+        text=_text(design, duration_s, gain, names),
+    )
 
 
-def _text(best: dict[str, Any], names: list[str]) -> str:
+def _text(design: Design, duration_s: float, gain: float, names: tuple[str, ...]) -> str:
     those = " from ".join(get(name).name.lower() for name in names[:2])
-    test = f"{best['words']} ({best['duration_s']:.0f} s)"
-    gain = best["expected_log_evidence"]
+    test = f"{design.words} ({duration_s:.0f} s)"
     if gain >= ENOUGH:
         return f"{test} should separate {those}: expected log evidence {gain:.0f}."
     return (
@@ -84,27 +117,10 @@ def _text(best: dict[str, Any], names: list[str]) -> str:
     )
 
 
-def _row(design: Design, record: Record, fits: dict[str, Fitted]) -> dict[str, Any]:
-    width = design.pulse_widths(record.pulse_rate_hz)
-    simulated = _blank(record, width)
-    pairs = {}
-    for one, other in permutations(fits, 2):
-        pairs[f"{one} against {other}"] = separation(fits[one], fits[other], simulated)
-    first = next(iter(fits.values()))
-    table = first.physical[first.problem.coefficients] @ first.problem.setup.basis.design(width).T
-    return {
-        "design": design.name,
-        "words": design.words,
-        "segments": [{"name": s.name, "sequence": s.sequence, "settings": s.settings} for s in design.segments],
-        "duration_s": width.size / record.pulse_rate_hz,
-        "dose": {
-            "pulses": int(np.sum(width > 0)),
-            "pulse_width_sum_us": float(width.sum()),
-            "torque_time_nm_s": float(np.abs(table).sum() / record.pulse_rate_hz),
-        },
-        "expected_log_evidence": float(min(pairs.values())),
-        "pairs": pairs,
-    }
+def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[str, Fitted]) -> float:
+    """Log evidence by which a test of such widths separates that pair of rivals which it separates least."""
+    simulated = _blank(record, width_us)
+    return float(min(separation(fits[one], fits[other], simulated) for one, other in permutations(fits, 2)))
 
 
 def _blank(record: Record, width: np.ndarray) -> Record:

@@ -21,9 +21,7 @@ from stimrig.identify.estimation.plain import prepare
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.short_record import Short, fit_short
 from stimrig.identify.experiments.designs import Piece, Segment, pieces
-from stimrig.identify.experiments.foresight import Foresight
-from stimrig.identify.experiments.knowledge import Knowledge, knowledge
-from stimrig.identify.experiments.target import Target
+from stimrig.identify.experiments.knowledge import Foresight, Knowledge, Target, knowledge
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.near_shape import KNOTS
@@ -79,7 +77,7 @@ class Decision:
         """Plain values, for the test's document and the page."""
         return {
             "kind": self.kind,
-            "segments": [{"name": s.name, "sequence": s.sequence, "settings": s.settings} for s in self.segments],
+            "segments": [segment.to_dict() for segment in self.segments],
             "words": self.words,
             "knowledge": None if self.knowledge is None else self.knowledge.to_dict(),
             "expected_torque_time_nm_s": self.expected_torque_time_nm_s,

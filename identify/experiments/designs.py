@@ -8,7 +8,7 @@ list of pulse widths, which the rig's sequence `widths` plays as it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
@@ -17,36 +17,20 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Segment:
-    """One sequence with its settings.
+    """One sequence with its settings."""
 
-    Parameters
-    ----------
-    name : str
-        Name of the segment in the recording.
-    sequence : str
-        rest, prbs, ramp, multilevel, staircase or steps.
-    settings : dict
-        As the rig expects them.
-    """
+    name: str  # of the segment in the recording
+    sequence: str  # rest, prbs, ramp, staircase, steps or widths
+    settings: dict[str, Any]  # as the rig expects them
 
-    name: str
-    sequence: str
-    settings: dict[str, Any] = field(default_factory=dict)
+    def to_dict(self) -> dict[str, Any]:
+        """As `POST /v1/tests` takes it."""
+        return dict(vars(self))
 
 
 @dataclass(frozen=True)
 class Design:
-    """A test: segments in order.
-
-    Parameters
-    ----------
-    name : str
-        Short name.
-    words : str
-        Description for people.
-    segments : tuple of Segment
-        In order.
-    """
+    """A test: segments in order, and what people call it."""
 
     name: str
     words: str
@@ -110,14 +94,8 @@ def designs(largest_us: float) -> list[Design]:
         return Segment("steps", "steps", settings)
 
     def prbs(share: float) -> Segment:
-        settings = {
-            "max_pulse_width_us": round(share * top, 1),
-            "bits": 7,
-            "clock_pulses": 4,
-            "chips": 40,
-            "seed": 3,
-        }
-        return Segment("prbs", "prbs", settings)
+        width = {"max_pulse_width_us": round(share * top, 1)}
+        return Segment("prbs", "prbs", width | {"bits": 7, "clock_pulses": 4, "chips": 40, "seed": 3})
 
     stairs = Segment("staircase", "staircase", {"max_pulse_width_us": top, "levels": 6, "hold_s": 1.0, "down": True})
     return [
@@ -160,18 +138,10 @@ CHIPS = (1, 0, 0, 1, 1, 0, 1, 0, 1, 1)
 
 @dataclass(frozen=True)
 class Piece:
-    """A candidate for the next segment.
+    """A candidate for the next segment."""
 
-    Parameters
-    ----------
-    kind : str
-        hold, step, ramp or prbs.
-    pulse_width_us : ndarray, shape (P,)
-        One width for each pulse, µs.
-    """
-
-    kind: str
-    pulse_width_us: np.ndarray
+    kind: str  # hold, step, ramp or prbs
+    pulse_width_us: np.ndarray  # one for each pulse, shape (P,)
 
     def segment(self, number: int) -> Segment:
         """As the rig plays it."""
@@ -180,15 +150,7 @@ class Piece:
 
 
 def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:
-    """All pieces between some levels.
-
-    Parameters
-    ----------
-    levels_us : ndarray
-        Levels to move between, µs, 0 among them.
-    pulse_rate_hz : float
-        Pulses a second.
-    """
+    """All pieces between some levels, 0 among them."""
     levels = np.unique(np.round(np.floor(10.0 * levels_us) / 10.0, 1))
     one, half, two = (max(round(s * pulse_rate_hz), 2) for s in (PIECE_S, HALF_S, LONG_S))
     chip = max(round(CHIP_S * pulse_rate_hz), 1)

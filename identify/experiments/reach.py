@@ -16,7 +16,7 @@ from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.earlier import Change, Earlier
 from stimrig.identify.experiments.adaptive import Decision, decide
-from stimrig.identify.experiments.target import Target
+from stimrig.identify.experiments.knowledge import Target
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 

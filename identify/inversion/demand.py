@@ -19,22 +19,6 @@ ROUNDS = 40
 CLOSE = 1e-8
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Where the demand may be.
-
-    Parameters
-    ----------
-    largest_nm : float
-        N·m; the smallest is 0.
-    rise_nm : ndarray or None, shape (K,)
-        Largest rise of the demand to each pulse from the one before, N·m; the first from 0.
-    """
-
-    largest_nm: float
-    rise_nm: np.ndarray | None = None
-
-
 class Banded:
     """A lower triangular Toeplitz matrix with few coefficients, shape (K, K)."""
 
@@ -60,7 +44,9 @@ class Banded:
         return out
 
 
-def best_demand(a: np.ndarray, b: np.ndarray, target_nm: np.ndarray, bounds: Bounds) -> np.ndarray:
+def best_demand(
+    a: np.ndarray, b: np.ndarray, target_nm: np.ndarray, largest_nm: float, rise_nm: np.ndarray | None = None
+) -> np.ndarray:
     """The demand within the bounds whose torque is closest to a target, N·m, shape (K,).
 
     Parameters
@@ -69,11 +55,13 @@ def best_demand(a: np.ndarray, b: np.ndarray, target_nm: np.ndarray, bounds: Bou
         Coefficients of G on the grid of pulses, a[0] = 1.
     target_nm : ndarray, shape (K,)
         Torque, N·m.
-    bounds : Bounds
-        Where the demand may be.
+    largest_nm : float
+        The largest demand; the smallest is 0.
+    rise_nm : ndarray or None, shape (K,)
+        Largest rise of the demand to each pulse from the one before, N·m; the first from 0.
     """
     size = target_nm.size
-    scale = bounds.largest_nm
+    scale = largest_nm
     A, B = Banded(a, size), Banded(b, size)
     bend = Banded(np.convolve(a, [1.0, -2.0, 1.0]), size)
     bands = max(len(a) + 2, int(np.ptp(B.used)) + 1 if B.used else 1)
@@ -83,8 +71,8 @@ def best_demand(a: np.ndarray, b: np.ndarray, target_nm: np.ndarray, bounds: Bou
     P = B.gram(np.ones(size), bands) + bend.gram(smooth, bands) + A.gram(np.full(size, RIDGE), bands)
     q = -B.transposed(target_nm / scale)
     sides = [(A, 1.0, np.ones(size)), (A, -1.0, np.zeros(size))]
-    if bounds.rise_nm is not None:
-        sides.append((Banded(np.convolve(a, [1.0, -1.0]), size), 1.0, bounds.rise_nm / scale))
+    if rise_nm is not None:
+        sides.append((Banded(np.convolve(a, [1.0, -1.0]), size), 1.0, rise_nm / scale))
     return np.clip(scale * A(_Programme(P, q, sides, bands).solve()), 0.0, scale)
 
 

@@ -26,48 +26,24 @@ PROBE_S = 3.0
 
 @dataclass(frozen=True)
 class Plant:
-    """f, f⁻¹ and G of a model.
+    """f, f⁻¹ and G of a model."""
 
-    Parameters
-    ----------
-    sign : float
-        1 or -1: the sign of the record's torque where the muscle pulls.
-    width_us, level_nm : ndarray, shape (M,)
-        The curve's table up to the widest pulse; torque positive in the direction of pull.
-    inverse_nm, inverse_us : ndarray, shape (L,)
-        Rising torques, and the smallest width that reaches each.
-    a, b : ndarray
-        G on the grid of pulses: a from 1, b from the pulse itself.
-    settled : int
-        Pulses after which a step has gone 95 % of its way.
-    rise_us : float or None
-        Largest rise from pulse to pulse.
-    whole : bool
-        Whether widths are whole µs.
-    """
-
-    sign: float
-    width_us: np.ndarray
-    level_nm: np.ndarray
-    inverse_nm: np.ndarray
-    inverse_us: np.ndarray
-    a: np.ndarray
-    b: np.ndarray
-    settled: int
-    rise_us: float | None
-    whole: bool
+    sign: float  # 1 or -1: of the record's torque where the muscle pulls
+    width_us: np.ndarray  # the curve's table up to the widest pulse
+    level_nm: np.ndarray  # f there, positive in the direction of pull
+    inverse_nm: np.ndarray  # rising torques
+    inverse_us: np.ndarray  # the smallest width that reaches each of them
+    a: np.ndarray  # G on the grid of pulses, from 1
+    b: np.ndarray  # from the pulse itself
+    settled: int  # pulses after which a step has gone 95 % of its way
+    rise_us: float | None  # largest rise from pulse to pulse
+    whole: bool  # whether widths are whole µs
 
     @classmethod
     def of(
         cls, model: Model, reference: Reference, largest_us: float | None, rise_us: float | None, whole: bool
     ) -> Plant:
-        """Of a model, for a reference.
-
-        Raises
-        ------
-        BadModel, BadRequest
-            As `invert`.
-        """
+        """Of a model, for a reference. Raises BadModel and BadRequest as `invert`."""
         rate_hz = reference.pulse_rate_hz
         if not isinstance(model.linear, SecondOrder):
             raise BadModel(

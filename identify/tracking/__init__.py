@@ -2,8 +2,7 @@
 
 from stimrig.identify.tracking.carried import moved_model, passed, slow_forms
 from stimrig.identify.tracking.follow import Outcome, Step, begin, follow, levels_of, model_for_next
-from stimrig.identify.tracking.rates import learn_rates
-from stimrig.identify.tracking.state import QUANTITIES, USUAL, State, Values
+from stimrig.identify.tracking.state import QUANTITIES, USUAL, State, Values, learn_rates
 
 __all__ = [
     "QUANTITIES",

@@ -23,8 +23,8 @@ from stimrig.identify.model_schema import parameter_value
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SplineBasis
-from stimrig.identify.tracking.forms import placed
 from stimrig.identify.tracking.state import State, Values
+from stimrig.identify.tracking.trial import placed
 
 CLOCK_S = 0.1
 """By so much a record may seem to begin before the end of the one before it: clocks are set."""
@@ -105,15 +105,7 @@ def _end_s(record: Record) -> float | None:
 
 
 def moved_curve(curve: Curve, values: Values) -> Curve:
-    """gain · f(u - shift), as a spline if it is shifted; beyond the curve's end it goes on level.
-
-    Parameters
-    ----------
-    curve : Curve
-        Of the approved model.
-    values : Values
-        Gain and shift.
-    """
+    """gain · f(u - shift), as a spline if it is shifted; beyond the curve's end it goes on level."""
     if values.threshold_shift_us == 0.0:
         return replace(curve, coefficients_nm=values.gain * curve.coefficients_nm)
     largest = curve.basis.largest_us

@@ -50,29 +50,16 @@ class Outcome(StrEnum):
 class Step:
     """One trial followed.
 
-    Parameters
-    ----------
-    outcome : Outcome
-        What became of it.
-    seen : Seen
-        What the trial said by itself.
-    before, after : State
-        What was expected of it; what is known after it.
-    coming : State
-        What is expected of the next trial: of this the controller is told.
-    distance : float or None
-        Squared distance of what was seen from what was expected, in standard deviations; None if it moved nothing.
-    effects : dict of dict
-        By effect id, its slow state at the trial's end, `now`, and as expected at the begin of the next one, `coming`,
-        after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that was the first.
+    `effects` holds by effect id its slow state at the trial's end, `now`, and as expected at the begin of the next one,
+    `coming`, after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that was the first.
     """
 
-    outcome: Outcome
-    seen: Seen
-    before: State
-    after: State
-    coming: State
-    distance: float | None
+    outcome: Outcome  # what became of it
+    seen: Seen  # what the trial said by itself
+    before: State  # what was expected of it
+    after: State  # what is known after it
+    coming: State  # what is expected of the next trial: of this the controller is told
+    distance: float | None  # squared, of what was seen from what was expected, in sd; None if it moved nothing
     effects: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property

@@ -11,11 +11,13 @@ One odd trial moves no level by more than its band. If the next one says the sam
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+
+from stimrig.identify.json_text import json_value
 
 QUANTITIES = ("gain", "threshold_shift_us", "time_scale")
 LEVELS = len(QUANTITIES)
@@ -27,37 +29,25 @@ MOST_BY_ODD = 1.9
 """Most that an odd trial moves, in standard deviations of what was expected: less than the band of 95 %."""
 
 
-def _row(*values: float) -> np.ndarray:
-    return np.array(values, float)
-
-
 @dataclass(frozen=True)
 class Rates:
-    """How fast a person changes, in the units of the levels (log gain, µs, log time scale); arrays of shape (3,).
+    """How fast a person changes, in the units of the levels (log gain, µs, log time scale); arrays of shape (3,)."""
 
-    Parameters
-    ----------
-    start : ndarray
-        Standard deviation of the first trial's levels: what the approved model does not know.
-    step : ndarray
-        Standard deviation of a change from one trial to the next that has no trend.
-    trend : ndarray
-        Mean trend at the first trial, per trial.
-    trend_sd, turn : ndarray
-        Standard deviations of the first trend, and of its change from trial to trial.
-    sessions : int
-        Sessions that they were learnt from; 0 for the usual ones.
-    """
-
-    start: np.ndarray = field(default_factory=lambda: _row(0.08, 6.0, 0.10))
-    step: np.ndarray = field(default_factory=lambda: _row(0.006, 0.5, 0.008))
-    trend: np.ndarray = field(default_factory=lambda: np.zeros(LEVELS))
-    trend_sd: np.ndarray = field(default_factory=lambda: _row(0.025, 1.2, 0.012))
-    turn: np.ndarray = field(default_factory=lambda: _row(0.008, 0.5, 0.005))
-    sessions: int = 0
+    start: np.ndarray  # standard deviation of the first trial's levels: what the approved model does not know
+    step: np.ndarray  # standard deviation of a change from one trial to the next that has no trend
+    trend: np.ndarray  # mean trend at the first trial, per trial
+    trend_sd: np.ndarray  # standard deviation of the first trend
+    turn: np.ndarray  # standard deviation of its change from trial to trial
+    sessions: int = 0  # that they were learnt from; 0 for the usual ones
 
 
-USUAL = Rates()
+USUAL = Rates(
+    start=np.array([0.08, 6.0, 0.10]),
+    step=np.array([0.006, 0.5, 0.008]),
+    trend=np.zeros(LEVELS),
+    trend_sd=np.array([0.025, 1.2, 0.012]),
+    turn=np.array([0.008, 0.5, 0.005]),
+)
 
 
 @dataclass(frozen=True)
@@ -83,31 +73,17 @@ class Values:
 class State:
     """What is known of the levels, their trends and the curve.
 
-    Parameters
-    ----------
-    mean : ndarray, shape (6 + n,)
-        Three levels, three trends, and what is to be added to the n coefficients of the approved curve, N·m.
-    covariance : ndarray, shape (6 + n, 6 + n)
-        Its covariance.
-    trials : int
-        Trials that it was learnt from.
-    odd : ndarray, shape (3,) or None
-        How far the last trial would have moved the levels, if it was odd.
-    unexplained : int
-        Trials since the last one that gain, threshold and speed explained.
-    effects : mapping of str to float
-        By effect id, the slow states of the approved model's effects at the end of what was seen last, 0 to 1.
-    ended_s : float or None
-        When that was, as Unix time; None: not known.
+    `mean`, shape (6 + n,), holds three levels, three trends, and what is to be added to the n coefficients of the
+    approved curve, N·m.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
-    trials: int = 0
-    odd: np.ndarray | None = None
-    unexplained: int = 0
-    effects: Mapping[str, float] = field(default_factory=dict)
-    ended_s: float | None = None
+    trials: int = 0  # that it was learnt from
+    odd: np.ndarray | None = None  # how far the last trial would have moved the levels, if it was odd
+    unexplained: int = 0  # trials since the last one that gain, threshold and speed explained
+    effects: Mapping[str, float] = field(default_factory=dict)  # slow states at the end of what was seen last, 0 to 1
+    ended_s: float | None = None  # when that was, as Unix time; None: not known
 
     @classmethod
     def start(cls, curve_covariance: np.ndarray, rates: Rates = USUAL) -> State:
@@ -149,15 +125,7 @@ class State:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
-        return {
-            "mean": self.mean.tolist(),
-            "covariance": self.covariance.tolist(),
-            "trials": self.trials,
-            "odd": None if self.odd is None else self.odd.tolist(),
-            "unexplained": self.unexplained,
-            "effects": dict(self.effects),
-            "ended_s": self.ended_s,
-        }
+        return json_value(vars(self))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> State:
@@ -218,3 +186,61 @@ def _filtered(before: State, vector: np.ndarray, information: np.ndarray) -> Sta
     away = solve[:, -1] - solve[:, :-1] @ before.mean[before.seen]
     covariance = before.covariance - lever @ solve[:, :-1] @ lever.T
     return State(before.mean + lever @ away, 0.5 * (covariance + covariance.T), before.trials + 1)
+
+
+# ---- how fast a person changes, learnt from earlier sessions of their own ----
+
+BELIEVED_SESSIONS = 2.0
+"""The usual start and the usual first trend count like this many sessions of the person's own."""
+BELIEVED_TRIALS = 12.0
+"""The usual steps and turns count like this many trials."""
+FIRST = 3
+"""Trials from which a session's first trend is taken."""
+
+Told = Mapping[str, Mapping[str, Any]]
+
+
+def learn_rates(sessions: Sequence[Sequence[Told]]) -> Rates:
+    """The usual rates, corrected by what a person's earlier sessions say.
+
+    Parameters
+    ----------
+    sessions : sequence of sequences
+        For each earlier session its trials in order, each as `levels_of` tells them (`now` of `Step.to_dict`). Sessions
+        of fewer than three trials say nothing.
+
+    Returns
+    -------
+    Rates
+        Each variance is a mean of the usual one and of the person's own, weighted by how many there are. The person's
+        own holds the scatter of the trials, too.
+    """
+    known = [_levels(session) for session in sessions if len(session) >= FIRST]
+    if not known:
+        return USUAL
+    count = len(known)
+    starts = np.array([levels[0] for levels in known])
+    trends = np.array([(levels[FIRST - 1] - levels[0]) / (FIRST - 1) for levels in known])
+    trend = trends.sum(axis=0) / (count + BELIEVED_SESSIONS)
+    bends = np.concatenate([np.diff(levels, n=2, axis=0) for levels in known])
+    usual = USUAL.turn**2 + 2.0 * USUAL.step**2  # of a bend, which holds one turn and two steps
+    own = np.sum(bends**2, axis=0)
+    faster = np.sqrt((BELIEVED_TRIALS * usual + own) / ((BELIEVED_TRIALS + len(bends)) * usual))
+    return Rates(
+        start=_pooled(USUAL.start, starts, count),
+        step=faster * USUAL.step,
+        trend=trend,
+        trend_sd=_pooled(USUAL.trend_sd, trends - trend, count),
+        turn=faster * USUAL.turn,
+        sessions=count,
+    )
+
+
+def _levels(session: Sequence[Told]) -> np.ndarray:
+    """Log gain, µs and log time scale of each trial, shape (N, 3)."""
+    values = [[float(trial[name]["value"]) for name in QUANTITIES] for trial in session]
+    return np.array([Values(*trial).levels for trial in values])
+
+
+def _pooled(usual: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:
+    return np.sqrt((BELIEVED_SESSIONS * usual**2 + np.sum(own**2, axis=0)) / (BELIEVED_SESSIONS + count))

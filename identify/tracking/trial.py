@@ -1,5 +1,9 @@
 """What one trial says of the levels: the model is fitted to it by three factors and what no model knows beforehand.
 
+The three quantities that are tracked are stages of a simulation: they act on any model, with or without effects. Gain
+and threshold may also move within a trial, in proportion to time, by `…_run` from its first to its last second; the
+level is that in its middle. So may the zero of the torque.
+
 The fit is robust: a stretch in which the torque is not the model's (a spasm, an effort) loses its weight. What is left
 unexplained is correlated in time; it counts as such, so a model that fits a trial poorly learns little from it.
 """
@@ -7,15 +11,17 @@ unexplained is correlated in time; it counts as such, so a model that fits a tri
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, make_grid, runs
+from stimrig.identify.effects import Parameter, Scene, form
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.predict import problem_of
 from stimrig.identify.simulation.problem import Problem
-from stimrig.identify.tracking.forms import placed
 from stimrig.identify.tracking.state import LEVELS, State
 
 SHORTEST_S = 1.0
@@ -50,45 +56,80 @@ of the gain by twice its band.
 """
 
 
+def _along(scene: Scene) -> np.ndarray:
+    """-1/2 at the first interval, 1/2 at the last."""
+    return (scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9) - 0.5
+
+
+@form(
+    "pulse_width",
+    "w = f(u - shift) where u > 0",
+    Parameter("threshold_shift_us", "µs", -200.0, 200.0),
+    Parameter("threshold_run_us", "µs", -50.0, 50.0),
+)
+def shift(width_us: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """Of the threshold."""
+    shift_us = p["threshold_shift_us"] + p["threshold_run_us"] * _along(scene)
+    return np.where(width_us > 0.0, np.maximum(width_us - shift_us, 0.0), width_us)
+
+
+@form("gain", "w = gain · f(u)", Parameter("gain_log", "1", -3.0, 3.0), Parameter("gain_run_log", "1", -1.0, 1.0))
+def gain(drive_nm: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """Of the drive."""
+    return drive_nm * np.exp(p["gain_log"] + p["gain_run_log"] * _along(scene))
+
+
+@form("additive", "y + drift · share of time", Parameter("drift_nm", "N·m", -100.0, 100.0))
+def drift(_none: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
+    """Of the zero."""
+    return p["drift_nm"] * _along(scene)
+
+
+def placed(model: Model, levels: np.ndarray, grid: Grid) -> tuple[Problem, np.ndarray]:
+    """The approved model on a record, at such levels and curve, and its parameters.
+
+    The first form is the gain, the last two are the shift and the drift.
+
+    Parameters
+    ----------
+    model : Model
+        The approved one.
+    levels : ndarray, shape (3 + n,)
+        Log gain, threshold shift (µs), log time scale, and what is added to the curve's coefficients (N·m).
+    grid : Grid
+        The record.
+
+    Raises
+    ------
+    BadModel
+        As `stimrig.identify.simulation.predict.problem_of`.
+    """
+    log_gain, shift_us, log_time = levels[:LEVELS].tolist()
+    forms = ((gain, (log_gain, 0.0)), (shift, (shift_us, 0.0)), (drift, (0.0,)))
+    problem, theta = problem_of(model, grid, forms)
+    theta[0] += log_time
+    theta[problem.coefficients] += levels[LEVELS:]
+    return problem, theta
+
+
 @dataclass(frozen=True)
 class Seen:
     """What a trial says.
 
-    Parameters
-    ----------
-    vector : ndarray, shape (3 + n,)
-        Information times what explains it best: log gain, threshold shift (µs), log time scale, and what is to be
-        added to the coefficients of the approved curve (N·m).
-    information : ndarray, shape (3 + n, 3 + n)
-        Inverse of their covariance.
-    error_nm : float
-        Robust standard deviation of what is left unexplained, N·m.
-    expected_nm : float
-        The same, as the approved model's own record leaves it, N·m.
-    before_nm : float
-        Root mean square of the error before this fit, N·m: of the model as it was expected.
-    torque_nm : float
-        Standard deviation over the trial of the torque that the fitted model predicts, N·m.
-    wanted_nm : float
-        The same of the model as it was expected.
-    came : float
-        How much of the expected torque came: slope of the measured one on it.
-    disturbed : tuple of (float, float)
-        Begin and end of the stretches that do not fit, s since the record's begin.
-    duration_s : float
-        Length of the record, s.
+    `vector`, shape (3 + n,), is the information times what explains the trial best: log gain, threshold shift (µs), log
+    time scale, and what is to be added to the coefficients of the approved curve (N·m).
     """
 
     vector: np.ndarray
-    information: np.ndarray
-    error_nm: float
-    expected_nm: float
-    before_nm: float
-    torque_nm: float
-    wanted_nm: float
-    came: float
-    disturbed: tuple[tuple[float, float], ...]
-    duration_s: float
+    information: np.ndarray  # inverse of their covariance
+    error_nm: float  # robust standard deviation of what is left unexplained
+    expected_nm: float  # the same, as the approved model's own record leaves it
+    before_nm: float  # root mean square of the error before this fit: of the model as it was expected
+    torque_nm: float  # standard deviation over the trial of the torque that the fitted model predicts
+    wanted_nm: float  # the same of the model as it was expected
+    came: float  # how much of the expected torque came: slope of the measured one on it
+    disturbed: tuple[tuple[float, float], ...]  # stretches that do not fit, s since the record's begin
+    duration_s: float  # of the record
 
     @property
     def misfit(self) -> float:
@@ -174,15 +215,15 @@ class _Asked:
 
 def _asked(model: Model, expected: State, grid: Grid) -> _Asked:
     problem, theta = placed(model, np.zeros(expected.seen.size), grid)
-    gain, shift, drift = (problem.chosen[place].first for place in (0, -2, -1))
+    gains, shifts, drifts = (problem.chosen[place].first for place in (0, -2, -1))
     curve = range(problem.coefficients.start, problem.coefficients.stop)
-    own = [gain + 1, shift + 1, *problem.delay, *problem.baselines, drift, *problem.initials]
+    own = [gains + 1, shifts + 1, *problem.delay, *problem.baselines, drifts, *problem.initials]
     target = problem.setup.to_muscle(grid.torque_nm)
     scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
     theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
     states = np.tile([0.1, 1.0], problem.setup.grid.starts.size)
     own_sd = np.r_[OWN, np.r_[np.ones(len(problem.baselines)), DRIFTS, states] * scale_nm]
-    free = np.array([gain, shift, 0, *curve, *own])
+    free = np.array([gains, shifts, 0, *curve, *own])
     return _Asked(problem, theta, free, target, _precision(expected, own_sd), own_sd)
 
 

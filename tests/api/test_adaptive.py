@@ -14,7 +14,7 @@ from stimrig.api.sessions.adaptive import KEPT, AdaptiveTests
 from stimrig.api.sessions.requests import TargetIn, TestIn
 from stimrig.api.sessions.rig_client import no_rig
 from stimrig.api.store.tables import Test
-from stimrig.identify.experiments.target import LEAST_PERCENT, MOST_PERCENT, Target
+from stimrig.identify.experiments.knowledge import LEAST_PERCENT, MOST_PERCENT, Target
 from stimrig.rig.messages import FinishedEvent
 from tests.api.conftest import Service, own_service, soon, wait_done
 

@@ -12,9 +12,9 @@ from stimrig import identify
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.errors import BadModel, BadRequest, IdentifyError
 from stimrig.identify.inversion import Inversion, Reference, invert
-from stimrig.identify.inversion.demand import BEND, RIDGE, Banded, Bounds, best_demand
+from stimrig.identify.inversion.demand import BEND, RIDGE, Banded, best_demand
 from stimrig.identify.inversion.plant import on_pulses
-from stimrig.identify.inversion.table import read_reference
+from stimrig.identify.inversion.reference import read_reference
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SigmoidBasis
@@ -73,7 +73,7 @@ def test_the_bounded_optimum_is_that_of_dense_least_squares():
     rng = np.random.default_rng(3)
     a, b = on_pulses(SecondOrder(0.1, 0.7, 0.03), 40.0)
     target = 3.0 * np.repeat(rng.uniform(-0.5, 1.2, 6), 10)
-    found = best_demand(a, b, target, Bounds(largest))
+    found = best_demand(a, b, target, largest)
 
     def dense(taps: np.ndarray) -> np.ndarray:
         return sum(np.diag(np.full(size - i, x), -i) for i, x in enumerate(taps))  # pyright: ignore

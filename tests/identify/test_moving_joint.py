@@ -22,7 +22,7 @@ from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.estimation.quality import quality, range_warnings
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.inversion import Reference, invert
-from stimrig.identify.inversion.table import read_reference
+from stimrig.identify.inversion.reference import read_reference
 from stimrig.identify.model import Model
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record

@@ -12,13 +12,13 @@ from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.diagnosis.result import steps
 from stimrig.identify.diagnosis.search import search_effects
-from stimrig.identify.effects import get
 from stimrig.identify.estimation.effect_fit import fitted_with, renewed_curve, with_effects
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import fitted_rows, prepare
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.methods.maximum_likelihood import METHOD
 from stimrig.identify.records.record import Record
+from tests.harness import few_effects
 from tests.harness.made_once import made_once
 from tests.identify.test_moving_joint import as_record, joined
 
@@ -105,8 +105,9 @@ def test_the_number_of_knots_that_somebody_asks_for_is_kept():
 
 
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():
-    search = search_effects(whole(), most=1, effects=[get("passive_torque")])
-    plain, found = steps(search)
+    with few_effects.only("passive_torque"):
+        search = search_effects(whole(), most=1)
+        plain, found = steps(search)
     assert plain.fitted is search.base and found.added == "passive_torque"
     assert found.fitted.log_evidence > search.last.log_evidence
     assert found.fitted.problem.setup.basis is not search.last.problem.setup.basis

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from numba.core.compiler_lock import global_compiler_lock
 
-from stimrig.identify.diagnosis import candidates, diagnose
+from stimrig.identify.diagnosis import diagnose
+from stimrig.identify.diagnosis import side_by_side as module
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.errors import Cancelled
 from tests.harness import few_effects
@@ -117,5 +118,5 @@ def test_a_diagnosis_does_not_depend_on_who_did_what(monkeypatch):
     record = hidden_muscles.record("fatigue", seed=11)
     with few_effects.only("fatigue", "output_saturation", "potentiation", "threshold_drift"):
         by_default = diagnose(record).to_dict()
-        monkeypatch.setattr(candidates, "WORKERS", 2 if candidates.WORKERS == 1 else 1)
+        monkeypatch.setattr(module, "WORKERS", 2 if module.WORKERS == 1 else 1)
         assert diagnose(record).to_dict() == by_default

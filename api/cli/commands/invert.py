@@ -27,7 +27,7 @@ def invert(
     from stimrig.api.models import inverted
     from stimrig.identify.errors import IdentifyError
     from stimrig.identify.inversion import invert as widths_for
-    from stimrig.identify.inversion.table import read_reference
+    from stimrig.identify.inversion.reference import read_reference
 
     model = load_model(model_json)
     try:

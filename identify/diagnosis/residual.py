@@ -1,0 +1,198 @@
+"""The residual of a model: at work compared with at rest, and on held-out rows with what noise allows there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stimrig.identify.diagnosis.thresholds import (
+    COUNTS,
+    FORM_ERROR,
+    HELD_OUT_RISE,
+    LEAST_HELD_OUT_ROWS,
+    NEAR,
+    QUIET,
+    STRUCTURE,
+    STRUCTURE_SHARE,
+)
+from stimrig.identify.dynamics.grid import Grid, ends_of, runs
+from stimrig.identify.effects import get
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.noise import band_part
+from stimrig.identify.noise.kernels import profile_noise
+from stimrig.identify.records.record import FORGOTTEN_S, Record
+
+MEDIAN = 0.6745
+"""Median of the size of normal errors over their standard deviation."""
+
+
+@dataclass(frozen=True)
+class ResidualStructure:
+    """What the residual of one model shows; all but log-likelihoods and `ar1` in N·m."""
+
+    white_nm: float  # standard deviation that white noise of the samples alone gives an interval's mean
+    busy_nm: float  # residual while the muscle works
+    ratio: float  # log-likelihood gained if rest and work each have their own noise: large if structure appears at work
+    ideal: float  # log-likelihood if the noise were everywhere as it is at rest
+    slow_nm: float  # standard deviation of the slow part of the residual
+    scale_nm: float  # the record's largest torque
+
+    @property
+    def left(self) -> bool:
+        """Whether work and rest differ, and by as much as matters: enough samples make every trifle significant."""
+        excess_nm = max(self.busy_nm**2 - self.white_nm**2, 0.0) ** 0.5
+        return self.ratio > STRUCTURE and excess_nm > STRUCTURE_SHARE * self.scale_nm
+
+
+def residual_structure(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> ResidualStructure:
+    """Compare a model's residual at work and at rest.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The model.
+    quiet : ndarray of bool, shape (K,)
+        Intervals in which the muscle rests.
+    noise_sd_nm : float
+        White noise of a sample, N·m.
+    """
+    setup = fitted.problem.setup
+    residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
+    count = float(np.median(setup.grid.count[setup.fitted]))
+    white = max(noise_sd_nm / np.sqrt(count), 1e-6 * setup.scale_nm)
+    rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)
+    together = _profile(residual, rests + works)
+    resting, working = _profile(residual, rests), _profile(residual, works)
+    ratio = resting[3] + working[3] - together[3] if rests and works else 0.0
+    return ResidualStructure(
+        white_nm=white,
+        busy_nm=_rms(residual, works),
+        ratio=ratio,
+        ideal=_ideal(setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
+        slow_nm=fitted.noise.sd_nm * float(np.sqrt(min(fitted.noise.share, 1.0))),
+        scale_nm=setup.scale_nm,
+    )
+
+
+def _ideal(fitted: np.ndarray, resting: tuple, white: float, size: int) -> float:
+    """Log-likelihood of a record of this length if its noise were everywhere as it is at rest."""
+    total = int(fitted.sum())
+    at_white = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
+    if size < 40:
+        return at_white
+    return min(at_white, resting[3] / size * total)
+
+
+def _long(flags: np.ndarray, least: int) -> list[slice]:
+    return [run for run in runs(flags) if run.stop - run.start >= least]
+
+
+def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, float, float]:
+    if not parts:
+        return (0.0, 0.0, 0.0, 0.0)
+    return profile_noise(residual, *ends_of(parts), 0.5, 0.5, True)
+
+
+def _rms(residual: np.ndarray, parts: list[slice]) -> float:
+    if not parts:
+        return 0.0
+    return float(np.sqrt(np.mean(np.concatenate([residual[p] for p in parts]) ** 2)))
+
+
+def quiet_rows(fitted: Fitted) -> np.ndarray:
+    """bool, shape (K,): intervals in which the muscle rests, according to the model."""
+    setup = fitted.problem.setup
+    problem, physical = fitted.problem, fitted.physical
+    part = setup.part_of(at_samples=False)
+    baseline = physical[problem.baselines.start : problem.baselines.stop]
+    torque = problem.run(fitted.theta)[0] - (baseline[0] if part is None else baseline[part])
+    drive = setup.grid.held(physical[problem.coefficients] @ setup.design)
+    level = QUIET * setup.scale_nm
+    still = (np.abs(torque) < level) & (np.abs(drive) < level)
+    # The half second after the last torque counts as work: slow tails belong to it.
+    tail = round(0.5 / setup.grid.step_s)
+    busy = np.convolve(~still, np.r_[np.zeros(tail), np.ones(tail + 1)], "same") > 0
+    return still & ~busy
+
+
+def held_readings(record: Record) -> float:
+    """Share of samples equal to the one before; 0 where coarse rounding of a quiet signal explains it."""
+    torque = record.torque_nm
+    change = np.abs(np.diff(torque[(torque > torque.min()) & (torque < torque.max())]))
+    moved = change[change > 1e-9 * max(float(np.ptp(torque)), 1e-300)]
+    if change.size < 100 or not moved.size or np.median(moved) < COUNTS * np.min(moved):
+        return 0.0  # it changes by single counts of the converter: between two of them it repeats
+    return float(np.mean(change == 0.0))
+
+
+@dataclass(frozen=True)
+class HeldOutError:
+    """The error of one model on the intervals held out, N·m."""
+
+    rms_nm: float  # of the intervals' means
+    allowed_nm: float  # that the noise of the fitted rows and the uncertainty of the parameters explain there
+
+    @property
+    def excess_nm(self) -> float:
+        """Error beyond what is allowed, N·m."""
+        return float(np.sqrt(max(self.rms_nm**2 - self.allowed_nm**2, 0.0)))
+
+    @property
+    def ratio(self) -> float:
+        """Error over what is allowed."""
+        return self.rms_nm / self.allowed_nm
+
+
+def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | None = None) -> HeldOutError | None:
+    """The error on the held-out intervals; None if there are too few, or if there is a tremor.
+
+    Only rows count whose pulse widths, and those of the seconds before, are near fitted ones: elsewhere the recruitment
+    curve is a guess. Efforts cannot be predicted, but they are rare: if one of the models has one, the median of the
+    error counts instead of its root mean square.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The model.
+    form : float
+        Error allowed because the model's form is inexact, as a share of the largest torque.
+    beside : Fitted or None
+        A model that this one is compared with.
+    """
+    setup = fitted.problem.setup
+    grid = setup.grid
+    rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
+    rows &= _covered(grid, setup.fitted)
+    if rows.sum() < LEAST_HELD_OUT_ROWS or fitted.noise.band > 0.0:
+        return None
+    residual = fitted.residual_nm[rows]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
+    scaled = fitted.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
+    slopes = fitted.slopes[:, rows] * scale[:, None]
+    band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
+    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
+    if all(get(effect).predictable for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
+        return HeldOutError(float(np.sqrt(np.mean(residual**2))), float(allowed))
+    return HeldOutError(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
+
+
+def held_out_rise(before: Fitted, after: Fitted) -> tuple[float, float] | None:
+    """Errors on held-out rows without and with an effect, N·m, if they rise and so speak against it; else None."""
+    old, new = held_out_error(before, beside=after), held_out_error(after)
+    if old is None or new is None or new.rms_nm <= HELD_OUT_RISE * max(old.rms_nm, new.allowed_nm):
+        return None
+    return old.rms_nm, new.rms_nm
+
+
+def _covered(grid: Grid, fitted: np.ndarray) -> np.ndarray:
+    """bool, shape (K,): intervals whose width, and all widths within the muscle's memory before, are near fitted
+    ones."""
+    widths = np.unique(grid.pulse_width_us[fitted])
+    if widths.size < 2:
+        return np.zeros(grid.size, bool)
+    after = np.clip(np.searchsorted(widths, grid.pulse_width_us), 1, widths.size - 1)
+    near = np.minimum(np.abs(grid.pulse_width_us - widths[after]), np.abs(grid.pulse_width_us - widths[after - 1]))
+    strange = near > NEAR * float(widths[-1])
+    memory = round(FORGOTTEN_S / grid.step_s)
+    return np.convolve(strange, np.ones(memory))[: grid.size] < 0.5
