@@ -80,59 +80,50 @@ def headline(
     leaves_structure: bool = False,
 ) -> dict[str, str]:
     """The verdict on this model: kind, title, sentence."""
-    beside = _beside(comparison)
     if diagnosis["verdict"] == "unexplained_structure":
-        where = diagnosis.get("where") or []
-        sits = " " + _("It sits mostly here: %(place)s.", place=place(where[0], 1)["words"]) if where else ""
+        kind, title = "unexplained", _("The error has structure that no effect of the library explains")
         words = _("The error depends on what the muscle does, so it is not measurement noise.")
-        title = _("The error has structure that no effect of the library explains")
-        return {"kind": "unexplained", "title": title, "words": words + sits + beside}
-    if missing:
+        if where := diagnosis.get("where"):
+            words += " " + _("It sits mostly here: %(place)s.", place=place(where[0], 1)["words"])
+    elif missing:
         names = _(" and ").join(plain(entry.get("name") or entry["effect"]) for entry in missing)
-        words = _("The recording gives evidence for: %(names)s.", names=names) + beside
-        return {"kind": "missing", "title": _missing(missing), "words": words}
-    return _nothing(diagnosis, comparison, effects, beside, leaves_structure)
+        kind, title = "missing", _missing(missing)
+        words = _("The recording gives evidence for: %(names)s.", names=names)
+    else:
+        kind, title, words = _nothing(diagnosis, comparison, effects, leaves_structure)
+    return {"kind": kind, "title": title, "words": words + _beside(comparison)}
 
 
 def _missing(missing: list[dict[str, Any]]) -> str:
     """How many effects are missing, and how sure that is. Beside a likely one, what is only possible does not count."""
-    sure = sum(map(likely, missing))
-    if not sure:
-        many = len(missing)
-        return ngettext(
-            "An effect is possibly missing in this model", "%(num)s effects are possibly missing in this model", many
-        )
-    return ngettext("An effect is missing in this model", "%(num)s effects are missing in this model", sure)
+    if sure := sum(map(likely, missing)):
+        return ngettext("An effect is missing in this model", "%(num)s effects are missing in this model", sure)
+    return ngettext(
+        "An effect is possibly missing in this model", "%(num)s effects are possibly missing in this model",
+        len(missing),
+    )  # fmt: skip
 
 
 def _nothing(
-    diagnosis: dict[str, Any],
-    comparison: dict[str, Any] | None,
-    effects: Sequence[str],
-    beside: str,
-    leaves_structure: bool,
-) -> dict[str, str]:
+    diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str], leaves_structure: bool
+) -> tuple[str, str, str]:
     """The verdict where no effect is asked for: nothing is missing, or the recording cannot tell."""
-    times = times_noise(comparison)
-    title = _("This recording cannot tell whether something is missing")
+    untold = _("This recording cannot tell whether something is missing")
     if best := only_open(diagnosis):
-        words = _("%(name)s explains too little to be named, and too much to be excluded. A longer test can decide.",
-                  name=plain(name_of(best["effect"], diagnosis.get("library") or {})))  # fmt: skip
-        return {"kind": "unsure", "title": title, "words": words + beside}
+        name = plain(name_of(best["effect"], diagnosis.get("library") or {}))
+        return "unsure", untold, _("%(name)s explains too little to be named, and too much to be excluded. A longer "
+                                   "test can decide.", name=name)  # fmt: skip
     if caution(diagnosis):
-        words = _("It is too short or too poor to show it. Record random pulses, a ramp and a check (segments prbs, "
-                  "ramp, validate).")  # fmt: skip
-        return {"kind": "unsure", "title": title, "words": words + beside}
-    if leaves_structure or (times is not None and times > NOISE_LIKE):
+        return "unsure", untold, _("It is too short or too poor to show it. Record random pulses, a ramp and a check "
+                                   "(segments prbs, ramp, validate).")  # fmt: skip
+    if leaves_structure or noisy(comparison or {}):
         title = _("No effect of the library has enough evidence in this recording")
         if effects:
             title = _("No more effect of the library has enough evidence in this recording")
-        words = _("Some error is left, but the evidence for each effect of the library is too weak.")
-        return {"kind": "unsure", "title": title, "words": words + beside}
+        return "unsure", title, _("Some error is left, but the evidence for each effect of the library is too weak.")
     title = _("Nothing more is missing: what is left is noise") if effects else _(
         "Nothing is missing: what is left is noise")  # fmt: skip
-    return {"kind": "nothing", "title": title,
-            "words": _("No effect of the library explains more than noise would.") + beside}  # fmt: skip
+    return "nothing", title, _("No effect of the library explains more than noise would.")
 
 
 def _beside(comparison: dict[str, Any] | None) -> str:
@@ -242,12 +233,11 @@ def splits(comparison: dict[str, Any] | None) -> list[dict[str, Any]]:
     by = (comparison or {}).get("by") or {}
     found = []
     for kind, title in SPLITS.items():
-        rows = list(by.get(kind) or [])
+        say = segment_words if kind == "segment" else plain
+        rows = [{**row, "words": say(row["label"])} for row in by.get(kind) or []]
         while kind == "frequency" and len(rows) > 1 and rows[-1]["share_of_excess"] < LEAST_SHARE:
             rows.pop()
         if rows:
-            told = segment_words if kind == "segment" else plain
-            rows = [{**row, "words": told(row["label"])} for row in rows]
             most = max(row["share_of_excess"] for row in rows) or 1.0
             found.append({"title": str(title), "rows": rows, "most": most})
     return found
@@ -287,17 +277,17 @@ def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str,
     ]  # fmt: skip
 
 
+VERSION = (
+    "id", "rms_nm", "held_out_rms_nm", "noise_sd_nm", "fit_percent", "held_out_fit_percent", "decision", "served",
+    "created_utc",
+)  # fmt: skip
+"""What is shown of a version."""
+
+
 def versions(rows: Sequence[dict[str, Any]], current: str) -> list[dict[str, Any]]:
     """The versions of one recording in the order in which they descend from each other."""
     return [
-        {
-            "id": row["id"],
-            "label": label(row),
-            "current": row["id"] == current,
-            **{key: row.get(key) for key in ("rms_nm", "held_out_rms_nm", "noise_sd_nm", "fit_percent")},
-            **{key: row.get(key) for key in ("held_out_fit_percent", "decision", "served", "created_utc")},
-        }
-        for row in rows
+        {**{key: row.get(key) for key in VERSION}, "label": label(row), "current": row["id"] == current} for row in rows
     ]
 
 
@@ -311,12 +301,12 @@ def label(row: dict[str, Any]) -> str:
 
 def of_steps(found: dict[str, Any]) -> list[dict[str, Any]]:
     """The steps of an improvement as versions."""
-    rows = [
-        {"id": str(number), "added_effect": step["added"], "noise_sd_nm": found["noise_sd_nm"], **step}
+    steps = [
+        {"id": str(number), "added_effect": step["added"], "noise_sd_nm": found["noise_sd_nm"], "served": False, **step}
         for number, step in enumerate(found["steps"])
     ]
-    shown = versions([{"created_utc": None, "decision": None, "served": False, **row} for row in rows], "")
-    return [{**row, "reason": step.get("reason", "")} for row, step in zip(shown, found["steps"], strict=True)]
+    shown = versions(steps, "")
+    return [{**row, "reason": step.get("reason", "")} for row, step in zip(shown, steps, strict=True)]
 
 
 def noisy(comparison: dict[str, Any]) -> bool:
@@ -336,16 +326,14 @@ def require_evidence(diagnosis: dict[str, Any], present: Sequence[str], added: S
     ApiError
         409, with the reason for each effect.
     """
-    reasons = {effect: refusal(diagnosis, present, effect) for effect in added}
-    found = {effect: reason for effect, reason in reasons.items() if reason}
+    found = {effect: reason for effect in added if (reason := refusal(diagnosis, present, effect))}
     if found:
         detail = " ".join(f"{effect}: {reason}" for effect, reason in found.items())
         detail += (
             " To add it against the evidence, send `force` and a reason; the held-out error then shows its effect."
         )
-        raise ApiError(
-            409, "effect-not-there", "The recording gives no evidence for this effect", detail, reasons=found
-        )
+        title = "The recording gives no evidence for this effect"
+        raise ApiError(409, "effect-not-there", title, detail, reasons=found)
 
 
 def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> str | None:

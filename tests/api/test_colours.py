@@ -68,7 +68,7 @@ def test_colours_stand_in_the_two_lists_only() -> None:
         literal = re.findall(r"[:,\s](#[0-9a-fA-F]{3,8}\b|rgba?\([^)]*\)|\bwhite\b|\bblack\b)(?=[;,\s}])", rules)
         assert literal == [], path.name
         used = set(re.findall(r"var\(--([\w-]+)\)", rules))
-        assert used - set(light) - {"side"} == set(), path.name
+        assert used - set(light) == set(), path.name
 
 
 @pytest.mark.parametrize("vision", VISION)
