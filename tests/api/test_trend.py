@@ -1,4 +1,4 @@
-"""The trend over sessions: one point each, its figures with uncertainty, what changed, as JSON, CSV and page."""
+"""The trend over sessions, models side by side: figures with uncertainty, what changed; JSON, CSV, pages, browser."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,19 @@ from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.store.tables import Analysis, Model
 from stimrig.api.workers.pool import WORKER
-from tests.api.conftest import Service, run_service
+from tests.api.conftest import Service, run_service, shared_service
 from tests.harness import sessions
 from tests.harness.muscle import Patient
 from tests.harness.sessions import Planned
+
+WEAKER = replace(Patient(), gain=0.82 * Patient().gain)
+DAYS = (
+    Planned(Patient(), 0.0), Planned(Patient(), 3.0, approved=False), Planned(WEAKER, 7.0),
+    Planned(WEAKER, 9.0, current_ma=25.0), Planned(Patient(), 12.0), Planned(Patient(), 14.0), Planned(WEAKER, 16.0),
+)  # fmt: skip
+LAPTOP = {"width": 1366, "height": 768}
+COUNT = 20
+service = shared_service()
 
 
 def made(service: Service, code: str, planned: list[Planned]) -> list[str]:
@@ -64,38 +74,37 @@ def test_deviations_are_those_of_repeated_records() -> None:
 
 
 def test_one_point_a_session_approved_first_and_the_newest_version_else(service: Service, client: httpx.Client) -> None:
-    ids = made(service, "P017", three())
+    ids = made(service, "ONE", three())
     context = service.app.state.context
     row = context.versions.get(ids[2])
     later = {**json.loads(row.document), "model_id": "a-second-version"}
-    context.versions.add(json.dumps(later), "P017", row.recording_id, "Ada", parent_id=row.id)
-    found = trend(client, "P017")["sessions"]
+    context.versions.add(json.dumps(later), "ONE", row.recording_id, "Ada", parent_id=row.id)
+    found = trend(client, "ONE")["sessions"]
     assert [one["model_id"] for one in found] == [ids[0], ids[1], "a-second-version"]
     assert [one["approved"] for one in found] == [True, False, False]
     assert [one["versions"] for one in found] == [1, 1, 2]
     context.versions.decide(ids[2], True, "Ada", "the first one")
-    last = trend(client, "P017")["sessions"][2]
+    last = trend(client, "ONE")["sessions"][2]
     assert (last["model_id"], last["approved_by"]) == (ids[2], "Ada")
     context.versions.decide(ids[2], False, "Ada", "no, it is not")
-    assert trend(client, "P017")["sessions"][2]["model_id"] == "a-second-version"
+    assert trend(client, "ONE")["sessions"][2]["model_id"] == "a-second-version"
 
 
 def test_what_changed_is_told_against_the_last_approved_session(service: Service, client: httpx.Client) -> None:
-    made(service, "P017", three())
-    same = trend(client, "P017")["changes"]
+    made(service, "SAME", three())
+    same = trend(client, "SAME")["changes"]
     assert same["differences"] == [] and same["doubts"] == []
     assert same["sentences"] == ["Nothing changed beyond its uncertainty since 03 Aug 2026."]
-    weaker = replace(Patient(), gain=0.82 * Patient().gain)
-    made(service, "P018", three(patient=weaker))
-    found = trend(client, "P018")["changes"]
+    made(service, "CHANGED", three(patient=WEAKER))
+    found = trend(client, "CHANGED")["changes"]
     assert [one["figure"] for one in found["differences"]] == ["plateau_nm"]
     assert found["sentences"] == ["Plateau 18\u00a0% lower than on 03 Aug 2026, more than twice its uncertainty."]
 
 
 def test_a_plateau_at_another_current_is_no_comparison(service: Service, client: httpx.Client) -> None:
     stronger = replace(Patient(), gain=1.4 * Patient().gain, time_constant_s=0.7)
-    made(service, "P017", three(patient=stronger, current_ma=25.0, notes={"electrodes": "moved"}))
-    found = trend(client, "P017")["changes"]
+    made(service, "CURRENT", three(patient=stronger, current_ma=25.0, notes={"electrodes": "moved"}))
+    found = trend(client, "CURRENT")["changes"]
     assert [one["figure"] for one in found["differences"]] == ["time_constant_s"]
     assert found["doubts"] == [
         "The current was 20.0\u00a0mA, now it is 25.0\u00a0mA: threshold and plateau are not compared.",
@@ -140,8 +149,8 @@ def _read_once(service: Service, client: httpx.Client) -> None:
 
 
 def test_the_table_has_units_times_and_no_formulas(service: Service, client: httpx.Client) -> None:
-    made(service, "P017", three(notes={"electrodes": "=1+1"}, current_ma=21.5))
-    answer = client.get("/v1/participants/P017/trend.csv")
+    made(service, "TABLE", three(notes={"electrodes": "=1+1"}, current_ma=21.5))
+    answer = client.get("/v1/participants/TABLE/trend.csv")
     assert answer.headers["content-type"].startswith("text/csv")
     head, *rows = csv.reader(io.StringIO(answer.text))
     assert {"threshold_us (µs)", "threshold_us sd (µs)", "current_ma (mA)", "session_utc"} <= set(head)
@@ -151,13 +160,15 @@ def test_the_table_has_units_times_and_no_formulas(service: Service, client: htt
     assert all(not cell.startswith(("=", "@", "+")) for row in rows for cell in row)
 
 
-def test_nobody_and_no_session(service: Service, client: httpx.Client, participant: str) -> None:
+def test_nobody_and_no_session(service: Service, client: httpx.Client) -> None:
+    participant = "NONE"
+    made(service, participant, [])
     assert client.get("/v1/participants/P999/trend").status_code == 404
     assert trend(client, participant) == {"participant": participant, "sessions": [], "changes": None}
     page = client.get(f"/participants/{participant}/trend")
     assert "No session with a model yet." in page.text and '<svg class="trend"' not in page.text
-    made(service, "P018", three()[:1])
-    first = client.get("/participants/P018/trend").text
+    made(service, "FIRST", three()[:1])
+    first = client.get("/participants/FIRST/trend").text
     assert "The trend begins with the second one." in first and first.count('<svg class="trend"') == 9
 
 
@@ -173,3 +184,130 @@ def test_nobody_and_no_session(service: Service, client: httpx.Client, participa
 def test_a_figure_shows_no_digits_that_nobody_knows(value: float, uncertainty: float | None, words: str) -> None:
     name = changes.name_of("fatigue.depth")
     assert changes.uncertain_words(value, uncertainty, name) == words
+
+
+# ---- side by side, and what a model page says of the last approved session -------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def days(service: Service) -> list[str]:
+    return made(service, "DAYS", list(DAYS))
+
+
+def cells(page: str, figure: str) -> list[tuple[str, str]]:
+    """Of each model what a figure's row shows: the value, and the difference with its mark."""
+    row = next(row for row in re.findall(r"<tr>.*?</tr>", page, re.S) if f'<th scope="row">{figure}' in row)
+    found = []
+    for cell in re.findall(r'<td class="num">(.*?)</td>', row, re.S):
+        value, _, more = cell.partition("<span")
+        found.append((value, re.sub(r"<[^>]+>|^[^>]*>", "", more)))
+    return found
+
+
+def compared(client: httpx.Client, days: list[str], **more: str) -> str:
+    answer = client.get("/compare", params={"model": days, **more})
+    assert answer.status_code == 200, answer.text
+    return answer.text
+
+
+def test_six_models_with_their_differences_to_the_oldest(client: httpx.Client, days: list[str]) -> None:
+    page = compared(client, days[5:0:-1] + days[:1])
+    found = cells(page, "Plateau")
+    assert len(found) == 6 and found[0][1] == ""
+    values = [float(value.split(" ±")[0]) for value, _ in found]
+    assert values[2] == pytest.approx(0.82 * values[0], rel=0.01)
+    assert [number for number, (_, difference) in enumerate(found) if difference[:1] in "▲▼" and difference] == [2]
+    assert found[2][1].startswith("▼ −1.2") and " ± 0.2" in found[2][1]
+    assert found[3][1] == "" and "threshold and plateau are not compared" in page  # at another current
+    assert cells(page, "Time constant")[3][1] != ""
+    assert page.count('class="sample"') == 6 and len(set(re.findall(r'stroke="(#\w+|var[^"]+)"', page))) >= 6
+
+
+def test_another_one_is_the_reference(client: httpx.Client, days: list[str]) -> None:
+    page = compared(client, [days[0], days[2]], reference=days[2])
+    found = cells(page, "Plateau")
+    assert found[1][1] == "" and found[0][1].startswith("▲ +1.2")
+
+
+@pytest.mark.parametrize("count", [1, 7])
+def test_too_few_and_too_many(client: httpx.Client, days: list[str], count: int) -> None:
+    answer = client.get("/compare", params={"model": days[:count]}, headers={"Accept": "text/html"})
+    assert answer.status_code == 422 and "choose 2 to 6 models" in answer.text
+    same = client.get("/compare", params={"model": [days[0], days[0]]})
+    assert same.status_code == 422
+
+
+def test_the_models_page_says_what_changed(client: httpx.Client, days: list[str]) -> None:
+    weaker = client.get(f"/models/{days[2]}", params={"diagnose": 0}).text
+    assert "Plateau 18\u00a0% lower than on 03 Aug 2026, more than twice its uncertainty." in weaker
+    same = client.get(f"/models/{days[1]}", params={"diagnose": 0}).text
+    assert "Nothing changed beyond its uncertainty since 03 Aug 2026." in same
+    first = client.get(f"/models/{days[0]}", params={"diagnose": 0}).text
+    assert 'class="changes' not in first
+    assert 'href="/participants/DAYS/trend"' in client.get("/participants/DAYS").text
+
+
+# ---- in a browser ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def weeks(service: Service) -> list[str]:
+    return made(service, "WEEKS", sessions.weeks(COUNT))
+
+
+@pytest.mark.browser
+def test_twenty_sessions_fit_a_laptop_and_lead_to_their_models(tab: Any, service: Service, weeks: list[str]) -> None:
+    tab.set_viewport_size(LAPTOP)
+    tab.goto(service.url + "/participants/WEEKS/trend")
+    assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    pictures = tab.locator("svg.trend")
+    assert pictures.count() == 9
+    lowest = max(pictures.nth(k).bounding_box()["y"] + pictures.nth(k).bounding_box()["height"] for k in range(9))
+    assert lowest <= LAPTOP["height"]  # all of them in the first screen
+    dots = [pictures.nth(1).locator(f".dot{kind}").count() for kind in ("", ".hollow")]
+    assert dots == [COUNT, sum(not one.approved for one in sessions.weeks(COUNT))]
+    column = pictures.nth(1).locator(".column").nth(6)
+    column.hover()
+    told = tab.locator("#tip").inner_text()
+    assert re.search(r"Plateau [\d.]+ ± [\d.]+\s*N·m", told) and "approved by Ada" in told and "baclofen" in told
+    assert tab.locator(".column.here").count() == 9  # the same session in every picture
+    column.click()
+    tab.wait_for_url(f"**/models/{weeks[6]}")
+    assert tab.errors == []
+
+
+@pytest.mark.browser
+def test_notes_are_text_and_pictures_have_no_markup_of_theirs(tab: Any, service: Service, weeks: list[str]) -> None:
+    evil = '"><script>document.title="x"</script><img src=x onerror="document.title=1">'
+    planned = [Planned(Patient(), 0.0), Planned(replace(Patient(), gain=5.0), 3.0, notes={"electrodes": evil})]
+    made(service, "EVIL", planned)
+    tab.goto(service.url + "/participants/EVIL/trend")
+    tab.locator("svg.trend").first.locator(".column").nth(1).hover()
+    assert "<script>" in tab.locator("#tip").inner_text()
+    assert tab.title() == "Trend of EVIL · stimrig" and tab.locator("main img").count() == 0
+
+
+@pytest.mark.browser
+def test_the_table_of_the_sessions_fits_a_laptop_in_german(tab: Any, service: Service, weeks: list[str]) -> None:
+    tab.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
+    tab.set_viewport_size(LAPTOP)
+    tab.goto(service.url + "/participants/WEEKS/trend")
+    table = tab.locator(".scroll:has(.over-time)")
+    assert table.evaluate("(box) => box.scrollWidth <= box.clientWidth")
+    tab.set_viewport_size({"width": 820, "height": 1180})
+    assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), "it scrolls within its own box"
+
+
+@pytest.mark.browser
+def test_no_violation(tab: Any, service: Service, weeks: list[str]) -> None:
+    made(service, "EMPTY", [])
+    from tests.api.test_axe import examined
+
+    compared = "/compare?" + "&".join(f"model={model}" for model in weeks[:6])
+    for path in ("/participants/WEEKS/trend", "/participants/EMPTY/trend", compared):
+        tab.goto(service.url + path)
+        examined(tab, path)
+    tab.emulate_media(color_scheme="dark")
+    for path in ("/participants/WEEKS/trend", compared):
+        tab.goto(service.url + path)
+        examined(tab, f"{path}, dark")
