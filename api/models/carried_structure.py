@@ -44,7 +44,7 @@ class CarriedStructure:
             The recording gives no model in the plain structure either.
         """
         earlier = await asyncio.to_thread(self.versions.last_approved, participant)
-        effects = list(self.settings.structure) if earlier is None else []
+        effects, warning = list(self.settings.structure) if earlier is None else [], ""
         if effects:
             try:
                 return await self._begun("fit", path, on_call, effects=effects, **how), ""
@@ -52,9 +52,7 @@ class CarriedStructure:
                 if error.code != "data":
                     raise
                 why = error.detail
-            warning = f"Fitted in the plain structure, not with {in_words(effects).replace('_', ' ')}: {why}"
-        else:
-            warning = ""
+                warning = f"Fitted in the plain structure, not with {in_words(effects).replace('_', ' ')}: {why}"
         return await self._begun("fit", path, on_call, **how), warning
 
     async def carry(self, plain: Model, path: str, on_call: OnCall | None = None, **how: Any) -> Model:
@@ -96,13 +94,12 @@ class CarriedStructure:
 
 def _not_carried(error: Exception) -> dict[str, Any]:
     """The finding where the structure could not be fitted."""
-    why = error.code if isinstance(error, ApiError) else "failed"
-    told = [part for part in (error.title, error.detail) if part] if isinstance(error, ApiError) else [str(error)]
+    why, told = "failed", [str(error)]
+    if isinstance(error, ApiError):
+        why, told = error.code, [part for part in (error.title, error.detail) if part]
     reason = "The structure of the last session was not fitted. " + " ".join(f"{part.rstrip('.')}." for part in told)
-    nothing: dict[str, Any] = {
-        name: [] for name in ("still_needed", "no_longer_needed", "undecided", "effects", "figures")
-    }
-    return {"offered": "plain", "why": why, "reason": reason, **nothing}
+    lists = ("still_needed", "no_longer_needed", "undecided", "effects", "figures")
+    return {"offered": "plain", "why": why, "reason": reason, **{name: [] for name in lists}}
 
 
 async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -> None:
@@ -132,24 +129,10 @@ async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -
 
 
 def shown(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> dict[str, Any] | None:
-    """What `carried.html` shows of it; None for a version whose recording was asked nothing of the kind.
+    """What `carried.html` shows of a version, the plain one or its child in the carried structure.
 
-    Parameters
-    ----------
-    versions : Versions
-        Where the earlier model and the other version of this recording are found.
-    row : Model
-        The version that the page shows: the plain one, or its child in the carried structure.
-    diagnosis : dict or None
-        What is missing in this version; None as long as it is being found out.
-
-    Returns
-    -------
-    dict or None
-        `earlier` (id and time); `kept`, `dropped` and `undecided` (effects with their reasons); `new` (names; None as
-        long as there is no diagnosis) and `again` (names of those left out that the diagnosis asks for); `offered`
-        (this version is the one), `better` (the carried one is), `is_plain`, `other` (id of the other version),
-        `reason`.
+    None where its recording was asked nothing of the kind. `new` is None as long as there is no diagnosis; `again`:
+    those left out that the diagnosis asks for; `offered`: this version is the one; `better`: the carried one is.
     """
     found = row.carried
     if found is None or found["why"] == "plain-before":
@@ -165,7 +148,9 @@ def shown(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> d
         "kept": [effect for effect in found["effects"] if effect["needed"]],
         "dropped": [effect for effect in left if effect["needed"] is False],
         "undecided": [effect for effect in left if effect["needed"] is None],
-        "new": None if missing is None else [_name(entry) for entry in missing if entry["effect"] not in known],
+        "new": None
+        if missing is None
+        else [name_of(entry["effect"], {entry["effect"]: entry}) for entry in missing if entry["effect"] not in known],
         "again": [effect["name"] for effect in found["effects"] if effect["effect"] in again],
         "offered": carried == (found["offered"] == "carried"),
         "other": _other(versions, row, carried),
@@ -173,10 +158,6 @@ def shown(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> d
         "is_plain": not carried,
         "reason": found["reason"],
     }
-
-
-def _name(entry: dict[str, Any]) -> str:
-    return name_of(entry["effect"], {entry["effect"]: entry})
 
 
 def _other(versions: Versions, row: Model, carried: bool) -> str | None:

@@ -1,8 +1,10 @@
-"""The languages of the pages: which one is taken, how numbers and dates are written, what is translated."""
+"""The languages of the pages: which one is taken, how numbers and dates are written, what is translated and how."""
 
 from __future__ import annotations
 
+import importlib
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,9 +17,11 @@ from hypothesis import strategies as st
 
 from stimrig.api import language
 from stimrig.api.language import extract, translated, words
+from stimrig.api.language.translated import PERSON, of
 from stimrig.api.language.words import best
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
+LANGUAGES = [code for code in language.CODES if code != language.DEFAULT]
 
 
 @pytest.mark.parametrize(
@@ -69,22 +73,19 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     }.items():
         made.add(message, translation)
     monkeypatch.setattr(words, "catalogue", lambda _code: made)
-    monkeypatch.setattr(translated_module(), "catalogue", lambda _code: made)
+    monkeypatch.setattr(MODULE, "catalogue", lambda _code: made)
     forget()
     yield
     monkeypatch.undo()
     forget()
 
 
-def translated_module() -> Any:
-    import importlib
-
-    return importlib.import_module("stimrig.api.language.translated")
+MODULE: Any = importlib.import_module("stimrig.api.language.translated")
+"""The package has a function of this name."""
 
 
 def forget() -> None:
-    module = translated_module()
-    for cached in (words.translations, module._certain, module._message, module._patterns, module._same):
+    for cached in (words.translations, MODULE._certain, MODULE._message, MODULE._patterns, MODULE._same):
         cached.cache_clear()
 
 
@@ -140,13 +141,13 @@ def forms_of(text: Any) -> tuple[str, ...]:
     return (text,) if isinstance(text, str) else tuple(text)
 
 
-@pytest.mark.parametrize("code", [code for code in language.CODES if code != language.DEFAULT])
+@pytest.mark.parametrize("code", LANGUAGES)
 def test_every_message_has_its_translation(code: str) -> None:
     """`python -m stimrig.api.language.extract --check` says the same; `make words` renews the catalogues."""
     assert extract.missing(code) == []
 
 
-@pytest.mark.parametrize("code", [code for code in language.CODES if code != language.DEFAULT])
+@pytest.mark.parametrize("code", LANGUAGES)
 def test_translations_keep_the_places(code: str) -> None:
     wrong = []
     for entry in words.catalogue(code):
@@ -168,3 +169,138 @@ def test_a_catalogue_is_one_file_and_ships() -> None:
 def test_no_catalogue_is_begun_for_what_is_no_language(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert extract.main([code]) == 2
     assert "no language" in capsys.readouterr().err and words.CODES == language.CODES
+
+
+# ---- sentences that other parts put together: whole, and with all their values ---------------------------------------
+
+NAMED = re.compile(r"%\((\w+)\)s")
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+def test_each_message_is_recognised_as_itself(code: str) -> None:
+    wrong, seen = [], set()
+    with language.using(code):
+        for entry in words.catalogue(code):
+            shape = NAMED.sub("%", str(entry.id))
+            if isinstance(entry.id, str) and entry.id and entry.string and shape not in seen:
+                seen.add(shape)
+                values = {
+                    name: "Ben Carter" if name == PERSON else f"Zq{k}" if k % 2 else f"{k}7"
+                    for k, name in enumerate(NAMED.findall(entry.id))
+                }
+                given, expected = (text % values if values else text for text in (entry.id, str(entry.string)))
+                wrong += [(given, of(code, given))] if of(code, given) != expected else []
+    assert wrong == []
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+@pytest.mark.parametrize(
+    "sentence",
+    [
+        "Nothing is missing: what is left is noise",
+        "Nothing more is missing: what is left is noise",
+        "Fatigue is very probably missing (99 %). The muscle tires: the longer it has worked, the less torque the same "
+        "pulse gives. It recovers at rest. After a stroke, muscles tire sooner. Late in a session the muscle needs "
+        "more charge, or longer rests. This record cannot clearly separate it from: potentiation, drift of the "
+        "baseline. To decide: The ramp repeated after stimulation, and once more after a rest.",
+        "data.csv, line 1: column 'Time' is taken for time_s, but its unit is not said. Give --map time_s=Time:s.",
+        "The recording gives evidence for: fatigue and drift of the baseline. Its error is 1.3 times the noise.",
+        "The error depends on what the muscle does, so it is not measurement noise. It sits mostly here: rising prbs, "
+        "100-200 µs: model too low by 0.12 N·m, 34 % of the error above the noise. Its error is 2.1 times "
+        "the noise.",
+        "Do not use this model: the fit of 20.0 % is too poor: the torque hardly follows the pulses.",
+        "Check this before use: on held-out rows the fit is 80.1 %, and the noise allows 96.3 %: something is missing; "
+        "see the diagnosis.",
+        "Valid for pulse widths of 100–300 µs, torques down to -5.0 N·m, 40–40 pulses/s.",
+        "A fast ramp (20 s) should separate fatigue from potentiation.",
+        "charge_per_phase_uc 12 µC is outside 0 … 10 (hard limit, over by 2): own rule",
+        "There is no participant 'P99'. POST /v1/participants makes one.",
+        "latched: stop pressed; the stimulator, asked now: stopped",
+    ],
+)
+def test_a_sentence_put_together_keeps_no_english(code: str, sentence: str) -> None:
+    with language.using(code):
+        found = of(code, sentence)
+    assert found is not None
+    english = (
+        r"\b(is|are|the|of|with|taken|to|without|too|it|something|possibly|more|missing|rising|low|and|from|over)\b"
+    )
+    assert not re.search(english, found), found
+    assert re.findall(r"\d+", found) == re.findall(r"\d+", sentence)
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+def test_english_stays_only_in_a_sentence_that_is_surely_meant(code: str) -> None:
+    with language.using(code):
+        assert "[Errno 19] No such device" in str(
+            of(code, "load cell on can0: the bus was lost: [Errno 19] No such device")
+        )
+        assert of(code, "A person with a code of its own is seen in the morning.") is None
+        assert language._("") == ""
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+def test_a_text_of_many_half_sentences_is_given_up(code: str) -> None:
+    """Without a bound, the parts of this text that may be messages are looked up for minutes."""
+    pieces = ("the", "is", "at", "of", ".", ":", ";", ",", "and", "from", "with", "in", "torque", "test", "N·m", "s")
+    text = " ".join(pieces[(7 * k + k // 5) % len(pieces)] for k in range(400))
+    with language.using(code):
+        assert of(code, text) is None
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+def test_renewing_a_catalogue_loses_nothing(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / f"{code}.po"
+    shutil.copy(words.HERE / path.name, path)
+    before = {str(entry.id): entry.string for entry in words.catalogue(code)}
+    head = words.catalogue(code).header_comment
+    for module in (words, extract):
+        monkeypatch.setattr(module, "HERE", tmp_path)
+    monkeypatch.setattr(extract, "CODES", (language.DEFAULT, code))
+    words.catalogue.cache_clear()
+    try:
+        extract.main([])
+        words.catalogue.cache_clear()
+        after = words.catalogue(code)
+        assert {str(entry.id): entry.string for entry in after if entry.id and entry.string}.items() <= before.items()
+        assert after.header_comment == head and sum(1 for entry in after if entry.string) > 500
+    finally:
+        words.catalogue.cache_clear()
+
+
+HOSTILE = [
+    "  " * 23 + " is outside " + " … " * 22 + " (" * 37,
+    "a " * 300 + " is outside " + " … " * 150 + " (" * 150,
+    "a " * 400 + " is above the participant's " + "b " * 400,
+    "c: " * 300 + " must be at least " + "d " * 300,
+    "ready, " * 280,
+    "P is of P, P of P. " * 100,
+    "calibration: " * 60 + "at at µs is above ; mark " * 40,
+]
+"""What anybody may type into an address, a reason or a note, and a message repeats."""
+
+
+@pytest.mark.parametrize("code", LANGUAGES)
+@pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
+def test_no_text_keeps_the_service_busy(code: str, text: str) -> None:
+    of(code, "ready")  # the catalogue is read
+    begun_s = time.process_time()
+    of(code, text)
+    assert time.process_time() - begun_s < 5.0, "seconds in the loop that also takes the stop; it was minutes once"
+
+
+def test_no_attribute_holds_what_may_be_marked_as_english() -> None:
+    """`translated` may give an element, `plain_words` does not."""
+    folder = Path(language.__file__).parents[1] / "web" / "pages" / "templates"
+    wrong = [path.name for path in folder.glob("*.html") if re.search(r'="[^"]*\|translated', path.read_text("utf-8"))]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("who", ["Ada", "Änne Weiß", "Anna Maria von Berg"])
+def test_who_stopped_may_have_a_name_of_several_words(who: str):
+    assert of("de", f"stop pressed on the page (by {who}).") == f"Stopp auf der Seite gedrückt (durch {who})."
+
+
+def test_what_confirms_a_stop_is_told_in_german():
+    told = of("de", "device: not initialised; torque fell from 9 to 4 N·m")
+    assert told == "Gerät: gibt keine Pulse ab (nicht initialisiert); das Drehmoment fiel von 9 auf 4 N·m"

@@ -119,9 +119,7 @@ def gather(
     """What is missing, and where the error sits."""
     found, comparison, job = diagnosis["found"], measured["comparison"], diagnosis["job"]
     view = explanation.view(found, comparison, row.effects, leaves_structure) if found else None
-    rows = explanation.versions(
-        [context.versions.document(version) for version in context.versions.lineage(row)], row.id
-    )
+    rows = versions_of(context, row)
     segments = (measured["curves"] or {}).get("segments") or []
     signatures = (found or {}).get("signatures") or {}
     # Where all is noise the worst of it is no place to look at.
@@ -142,6 +140,12 @@ def gather(
         "carried": carried_structure.shown(context.versions, row, found),
         "figures": diagnosis_charts.of_why(comparison, segments, view, signatures, rows),
     }
+
+
+def versions_of(context: Context, row: Model) -> list[dict[str, Any]]:
+    """The versions of the model's recording, as its page and its report show them."""
+    lineage = context.versions.lineage(row)
+    return explanation.versions([context.versions.document(version) for version in lineage], row.id)
 
 
 @router.post("/models/{model_id}/diagnosis/cancel")

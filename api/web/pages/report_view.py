@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -14,20 +13,19 @@ from stimrig.api.charts.svg import svg
 from stimrig.api.clock import local_day
 from stimrig.api.language import _
 from stimrig.api.models import advice, explanation, stored_model
-from stimrig.api.models.places import Site, site_of, site_of_recording
-from stimrig.api.store.tables import Model, Note, Participant, Recording, Test
+from stimrig.api.models.places import site_of, site_of_recording
+from stimrig.api.store.tables import Note, Participant, Recording, Test
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
-from stimrig.api.web.pages.model_view import facts, measurement
+from stimrig.api.web.pages.model_view import facts, measurement, versions_of
 from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
-TALL, LOW = 312.0, 215.0
+SIZES = {
+    "comparison": (760.0, 312.0), "recruitment": (375.0, 215.0), "step": (375.0, 215.0), "joint_g": (760.0, 215.0),
+    "joint_h": (760.0, 215.0),
+}  # fmt: skip
 MOST_NOTES = 12
 """Notes on one report; the participant's page has all of them."""
-
-
-def _versions(context: Context, lineage: list[Model], shown: str) -> list[dict[str, Any]]:
-    return explanation.versions([context.versions.document(version) for version in lineage], shown)
 
 
 @router.get("/models/{model_id}/report")
@@ -39,23 +37,14 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
     figures = model_charts.of_model(document, measured["curves"], measured["comparison"])
     figures |= joint_charts.of_joint(document)
-    lineage = await asyncio.to_thread(context.versions.lineage, row)
-    drawn = {
-        name: svg(figures[name], width, height, words, on_paper=True)
-        for name, width, height, words in (
-            (
-                "comparison",
-                760.0,
-                TALL,
-                _("Torque measured and predicted, what is left, and the pulse width, over time"),
-            ),
-            ("recruitment", 375.0, LOW, _("Steady torque over pulse width")),
-            ("step", 375.0, LOW, _("Step response over time")),
-            ("joint_g", 760.0, LOW, _("Share of the muscle's torque over the angle of the joint")),
-            ("joint_h", 760.0, LOW, _("Passive torque over the angle of the joint")),
-        )
-        if name in figures
+    words = {
+        "comparison": _("Torque measured and predicted, what is left, and the pulse width, over time"),
+        "recruitment": _("Steady torque over pulse width"),
+        "step": _("Step response over time"),
+        "joint_g": _("Share of the muscle's torque over the angle of the joint"),
+        "joint_h": _("Passive torque over the angle of the joint"),
     }
+    drawn = {name: svg(figures[name], *SIZES[name], words[name], on_paper=True) for name in words if name in figures}
     leaves = advice.leaves_structure(advice.findings(document))
     return page(
         request,
@@ -65,52 +54,29 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
         drawn=drawn,
         problem=measured["problem"],
         why=explanation.view(found, measured["comparison"], row.effects, leaves) if found else None,
-        versions=await asyncio.to_thread(_versions, context, lineage, row.id),
+        versions=await asyncio.to_thread(versions_of, context, row),
         recording=recording,
         session=await asyncio.to_thread(session_of, context, recording),
     )
 
 
-@dataclass(frozen=True)
-class SessionFacts:
-    """The session of a model, as it was when its test was begun.
+def session_of(context: Context, recording: Recording) -> dict[str, Any]:
+    """The session that a recording belongs to, as it was when its test was begun; `test` None: it was uploaded.
 
-    Parameters
-    ----------
-    site : list of str or None
-        As it was then; of a record whose site was not kept, as it is now.
-    profile : dict
-        The limits and thresholds of that test; empty for a record that was uploaded.
-    test : Test or None
-        None: the record was uploaded.
-    notes : list of Note
-        Those of the test, and of the participant on its day, that nobody struck.
-    more_notes : int
-        So many do not fit on the report.
+    The site of a record whose site was not kept is that of now.
     """
-
-    site: Site
-    profile: dict[str, Any]
-    test: Test | None
-    notes: list[Note]
-    more_notes: int
-
-    @property
-    def ran_by(self) -> str | None:
-        """Who ran the test at the rig."""
-        return (self.test.ran_by or self.test.requested_by) if self.test else None
-
-
-def session_of(context: Context, recording: Recording) -> SessionFacts:
-    """The session that a recording belongs to."""
     participant: Participant = context.store.get(Participant, recording.participant)
     test: Test | None = context.store.get(Test, recording.test_id) if recording.test_id else None
     notes = _notes(context, recording, test)
     kept = site_of_recording(recording, test if test and "side" in test.plan else None)
-    return SessionFacts(
-        kept or site_of(participant), (test.plan.get("profile") or {}) if test else {}, test,
-        notes[:MOST_NOTES], max(0, len(notes) - MOST_NOTES),
-    )  # fmt: skip
+    return {
+        "site": kept or site_of(participant),
+        "profile": (test.plan.get("profile") or {}) if test else {},
+        "test": test,
+        "ran_by": (test.ran_by or test.requested_by) if test else None,
+        "notes": notes[:MOST_NOTES],
+        "more_notes": max(0, len(notes) - MOST_NOTES),
+    }
 
 
 def _notes(context: Context, recording: Recording, test: Test | None) -> list[Note]:
