@@ -41,9 +41,13 @@ BEAT_PERIOD_S = 0.5
 
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
-    logging.basicConfig(level=logging.DEBUG if options.verbose else logging.INFO, handlers=[_handler()], force=True)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_JsonLines())
+    logging.basicConfig(level=logging.DEBUG if options.verbose else logging.INFO, handlers=[handler], force=True)
     try:
-        config = _configure(options)
+        overrides = {"data_dir": options.data, "socket": options.socket, "clock_speed": options.clock_speed}
+        config = configuration.chosen(options, **overrides)
+        assert config is not None
         if options.check:
             _check(config)
             return 0
@@ -58,9 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m stimrig.rig", description="The process that owns the rig's devices."
     )
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--config", type=Path, metavar="FILE", help="rig file (TOML), see docs/rig-file.md")
-    source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
+    configuration.add_arguments(parser, required=True, about="rig file (TOML), see docs/rig-file.md")
     parser.add_argument("--socket", type=Path, help="Unix socket to listen on; overrides the rig file")
     parser.add_argument("--data", type=Path, help="folder for journals and recordings; overrides the rig file")
     parser.add_argument("--clock-speed", type=float, help="with --emulator-json only: rig seconds per real second")
@@ -68,13 +70,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--die-with-parent", action="store_true", help="end as on SIGTERM when the parent has died")
     parser.add_argument("--verbose", action="store_true")
     return parser
-
-
-def _configure(options: argparse.Namespace) -> configuration.RigConfig:
-    overrides = {"data_dir": options.data, "socket": options.socket, "clock_speed": options.clock_speed}
-    if options.config is not None:
-        return configuration.load(options.config, **overrides)
-    return configuration.for_emulator(options.emulator_json, **overrides)
 
 
 def _check(config: configuration.RigConfig) -> None:
@@ -134,12 +129,6 @@ async def _trouble(rig: Rig, ask: Ask) -> str | None:
 async def _stop_by_key(rig: Rig) -> None:
     evidence = await rig.stop("a key in the terminal", "operator")
     log.info("stop by key: %s, %s", "confirmed" if evidence.confirmed else "NOT CONFIRMED", evidence.detail)
-
-
-def _handler() -> logging.Handler:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_JsonLines())
-    return handler
 
 
 class _JsonLines(logging.Formatter):

@@ -112,7 +112,9 @@ def _by_stamps(stamp_s: Array, sensor_s: Array, torque: Reference) -> tuple[Line
     """Through the interface's stamps of both: a line from the sensor's clock to the stamps, one on to the test's."""
     on = align.robust_line(torque.samples["stamp_s"], torque.time_s)
     of = align.robust_line(sensor_s, stamp_s)
-    return _chained(of, on), float(np.hypot(on.error_s, of.error_s))
+    end_s = float(on.at(of.at(np.array([of.centre_s])))[0])
+    line = Line(end_s - of.centre_s, of.rate * on.rate, of.centre_s, 0.0)
+    return line, float(np.hypot(on.error_s, of.error_s))
 
 
 def _by_order(samples: NDArray[Any], sensor_s: Array, torque: Reference) -> tuple[Line, float, Method] | None:
@@ -156,11 +158,6 @@ def _by_arrival(host_s: Array, sensor_s: Array) -> tuple[Line, float, Method]:
     line = align.line_below(*points)
     error_s = align.misfit(line, *points)
     return line, float(np.hypot(line.error_s, error_s)), "regression"
-
-
-def _chained(first: Line, then: Line) -> Line:
-    end_s = float(then.at(first.at(np.array([first.centre_s])))[0])
-    return Line(end_s - first.centre_s, first.rate * then.rate, first.centre_s, 0.0)
 
 
 LIKELY_RATE_HZ = 200.0

@@ -70,7 +70,12 @@ def assemble(contents: JournalContents, outcome: str = "fault", reason: str = ""
 
 def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recording:
     _refuse_empty(contents)
-    notes = _damage(contents)
+    notes = []
+    if contents.damaged:
+        notes.append(
+            f"the journal is damaged: {contents.damaged_bytes} bytes cannot be read and at least "
+            f"{contents.blocks_missing} blocks are missing"
+        )
     header = contents.first_json(Kind.HEADER) or _header_of_blocks(contents, notes)
     planned, segments = planned_pulses(contents, header, notes)
     rate_hz = float(header["plan"]["pulse_rate_hz"])
@@ -100,7 +105,9 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
         "created_utc": utc_text(unix_s),
         "outcome": end["outcome"],
         "reason": end["reason"],
-        **_ending(contents, header, end),
+        "adaptive": int(bool(header["plan"].get("adaptive"))),
+        "ended_by": end.get("ended_by", "plan") if end["outcome"] == "completed" else end["outcome"],
+        "laid": json.dumps([block.described() for block in laid_blocks(contents)]),
         "software": header["software"],
         "configuration": json.dumps({"rig": header["configuration"], "plan": header["plan"]}),
         "pulse_rate_hz": rate_hz,
@@ -113,16 +120,6 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     }
     events = [json.loads(payload) for kind, payload in contents.blocks if kind == Kind.EVENT]
     return Recording(columns, [s.name for s in segments], attributes, alignment, events, angle)
-
-
-def _ending(contents: JournalContents, header: dict[str, Any], end: dict[str, Any]) -> dict[str, Any]:
-    """Attributes of a test that may have been extended while it played."""
-    completed = end["outcome"] == "completed"
-    return {
-        "adaptive": int(bool(header["plan"].get("adaptive"))),
-        "ended_by": end.get("ended_by", "plan") if completed else end["outcome"],
-        "laid": json.dumps([block.described() for block in laid_blocks(contents)]),
-    }
 
 
 def _refuse_empty(contents: JournalContents) -> None:
@@ -138,18 +135,11 @@ def _refuse_empty(contents: JournalContents) -> None:
     raise RecordingError(f"journal {contents.path}: it ends before its plan, so no pulse was sent; nothing to seal")
 
 
-def _damage(contents: JournalContents) -> list[str]:
-    if not contents.damaged:
-        return []
-    return [
-        f"the journal is damaged: {contents.damaged_bytes} bytes cannot be read and at least {contents.blocks_missing} "
-        "blocks are missing"
-    ]
-
-
 def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, Any]:
     """A header inferred from the blocks, if both copies are damaged."""
     intents = read_intents(contents)
+    torque = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE and len(p)]
+    first_s = [float(samples["host_time_s"][0]) for samples in torque[:1]]
     rate_hz = LIKELY_RATE_HZ
     if len(intents) > 1 and intents[-1][0] > intents[0][0]:
         rate_hz = round((intents[-1][0] - intents[0][0]) / (intents[-1][2] - intents[0][2]), 6)
@@ -169,10 +159,10 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
         },
         "segments": [],
         "current_ma": max((intent[4] for intent in intents), default=0.0),
-        "sample_rate_hz": _sample_rate(contents),
+        "sample_rate_hz": (len(torque) > 1 and align.counted_rate_hz(np.concatenate(torque))) or 1.0,
         "software": "unknown",
         "configuration": {},
-        "time_s": _first_time(contents),
+        "time_s": min([*(intent[1] for intent in intents[:1]), *first_s], default=0.0),
         "unix_s": contents.path.stat().st_mtime if contents.path.exists() else 0.0,
     }
 
@@ -187,17 +177,6 @@ def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) ->
     if intents:
         t0_s = float(np.median([due_s - index / rate_hz for index, _, due_s, _, _ in intents]))
     return bool(intents), t0_s, float(header["unix_s"]) + t0_s - float(header["time_s"])
-
-
-def _sample_rate(contents: JournalContents) -> float:
-    blocks = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE and len(p)]
-    return (len(blocks) > 1 and align.counted_rate_hz(np.concatenate(blocks))) or 1.0
-
-
-def _first_time(contents: JournalContents) -> float:
-    times = [intent[1] for intent in read_intents(contents)[:1]]
-    times += [float(np.frombuffer(p, SAMPLE)["host_time_s"][0]) for k, p in contents.blocks if k == Kind.TORQUE][:1]
-    return min(times, default=0.0)
 
 
 def _last_time(contents: JournalContents) -> float:

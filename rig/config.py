@@ -5,6 +5,7 @@ An error is one line: file, key, what is wrong, how to correct it.
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import tomllib
@@ -198,6 +199,20 @@ def _emulated_sensor(line: dict[str, Any]) -> dict[str, Any]:
         "radians_per_unit": math.radians(float(line.get("scale", 1.0))),
         **({} if of_the_cell else {"sample_rate_hz": float(line["rate_hz"])}),
     }
+
+
+def add_arguments(parser: argparse.ArgumentParser, required: bool, about: str) -> None:
+    """The two ways to say which rig; see `chosen`."""
+    source = parser.add_mutually_exclusive_group(required=required)
+    source.add_argument("--config", type=Path, metavar="FILE", help=about)
+    source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
+
+
+def chosen(options: argparse.Namespace, **overrides: Any) -> RigConfig | None:
+    """The rig of a command line; None: it names none. Raises ConfigError."""
+    if options.config is not None:
+        return load(options.config, **overrides)
+    return None if options.emulator_json is None else for_emulator(options.emulator_json, **overrides)
 
 
 def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:

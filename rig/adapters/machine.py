@@ -91,16 +91,12 @@ class Driver:
             with contextlib.suppress(queue.Empty):
                 action = self._inbox.get(timeout=wait_s) if wait_s > 0 else self._inbox.get_nowait()
                 while action is not None:  # what came before is taken before any task goes on
-                    self._do(action)
+                    try:
+                        action()
+                    except Exception:  # a bug in this program; whoever waits for the outcome finds out by the time
+                        log.exception("something that came could not be taken")
                     action = self._inbox.get_nowait()
                 return
-
-    @staticmethod
-    def _do(action: Callable[[], None]) -> None:
-        try:
-            action()
-        except Exception:  # a bug in this program; whoever waits for the outcome finds out by the time
-            log.exception("something that came could not be taken")
 
 
 @contextlib.contextmanager

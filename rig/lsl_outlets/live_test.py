@@ -158,13 +158,17 @@ class LiveTest:
         batch, finish = Batch(), finish or self.ended
         if self._t0_s is None:
             return batch
-        self._begin(batch)
+        if not self._told:
+            self._told = True
+            batch.marks.append((self._lsl_s(self._t0_s), self._mark("start")))
         self._pass_pulses(batch, finish)
         self._align(finish)
         if self._good or finish:
             self._pass_torque(batch, finish)
         if self.ended:
-            batch.marks.append((self._lsl_s(self._end["time_s"]), self._last_mark()))
+            said = {"outcome": self._end.get("outcome"), "duration_s": self._end["time_s"] - self._t0_s}
+            counts = {"samples_sent": self.sent_samples, "pulses_sent": self.sent_pulses}
+            batch.marks.append((self._lsl_s(self._end["time_s"]), {**self._mark("end"), **said, **counts}))
         return batch
 
     def _head(self, header: dict[str, Any]) -> None:
@@ -196,28 +200,10 @@ class LiveTest:
         else:
             pulse.acked_s = journal.ACKED.unpack_from(payload)[1]
 
-    def _begin(self, batch: Batch) -> None:
-        if self._told:
-            return
-        self._told = True
-        assert self._t0_s is not None
-        batch.marks.append((self._lsl_s(self._t0_s), {"event": "start", **self._names()}))
-
-    def _names(self) -> dict[str, Any]:
+    def _mark(self, event: str) -> dict[str, Any]:
         plan = self._header.get("plan", {})
         names = {name: plan.get(name) for name in ("test_id", "participant", "kind")}
-        return {"recording_id": self._header.get("recording_id"), **names}
-
-    def _last_mark(self) -> dict[str, Any]:
-        assert self._t0_s is not None
-        return {
-            "event": "end",
-            **self._names(),
-            "outcome": self._end.get("outcome"),
-            "duration_s": self._end["time_s"] - self._t0_s,
-            "samples_sent": self.sent_samples,
-            "pulses_sent": self.sent_pulses,
-        }
+        return {"event": event, "recording_id": self._header.get("recording_id"), **names}
 
     def _pass_pulses(self, batch: Batch, finish: bool) -> None:
         """Pass on what was written and acknowledged, in order; an ack may still correct the time of writing."""
@@ -267,18 +253,15 @@ class LiveTest:
         samples = np.concatenate([held[1] for held in self._held[:passing]])
         del self._held[:passing]
         time_s = self._alignment.fit.line.at(cell_s)
-        keep = self._inside(time_s) & (samples["host_time_s"] >= self._since_s)
+        margin_s, begin_s = MARGIN_S * self._speed, self._t0_s or 0.0
+        end_s = self._end["time_s"] if self.ended else np.inf
+        keep = (time_s >= begin_s - margin_s) & (time_s < end_s + margin_s)
+        keep &= samples["host_time_s"] >= self._since_s
         time_s = np.maximum.accumulate(np.maximum(time_s[keep], self._last_s))
         if len(time_s):
             self._last_s = float(time_s[-1])
         batch.torque_s, batch.torque_nm = self._lsl_s(time_s), samples["torque_nm"][keep]
         self.sent_samples += len(time_s)
-
-    def _inside(self, time_s: Array) -> NDArray[np.bool_]:
-        assert self._t0_s is not None
-        margin_s = MARGIN_S * self._speed
-        end_s = self._end["time_s"] if self.ended else np.inf
-        return (time_s >= self._t0_s - margin_s) & (time_s < end_s + margin_s)
 
     def _lsl_s(self, rig_s: Any) -> Any:
         return rig_s / self._speed + self._offset_s

@@ -320,7 +320,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s lsl: %(message)s", stream=sys.stderr, force=True)
     try:
-        config = _configuration(options)
+        # the rig's socket is not used
+        config = configuration.chosen(options, data_dir=options.data, socket=Path("none"))
         folder = options.data or (config.data_dir if config is not None else None)
         if folder is None:
             raise ConfigError("lsl: give the rig's data folder with --data, or its rig file with --config")
@@ -339,7 +340,11 @@ def _stream(folder: Path, config: configuration.RigConfig | None, name: str) -> 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     lsl = library()
-    rate_hz, speed, devices = _of(config)
+    rate_hz, speed, devices = 0.0, 1.0, dict[str, str]()
+    if config is not None:
+        rate_hz = float(config.load_cell.model_dump().get("sample_rate_hz", 0.0))
+        speed = config.clock_speed
+        devices = {"load_cell": config.load_cell.device, "stimulator": config.stimulator.device}
     streams = Outlets(lsl, rate_hz * speed, devices, name)
     streaming = Streaming(folder, streams, clock_offset_s(lsl), rate_hz, speed)
     print(json.dumps({"streams": streams.names}), flush=True)
@@ -351,29 +356,9 @@ def _stream(folder: Path, config: configuration.RigConfig | None, name: str) -> 
         time.sleep(LAST_S)
 
 
-def _of(config: configuration.RigConfig | None) -> tuple[float, float, dict[str, str]]:
-    """Nominal sample rate (0: not known), the clock's speed, and the devices' names."""
-    if config is None:
-        return 0.0, 1.0, {}
-    rate_hz = float(config.load_cell.model_dump().get("sample_rate_hz", 0.0))
-    devices = {"load_cell": config.load_cell.device, "stimulator": config.stimulator.device}
-    return rate_hz, config.clock_speed, devices
-
-
-def _configuration(options: argparse.Namespace) -> configuration.RigConfig | None:
-    places = {"data_dir": options.data, "socket": Path("none")}  # the rig's socket is not used
-    if options.config is not None:
-        return configuration.load(options.config, **places)
-    if options.emulator_json is not None:
-        return configuration.for_emulator(options.emulator_json, **places)
-    return None
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m stimrig.rig.lsl_outlets", description="Torque and pulses for LSL.")
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument("--config", type=Path, metavar="FILE", help="rig file: says rate and devices")
-    source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
+    configuration.add_arguments(parser, required=False, about="rig file: says rate and devices")
     parser.add_argument("--data", type=Path, metavar="DIR", help="data folder of the rig; overrides the rig file")
     parser.add_argument("--name", default="stimrig", help="what the streams' names begin with (default: stimrig)")
     return parser
