@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import httpx
 
 from stimrig.rig import keys
-from stimrig.rig.messages import StatusRequest, StopEvidence, StopRequest
+from stimrig.rig.messages import StopEvidence
+from stimrig.rig.requests import StatusRequest, StopRequest
 
 if TYPE_CHECKING:
     from stimrig.api.sessions.rig_client import RigClient

@@ -24,7 +24,8 @@ from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Participant, Test
 from stimrig.api.workers.pool import Adviser
-from stimrig.rig.messages import SAFE_END_S, AdaptivePlan, FinishedEvent, PreviewRequest, SegmentPlan, TestPlan
+from stimrig.rig.messages import SAFE_END_S, AdaptivePlan, FinishedEvent, SegmentPlan, TestPlan
+from stimrig.rig.requests import PreviewRequest
 
 ADAPTIVE = "adaptive"
 """Kind of test."""

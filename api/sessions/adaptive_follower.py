@@ -20,7 +20,8 @@ from stimrig.api.errors import ApiError
 from stimrig.api.sessions.kinds import SERVICE, Watcher
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.workers.pool import Adviser
-from stimrig.rig.messages import AHEAD, SAFE_END_S, EnoughRequest, ExtendRequest, LiveEvent, SegmentPlan, TestPlan
+from stimrig.rig.messages import AHEAD, SAFE_END_S, LiveEvent, SegmentPlan, TestPlan
+from stimrig.rig.requests import EnoughRequest, ExtendRequest
 
 log = logging.getLogger("stimrig.adaptive")
 

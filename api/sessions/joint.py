@@ -16,7 +16,7 @@ from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Covera
 from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, SERVICE, Planned, Watched, Watcher, begun
 from stimrig.api.sessions.requests import AngleIn, TestIn
 from stimrig.api.store.tables import Test
-from stimrig.rig import messages
+from stimrig.rig import messages, requests
 
 SAME_ANGLE_RAD = math.radians(2.5)
 """A held test was at an angle that is listed where it is as near as this: half of the steps of the list."""
@@ -70,7 +70,7 @@ class JointTests(Watched):
     ) -> Layout:
         """What the three tests are, as long as the paper's torque-time allows."""
         paper = plan.model_copy(update={"kind": "pre-session", "segments": None})
-        preview = await self.rig.ask(messages.PreviewRequest(plan=paper, recruitment=None), timeout_s=preview_s)
+        preview = await self.rig.ask(requests.PreviewRequest(plan=paper, recruitment=None), timeout_s=preview_s)
         table = await asyncio.to_thread(self.versions.recruitment, plan.participant)
         curve = joint_plan.curve_of(table, plan.largest_us, plan.profile.motor_pulse_width_us)
         moving_s = (joint_plan.MOVING_S if longest_s is None else longest_s) - messages.SAFE_END_S
@@ -256,7 +256,7 @@ class JointWatcher(Watcher):
 
     async def _say_enough(self) -> None:
         try:
-            await self.rig.ask(messages.EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
+            await self.rig.ask(requests.EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
         except ApiError as error:  # it has ended by itself, or a person was quicker
             if error.code != "rig-late":
                 self.told.state, self.told.ended = "watching", ""

@@ -14,7 +14,7 @@ from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store import Store, seen
 from stimrig.api.store.tables import AuditEntry, Participant, Token
-from stimrig.rig.messages import StopRequest, WithdrawRequest
+from stimrig.rig.requests import StopRequest, WithdrawRequest
 
 log = logging.getLogger("stimrig.trials")
 ENDING_S = 2.0

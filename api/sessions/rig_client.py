@@ -16,7 +16,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, from_rig
-from stimrig.rig import messages
+from stimrig.rig import messages, requests
 
 log = logging.getLogger("stimrig.rig_client")
 
@@ -25,7 +25,7 @@ RECONNECT_S = 0.25
 STATUS_EVERY_S = 1.0
 MOST_LATCHES = 100
 
-APART = (messages.StopRequest, messages.WithdrawRequest, messages.PreviewRequest)
+APART = (requests.StopRequest, requests.WithdrawRequest, requests.PreviewRequest)
 """Asked on connections of their own: the first two wait behind no start, and a preview is long, both ways, while the
 lasting connection carries a test's live signals."""
 M = TypeVar("M", bound=BaseModel)
@@ -139,7 +139,7 @@ class RigClient:
 
     async def fresh_status(self) -> messages.Status:
         """Ask for the state now; the newest that was told, which may have come behind the answer."""
-        answer = await self.ask_for(messages.Status, messages.StatusRequest())
+        answer = await self.ask_for(messages.Status, requests.StatusRequest())
         return self.status or answer
 
     async def _request_apart(self, message: Any, timeout_s: float) -> messages.Reply:
@@ -149,7 +149,7 @@ class RigClient:
         request = line_of(message)
         try:
             async with asyncio.timeout(timeout_s):
-                reader, writer = await _opened(self.path, isinstance(message, messages.StopRequest))
+                reader, writer = await _opened(self.path, isinstance(message, requests.StopRequest))
                 try:
                     writer.write(request)
                     line = await reader.readline()
@@ -190,7 +190,7 @@ class RigClient:
 
     async def _listen(self, reader: asyncio.StreamReader) -> None:
         assert self._writer is not None
-        subscription = messages.SubscribeRequest(id=next(self._numbers))
+        subscription = requests.SubscribeRequest(id=next(self._numbers))
         self._writer.write(subscription.model_dump_json().encode() + b"\n")
         poll = asyncio.create_task(self._poll(), name="rig poll")
         try:
@@ -234,7 +234,7 @@ class RigClient:
 
     def _take_state(self, asked: Any, reply: messages.Reply) -> None:
         """Keep a state as it is read: who asked for it may come to it after a later one."""
-        if isinstance(asked, messages.StatusRequest) and reply.ok:
+        if isinstance(asked, requests.StatusRequest) and reply.ok:
             with contextlib.suppress(ValidationError):  # `ask_for` says it
                 self.status = messages.Status.model_validate(reply.body)
 
@@ -259,9 +259,9 @@ def tell_all(listeners: list[Callable[[Any], None]], news: Any) -> None:
 def line_of(message: Any) -> bytes:
     """A request as a line. Raises ApiError (422) where the rig would not hear it out."""
     line = message.model_dump_json().encode() + b"\n"
-    if len(line) > messages.LONGEST_LINE:
+    if len(line) > requests.LONGEST_LINE:
         detail = (
-            f"The plan has {len(line)} bytes; the rig takes at most {messages.LONGEST_LINE}. Make the test shorter."
+            f"The plan has {len(line)} bytes; the rig takes at most {requests.LONGEST_LINE}. Make the test shorter."
         )
         raise ApiError(422, "too-long", "The plan is too long", detail)
     return line
@@ -286,7 +286,7 @@ async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[messages
     except OSError as error:
         raise no_rig(str(error)) from error
     try:
-        writer.write(messages.SubscribeRequest(samples=True).model_dump_json().encode() + b"\n")
+        writer.write(requests.SubscribeRequest(samples=True).model_dump_json().encode() + b"\n")
         async for event in _live_events(reader):
             if event.get("test_id") == test_id:
                 if event["event"] == "finished":

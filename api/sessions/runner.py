@@ -32,7 +32,7 @@ from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.tables import Participant, Test, Token
 from stimrig.api.workers.pool import Adviser, Pool
-from stimrig.rig import messages
+from stimrig.rig import messages, requests
 
 log = logging.getLogger("stimrig.trials")
 NOT_CONFIRMED = "The stop is not confirmed"
@@ -167,7 +167,7 @@ class Runner(Playing):
                     raise right_ended()
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.kinds[plan.kind].begin(planned)
-                await self.rig.ask(messages.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
+                await self.rig.ask(requests.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self.stop_quietly(f"start of {plan.test_id} was not answered")
@@ -259,7 +259,7 @@ class Runner(Playing):
 
     async def _previewed(self, plan: messages.TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)
-        return await self.rig.ask(messages.PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
+        return await self.rig.ask(requests.PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
 
     def _recruitment(self, participant: str) -> messages.RecruitmentTable | None:
         """The approved model's recruitment curve, to estimate the torque-time of a plan with."""
@@ -277,7 +277,7 @@ class Runner(Playing):
         self._halted_s = self.clock.monotonic_s()
         subject = self.current.test_id if self.current else "rig"
         try:
-            request = messages.StopRequest(reason=reason or "stop pressed", by=by)
+            request = requests.StopRequest(reason=reason or "stop pressed", by=by)
             evidence = await self.rig.ask_for(messages.StopEvidence, request, timeout_s=8.0)
         except ApiError as error:
             await self._note(by, "stop failed", subject, detail=error.detail)
@@ -297,7 +297,7 @@ class Runner(Playing):
         ApiError
             409: it does not run, or is ending; 422: it has a fixed plan.
         """
-        found = await self.rig.ask_for(messages.Extended, messages.EnoughRequest(test_id=row.id, by=by, at_once=True))
+        found = await self.rig.ask_for(messages.Extended, requests.EnoughRequest(test_id=row.id, by=by, at_once=True))
         self.kinds[row.kind].said_enough(row.id)
         return found
 

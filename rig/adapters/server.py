@@ -21,7 +21,8 @@ from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connect
 from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
 from stimrig.rig.errors import BusyError, ConfigError, PlanError, RigError
-from stimrig.rig.messages import LONGEST_LINE, Event, LiveEvent, StateEvent, Status, StopRequest, stop_socket
+from stimrig.rig.messages import Event, LiveEvent, StateEvent, Status, stop_socket
+from stimrig.rig.requests import LONGEST_LINE, StopRequest
 
 log = logging.getLogger("rig.socket")
 

@@ -19,7 +19,8 @@ from pydantic import ValidationError
 
 from stimrig.rig.control.replies import id_of, internal_error, refusal, to_line
 from stimrig.rig.errors import ConfigError, RigError
-from stimrig.rig.messages import Reply, StopEvidence, StopRequest
+from stimrig.rig.messages import Reply, StopEvidence
+from stimrig.rig.requests import StopRequest
 
 GRACE_S = 2.0
 """So long after it came, or after its last request, a connection is closed for no other, unless too many come."""

@@ -24,7 +24,8 @@ from stimrig.rig.devices import DeviceSettings
 from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError
 from stimrig.rig.limits import Limit, refuse
 from stimrig.rig.machine import Machine
-from stimrig.rig.messages import AngleCalibration, AnglePose, AnglePoseRequest, AngleStatus, TestPlan
+from stimrig.rig.messages import AngleCalibration, AnglePose, AngleStatus, TestPlan
+from stimrig.rig.requests import AnglePoseRequest
 from stimrig.rig.signals import TRUSTED, AngleScale
 from stimrig.rig.trial import Trial
 

@@ -16,13 +16,12 @@ from stimrig.rig.control.state import State
 from stimrig.rig.errors import BusyError, PlanError
 from stimrig.rig.limits import Limit
 from stimrig.rig.machine import Machine
-from stimrig.rig.messages import (
-    Calibrated,
+from stimrig.rig.messages import Calibrated, CalibrationResult
+from stimrig.rig.requests import (
     CalibrateFinishRequest,
     CalibrateMarkRequest,
     CalibrateStartRequest,
     CalibrateStepRequest,
-    CalibrationResult,
 )
 
 log = logging.getLogger("rig")

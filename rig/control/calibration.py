@@ -19,7 +19,6 @@ from stimrig.rig.control.calibration_steps import rule_of
 from stimrig.rig.errors import PlanError, RefusedError
 from stimrig.rig.limits import FINEST, Limit, Steps
 from stimrig.rig.messages import (
-    CalibrateStartRequest,
     CalibrationStatus,
     CalibrationTrain,
     Direction,
@@ -29,6 +28,7 @@ from stimrig.rig.messages import (
     TestPlan,
     Threshold,
 )
+from stimrig.rig.requests import CalibrateStartRequest
 
 ORDER: tuple[Threshold, ...] = ("sensory", "motor", "comfort")
 STEPS: tuple[Direction, ...] = ("up", "fine", "repeat", "down")

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 from stimrig.rig.errors import RefusedError
 from stimrig.rig.limits import Limit
-from stimrig.rig.messages import CalibrateStartRequest, Profile, Threshold
+from stimrig.rig.messages import Profile, Threshold
+from stimrig.rig.requests import CalibrateStartRequest
 
 FIRST_SHARE = 0.6
 """The first train's width, as a share of the last sensory threshold: too narrow to be felt, unless much has changed."""

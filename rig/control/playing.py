@@ -22,16 +22,8 @@ from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
 from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError, WithdrawnError
 from stimrig.rig.machine import Machine
-from stimrig.rig.messages import (
-    EnoughRequest,
-    Event,
-    Extended,
-    ExtendRequest,
-    FinishedEvent,
-    StopEvidence,
-    Withdrawn,
-    WithdrawRequest,
-)
+from stimrig.rig.messages import Event, Extended, FinishedEvent, StopEvidence, Withdrawn
+from stimrig.rig.requests import EnoughRequest, ExtendRequest, WithdrawRequest
 from stimrig.rig.tasks import Signal, Task
 from stimrig.rig.trial import Trial
 

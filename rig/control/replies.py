@@ -14,7 +14,8 @@ from stimrig.rig import limits, plan
 from stimrig.rig.control.calibration import check_profile, check_range
 from stimrig.rig.errors import RigError
 from stimrig.rig.limits import Limit
-from stimrig.rig.messages import Preview, PreviewRequest, Problem, Reply
+from stimrig.rig.messages import Preview, Problem, Reply
+from stimrig.rig.requests import PreviewRequest
 
 _HEAD = re.compile(rb'\s*\{\s*"kind"\s*:\s*"([a-z_-]{1,40})"\s*,\s*"id"\s*:\s*(\d{1,15})\s*[,}]')
 

@@ -25,18 +25,17 @@ from stimrig.rig.errors import ConfigError, DeviceError, LatchChangedError, Plan
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
     PASSIVE,
-    AnglePoseRequest,
     Event,
     FinishedEvent,
     LiveEvent,
     Reply,
-    Request,
     Sequences,
     StateEvent,
     Status,
     StopEvidence,
     TestPlan,
 )
+from stimrig.rig.requests import AnglePoseRequest, Request
 from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")

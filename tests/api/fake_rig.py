@@ -24,11 +24,12 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from stimrig.rig import messages as m
+from stimrig.rig import requests as rig_requests
 from tests.api.fake_arm import FakeArm
 from tests.api.fake_score import PULSE_RATE_HZ, FakeScore
 from tests.harness.muscle import Patient
 
-REQUESTS: TypeAdapter[Any] = TypeAdapter(m.Request)
+REQUESTS: TypeAdapter[Any] = TypeAdapter(rig_requests.Request)
 FRAME_S = 0.05
 
 
@@ -85,7 +86,7 @@ class FakeRig:
         self.state, self.reason = "ready", ""
         self.stops = 0
         self.calibrated: m.Calibrated | None = None
-        self.withdrawn: list[m.WithdrawRequest] = []
+        self.withdrawn: list[rig_requests.WithdrawRequest] = []
         self.plan: m.TestPlan | None = None
         self.last_plan: m.TestPlan | None = None
         """Kept when the test has ended."""
@@ -93,7 +94,7 @@ class FakeRig:
         self.segment: str | None = None
         self.confirms_stop = True
         self.calibration: m.CalibrationStatus | None = None
-        self.asked: m.CalibrateStartRequest | None = None
+        self.asked: rig_requests.CalibrateStartRequest | None = None
         self.mute = self.ignores_starts = False
         self.starts = 0
         self.stopped_by: str | None = None
@@ -177,7 +178,7 @@ class FakeRig:
                 if self.mute:
                     continue
                 request = REQUESTS.validate_json(line)
-                if self.ignores_starts and isinstance(request, m.StartRequest):
+                if self.ignores_starts and isinstance(request, rig_requests.StartRequest):
                     continue
                 reply = await self._answer(request, writer)
                 writer.write(reply.model_dump_json().encode() + b"\n")

@@ -19,7 +19,8 @@ import pytest
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions.rig_client import line_of
 from stimrig.api.web import middleware, server
-from stimrig.rig.messages import LONGEST_LINE, PreviewRequest, Profile, SegmentPlan, TestPlan
+from stimrig.rig.messages import Profile, SegmentPlan, TestPlan
+from stimrig.rig.requests import LONGEST_LINE, PreviewRequest
 from tests.api.conftest import Server, Service, soon
 from tests.api.test_stop_right import stops_noted
 

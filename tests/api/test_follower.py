@@ -10,17 +10,8 @@ import pytest
 
 from stimrig.api.sessions import adaptive_follower, kinds
 from stimrig.api.sessions.adaptive_follower import Follower
-from stimrig.rig.messages import (
-    AHEAD,
-    AdaptivePlan,
-    ExtendRequest,
-    LaidSegment,
-    LatePulse,
-    LiveEvent,
-    Profile,
-    SegmentPlan,
-    TestPlan,
-)
+from stimrig.rig.messages import AHEAD, AdaptivePlan, LaidSegment, LatePulse, LiveEvent, Profile, SegmentPlan, TestPlan
+from stimrig.rig.requests import ExtendRequest
 
 FIRST_S = 3.0
 NEXT = {"name": "hold 2", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 10, "jumps": True}}

@@ -22,7 +22,8 @@ from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store
 from stimrig.api.store.holds import Holds
 from stimrig.api.store.tables import Model, Participant, Recording, Test
-from stimrig.rig.messages import Reply, StartRequest, StateEvent, Status
+from stimrig.rig.messages import Reply, StateEvent, Status
+from stimrig.rig.requests import StartRequest
 from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
 

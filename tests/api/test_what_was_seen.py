@@ -19,7 +19,7 @@ from stimrig.api.store import audit
 from stimrig.api.store.tables import Token
 from stimrig.api.web import guards
 from stimrig.rig import messages as m
-from stimrig.rig.messages import WithdrawRequest
+from stimrig.rig.requests import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
 from tests.api.fake_arm import still
 from tests.api.test_access import csrf, signed_in

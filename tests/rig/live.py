@@ -15,17 +15,8 @@ from stimrig.rig.control import pair
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Disk
-from stimrig.rig.messages import (
-    CalibrateMarkRequest,
-    CalibrateStepRequest,
-    Direction,
-    Event,
-    Profile,
-    Status,
-    StopEvidence,
-    TestPlan,
-    Threshold,
-)
+from stimrig.rig.messages import Direction, Event, Profile, Status, StopEvidence, TestPlan, Threshold
+from stimrig.rig.requests import CalibrateMarkRequest, CalibrateStepRequest
 from stimrig.rig.signals import Block
 from stimrig.rig.tasks import Outcome, Task, Tasks
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, hold, rest

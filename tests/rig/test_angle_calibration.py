@@ -20,7 +20,8 @@ from stimrig.rig.devices import can_angle_sensor
 from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, PlanError, RefusedError, RigError
 from stimrig.rig.journal import Kind
 from stimrig.rig.limits import HARD_LIMITS
-from stimrig.rig.messages import AngleCalibration, AnglePlan, AnglePoseRequest, Profile, Status, TestPlan
+from stimrig.rig.messages import AngleCalibration, AnglePlan, Profile, Status, TestPlan
+from stimrig.rig.requests import AnglePoseRequest
 from tests.rig.angle import FakeSensor, OpenedSensor
 from tests.rig.live import SPEED, LiveRig
 from tests.simulator.virtual_time import VirtualMachine

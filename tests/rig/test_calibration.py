@@ -17,7 +17,8 @@ from stimrig.rig.devices.p24 import P24
 from stimrig.rig.devices.rehastim2 import RehaStim2
 from stimrig.rig.errors import PlanError, RefusedError
 from stimrig.rig.limits import HARD_LIMITS, Steps
-from stimrig.rig.messages import CalibrateStartRequest, FinishedEvent, Profile
+from stimrig.rig.messages import FinishedEvent, Profile
+from stimrig.rig.requests import CalibrateStartRequest
 
 NOON_S = datetime(2026, 3, 4, 12, tzinfo=UTC).timestamp()
 

@@ -16,17 +16,8 @@ from stimrig.rig.clock import utc_text
 from stimrig.rig.control.calibration import end_of_day_s
 from stimrig.rig.control.replies import previewed
 from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
-from stimrig.rig.messages import (
-    AdaptivePlan,
-    EnoughRequest,
-    Extended,
-    ExtendRequest,
-    LiveEvent,
-    PreviewRequest,
-    Profile,
-    SegmentPlan,
-    TestPlan,
-)  # fmt: skip
+from stimrig.rig.messages import AdaptivePlan, Extended, LiveEvent, Profile, SegmentPlan, TestPlan
+from stimrig.rig.requests import EnoughRequest, ExtendRequest, PreviewRequest  # fmt: skip
 from stimrig.rig.signals import PulseStatus
 from tests.rig.fakes import VirtualRig, hold, rest
 from tests.rig.live import LiveRig

@@ -14,7 +14,8 @@ from stimrig.rig.adapters.files import Files
 from stimrig.rig.clock import MonotonicClock, utc_text
 from stimrig.rig.control.memory import Latch, Rest
 from stimrig.rig.errors import BusyError, PlanError, RigError
-from stimrig.rig.messages import CalibrateFinishRequest, CalibrateStartRequest, CalibrationResult, Threshold
+from stimrig.rig.messages import CalibrationResult, Threshold
+from stimrig.rig.requests import CalibrateFinishRequest, CalibrateStartRequest
 from tests.rig.fakes import slow_work
 from tests.rig.live import LiveRig
 from tests.simulator.disk import SimulatedDisk

@@ -24,7 +24,7 @@ from stimrig.rig.errors import (
     RigError,
     WithdrawnError,
 )
-from stimrig.rig.messages import CalibrateStartRequest, CalibrateStepRequest, WithdrawRequest
+from stimrig.rig.requests import CalibrateStartRequest, CalibrateStepRequest, WithdrawRequest
 from stimrig.rig.tasks import Task
 from tests.rig.live import LiveRig
 from tests.simulator.clinic import answer

@@ -14,7 +14,8 @@ from stimrig.rig.control import state
 from stimrig.rig.control.calibration import end_of_day_s
 from stimrig.rig.control.replies import previewed, refusal
 from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError, RestError, UncertainError
-from stimrig.rig.messages import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest, Profile, SegmentPlan
+from stimrig.rig.messages import Profile, SegmentPlan
+from stimrig.rig.requests import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest
 from tests.rig.live import SPEED, WORK_S, LiveRig
 
 Make = Callable[..., LiveRig]

@@ -11,20 +11,8 @@ from pydantic import ValidationError
 
 from stimrig.rig.control.replies import id_of, invalid_request, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
-from stimrig.rig.messages import (
-    EnoughRequest,
-    Event,
-    ExtendRequest,
-    FinishedEvent,
-    RearmRequest,
-    Reply,
-    SegmentPlan,
-    StartRequest,
-    StateEvent,
-    StopRequest,
-    TestPlan,
-    WithdrawRequest,
-)
+from stimrig.rig.messages import Event, FinishedEvent, Reply, SegmentPlan, StateEvent, TestPlan
+from stimrig.rig.requests import EnoughRequest, ExtendRequest, RearmRequest, StartRequest, StopRequest, WithdrawRequest
 from tests.simulator.host import Process
 from tests.simulator.world import World
 

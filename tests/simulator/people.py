@@ -6,18 +6,14 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from stimrig.rig.messages import (
-    AdaptivePlan,
-    AnglePlan,
+from stimrig.rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
+from stimrig.rig.requests import (
     CalibrateFinishRequest,
     CalibrateMarkRequest,
     CalibrateStartRequest,
     CalibrateStepRequest,
     CalibrateStoredRequest,
-    Profile,
     RearmRequest,
-    SegmentPlan,
-    TestPlan,
 )
 from tests.simulator.clinic import Asked
 

@@ -22,7 +22,7 @@ from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
 from stimrig.api.web.routes import participants
-from stimrig.rig import messages
+from stimrig.rig import messages, requests
 
 router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibration"], responses=PROBLEM)
 
@@ -203,7 +203,7 @@ async def begin_calibration(
         identity = await asyncio.to_thread(_write_begin, context, who.name, code, asked)
         last = messages.Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
-            messages.CalibrateStartRequest(calibration_id=identity, participant=code, by=who.name, last=last, **asked)
+            requests.CalibrateStartRequest(calibration_id=identity, participant=code, by=who.name, last=last, **asked)
         )
         return tagged(response, await standing(context, code))
 
@@ -228,7 +228,7 @@ async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, respons
     """
     async with context.holds.turn(LIMITS_TURN):  # of two presses on the same sight one plays
         check_seen(await sound(context, code))
-        await context.rig.ask(messages.CalibrateStepRequest(direction=body.direction, shown_us=body.shown_us))
+        await context.rig.ask(requests.CalibrateStepRequest(direction=body.direction, shown_us=body.shown_us))
     return tagged(response, await standing(context, code))
 
 
@@ -238,7 +238,7 @@ async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response:
     async with context.holds.turn(LIMITS_TURN):  # no train comes between looking and marking
         found = await sound(context, code)
         check_seen(found)
-        await context.rig.ask(messages.CalibrateMarkRequest(threshold=body.threshold))
+        await context.rig.ask(requests.CalibrateMarkRequest(threshold=body.threshold))
     width_us = found["pulse_width_us"]
     await asyncio.to_thread(note, context, who.name, f"mark {body.threshold}", code, pulse_width_us=width_us)
     return tagged(response, await standing(context, code))
@@ -259,10 +259,10 @@ async def finish_calibration(context: Ctx, who: Tester, code: str, body: FinishI
             identity = waits.calibration_id
             if (sent := seen.sent.get()) and sent.partition(".")[0] != identity:
                 raise another_calibration(waits.by)
-        request = messages.CalibrateFinishRequest(by=who.name, discard=discard, calibration_id=identity)
+        request = requests.CalibrateFinishRequest(by=who.name, discard=discard, calibration_id=identity)
         result = await context.rig.ask_for(messages.CalibrationResult, request)
         profile = await asyncio.to_thread(_store, context, code, result, who.name, identity)
         with contextlib.suppress(ApiError):  # it is stored, whatever the rig says now
-            await context.rig.ask(messages.CalibrateStoredRequest(calibration_id=identity))
+            await context.rig.ask(requests.CalibrateStoredRequest(calibration_id=identity))
             await context.rig.fresh_status()
     return {"profile": profile, "recordings": result.recordings}

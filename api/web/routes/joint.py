@@ -24,7 +24,8 @@ from stimrig.api.web.responses.rig import AngleOut, JointOverviewOut
 from stimrig.api.web.routes import participants
 from stimrig.api.web.routes.criticism import LATER, later
 from stimrig.api.workers.jobs import FIT_TOGETHER, Job
-from stimrig.rig.messages import AnglePoseRequest, AngleStatus, Status
+from stimrig.rig.messages import AngleStatus, Status
+from stimrig.rig.requests import AnglePoseRequest
 
 router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
 

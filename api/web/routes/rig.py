@@ -17,7 +17,8 @@ from stimrig.api.web.guards import Press
 from stimrig.api.web.middleware import wants_html
 from stimrig.api.web.responses.base import answers
 from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
-from stimrig.rig.messages import RearmRequest, SequencesRequest, StopEvidence
+from stimrig.rig.messages import StopEvidence
+from stimrig.rig.requests import RearmRequest, SequencesRequest
 
 router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
 FORM = {"schema": StopIn.model_json_schema()}
