@@ -1,37 +1,17 @@
-"""Titles of the library's effects and names of their parameters, in the page's language; ids are for programs.
-
-The same titles stand in `stimrig.identify.effects`, which the web process does not load (a test compares them).
-"""
+"""Titles of the library's effects and names of their parameters, in the page's language; ids are for programs."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from stimrig.api import language
 from stimrig.api.language import lazy
 
-EFFECTS: dict[str, Any] = {
-    "activation_dependent_speed": lazy("Speed depends on activation"),
-    "asymmetric_relaxation": lazy("Contraction and relaxation differ in speed"),
-    "baseline_drift": lazy("Drift of the baseline"),
-    "catch_like": lazy("Catch-like boost at the onset of a train"),
-    "electromechanical_delay": lazy("Electromechanical delay"),
-    "fatigue": lazy("Fatigue"),
-    "mains_hum": lazy("Mains hum"),
-    "mixed_fibres": lazy("Fast and slow fibres in parallel"),
-    "output_saturation": lazy("Saturation of the output"),
-    "passive_torque": lazy("Passive torque of the joint"),
-    "potentiation": lazy("Potentiation"),
-    "recruitment_hysteresis": lazy("Hysteresis of recruitment"),
-    "sensor_clipping": lazy("Clipping of the sensor"),
-    "series_compliance": lazy("Compliance in series"),
-    "threshold_drift": lazy("Drift of the recruitment threshold"),
-    "torque_angle": lazy("Torque depends on angle"),
-    "torque_velocity": lazy("Torque depends on velocity"),
-    "tremor": lazy("Tremor"),
-    "voluntary_effort": lazy("Voluntary effort or spasm"),
-}
 PARAMETERS: dict[str, Any] = {
     "bend_1": lazy("slope over the angle"),
     "ceiling": lazy("ceiling"),
@@ -66,10 +46,21 @@ UNITS = (
 )  # fmt: skip
 
 
+@cache
+def titles() -> dict[str, str]:
+    """Titles by id, as the effects' files say them; read as text, since the web process does not load their physics."""
+    spec = find_spec("stimrig.identify.effects")
+    assert spec is not None and spec.origin is not None
+    texts = (path.read_text(encoding="utf-8") for path in sorted(Path(spec.origin).parent.glob("*.py")))
+    return dict(
+        pair for text in texts for pair in re.findall(r'^    id="(\w+)",\n    name="(.+)",$', text, re.MULTILINE)
+    )
+
+
 def effect_words(effect: str) -> str:
     """An effect's title; the id of a person's own effect as words."""
-    known = EFFECTS.get(effect)
-    return str(known) if known is not None else effect.replace("_", " ").capitalize()
+    known = titles().get(effect)
+    return effect.replace("_", " ").capitalize() if known is None else language._(known)
 
 
 def within(effect: str) -> str:

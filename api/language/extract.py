@@ -84,13 +84,6 @@ VOCABULARY = (
     # what was not found, what ran
     "file", "job", "model", "participant", "recording", "schema", "test", "token", "user", "comparison", "diagnosis",
     "identification", "prediction",
-    # effects by their ids
-    "recruitment hysteresis", "asymmetric relaxation", "electromechanical delay", "mixed fibres", "threshold drift",
-    "baseline drift", "voluntary effort", "output saturation", "sensor clipping", "series compliance", "torque angle",
-    "torque velocity", "passive torque", "activation dependent speed", "catch like", "activation_dependent_speed",
-    "asymmetric_relaxation", "baseline_drift", "catch_like", "electromechanical_delay", "mains_hum", "mixed_fibres",
-    "output_saturation", "passive_torque", "recruitment_hysteresis", "sensor_clipping", "series_compliance",
-    "threshold_drift", "torque_angle", "torque_velocity", "voluntary_effort",
     # what a worker does
     "tried %(effect)s", "comparing", "done", "loading", "predicting", "writing",
     # what a controller's trials tell
@@ -152,8 +145,10 @@ class _Sentences(ast.NodeVisitor):
         owner = getattr(getattr(node.func, "value", None), "id", "")
         if name not in NOT_SHOWN and owner not in ("log", "re", "audit"):
             self.generic_visit(node)
-        if name in NAMED:
-            self.found += [text for part in node.keywords if part.arg in NAMED[name] and (text := _text(part.value))]
+        given = {part.arg: text for part in node.keywords if (text := _text(part.value))}
+        self.found += [given[part] for part in NAMED.get(name, ()) if part in given]
+        if name == "Effect" and "_" in given.get("id", ""):  # a page may find an effect by its id, or by that as words
+            self.found += [given["id"], given["id"].replace("_", " ")]
 
     def visit_Constant(self, node: ast.Constant) -> None:
         if isinstance(node.value, str) and _is_sentence(node.value):
