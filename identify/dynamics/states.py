@@ -7,7 +7,7 @@ from numba import njit
 
 from stimrig.identify.dynamics import second_order
 
-step_matrix = njit(cache=True, nogil=True, inline="always")(second_order.step_matrix)
+step_matrix = njit(cache=True, nogil=True)(second_order.step_matrix)
 
 
 @njit(cache=True, nogil=True)
@@ -67,7 +67,8 @@ def held_states(drive, even, begins, initial):  # pragma: no cover
     for m in range(0, rows, 4):
         for r in range(4):
             four[r] = min(m + r, rows - 1)
-            step[r] = even[four[r]]
+            for j in range(4):
+                step[r, j] = even[four[r], j]
         through(drive, torque, rate, four, step, none, begins, initial)
     return torque, rate
 
@@ -109,8 +110,7 @@ CUBIC = (0.0, 1.0)
 """Used in place of T and ζ if no dynamics are given."""
 
 
-@njit(cache=True, nogil=True)
-def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cover
+def curve_weights(fraction: np.ndarray, step_s: float, time_constant_s: float, damping: float) -> np.ndarray:
     """Weights of (y0, y0', y1, y1') for the curve between two boundary states, shape (N, 4).
 
     It is the cubic with the smallest change that makes it exact for a held input. Without the change, a lag of a few
@@ -123,17 +123,21 @@ def curve_weights(fraction, step_s, time_constant_s, damping):  # pragma: no cov
     step_s, time_constant_s, damping : float
         Of the step, and T and ζ of the dynamics; T = 0 for the cubic itself.
     """
-    out = np.zeros((fraction.size, 4))
-    exact = time_constant_s > 0.0
     ends, lift, reached = np.zeros((3, 4)), np.zeros((3, 4)), 1.0
-    if exact:
+    if time_constant_s > 0.0:
         # The three possible motions with a held input: constant, response to a step, response to an initial rate.
-        p11, p12, p21, p22 = step_matrix(time_constant_s, damping, step_s)
+        p11, p12, p21, p22 = second_order.step_matrix(time_constant_s, damping, step_s)
         ends[0, 0] = ends[0, 2] = ends[1, 2] = ends[2, 1] = 1.0
         ends[1, 3] = -step_s * p21 / (1.0 - p11)
         ends[2, 2], ends[2, 3] = p12 / step_s, p22
-        lift = np.ascontiguousarray(np.linalg.solve(ends @ ends.T, ends))
-        reached = 1.0 - p11
+        lift, reached = np.linalg.solve(ends @ ends.T, ends), 1.0 - p11
+    return _curve_weights(fraction, step_s, time_constant_s, damping, ends, lift, reached)
+
+
+@njit(cache=True, nogil=True)
+def _curve_weights(fraction, step_s, time_constant_s, damping, ends, lift, reached):  # pragma: no cover
+    out = np.zeros((fraction.size, 4))
+    exact = time_constant_s > 0.0
     for n in range(fraction.size):
         s = fraction[n]
         t = 1.0 - s
@@ -202,8 +206,10 @@ def mean_weights(four, offset, place, interval, count):  # pragma: no cover
     weights : ndarray, shape (K, B, 2)
         For (y, y').
     """
-    low = offset.min()
-    weights = np.zeros((count.size, offset.max() - low + 2, 2))
+    low, high = offset[0], offset[0]
+    for u in range(offset.size):
+        low, high = min(low, offset[u]), max(high, offset[u])
+    weights = np.zeros((count.size, high - low + 2, 2))
     for n in range(place.size):
         u, k = place[n], interval[n]
         b, r = offset[u] - low, 1.0 / count[k]

@@ -75,14 +75,14 @@ class SpeedLaw(IntEnum):
     """the same with the quicker one first"""
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _uptake(slope, w, a):  # pragma: no cover
     """Factor on the lag of a saturating uptake, where w/(1 + s w) - a/(1 + s a) drives a towards w."""
     w, a = min(max(w, 0.0), 1.2), min(max(a, 0.0), 1.2)
     return max(1.0 + slope * w, 0.08) * max(1.0 + slope * a, 0.08)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     """Factors on T, on the slower and on the quicker lag; `law` holds a value for each `SpeedLaw`."""
     m = 1.0
@@ -142,7 +142,7 @@ def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0), min(max(q, 0.02), 50.0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
     """Factor on the second of two lags; `lag_s` is its present value, s."""
     factor = 1.0
@@ -269,9 +269,13 @@ def run_core(
             torque[m, k + 1] = y
             rate[m, k + 1] = v
     if many % 4:
-        four[many % 4 :] = four[0]
+        for r in range(many % 4, 4):
+            four[r] = four[0]
         through(drive, torque, rate, four, even, first, begins, initial)
     if few % 4:
-        plain[few % 4 :], step[few % 4 :] = plain[0], step[0]
+        for r in range(few % 4, 4):
+            plain[r] = plain[0]
+            for j in range(4):
+                step[r, j] = step[0, j]
         through(drive, torque, rate, plain, step, none, begins, initial)
     return torque, rate

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
@@ -337,17 +336,11 @@ class State:
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve a symmetric system, scaled to a unit diagonal, with a very small ridge for empty columns."""
-    solved = _scaled_solve(np.ascontiguousarray(matrix), np.ascontiguousarray(right.reshape(len(right), -1)))
-    return solved.reshape(right.shape)
-
-
-@njit(cache=True, nogil=True)
-def _scaled_solve(matrix, right):  # pragma: no cover
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    scaled = matrix * scale.reshape(-1, 1) * scale
-    for i in range(scale.size):
-        scaled[i, i] = 1.0 + 1e-12
-    return scale.reshape(-1, 1) * np.linalg.solve(scaled, scale.reshape(-1, 1) * right)
+    scale = 1.0 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
+    scaled = matrix * scale[:, None] * scale
+    scaled.flat[:: scale.size + 1] = 1.0 + 1e-12
+    lift = scale[:, None] if right.ndim == 2 else scale
+    return lift * np.linalg.solve(scaled, lift * right)
 
 
 def _moved(linear: SecondOrder, step: np.ndarray) -> SecondOrder:

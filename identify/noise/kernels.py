@@ -67,7 +67,7 @@ def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
     half_log_det : float
         0.5 log det of the correlation matrix.
     """
-    total = 0
+    total = np.int64(0)  # typed: `_whiten_means` is compiled once
     for i in range(start.size):
         total += stop[i] - start[i]
     if share > 1.0:
@@ -242,7 +242,8 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
     settled = False
     for k in range(length):
         if settled:
-            gains[k] = gains[k - 1]
+            for i in range(3):
+                gains[k, i] = gains[k - 1, i]
             variances[k] = variances[k - 1]
             continue
         h = np.empty(3)
@@ -263,7 +264,7 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
 @njit(cache=True, nogil=True)
 def whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
     """As `whiten_rows`, with an oscillator: `turn` is its angle per step, `keep` its decay, `band` its share."""
-    total, longest = 0, 0
+    total, longest = np.int64(0), np.int64(0)  # typed: `_gains` is compiled once
     for i in range(start.size):
         total += stop[i] - start[i]
         longest = max(longest, stop[i] - start[i])
@@ -348,19 +349,21 @@ def smooth_band(row, start, stop, ar1, slow, turn, keep, band):  # pragma: no co
         state = np.zeros((length, 3))
         x = np.zeros(3)
         for k in range(length):
-            state[k] = x
             errors[k] = row[start[i] + k] - x[0] - x[1]
-            y = x + gains[k] * errors[k]
+            y = np.empty(3)
+            for a in range(3):
+                state[k, a] = x[a]
+                y[a] = x[a] + gains[k, a] * errors[k]
             for a in range(3):
                 x[a] = f[a, 0] * y[0] + f[a, 1] * y[1] + f[a, 2] * y[2]
         # Backward pass on the adjoint r: x_hat = x + P r, with P h = gain * variance; only the oscillator is wanted.
         r = np.zeros(3)
         covariances = np.zeros((length, 3, 3))
         for k in range(length):
-            covariances[k] = p
             kalman = np.zeros((3, 3))
             for a in range(3):
                 for b in range(3):
+                    covariances[k, a, b] = p[a, b]
                     kalman[a, b] = p[a, b] - gains[k, a] * (p[0, b] + p[1, b])
             p = _ahead(f, kalman, q)
         for k in range(length - 1, -1, -1):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from stimrig.identify.recruitment.bases import SplineBasis
 
@@ -148,8 +147,10 @@ def choose_weight(
     return Choice(weight, left / freedom_left)
 
 
-@njit(cache=True, nogil=True)
-def _weighed(gram, moment, energy, freedom_left, roughness, straight):  # pragma: no cover
+def _weighed(
+    gram: np.ndarray, moment: np.ndarray, energy: float, freedom_left: int, roughness: np.ndarray, straight: int
+) -> tuple[float, float]:
+    """The weight, and the squares that it leaves."""
     size = len(gram)
     balance = np.trace(gram) / max(np.trace(roughness), 1e-300)
     floor = 1e-11 * balance
@@ -160,17 +161,14 @@ def _weighed(gram, moment, energy, freedom_left, roughness, straight):  # pragma
     bent = np.maximum(bent, 0.0)
     part = (turn.T @ (inverse @ moment)) ** 2
     weight = balance * np.exp(np.linspace(np.log(LOWEST), np.log(HIGHEST), 73))
-    score = np.empty(weight.size)
-    for i in range(weight.size):
-        bottom = np.maximum(1.0 + (weight[i] - floor) * bent, 1e-12)
-        squares = max(energy - (part / bottom).sum(), 1e-14 * energy + 1e-300)
-        score[i] = -freedom_left * np.log(squares) - np.log(bottom).sum() + (size - straight) * np.log(weight[i])
+    bottom = np.maximum(1.0 + (weight - floor)[:, None] * bent, 1e-12)
+    squares = np.maximum(energy - (part / bottom).sum(axis=1), 1e-14 * energy + 1e-300)
+    score = -freedom_left * np.log(squares) - np.log(bottom).sum(axis=1) + (size - straight) * np.log(weight)
     best = int(np.argmax(score))
-    chosen = weight[best]
+    chosen = float(weight[best])
     if 0 < best < weight.size - 1:  # the top of the parabola through three points
         below, here, above = score[best - 1], score[best], score[best + 1]
         shift = 0.5 * (below - above) / min(below - 2 * here + above, -1e-12)
         chosen = weight[best] * (weight[1] / weight[0]) ** shift
     bottom = np.maximum(1.0 + (chosen - floor) * bent, 1e-12)
-    left = max(energy - (part / bottom).sum(), 1e-14 * energy)
-    return chosen, left
+    return float(chosen), max(energy - float((part / bottom).sum()), 1e-14 * energy)
