@@ -27,12 +27,12 @@ def progress_bar(wanted: bool = True) -> Iterator[Callable[[float, str], None]]:
     callable
         Takes the share that is done, 0 to 1, and a line of text.
     """
+    if not wanted or not (in_notebook() or sys.stderr.isatty()):
+        yield lambda _share, _text="": None
+        return
     from tqdm.auto import tqdm  # here: a verb that shows no bar does not wait for it
 
-    shown = wanted and (in_notebook() or sys.stderr.isatty())
-    with tqdm(
-        total=1.0, delay=PATIENCE_S, miniters=0, mininterval=0, leave=False, disable=not shown, bar_format=FORMAT
-    ) as bar:
+    with tqdm(total=1.0, delay=PATIENCE_S, miniters=0, mininterval=0, leave=False, bar_format=FORMAT) as bar:
 
         def tell(share: float, text: str = "") -> None:
             bar.set_description_str(text[:LONGEST], refresh=False)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any
 
 import numpy as np
 
-from stimrig.identify.diagnosis.improvement import helpful
-from stimrig.identify.diagnosis.search import Progress, search_effects, silent
 from stimrig.identify.effects import get
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.effect_fit import effect_names, renewed_curve, with_effects
@@ -21,6 +19,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 
 AUTO = "auto"
+Progress = Callable[[float, str], None]
 MOVING_JOINT = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
 """Effects with which `fit` estimates all of the paper's Fig. 2 together, from joined records: h(x, ẋ), then g(x, ẋ) as
 a curve over the angle times a hyperbola over the velocity, both of free shape."""
@@ -84,7 +83,7 @@ def fit(
             if against:
                 message = f"effects cannot be fitted with {' and '.join(against)}"
                 raise BadRequest(message, place="effects", fix="Use maximum-likelihood without this option.")
-            return _with_effects(record, wanted, names, options, progress or silent)
+            return _with_effects(record, wanted, names, options, progress or (lambda _share, _text: None))
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
             f"{method} finds no solution on this record ({error})", fix="Check that torque follows the pulses."
@@ -115,6 +114,9 @@ def _with_effects(
             raise BadRequest(
                 f"{AUTO} takes no options, but {given} is given", place="effects", fix="Leave out the options."
             )
+        from stimrig.identify.diagnosis.improvement import helpful  # here: a fit without a search does not load it
+        from stimrig.identify.diagnosis.search import search_effects
+
         last = helpful(search_effects(record, progress, fitted=rows))[0][-1].fitted
         progress(1.0, "done")
         return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(effect_names(last)) or 'none'}"])

@@ -12,9 +12,9 @@ from typing import Any
 
 from stimrig import identify
 from stimrig.api.whole_file import sha256_of
+from stimrig.identify.records import HDF5_MAGIC
 from stimrig.identify.records.cells import quoted
 from stimrig.identify.records.join import join, write_joined
-from stimrig.identify.records.recording import attributes
 
 Progress = Callable[[float, str], None]
 JOINT = ("angle_rad", "velocity_rad_s")
@@ -95,8 +95,13 @@ def _dropped(records: Sequence[Any], called: Callable[[int], str]) -> list[str]:
 def begun(path: Path) -> float | None:
     """When a sealed recording's clock was 0, as Unix time; None for CSV: a joined one says it of its parts."""
     try:
+        with path.open("rb") as file:
+            if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
+                return None
+        from stimrig.identify.records.recording import attributes  # here: a table does not wait for h5py
+
         return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()
-    except (identify.IdentifyError, ValueError, OverflowError):
+    except (identify.IdentifyError, OSError, ValueError, OverflowError):
         return None
 
 
@@ -148,6 +153,7 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
     """The sealed recording of a test, when the service did not hear of its end."""
     from stimrig.api.store.uploads import PREFIX
+    from stimrig.identify.records.recording import attributes
 
     progress(0.1, "looking through the recordings")
     for path in sorted(Path(folder).glob("**/*.h5")):

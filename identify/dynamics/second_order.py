@@ -9,7 +9,6 @@ shifts the times at which the curve is read.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import lapack
 
 Core = tuple[float, float]
 """T, s, and ζ."""
@@ -72,6 +71,8 @@ def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
     forced : ndarray, shape (K,) or (K, M)
         Right-hand side; it is overwritten if it is in Fortran order.
     """
+    from scipy.linalg import lapack  # here: its import takes as long as a fit, which does not need it
+
     bands = np.empty((len(a), forced.shape[0]), order="F")
     bands[:] = np.asarray(a, float)[:, None]
     solved, _ = lapack.dtbtrs(  # pyright: ignore[reportAttributeAccessIssue]

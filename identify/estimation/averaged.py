@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.earlier import Change, Earlier
 from stimrig.identify.estimation.joint import Fitted, gram
 from stimrig.identify.estimation.plain import joint_of
-from stimrig.identify.estimation.short_record import Short
+from stimrig.identify.estimation.short_record import Short, fit_short
+from stimrig.identify.model import Model
 from stimrig.identify.noise import profile, whitened
+from stimrig.identify.recruitment.near_shape import DEVIATIONS
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
@@ -18,6 +25,8 @@ LEAST_SD = 1e-5
 is known so exactly that the covariance could not be inverted."""
 RIDGE = 1e-10
 """Share of each variance that is added, for the same reason."""
+DRAWS = 1500
+NEAR_SIGMOID_OPTIONS = {"recruitment", "earlier", "order"}
 
 
 @dataclass(frozen=True)
@@ -122,3 +131,30 @@ def _inverse(covariance: np.ndarray) -> np.ndarray:
 def _positive(matrix: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+
+def near_sigmoid(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
+    """A curve that never falls, near a sigmoid or near the person's last curve, and why it is as it is.
+
+    Raises
+    ------
+    BadRequest
+        Options that belong to another kind of curve, or an earlier model that is none.
+    """
+    others = sorted(set(options) - NEAR_SIGMOID_OPTIONS)
+    if others or options.get("recruitment", "near-sigmoid") != "near-sigmoid":
+        against = ", ".join(others) or f"recruitment={options['recruitment']}"
+        raise BadRequest(f"not with {against}", place="recruitment", fix="Give near-sigmoid, and earlier or nothing.")
+    model = options.get("earlier")
+    if model is not None and not isinstance(model, Model):
+        raise BadRequest("not a model", place="earlier", fix="Give the person's last model, or none.")
+    last = None if model is None else Earlier(model, Change())
+    short = fit_short(grid, rows, last=last, fine=True, draws=DRAWS)
+    return averaged(short), [_why(short, last)]
+
+
+def _why(short: Short, last: Earlier | None) -> str:
+    if last is not None:
+        return "a curve that never falls, near that of the last model"
+    kind = DEVIATIONS[int(np.argmax(short.weights))]
+    return f"a curve that never falls; its slope is a sigmoid's times a factor of {np.exp(kind.sd):.1f} or less, mostly"

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from scipy.linalg import lapack
 
 from stimrig.identify.effects import get, registry
 from stimrig.identify.effects.base import Form
@@ -241,10 +240,11 @@ def _step(
     system = hessian[np.ix_(free, free)] / scale[:, None] / scale[None, :]
     system[np.diag_indices_from(system)] += damping
     step = np.zeros(theta.size)
-    solved, failed = lapack.dposv(system, gradient[free] / scale)[1:]  # pyright: ignore[reportAttributeAccessIssue]
-    if failed:
-        raise np.linalg.LinAlgError("the information is not positive definite")
-    step[free] = solved / scale
+    try:
+        root = np.linalg.cholesky(system)
+    except np.linalg.LinAlgError as error:
+        raise np.linalg.LinAlgError("the information is not positive definite") from error
+    step[free] = np.linalg.solve(root.T, np.linalg.solve(root, gradient[free] / scale)) / scale
     # The time constant and the damping change by a factor of 2 at most, effects by a third of their range.
     limit = np.full(theta.size, np.inf)
     limit[:2] = 0.7
@@ -310,8 +310,8 @@ def band_as_effect(fitted: Fitted) -> Fitted:
     The wave is the smoothed part of the residual that belongs to the band: a cosine and a sine whose amplitudes are
     linear between knots. It describes what was measured and cannot be predicted.
     """
-    effect = next((e for e in registry().values() if e.band), None)
-    if fitted.noise.band <= 0.0 or effect is None:
+    effect = next((e for e in registry().values() if e.band), None) if fitted.noise.band > 0.0 else None
+    if effect is None:
         return fitted
     setup = fitted.problem.setup
     step_s, span_s = setup.grid.step_s, setup.scene.span_s

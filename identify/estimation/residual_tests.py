@@ -12,7 +12,6 @@ from math import erfc, sqrt
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.noise import correlation_slopes, whitened
@@ -62,7 +61,7 @@ def _smoother_rows(fitted: Fitted) -> np.ndarray:
     size = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     both = size[:, None] * size[None, :]
     root = np.linalg.cholesky(hessian * both + 1e-10 * np.eye(size.size))
-    lift = solve_triangular(root, np.diag(size), lower=True)
+    lift = np.linalg.solve(root, np.diag(size))
     values, vectors = np.linalg.eigh(lift @ (hessian - prior) @ lift.T)
     return (vectors[:, values > NEGLIGIBLE].T @ lift) @ own
 

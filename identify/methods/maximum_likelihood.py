@@ -16,25 +16,19 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
 from stimrig.identify.errors import BadRequest
-from stimrig.identify.estimation.averaged import averaged
-from stimrig.identify.estimation.earlier import Change, Earlier
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import estimate, fitted_rows, still_rows, to_fitted
 from stimrig.identify.estimation.projection import Projection, Solution, project, search
-from stimrig.identify.estimation.short_record import Short, fit_short
 from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.two_stage import general
 from stimrig.identify.model import Model
 from stimrig.identify.noise import log_likelihood, whiten
 from stimrig.identify.recruitment import basis_at
 from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis
-from stimrig.identify.recruitment.near_shape import DEVIATIONS
 from stimrig.identify.recruitment.smoothing import KNOTS
 
 HIGHEST_POWER = 9
-DRAWS = 1500
-NEAR_SIGMOID_OPTIONS = {"recruitment", "earlier", "order"}
 
 
 def power_series(first: Solution, order: int | None = None) -> tuple[Solution, str]:
@@ -117,33 +111,6 @@ def monotone(solution: Solution) -> Solution:
     return replace(solution, coefficients=coefficients)
 
 
-def near_sigmoid(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
-    """A curve that never falls, near a sigmoid or near the person's last curve, and why it is as it is.
-
-    Raises
-    ------
-    BadRequest
-        Options that belong to another kind of curve, or an earlier model that is none.
-    """
-    others = sorted(set(options) - NEAR_SIGMOID_OPTIONS)
-    if others or options.get("recruitment", "near-sigmoid") != "near-sigmoid":
-        against = ", ".join(others) or f"recruitment={options['recruitment']}"
-        raise BadRequest(f"not with {against}", place="recruitment", fix="Give near-sigmoid, and earlier or nothing.")
-    model = options.get("earlier")
-    if model is not None and not isinstance(model, Model):
-        raise BadRequest("not a model", place="earlier", fix="Give the person's last model, or none.")
-    last = None if model is None else Earlier(model, Change())
-    short = fit_short(grid, rows, last=last, fine=True, draws=DRAWS)
-    return averaged(short), [_why_near(short, last)]
-
-
-def _why_near(short: Short, last: Earlier | None) -> str:
-    if last is not None:
-        return "a curve that never falls, near that of the last model"
-    kind = DEVIATIONS[int(np.argmax(short.weights))]
-    return f"a curve that never falls; its slope is a sigmoid's times a factor of {np.exp(kind.sd):.1f} or less, mostly"
-
-
 class MaximumLikelihood:
     """The default method."""
 
@@ -173,6 +140,8 @@ class MaximumLikelihood:
     def start(self, grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
         """Fit the structure without effects, to which effects are added; with the reasons for its form."""
         if options.get("recruitment") == "near-sigmoid" or "earlier" in options:
+            from stimrig.identify.estimation.averaged import near_sigmoid  # here: only this curve needs scipy
+
             return near_sigmoid(grid, rows, options)
         delay_s = float(options["delay_s"]) if "delay_s" in options else None
         knots = int(options["knots"]) if "knots" in options else None
