@@ -63,10 +63,6 @@ class AngleSensor:
         self.clock = SampleClock(settings.angle_rate_hz, settings.angle_clock_ppm, jitter_s, JITTER_SEED, epoch_us)
         self._encoder, self._send = encoder, send
 
-    def next_s(self) -> float:
-        """When the next sample is due."""
-        return self.clock.next_s()
-
     def sample(self) -> None:
         """Take the next sample and send its frame."""
         time_s = self.clock.next_s()

@@ -15,7 +15,7 @@ from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.limb import Limb
 from stimrig.hardware_sim.electrodes import Electrodes
-from stimrig.hardware_sim.faults.registry import Faults
+from stimrig.hardware_sim.faults import Faults
 from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.patients.muscle import Muscle

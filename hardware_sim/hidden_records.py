@@ -27,7 +27,7 @@ from stimrig.hardware_sim.hidden.scenario import Scenario, draw_pair, draw_scena
 
 SLOWEST_SIMULATION_HZ = 1600
 NOISES = ("white", "ar1", "slow")
-SLOW_CORRELATION_S = 0.075
+SLOW_SD_NM, SLOW_CORRELATION_S = 0.04, 0.075
 
 
 def generate(
@@ -39,14 +39,10 @@ def generate(
     design: str = "full",
     noise_sd_nm: float = 0.04,
     noise: str = "white",
-    rho_40hz: float | None = None,
-    slow_sd_nm: float = 0.04,
     with_validate: bool = True,
-    validate_s: float = 16.0,
     steep: bool = False,
     moving: bool = False,
     pulsed: bool = False,
-    formulation: int | None = None,
     sampled_late_s: float = 0.0,
     again_after_s: float | None = None,
 ) -> dict[str, Any]:
@@ -65,16 +61,14 @@ def generate(
         40 to 2000; torque is point-sampled from a simulation at 1600 Hz or more.
     design
         `full`, `short` (PRBS and ramp only) or `long`.
-    noise, rho_40hz, slow_sd_nm
-        See `draw_noise`; without `rho_40hz` it is drawn between 0.5 and 0.99.
+    noise
+        See `draw_noise`; an autocorrelation is drawn between 0.5 and 0.99.
     steep
         Recruitment that rises from 10 to 90 % within 5 to 25 µs.
     moving
         The joint moves slowly, `angle_rad` and `velocity_rad_s` are recorded (always so where an effect needs it).
     pulsed
         Each pulse drives the muscle in a burst of 3 to 12 ms about the middle of its period, not over all of it.
-    formulation
-        Which of the effect's formulations; drawn if None.
     sampled_late_s
         The load cell samples this much later than its time stamps say; negative: earlier. Rounded to a simulation step.
     again_after_s
@@ -95,7 +89,6 @@ def generate(
     if not 40 <= rate_hz <= 2000:
         raise ValueError(f"rate {rate_hz} Hz: give 40 to 2000")
     names = () if effect is None else (effect,) if isinstance(effect, str) else tuple(effect)
-    design_settings = {"validate_s": validate_s, "with_validate": with_validate}
     scenario = draw_scenario(
         names,
         strength if names else "middle",
@@ -104,28 +97,26 @@ def generate(
         steep=steep,
         moving=moving,
         pulsed=pulsed,
-        formulation=formulation,
         design=design,
-        **design_settings,
+        with_validate=with_validate,
     )
     sequence = scenario.design
     if again_after_s is not None:
         largest_us = float(scenario.base.largest_width_us)
-        sequence = sequence.then(
-            again_after_s, make_design(design, rng_of(seed, "again"), largest_us, **design_settings)
-        )
+        again = make_design(design, rng_of(seed, "again"), largest_us, with_validate=with_validate)
+        sequence = sequence.then(again_after_s, again)
     rng = rng_of(seed, "noise", *names, strength)
-    rho = float(1.0 - np.exp(rng.uniform(np.log(0.01), np.log(0.5)))) if rho_40hz is None else rho_40hz
+    rho = float(1.0 - np.exp(rng.uniform(np.log(0.01), np.log(0.5))))
 
     def noise_nm(count: int) -> Floats:
-        return draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho, slow_sd_nm)
+        return draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho)
 
     record = sampled(scenario, sequence, rate_hz, sampled_late_s, noise_nm)
     conditions = {"kind": noise, "sd_nm": noise_sd_nm}
     if noise == "ar1":
         conditions["rho_40hz"] = round(rho, 5)
     if noise == "slow":
-        conditions |= {"slow_sd_nm": slow_sd_nm, "slow_correlation_s": SLOW_CORRELATION_S}
+        conditions |= {"slow_sd_nm": SLOW_SD_NM, "slow_correlation_s": SLOW_CORRELATION_S}
     about = {"seed": seed, "noise": conditions, "steep": steep, "design": design, "rate_hz": rate_hz}
     return record | {"truth": scenario.truth(noise_sd_nm) | about}
 
@@ -136,13 +127,11 @@ def _ar1(rng: Generator, count: int, sd_nm: float, rho: float) -> Floats:
     return np.asarray(lfilter([1.0], [1.0, -rho], innovations))
 
 
-def draw_noise(
-    kind: str, rng: Generator, count: int, rate_hz: float, sd_nm: float, rho_40hz: float, slow_sd_nm: float
-) -> Floats:
+def draw_noise(kind: str, rng: Generator, count: int, rate_hz: float, sd_nm: float, rho_40hz: float) -> Floats:
     """Sensor noise at the record's rate, N·m, shape (count,).
 
     `white`; `ar1`: first-order, with autocorrelation `rho_40hz` over 25 ms and standard deviation `sd_nm`; `slow`: the
-    white noise and beside it noise of `slow_sd_nm` with a correlation time of 75 ms.
+    white noise and beside it noise of 0.04 N·m with a correlation time of 75 ms.
 
     Raises
     ------
@@ -154,7 +143,7 @@ def draw_noise(
     if kind == "ar1":
         return _ar1(rng, count, sd_nm, rho_40hz ** (40.0 / rate_hz))
     if kind == "slow":
-        slow = _ar1(rng, count, slow_sd_nm, math.exp(-1.0 / (rate_hz * SLOW_CORRELATION_S)))
+        slow = _ar1(rng, count, SLOW_SD_NM, math.exp(-1.0 / (rate_hz * SLOW_CORRELATION_S)))
         return rng.normal(0.0, sd_nm, count) + slow
     raise ValueError(f"noise {kind!r}: one of {', '.join(NOISES)}")
 

@@ -85,21 +85,19 @@ class SampleClock:
 
 
 class Sampler(Protocol):
-    """A sensor whose samples are taken one by one."""
+    """A sensor whose samples are taken one by one, by its clock."""
 
-    def next_s(self) -> float:
-        """When its next sample is due, in emulated seconds."""
-        ...
+    clock: SampleClock
 
     def sample(self) -> None:
-        """Take that sample."""
+        """Take the next sample."""
         ...
 
 
 def take_in_order(samplers: Sequence[Sampler], until_s: float) -> None:
     """Take all samples due before `until_s`, of all sensors in the order of their time: a limb's time only advances."""
     while True:
-        first = min(samplers, key=lambda sampler: sampler.next_s())
-        if first.next_s() >= until_s:
+        first = min(samplers, key=lambda sampler: sampler.clock.next_s())
+        if first.clock.next_s() >= until_s:
             return
         first.sample()

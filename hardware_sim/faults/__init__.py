@@ -1,1 +1,186 @@
-"""Faults that a test can switch on: a fault is one function marked `@fault` in any file of this folder."""
+"""Faults by name, switched on and off at any moment.
+
+A fault is a function marked `@fault` in any file of this folder. It takes the target and, by keyword, its settings
+with their defaults. It makes the fault happen and returns a function that undoes it. Its name is the fault's name.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+import pkgutil
+import random
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol, TypeVar
+
+from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
+from stimrig.hardware_sim.errors import FaultError
+from stimrig.hardware_sim.load_cells.frames import Frame
+from stimrig.hardware_sim.load_cells.sampler import LoadCell
+from stimrig.hardware_sim.stimulators.board import Board, Firmware
+from stimrig.hardware_sim.timeline import Timeline
+
+Undo = Callable[[], None]
+Make = TypeVar("Make", bound=Callable[..., Undo])
+Hook = TypeVar("Hook")
+_FAULTS: dict[str, Callable[..., Undo]] = {}
+
+
+class Target(Protocol):
+    """The emulated devices and their cables; `random` gives every random number that a fault needs.
+
+    The encoder is there where the rig has an arm, the angle sensor where the angle comes in frames of its own.
+    """
+
+    random: random.Random
+    timeline: Timeline
+    board: Board
+    firmware: Firmware
+    load_cell: LoadCell
+    encoder: Encoder | None
+    angle_sensor: AngleSensor | None
+
+    def plug_stimulator(self, plugged: bool = True) -> None:
+        """Connect the stimulator, or pull its cable."""
+
+    def plug_cell(self, plugged: bool = True) -> None:
+        """Connect the load cell's adapter, or pull it."""
+
+
+def fault(make: Make) -> Make:
+    """Register a fault under its function's name."""
+    _FAULTS[make.__name__] = make
+    return make
+
+
+def library() -> dict[str, Callable[..., Undo]]:
+    """All faults, by name."""
+    for entry in pkgutil.iter_modules(__path__):
+        importlib.import_module(f"{__name__}.{entry.name}")
+    return dict(sorted(_FAULTS.items()))
+
+
+def hooked(hook: Hook, *places: list[Hook]) -> Undo:
+    """Add `hook` to the hooks at these places; the result removes it."""
+    for hooks in places:
+        hooks.append(hook)
+
+    def unhook() -> None:
+        for hooks in places:
+            hooks.remove(hook)
+
+    return unhook
+
+
+def replaced(owner: object, attribute: str, value: object) -> Undo:
+    """Set an attribute of `owner`; the result sets it back."""
+    before = getattr(owner, attribute)
+    setattr(owner, attribute, value)
+    return lambda: setattr(owner, attribute, before)
+
+
+def sometimes(
+    target: Target, probability: float, change: Callable[[Any], Any], keep: Callable[[Any], Any] = lambda what: what
+) -> Any:
+    """A hook that gives `change(what)` with this probability, else `keep(what)`."""
+    return lambda what, *_: change(what) if target.random.random() < probability else keep(what)
+
+
+def frames_sometimes(target: Target, probability: float, change: Callable[[Frame], Iterable[Frame]]) -> Any:
+    """A hook that sends `change(frame)` instead of a frame with this probability."""
+    return sometimes(target, probability, change, lambda frame: (frame,))
+
+
+def stuck() -> Callable[[float, float], float]:
+    """A hook that holds the first reading."""
+    first: list[float] = []
+
+    def hold(reading: float, _time_s: float) -> float:
+        if not first:
+            first.append(reading)
+        return first[0]
+
+    return hold
+
+
+def at_another_rate(clock: Any, percent: float) -> Undo:
+    """Sample by `percent` faster than nominal."""
+    clock.set_rate_factor(1.0 + percent / 100.0)
+    return lambda: clock.set_rate_factor(1.0)
+
+
+def check_not_negative(fault_name: str, setting: str, value: float) -> None:
+    """Refuse a setting of a fault that is no number from 0 on."""
+    if not 0 <= value < math.inf:
+        raise FaultError(f"setting '{setting}' of fault '{fault_name}' must be a number from 0 on, not {value:g}")
+
+
+class Faults:
+    """Which faults of one target are on, and what undoes them."""
+
+    def __init__(self, target: Target) -> None:
+        self._target = target
+        self._library = library()
+        self._on: dict[str, Undo] = {}
+
+    def active(self) -> list[str]:
+        """Names of the faults that are on."""
+        return sorted(self._on)
+
+    def describe(self) -> dict[str, Any]:
+        """Each fault's first line of documentation and its settings with their defaults."""
+        return {
+            name: {"what": (make.__doc__ or "").split("\n")[0], "settings": _settings(make)}
+            for name, make in self._library.items()
+        }
+
+    def on(self, name: str, settings: dict[str, Any], for_s: float | None = None) -> None:
+        """Switch a fault on, for `for_s` emulated seconds or until it is switched off.
+
+        Raises
+        ------
+        FaultError
+            No such fault, or no such setting, or a setting of another type than its default.
+        """
+        make = self._find(name)
+        known = _settings(make)
+        for key, value in settings.items():
+            if key not in known:
+                raise FaultError(f"fault '{name}' has no setting '{key}'; it has {', '.join(known) or 'none'}")
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if isinstance(known[key], bool) != isinstance(value, bool) or not (number or isinstance(value, bool)):
+                raise FaultError(f"setting '{key}' of fault '{name}' must be like {known[key]!r}, not {value!r}")
+        if name in self._on:
+            self.off(name)
+        undo = make(self._target, **settings)
+        self._on[name] = undo
+        if for_s is not None:
+            self._target.timeline.after(for_s, lambda: self._end(name, undo))
+
+    def off(self, name: str) -> None:
+        """Switch a fault off; nothing happens if it is off already.
+
+        Raises
+        ------
+        FaultError
+            No such fault.
+        """
+        self._find(name)
+        undo = self._on.pop(name, None)
+        if undo is not None:
+            undo()
+
+    def _end(self, name: str, undo: Undo) -> None:
+        if self._on.get(name) is undo:  # otherwise it was switched on again in the meantime
+            self.off(name)
+
+    def _find(self, name: str) -> Callable[..., Undo]:
+        if name not in self._library:
+            raise FaultError(f"unknown fault '{name}'; there are {', '.join(self._library)}")
+        return self._library[name]
+
+
+def _settings(make: Callable[..., Undo]) -> dict[str, Any]:
+    parameters = list(inspect.signature(make).parameters.values())[1:]
+    return {parameter.name: parameter.default for parameter in parameters}

@@ -10,7 +10,7 @@ from collections import deque
 
 from stimrig.hardware_sim.angle_sensor import AngleHook, AngleSensor, Encoder
 from stimrig.hardware_sim.errors import FaultError
-from stimrig.hardware_sim.faults.registry import (
+from stimrig.hardware_sim.faults import (
     Target,
     Undo,
     at_another_rate,

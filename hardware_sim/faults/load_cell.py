@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from stimrig.hardware_sim.faults.registry import (
+from stimrig.hardware_sim.faults import (
     Target,
     Undo,
     at_another_rate,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stimrig.hardware_sim.faults.registry import Target, Undo, fault, hooked, replaced, sometimes
+from stimrig.hardware_sim.faults import Target, Undo, fault, hooked, replaced, sometimes
 
 HALF_A_FRAME = bytes.fromhex("f0815581")
 

@@ -77,7 +77,6 @@ def draw_scenario(
     steep: bool = False,
     moving: bool = False,
     pulsed: bool = False,
-    formulation: int | None = None,
     design: str = "full",
     **design_settings: Any,
 ) -> Scenario:
@@ -101,8 +100,7 @@ def draw_scenario(
         sequence = make_design(design, rng, float(base.largest_width_us), moving=moving, **design_settings)
         try:
             hidden = tuple(
-                _draw_effect(rng, name, strength, noise_sd_nm, base, sequence, find_forms(name, seed), formulation)
-                for name in names
+                _draw_effect(rng, name, strength, noise_sd_nm, base, sequence, find_forms(name, seed)) for name in names
             )
             combine(base, [(one.formulation, one.magnitude) for one in hidden])
         except NotSuited:
@@ -119,11 +117,10 @@ def _draw_effect(
     base: Base,
     design: Design,
     forms: list[Form],
-    choice: int | None,
 ) -> HiddenEffect:
-    """One effect of this strength on this base; `choice` is its form, drawn if None."""
+    """One effect of this strength on this base, in one of these forms."""
     low, high = BANDS[strength]
-    formulation = forms[int(rng.integers(len(forms))) if choice is None else choice](rng, base)
+    formulation = forms[int(rng.integers(len(forms)))](rng, base)
     target_nm = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
     band_nm = noise_sd_nm * low, noise_sd_nm * high
     magnitude, excess = find_magnitude(find_effect(effect).counted, formulation, base, design, target_nm, band_nm)

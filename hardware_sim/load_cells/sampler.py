@@ -67,10 +67,6 @@ class LoadCell:
         self._held.clear()
         self._frames.clear()
 
-    def next_s(self) -> float:
-        """When the next sample is due."""
-        return self.clock.next_s()
-
     def take_frames(self) -> list[Frame]:
         """The frames made since the last call."""
         frames, self._frames = self._frames, []

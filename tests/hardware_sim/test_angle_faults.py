@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stimrig.hardware_sim.errors import FaultError
-from stimrig.hardware_sim.faults.registry import library
+from stimrig.hardware_sim.faults import library
 from tests.hardware_sim.virtual_host import LAYOUT, VirtualHost
 
 ANGLE_FAULTS = sorted(name for name in library() if name.startswith("angle_"))

@@ -8,11 +8,10 @@ import struct
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.errors import FaultError, SettingsError
+from stimrig.hardware_sim.errors import FaultError
 from stimrig.hardware_sim.load_cells.cells import CanOpen, Counts, Plain
 from stimrig.hardware_sim.load_cells.frames import Sample
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
-from stimrig.hardware_sim.settings import Settings
 from tests.hardware_sim.test_load_cells import cell
 from tests.hardware_sim.virtual_host import LAYOUT, VirtualHost
 
@@ -90,12 +89,6 @@ def test_what_the_cells_carry() -> None:
     carried = {made: (made.has_counter, made.has_sync) for made in (Plain(), Plain(3), CanOpen())}
     assert list(carried.values()) == [(True, True), (True, False), (True, True)]
     assert not Counts().has_counter
-
-
-def test_settings_out_of_range() -> None:
-    for value in (-1.0, math.nan, math.inf):
-        with pytest.raises(SettingsError, match="--clock-jitter-us must be between"):
-            Settings(clock_jitter_us=value)
 
 
 class TestFaults:

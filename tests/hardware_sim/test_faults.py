@@ -13,7 +13,7 @@ import can
 import pytest
 import serial
 
-from stimrig.hardware_sim.faults.registry import library
+from stimrig.hardware_sim.faults import library
 from stimrig.hardware_sim.stimulators.framing import Packet
 from stimrig.hardware_sim.stimulators.sciencemode4 import encode
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config

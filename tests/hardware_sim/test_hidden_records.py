@@ -56,9 +56,9 @@ def test_short_and_long_designs() -> None:
 
 def test_noise_is_what_it_says() -> None:
     rng = np.random.default_rng(9)
-    white = draw_noise("white", rng, 200_000, 400, 0.04, 0.9, 0.04)
-    coloured = draw_noise("ar1", rng, 400_000, 400, 0.04, 0.9, 0.04)
-    slow = draw_noise("slow", rng, 400_000, 400, 0.04, 0.9, 0.04)
+    white = draw_noise("white", rng, 200_000, 400, 0.04, 0.9)
+    coloured = draw_noise("ar1", rng, 400_000, 400, 0.04, 0.9)
+    slow = draw_noise("slow", rng, 400_000, 400, 0.04, 0.9)
     assert white.std() == pytest.approx(0.04, rel=0.02)
     assert coloured.std() == pytest.approx(0.04, rel=0.05)
     assert np.corrcoef(coloured[:-10], coloured[10:])[0, 1] == pytest.approx(0.9, abs=0.02)

@@ -96,33 +96,44 @@ def test_patient_file_faults_and_readable_lines(tmp_path: Path) -> None:
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["--patient", "nobody"], "calcium, changing, paper"),
-        (["--patient", "nobody.toml"], "nobody.toml: cannot be read"),
-        (["--noise-nm", "much"], "--noise-nm"),
-        (["--noise-nm", "nan"], "--noise-nm must be between 0 and 10"),
-        (["--noise-nm", "-1"], "--noise-nm must be between 0 and 10"),
-        (["--rate-hz", "0"], "--rate-hz must be between"),
-        (["--speed", "inf"], "--speed must be between"),
-        (["--load-cell", "usb"], "slcan"),
-        (["--fault", "earthquake"], "unknown fault 'earthquake'"),
-        (["--fault", "late_ack,delay_s=long"], "SETTING=NUMBER"),
-        (["--fault", "late_ack,delay=1"], "no setting 'delay'; it has delay_s"),
-        (["--hidden", "x"], "--hidden"),
-        (["--samples-per-frame", "2"], "--samples-per-frame must be 1 or 3 with --cell plain, not 2"),
-        (["--cell", "canopen", "--samples-per-frame", "3"], "must be 1 with --cell canopen"),
-        (["--clock-jitter-us", "-1"], "--clock-jitter-us must be between"),
-        (["--stimulator", "rehastim3"], "rehastim2"),
-        (["--wrong"], "--wrong"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_2(arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments) == 2
+BAD_INPUT = {
+    "--patient nobody": "calcium, changing, paper",
+    "--patient nobody.toml": "nobody.toml: cannot be read",
+    "--noise-nm much": "--noise-nm",
+    "--noise-nm nan": "--noise-nm must be between 0 and 10",
+    "--noise-nm -1": "--noise-nm must be between 0 and 10",
+    "--rate-hz 0": "--rate-hz must be between",
+    "--speed inf": "--speed must be between",
+    "--clock-jitter-us -1": "--clock-jitter-us must be between",
+    "--load-cell usb": "slcan",
+    "--stimulator rehastim3": "rehastim2",
+    "--fault earthquake": "unknown fault 'earthquake'",
+    "--fault late_ack,delay_s=long": "SETTING=NUMBER",
+    "--fault late_ack,delay=1": "no setting 'delay'; it has delay_s",
+    "--hidden x": "--hidden",
+    "--samples-per-frame 2": "--samples-per-frame must be 1 or 3 with --cell plain, not 2",
+    "--cell canopen --samples-per-frame 3": "must be 1 with --cell canopen",
+    "--wrong": "--wrong",
+    "--arm fly": "neither a file nor one of",
+    "--arm design": "neither a file nor one of",
+    "--arm held,angle_deg=ten": "'angle_deg=ten' must be SETTING=NUMBER",
+    "--arm held,angle=10": "no setting 'angle'; it has angle_deg",
+    "--arm held,angle_deg=200": "must be between -10 and 160",
+    "--arm held --angle-bits 30": "--angle-bits must be between 8 and 20",
+    "--arm held --angle-noise-deg nan": "--angle-noise-deg must be between",
+    "--arm held --angle in-cell --cell plain": "--cell with_angle goes with",
+    "--cell with_angle": "--cell with_angle goes with",
+    "--arm held --arm-law passive=jelly": "unknown law of passive 'jelly'",
+    "--arm held --arm-law passive=linear_friction,dry_nm=much": "must be SETTING=NUMBER",
+    "--hidden 1 --arm held --arm-law passive=none": "is hidden, too",
+}
+
+
+@pytest.mark.parametrize(("arguments", "told"), BAD_INPUT.items())
+def test_bad_input_is_one_line_and_exit_2(arguments: str, told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments.split()) == 2
     output, errors = capsys.readouterr()
-    assert output == ""
-    assert errors.count("\n") == 1
+    assert (output, errors.count("\n")) == ("", 1)
     assert told in errors
 
 
