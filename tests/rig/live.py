@@ -175,6 +175,18 @@ class LiveRig:
     def start(self, plan: TestPlan, key: str = "") -> Status:
         return self.ask(self.rig.start(plan, key))
 
+    def play(self, test_id: str, **fields: Any) -> FinishedEvent:
+        """A test to its end."""
+        self.start(self.plan(test_id, **fields))
+        self.wait("ready")
+        return self.finished
+
+    @property
+    def finished(self) -> FinishedEvent:
+        """The newest test that has ended."""
+        assert self.rig.finished is not None
+        return self.rig.finished
+
     def stop(self, reason: str, by: str = "nurse") -> StopEvidence:
         return self.ask(self.rig.stop(reason, by))
 

@@ -278,8 +278,8 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Angled, tmp_path: 
     header = journal.read(tmp_path / "journals" / "t.journal").first_json(Kind.HEADER)
     assert header is not None and header["angle"]["calibration"]["by"] == "nurse" and header["angle"]["one_bus"] is True
     live.wait("ready")
-    finished = live.rig.finished
-    assert finished is not None and finished.outcome == "completed", finished
+    finished = live.finished
+    assert finished.outcome == "completed", finished
     assert finished.summary["angle"]["range_rad"] == pytest.approx([math.radians(60)] * 2, abs=0.02)
     event = live.rig.live(samples=True)
     assert event is not None and event.angle and event.angle_rad == pytest.approx(math.radians(60), abs=0.02)
@@ -291,10 +291,9 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Angled, tmp_path: 
     live.machine.wait(10.0)  # it rests
     with pytest.raises(DeviceError, match=r"the bus was lost|no adapter"):
         live.start(live.plan("u", **HELD))
-    live.start(live.plan("plain"))
-    live.wait("ready")
-    finished = live.rig.finished
-    assert finished is not None and finished.outcome == "completed"
+    live.play("plain")
+    finished = live.finished
+    assert finished.outcome == "completed"
     assert any(line.startswith("angle sensor") for line in finished.summary["warnings"])
 
 
@@ -331,7 +330,7 @@ def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Angled):
     live.hold(60.0)
     live.start(plan)  # without a pulse it needs no widths that were found today
     live.wait("ready")
-    assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+    assert live.finished.outcome == "completed"
     assert live.stimulator.sent == []
     with pytest.raises(RefusedError, match="not calibrated; a test needs a calibration made on the same day"):
         live.start(live.plan("h", **HELD))
@@ -361,8 +360,7 @@ def test_a_range_that_was_said_under_another_calibration_is_refused(angled: Angl
             live.start(live.plan("one", profile=wrong, **HELD))
     right = said.model_copy(update={"angle_set_at_utc": first.set_at_utc})
     live.machine.wait(10.0)
-    live.start(live.plan("one", profile=right, **HELD))
-    live.wait("ready")
+    live.play("one", profile=right, **HELD)
     live.machine.wait(10.0)
     live.start(live.plan("two", profile=said))  # it asks for no angle
     live.wait("ready")

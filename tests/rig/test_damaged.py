@@ -257,8 +257,8 @@ def died(
     live.rig.player.run.journal._failure = "dead"  # nothing of that process is written any more
     disk.process_ended()
     again = make(disk=disk, clock=live.clock)
-    assert again.rig.status().state == "uncertain" and again.rig.finished is not None
-    return felt_uc, again.rig.finished.summary
+    assert again.rig.status().state == "uncertain"
+    return felt_uc, again.finished.summary
 
 
 @pytest.mark.parametrize(

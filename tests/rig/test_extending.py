@@ -86,8 +86,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     ending = live.ask(live.rig.player.enough(EnoughRequest(test_id="one", by="nurse")))
     assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))
     live.wait("ready")
-    finished = live.rig.finished
-    assert finished is not None
+    finished = live.finished
     assert (finished.outcome, finished.summary["ended_by"]) == ("completed", "enough")
     assert finished.summary["torque_time_nms"] > 0.1
     with h5py.File(str(finished.recording_path)) as file:
@@ -138,8 +137,7 @@ def test_a_fixed_test_and_a_calibration_are_not_extended(make: Make):
 def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make: Make):
     """The fixed plan would not stimulate for a minute, an extension might after half a second."""
     live = make()
-    live.start(live.plan("before", hold_s=0.5))
-    live.wait("ready")
+    live.play("before", hold_s=0.5)
     rested = Profile(rest_between_tests_s=30.0)
     quiet = [rest(0.5), rest(60.0)]
     assert live.start(live.plan("fixed", profile=rested, segments=[*quiet, *added()])).state == "arming"

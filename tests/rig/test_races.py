@@ -153,15 +153,13 @@ def test_a_stop_at_each_moment_holds_until_a_person_undoes_it(make: Make, story:
         assert live.rig.status().calibration is None and live.rig.trouble() is None
         assert remembered(live) == {"state": "latched", "reason": reason}
         if story == "sealing":
-            assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
-            assert live.rig.finished.recording_path is not None
+            assert live.finished.outcome == "completed"
+            assert live.finished.recording_path is not None
         with pytest.raises(LatchedError):
             live.start(live.plan("two"))
         assert live.rearm().state == "ready"
         assert live.states[-1] == "ready"
-        live.start(live.plan("two", hold_s=0.5))
-        live.wait("ready")
-        assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+        assert live.play("two", hold_s=0.5).outcome == "completed"
     assert ended == errors
 
 
@@ -264,7 +262,7 @@ def test_a_later_reason_is_told_and_outlives_the_process(make: Make, state: str)
     both = "it hurts (by colleague); before: the session is over (by nurse)"
     assert live.wait("latched") == both
     assert remembered(live) == {"state": "latched", "reason": both}
-    assert live.rig.finished is not None and live.rig.finished.reason == "the session is over (by nurse)"
+    assert live.finished.reason == "the session is over (by nurse)"
     live.close()
     live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
     again = make(disk=live.machine.disk, clock=live.clock)
@@ -372,12 +370,9 @@ def test_at_each_moment_before_its_first_pulse_it_plays_none_and_does_not_latch(
         with pytest.raises(FileNotFoundError):
             remembered(live)
         if task.error is None:
-            assert live.rig.finished is not None
-            assert (live.rig.finished.outcome, live.rig.finished.reason) == ("stopped", WHY)
-            assert live.rig.finished.summary["ended_by"] == "withdrawn"
-        live.start(live.plan("two", hold_s=0.5))
-        live.wait("ready")
-        assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+            assert (live.finished.outcome, live.finished.reason) == ("stopped", WHY)
+            assert live.finished.summary["ended_by"] == "withdrawn"
+        assert live.play("two", hold_s=0.5).outcome == "completed"
     assert ended == {WithdrawnError, type(None)}
 
 
@@ -389,8 +384,7 @@ def test_one_that_has_begun_ends_only_where_that_is_asked(make: Make, begun: boo
     assert withdraw(live, begun=begun) is begun
     sent = len(live.stimulator.sent)
     live.wait("ready")
-    finished = live.rig.finished
-    assert finished is not None
+    finished = live.finished
     if not begun:
         assert finished.outcome == "completed" and len(live.stimulator.sent) == 40
         return
@@ -425,7 +419,7 @@ def test_of_one_that_is_over_nothing_is_withdrawn(make: Make):
     assert not withdraw(live, begun=True)
     live.wait("ready")
     assert not withdraw(live, begun=True)
-    assert live.rig.finished is not None and live.rig.finished.outcome == "completed"
+    assert live.finished.outcome == "completed"
 
 
 def test_a_stop_outranks_it(make: Make):

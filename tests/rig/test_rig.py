@@ -34,8 +34,7 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
     assert live.rig.trouble() is None
     live.wait("ready")
     assert live.states == ["ready", "arming", "running", "sealing", "ready"]
-    finished = live.rig.finished
-    assert finished is not None
+    finished = live.finished
     assert (finished.outcome, finished.reason) == ("completed", "")
     assert finished in live.events
     assert finished.summary["warnings"] == []
@@ -49,8 +48,7 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
 
 def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
     live = make()
-    live.start(live.plan("one", hold_s=0.5))
-    live.wait("ready")
+    live.play("one", hold_s=0.5)
     rested = Profile(rest_between_tests_s=60.0)
     with pytest.raises(
         RestError, match=r"rest_between_tests_s .*participant's profile, under by .*; wait 5\d"
@@ -63,8 +61,7 @@ def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
 
 def test_the_rest_outlives_a_clean_restart_and_a_wall_clock_set_ahead(make: Make):
     live = make()
-    live.start(live.plan("one", hold_s=0.5))
-    live.wait("ready")
+    live.play("one", hold_s=0.5)
     live.close()
     live.clock.set_unix_ahead(86_400)
     again = make()
@@ -75,8 +72,7 @@ def test_the_rest_outlives_a_clean_restart_and_a_wall_clock_set_ahead(make: Make
 
 def test_a_calibration_does_not_shorten_the_rest_after_a_test(make: Make):
     live = make(limits=LimitSettings(rest_between_tests_s=60.0))
-    live.start(live.plan("one", hold_s=0.5))
-    live.wait("ready")
+    live.play("one", hold_s=0.5)
     live.ask(live.rig.calibrations.start(CalibrateStartRequest(calibration_id="c", participant="P", by="t")))
     with pytest.raises(RefusedError, match=r"rest_between_tests_s .*wait 5\d"):
         live.step("up")
@@ -170,8 +166,7 @@ def test_a_journal_without_an_end_comes_back_uncertain(make: Make, tmp_path: Pat
     assert not again.stimulator.armed  # and was stopped
     with pytest.raises(UncertainError):
         again.start(again.plan("two"))
-    assert again.rig.finished is not None
-    assert again.rig.finished.outcome == "fault"
+    assert again.finished.outcome == "fault"
     assert again.rearm().state == "ready"
     with pytest.raises(RefusedError, match="rest_between_tests_s"):  # a death is no rest
         again.start(again.plan("three", profile=Profile(rest_between_tests_s=60.0)))
@@ -188,9 +183,8 @@ def test_a_damaged_journal_is_sealed_and_kept(make: Make, tmp_path: Path):
     (tmp_path / "recordings").rename(tmp_path / "elsewhere")  # the stopped test's own
     again = make()
     again.wait("uncertain")
-    assert again.rig.finished is not None
-    assert again.rig.finished.recording_path is not None
-    assert any("the journal is damaged" in words for words in again.rig.finished.summary["warnings"])
+    assert again.finished.recording_path is not None
+    assert any("the journal is damaged" in words for words in again.finished.summary["warnings"])
     assert (tmp_path / "journals" / "dead.damaged").read_bytes() == left
     assert not (tmp_path / "journals" / "dead.journal").exists()
 
@@ -203,9 +197,8 @@ def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make):
         live.clock.set_unix_ahead(3600 * hours)
         live.wait_pulses(10)
     live.wait("ready")
-    assert live.rig.finished is not None
-    assert live.rig.finished.outcome == "completed"
-    with h5py.File(str(live.rig.finished.recording_path)) as file:
+    assert live.finished.outcome == "completed"
+    with h5py.File(str(live.finished.recording_path)) as file:
         times = file["pulses/written_time_s"][:]
         assert 0.4 < times[times == times].min() < times[times == times].max() < 3.0
         assert np.all(np.diff(times[times == times]) > 0)
