@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stimrig.rig.acquire.stream import Stream
 from stimrig.rig.align import RATE_TOLERANCE
-from stimrig.rig.angle_velocity import LiveSlope
+from stimrig.rig.align_angle import LiveSlope
 from stimrig.rig.devices import AngleSensor
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.journal import Kind

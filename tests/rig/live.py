@@ -15,7 +15,7 @@ from stimrig.rig.control import pair
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Disk
-from stimrig.rig.messages import Direction, Event, Profile, Status, StopEvidence, TestPlan, Threshold
+from stimrig.rig.messages import Direction, Event, FinishedEvent, Profile, Status, StopEvidence, TestPlan, Threshold
 from stimrig.rig.requests import CalibrateMarkRequest, CalibrateStepRequest
 from stimrig.rig.signals import Block
 from stimrig.rig.tasks import Outcome, Task, Tasks

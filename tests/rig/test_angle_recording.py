@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.rig import align_angle, angle_velocity, archive, assembly, journal
+from stimrig.rig import align_angle, archive, assembly, journal
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.align_angle import Reference
 from stimrig.rig.errors import RecordingError
@@ -116,13 +116,13 @@ def test_velocities_of_a_swing():
     angle_rad = np.array([swinging(t) for t in time_s])
     true_rad_s = math.radians(30) * math.pi / 2 * np.cos(math.pi / 2 * time_s)
     noisy = angle_rad + math.radians(0.02) * np.random.default_rng(0).standard_normal(800)
-    found = angle_velocity.centred(noisy, np.arange(800), SENSOR_HZ)
+    found = align_angle.centred(noisy, np.arange(800), SENSOR_HZ)
     assert np.max(np.abs(found - true_rad_s)[6:-6]) < 0.03
-    assert np.max(np.abs(angle_velocity.centred(angle_rad, np.arange(800), SENSOR_HZ) - true_rad_s)) < 1e-3
-    live = angle_velocity.LiveSlope(SENSOR_HZ)
+    assert np.max(np.abs(align_angle.centred(angle_rad, np.arange(800), SENSOR_HZ) - true_rad_s)) < 1e-3
+    live = align_angle.LiveSlope(SENSOR_HZ)
     numbers = np.arange(800)
     late = np.concatenate([live.add(numbers[i : i + 7], angle_rad[i : i + 7]) for i in range(0, 800, 7)])
-    before_s = time_s - angle_velocity.LIVE_WINDOW_S / 2
+    before_s = time_s - align_angle.LIVE_WINDOW_S / 2
     assert np.max(np.abs(late - math.radians(30) * math.pi / 2 * np.cos(math.pi / 2 * before_s))[20:]) < 1e-3
     assert np.isnan(late[:2]).all()
 
@@ -130,9 +130,9 @@ def test_velocities_of_a_swing():
 def test_a_long_gap_breaks_the_velocity_and_a_short_one_does_not():
     number = np.delete(np.arange(400), [*range(100, 106), *range(200, 220)])
     angle_rad = np.where(number < 210, 0.01 * number, 5.0 - 0.01 * number)  # 2 rad/s, after the long gap -2 rad/s
-    found = angle_velocity.centred(angle_rad, number, SENSOR_HZ)
+    found = align_angle.centred(angle_rad, number, SENSOR_HZ)
     assert np.allclose(found, np.where(number < 210, 2.0, -2.0))
-    assert np.isfinite(angle_velocity.centred(np.array([1.0]), np.array([5]), SENSOR_HZ)).all()
+    assert np.isfinite(align_angle.centred(np.array([1.0]), np.array([5]), SENSOR_HZ)).all()
 
 
 @pytest.fixture(scope="module")

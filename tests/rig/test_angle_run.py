@@ -13,7 +13,7 @@ import pytest
 from stimrig import identify
 from stimrig.rig import archive, limits
 from stimrig.rig.acquire.angle_guard import check_start, outside
-from stimrig.rig.control.summary import warnings
+from stimrig.rig.control.sealing import warnings
 from stimrig.rig.errors import DeviceError, PlanError, RefusedError
 from stimrig.rig.messages import AdaptivePlan, AnglePlan
 from stimrig.rig.signals import Pulse, PulseStatus

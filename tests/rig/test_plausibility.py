@@ -10,7 +10,7 @@ import pytest
 
 from stimrig.rig.acquire.plausibility import PlausibilityCheck
 from stimrig.rig.acquire.receiver import Receiver
-from stimrig.rig.control.summary import warnings
+from stimrig.rig.control.sealing import warnings
 from stimrig.rig.signals import SAMPLE
 from tests.rig.fakes import VirtualRig, hold, rest
 

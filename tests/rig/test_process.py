@@ -20,10 +20,10 @@ import pytest
 
 from stimrig.rig import __main__ as program
 from stimrig.rig import config
+from stimrig.rig.__main__ import Notifier
 from stimrig.rig.control import pair
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.keys import StopKey, in_front
-from stimrig.rig.notify import Notifier
 from tests.rig.fakes import FakeCell, FakeStimulator
 from tests.rig.live import LINE, LiveRig
 from tests.simulator.virtual_time import VirtualClock

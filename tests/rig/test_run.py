@@ -18,7 +18,7 @@ from stimrig.rig import archive
 from stimrig.rig.acquire.evidence import DECAY_S, NO_SIGNAL, SILENT_S, watch_decay
 from stimrig.rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
 from stimrig.rig.adapters.files import Files
-from stimrig.rig.control.summary import warnings
+from stimrig.rig.control.sealing import warnings
 from stimrig.rig.devices import p24, rehastim2
 from stimrig.rig.errors import WireError
 from stimrig.rig.limits import Steps
