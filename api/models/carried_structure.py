@@ -129,7 +129,7 @@ async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -
 
 
 def shown(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> dict[str, Any] | None:
-    """What `carried.html` shows of a version, the plain one or its child in the carried structure.
+    """What `model.html` shows of what was carried over: to the plain version, or to its child in that structure.
 
     None where its recording was asked nothing of the kind. `new` is None as long as there is no diagnosis; `again`:
     those left out that the diagnosis asks for; `offered`: this version is the one; `better`: the carried one is.

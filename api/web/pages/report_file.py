@@ -96,7 +96,7 @@ def _page(template: str, **values: Any) -> str:
     inside = {
         "style": Markup((HERE / "static" / "page.css").read_text("utf-8")),
         "plotly": Markup(packaged("plotly.min.js").read_text("utf-8").replace("</script", "<\\/script")),
-        "script": Markup("\n".join((HERE / "static" / name).read_text("utf-8") for name in ("charts.js", "model.js"))),
+        "script": Markup((HERE / "static" / "charts.js").read_text("utf-8")),
     }
     policy = report_policy(inside["plotly"], inside["script"])
     return environment.get_template(template).render(**values, **inside, policy=policy)
