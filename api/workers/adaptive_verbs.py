@@ -40,9 +40,8 @@ def outlook(
 
     `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
-    from stimrig.identify.experiments.adaptive import decide
+    from stimrig.identify.experiments.adaptive import decide, reach
     from stimrig.identify.experiments.knowledge import Target
-    from stimrig.identify.experiments.reach import reach
 
     progress(0.1, "playing the test on a simulated muscle")
     left = {"target": Target(**target), "left_s": playable_s, "left_nm_s": max_torque_time_nm_s}

@@ -11,9 +11,8 @@ import pytest
 from stimrig import identify
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.earlier import USUAL, learn_change
-from stimrig.identify.experiments.adaptive import SETTLED_S, Target, decide
+from stimrig.identify.experiments.adaptive import SETTLED_S, Reach, Target, decide, reach, worse
 from stimrig.identify.experiments.designs import pieces
-from stimrig.identify.experiments.reach import Reach, reach, worse
 from stimrig.identify.records.record import Record
 from stimrig.rig.sequences import build
 from tests.harness.adaptive import Muscle, Played, play, recorded, shaped, sigmoid

@@ -22,7 +22,7 @@ from stimrig.identify.records.record import Part, Record
 from stimrig.identify.simulation.predict import predict, problem_of
 from stimrig.identify.simulation.pulses import above_rest
 from stimrig.identify.tracking import State, begin, follow, model_for_next, moved_model, passed
-from stimrig.identify.tracking.carried import rested, slow_forms, with_states
+from stimrig.identify.tracking.follow import rested, slow_forms, with_states
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
