@@ -16,8 +16,8 @@ from stimrig.api.errors import ApiError
 from stimrig.api.outbox.chain import BEGIN, NOWHERE, Position, item_hash
 from stimrig.api.outbox.messages import BatchIn, HelloIn, ItemIn
 from stimrig.api.store import Store
+from stimrig.api.store.audit import canonical, digest, storable
 from stimrig.api.store.centre_tables import CentreChain, CentreItem, CentreRig
-from stimrig.api.store.hashes import canonical, digest, storable
 from stimrig.identify.json_text import BadJson, parse
 
 MOST_BATCH_BYTES = 4_000_000

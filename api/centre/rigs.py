@@ -14,8 +14,8 @@ from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.people.auth import unauthorized
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit
+from stimrig.api.store.audit import digest
 from stimrig.api.store.centre_tables import CentreRig
-from stimrig.api.store.hashes import digest
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,59}")
 KEY_BEGINS = "stimrig_rig_"

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from stimrig.api.store.hashes import GENESIS, canonical, digest
+from stimrig.api.store.audit import GENESIS, canonical, digest
 from stimrig.api.store.tables import OutboxItem
 
 BEGIN = "begin"

@@ -24,7 +24,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.outbox import chain
 from stimrig.api.outbox.chain import Telling
 from stimrig.api.store import Store, uploads
-from stimrig.api.store.hashes import canonical
+from stimrig.api.store.audit import canonical
 from stimrig.api.store.tables import (
     OPEN_STATES,
     Approval,

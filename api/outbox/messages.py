@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstra
 
 from stimrig.api.outbox.chain import Position
 from stimrig.api.outbox.receipts import Receipt
-from stimrig.api.store.hashes import GENESIS
+from stimrig.api.store.audit import GENESIS
 
 MOST_ITEMS = 500
 LARGEST = 2**53

@@ -30,7 +30,7 @@ from stimrig.api.outbox.status import Status
 from stimrig.api.outbox.telling import Telling
 from stimrig.api.settings import Settings, loopback
 from stimrig.api.store import Store
-from stimrig.api.store.hashes import digest
+from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import OutboxItem
 from stimrig.api.version import software_version
 

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from stimrig.api import owner_only
 from stimrig.api.clock import Clock
 from stimrig.api.store import Store, audit
-from stimrig.api.store.hashes import GENESIS, canonical
+from stimrig.api.store.audit import GENESIS, canonical
 from stimrig.api.store.tables import AuditEntry
 
 HOUR_S = 3600.0

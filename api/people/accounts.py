@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import secrets
+import unicodedata
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,11 +19,10 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.people import names
 from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
-from stimrig.api.store.hashes import digest
+from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import Confirmation, KnownPlace, Token, User
 
 CONFIRMED_S = 120.0
@@ -55,7 +55,7 @@ class People:
             if taken is not None:
                 raise ApiError(409, "exists", "The name is taken", f"User {taken.name!r} exists. Take another name.")
             token = self.auth.token_of_person(session, name, scopes)
-            row = User(name=name, folded_name=names.folded(name), password_hash=hashed, token_hash=token.hash)
+            row = User(name=name, folded_name=folded_name(name), password_hash=hashed, token_hash=token.hash)
             row.created_utc = row.changed_utc = now
             session.add(row)
             audit.write(session, now, by, "add user", name, scopes=token.scopes)
@@ -71,7 +71,7 @@ class People:
         """
         place = place_of(address)
         row, known = await asyncio.to_thread(self._look_up, name, place)
-        name = row.name if row else names.folded(name)
+        name = row.name if row else folded_name(name)
         with self.passwords.room(known) as lane:
             self.guesses.password(name, place, known)
             right = await self.passwords.verify(lane, row.password_hash if row else None, password)
@@ -251,7 +251,7 @@ def _of_name(session: Session, name: str) -> User | None:
     """The person of a name as it was typed; the exact one first, as names from before were told apart by case."""
     if "\0" in name:  # PostgreSQL takes no such text, and nobody is called so
         return None
-    same = select(User).where(User.folded_name == names.folded(name)).order_by(User.name).limit(1)
+    same = select(User).where(User.folded_name == folded_name(name)).order_by(User.name).limit(1)
     return session.get(User, name) or session.scalars(same).first()
 
 
@@ -321,3 +321,54 @@ class Passwords:
         """Let the threads go."""
         for lane in (self._strangers, self._known):
             lane.threads.shutdown(wait=False, cancel_futures=True)
+
+
+LONGEST = 80
+NAME_MARKS = " ._@'’,()-"
+"""What a name may hold beside letters, their marks and digits."""
+UNSEEN = frozenset("\u034f\u115f\u1160\u17b4\u17b5\u3164\uffa0")
+"""Letters and marks that nobody sees; Unicode calls them ignorable."""
+ALPHABETS = frozenset({"LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE"})
+"""Alphabets that share letters of one shape: a name keeps to one of them."""
+
+
+def written_name(text: str) -> str:
+    """A name in the one way that it is stored: composed (NFC), every run of white space one space, none at the ends.
+
+    Raises
+    ------
+    ValueError
+        In a sentence for people: what the name holds that it cannot, or how long it is.
+    """
+    composed = unicodedata.normalize("NFC", text).strip()
+    spaced = "".join(" " if unicodedata.category(sign) == "Zs" else sign for sign in composed)
+    name = " ".join(part for part in spaced.split(" ") if part)
+    if not 1 <= len(name) <= LONGEST:
+        raise ValueError(f"a name has 1 to {LONGEST} characters, this one {len(name)}")
+    odd = next((sign for sign in name if not _allowed_in_name(sign)), None)
+    if odd is not None:
+        raise ValueError(f"the character {_called_sign(odd)} cannot stand in a name")
+    if not any(unicodedata.category(sign)[0] in "LN" for sign in name):
+        raise ValueError("a name has at least one letter or digit")
+    found = {unicodedata.name(sign, "").split(" ")[0] for sign in name} & ALPHABETS
+    if len(found) > 1:
+        raise ValueError(f"letters of two alphabets ({', '.join(sorted(found)).lower()}) look alike; take one of them")
+    return name
+
+
+def folded_name(text: str) -> str:
+    """A name as two people must not share it: without its case and without the ways to write its letters."""
+    plain = unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", text).casefold())
+    return " ".join(plain.split())
+
+
+def _allowed_in_name(sign: str) -> bool:
+    kind = unicodedata.category(sign)
+    letter = kind[0] == "L" or kind in ("Mn", "Mc", "Nd")
+    selector = "VARIATION SELECTOR" in unicodedata.name(sign, "")
+    return (letter and sign not in UNSEEN and not selector) or sign in NAME_MARKS
+
+
+def _called_sign(sign: str) -> str:
+    """A character so that a person can find it, also where it is not seen."""
+    return f"U+{ord(sign):04X} ({unicodedata.name(sign, 'without a name').lower()})"

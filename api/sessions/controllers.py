@@ -19,7 +19,7 @@ from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, Wi
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store import Store, seen
-from stimrig.api.store.hashes import digest
+from stimrig.api.store.audit import digest
 from stimrig.api.store.holds import Turn
 from stimrig.api.store.tables import Participant, Test, Token
 

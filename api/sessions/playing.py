@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.people import names
+from stimrig.api.people import accounts
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store import Store, seen
@@ -161,7 +161,7 @@ def rests_of(participant: str, kind: str) -> tuple[seen.About, ...]:
 
 def other_than(asker: str, ran_by: str | None) -> str | None:
     """Who ran a test, where that was not who asked for it."""
-    return ran_by if ran_by and names.folded(ran_by) != names.folded(asker) else None
+    return ran_by if ran_by and accounts.folded_name(ran_by) != accounts.folded_name(asker) else None
 
 
 def refuse_archived(participant: Participant) -> None:

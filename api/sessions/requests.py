@@ -21,7 +21,7 @@ from pydantic import (
 from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.errors import ApiError
 from stimrig.api.models.tracking import USUAL_PERCENT, Limits
-from stimrig.api.people import names
+from stimrig.api.people import accounts
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.rig.messages import HELD, MOVING, PASSIVE, Profile
@@ -48,7 +48,7 @@ Muscle = Annotated[
     AfterValidator(_plain),
     Field(description="the muscle that is stimulated", examples=["biceps brachii"]),
 ]
-PersonName = Annotated[str, StringConstraints(min_length=1, max_length=320), AfterValidator(names.written)]
+PersonName = Annotated[str, StringConstraints(min_length=1, max_length=320), AfterValidator(accounts.written_name)]
 PARTICIPANT_CODE = r"[A-Za-z0-9_-]{1,32}"
 Code = Annotated[
     str,

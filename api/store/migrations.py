@@ -217,7 +217,7 @@ def _0006(op: Operations) -> None:
 
 
 def _folded(name: str) -> str:
-    """As `stimrig.api.people.names` did when 0006 was written."""
+    """As `stimrig.api.people.accounts` did when 0006 was written."""
     return " ".join(unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold()).split())
 
 

@@ -25,8 +25,7 @@ from stimrig.api.models.trend import Trend
 from stimrig.api.outbox.feed import Feed
 from stimrig.api.outbox.receipts import note_hourly
 from stimrig.api.people.accounts import People
-from stimrig.api.people.auth import Auth, Principal, Scope
-from stimrig.api.people.idle_lock import FLUSH_S, IdleLock
+from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock, Principal, Scope
 from stimrig.api.people.pace import Guesses
 from stimrig.api.sessions.lifecycle import Follower
 from stimrig.api.sessions.notes import Notes

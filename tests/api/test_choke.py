@@ -3,25 +3,39 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
+import os
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
+import hypothesis
 import pytest
+import schemathesis
+from schemathesis.checks import CHECKS
 
+from stimrig.api.cli import stop_key
+from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.people.auth import Auth, IdleLock, Scope
+from stimrig.api.people.pace import Guesses
 from stimrig.api.sessions.rig_client import line_of
+from stimrig.api.store import Store
+from stimrig.api.store.audit import digest
 from stimrig.api.web import middleware, server
 from stimrig.rig.messages import Profile, SegmentPlan, TestPlan
 from stimrig.rig.requests import LONGEST_LINE, PreviewRequest
-from tests.api.conftest import Server, Service, soon
+from tests.api.conftest import TOKEN, Server, Service, let_go, shared_service, soon, wait_done
+from tests.api.test_problems import problem
 from tests.api.test_stop_right import stops_noted
 
 
@@ -149,3 +163,206 @@ def test_what_the_rig_would_not_hear_out_is_not_sent():
     plan = TestPlan(test_id="t", participant="P", profile=Profile(), segments=[widths])
     with pytest.raises(ApiError, match="too long"):
         line_of(PreviewRequest(plan=plan))
+
+
+SEED = int(os.environ.get("STIMRIG_SEED", "20261120"))
+EXAMPLES = int(os.environ.get("STIMRIG_EXAMPLES", "8"))
+"""Of each operation; a hunt takes more."""
+AUTHORIZED = {"Authorization": f"Bearer {TOKEN}"}
+# A stop is open to any body by design; the controller's fetch and the page's form have their own tests.
+CHECKED = ["not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance"]
+
+
+abused = shared_service(speed=400.0)
+
+
+def test_made_up_requests_meet_no_server_error(abused: Service) -> None:
+    """Schemathesis over the OpenAPI document: every operation, a fixed seed, a bounded number of examples."""
+    with abused.client() as client:
+        client.post("/v1/participants", json={"code": "P017"})
+        document = client.get("/openapi.json").json()
+    schema = schemathesis.openapi.from_dict(document)
+    schema.config.update(base_url=abused.url)
+    tried: Counter[str] = Counter()
+    failures: list[str] = []
+    limits = hypothesis.settings(
+        max_examples=EXAMPLES, deadline=None, database=None, derandomize=True,
+        phases=[hypothesis.Phase.generate], suppress_health_check=list(hypothesis.HealthCheck),
+    )  # fmt: skip
+    for result in schema.get_all_operations():
+        operation = result.ok()
+
+        @hypothesis.seed(SEED)
+        @limits
+        @hypothesis.given(case=operation.as_strategy())
+        def attack(case: schemathesis.Case) -> None:
+            answer = case.call(headers=AUTHORIZED, timeout=60)
+            tried[case.operation.label] += 1
+            try:
+                case.validate_response(answer, checks=[CHECKS.get_one(name) for name in CHECKED])
+            except schemathesis.core.failures.FailureGroup as group:
+                failures.extend(f"{case.operation.label}: {failure}" for failure in group.exceptions)
+
+        attack()
+    assert failures == []
+    assert len(tried) == sum(len(methods) for methods in document["paths"].values())
+
+
+def test_fifty_starts_at_once_give_one_test_and_forty_nine_refusals(service: Service) -> None:
+    service.rig.speed = 0.5  # it runs until all fifty are answered
+    with service.client(limits=httpx.Limits(max_connections=50)) as client:
+        client.post("/v1/participants", json={"code": "P017"})
+        with concurrent.futures.ThreadPoolExecutor(50) as pool:
+            answers = list(pool.map(lambda _: client.post("/v1/tests", json={"participant": "P017"}), range(50)))
+        codes = Counter(answer.status_code for answer in answers)
+        assert codes == {202: 1, 409: 49}
+        (winner,) = [answer.json()["id"] for answer in answers if answer.status_code == 202]
+        for answer in answers:
+            if answer.status_code == 409:
+                problem = answer.json()
+                assert answer.headers["content-type"] == "application/problem+json"
+                assert problem["holder"]["test_id"] == winner and winner in problem["detail"]
+        assert service.rig.starts == 1
+        assert len(client.get("/v1/tests").json()) == 1
+        service.rig.speed = 30.0
+        assert wait_done(client, winner)["state"] == "completed"
+
+
+@pytest.mark.parametrize("path", ["/v1/participants/P017/recordings", "/v1/participants", "/v1/stop"])
+def test_a_body_without_an_end_is_not_taken_in(service: Service, path: str) -> None:
+    """A client that never stops sending is cut off; the service answers others meanwhile."""
+    service.app.state.context.settings.max_upload_mb = 1.0
+    with service.client() as client:
+        client.post("/v1/participants", json={"code": "P017"})
+        seen = client.get("/v1/participants/P017").headers["etag"]
+        host, port = service.url.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), timeout=10) as line:
+            head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {TOKEN}\r\n"
+            head += f"If-Match: {seen}\r\n"
+            line.sendall(f"{head}Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n".encode())
+            chunk = b"10000\r\n" + b"x" * 65536 + b"\r\n"
+            sent, end = 0, time.monotonic() + 8
+            answer = b""
+            line.settimeout(0.01)
+            while time.monotonic() < end and not answer and sent < 40 * 65536:
+                try:
+                    line.sendall(chunk)
+                    sent += 65536
+                    answer = line.recv(4096)
+                except TimeoutError:
+                    continue
+                except OSError:
+                    break
+            line.settimeout(5)
+            if not answer:
+                try:
+                    answer = line.recv(4096)
+                except OSError:
+                    answer = b""
+        if path == "/v1/stop":
+            assert answer.startswith(b"HTTP/1.1 200") and service.rig.stopped_by, "a stop is a stop"
+        else:
+            assert answer.startswith(b"HTTP/1.1 413") and b"application/problem+json" in answer, answer[:200]
+        assert client.get("/health").status_code == 200
+        assert not list((service.data / "recordings").rglob("upload-*"))
+
+
+def test_a_token_that_is_read_while_it_is_revoked_is_not_valid_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every live channel looks once a second: one of the looks may be under way."""
+    store, clock = Store(f"sqlite:///{tmp_path}/a.db"), Clock()
+    auth = Auth(store, clock, Guesses(clock), IdleLock(store, clock, 0))
+    text = auth.issue("bench", [Scope.READ_LIVE], "settings")
+    get, was_read, is_revoked = store.get, threading.Event(), threading.Event()
+
+    def slow(*asked: Any) -> Any:
+        row = get(*asked)
+        was_read.set()
+        assert is_revoked.wait(20)
+        return row
+
+    monkeypatch.setattr(store, "get", slow)
+    look = threading.Thread(target=auth.bearer, args=(text,))
+    look.start()
+    assert was_read.wait(20) and auth.revoke(digest(text)[:16], "settings")
+    is_revoked.set()
+    look.join(20)
+    with pytest.raises(ApiError, match="revoked"):
+        auth.bearer(text)
+    store.close()
+
+
+def test_a_stop_that_is_answered_with_nonsense_names_the_emergency_switch(
+    client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def nonsense(*_: Any) -> dict[str, Any]:
+        return {"confirmed": "perhaps"}
+
+    monkeypatch.setattr(service.rig, "_on_stop", nonsense)
+    told = problem(client.post("/v1/stop", json={}), 503)
+    assert told["detail"].startswith("Use the stimulator's own emergency switch now.")
+    entries = client.get("/v1/audit").json()
+    assert "stop failed" in str(entries), "it is in the audit trail, too"
+
+
+def test_a_stop_whose_answer_is_no_answer_names_the_emergency_switch(client: httpx.Client, service: Service) -> None:
+    answers = [b"", b"nonsense\n", b"5\n", b"x" * (33 * 1024 * 1024)]
+
+    async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readline()
+        writer.write(answers.pop())
+        writer.close()
+
+    door = service.rig.path.with_name(service.rig.path.name + ".stop")
+    context = service.app.state.context
+    path = context.rig.path
+
+    async def serve() -> asyncio.Server:
+        return await asyncio.start_unix_server(served, str(door))
+
+    server = asyncio.run_coroutine_threadsafe(serve(), service.rig_thread.loop).result(10)
+    context.rig.path = door
+    try:
+        while answers:
+            told = problem(client.post("/v1/stop", json={}), 503)
+            assert told["detail"].startswith("Use the stimulator's own emergency switch now."), answers
+            assert "validation error" not in told["detail"]
+    finally:
+        context.rig.path = path
+        service.rig_thread.loop.call_soon_threadsafe(server.close)
+
+
+def test_a_start_that_cannot_be_written_down_plays_nothing_on(
+    service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lifecycle = service.app.state.context.runner.lifecycle
+    update = lifecycle.update
+
+    def broken(test_id: str, **fields: Any) -> Any:
+        if fields.get("state") == "running":
+            raise OSError("the disk is full")
+        return update(test_id, **fields)
+
+    monkeypatch.setattr(lifecycle, "update", broken)
+    service.rig.speed = 1.0
+    with service.client(headers={"Connection": "close"}) as client:
+        assert client.post("/v1/tests", json={"participant": participant}).status_code == 500
+        assert service.rig.stopped_by == "service"
+        (test,) = client.get("/v1/tests").json()
+        assert wait_done(client, test["id"], 20)["state"] == "stopped"
+        assert let_go(client)
+
+
+def test_a_stop_key_whose_answer_is_nonsense_says_that_the_stop_is_not_confirmed(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def nonsense(*_: Any) -> dict[str, Any]:
+        return {"confirmed": "perhaps"}
+
+    async def running(*_: Any) -> dict[str, Any]:
+        return {"state": "running"}
+
+    monkeypatch.setattr(service.rig, "_on_stop", nonsense)
+    monkeypatch.setattr(service.rig, "_on_status", running)
+    assert stop_key.at_rig(service.rig.path)().startswith(stop_key.DOUBT)

@@ -15,7 +15,7 @@ from sqlalchemy import select
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from stimrig.api.store.hashes import digest
+from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import AuditEntry, Test, Token
 from stimrig.api.web.guards import OPEN
 from tests.api.browser import without_values

@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from stimrig.api.clock import Clock
-from stimrig.api.people.idle_lock import IdleLock
+from stimrig.api.people.auth import IdleLock
 from stimrig.api.people.pace import Pace
 from tests.api.browser import PASSWORD, without_values
 from tests.api.conftest import STUB, TOKEN, Service, run_service, wait_done

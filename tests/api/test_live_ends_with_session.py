@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from stimrig.api.store.hashes import digest
+from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import PageSession, Token
 from stimrig.api.web.routes.tests import _next
 from tests.api.browser import PASSWORD

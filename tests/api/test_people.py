@@ -18,7 +18,7 @@ from sqlalchemy import inspect
 
 from stimrig.api.cli import main
 from stimrig.api.clock import Clock
-from stimrig.api.people import accounts, names
+from stimrig.api.people import accounts
 from stimrig.api.people.pace import Guesses, Pace
 from stimrig.api.sessions.stops import StopRights
 from stimrig.api.settings import Settings
@@ -284,18 +284,18 @@ def test_a_try_under_a_name_that_postgresql_takes_not_is_written_down(service: S
 @given(st.text(max_size=90))
 def test_a_written_name_stays_as_it_is(text: str) -> None:
     try:
-        once = names.written(text)
+        once = accounts.written_name(text)
     except ValueError as error:
         assert str(error) and str(error).isprintable()
         return
-    assert names.written(once) == once and names.folded(once) == names.folded(text)
-    assert once == once.strip() and len(once) <= names.LONGEST
+    assert accounts.written_name(once) == once and accounts.folded_name(once) == accounts.folded_name(text)
+    assert once == once.strip() and len(once) <= accounts.LONGEST
 
 
 def test_a_page_of_the_longest_name_may_stop() -> None:
     rights = StopRights(b"k" * 32, Clock())
-    name = "𐓏" * names.LONGEST
-    assert rights.holder(rights.give(names.written(name), "T20260301T100000-abcdef")) == name
+    name = "𐓏" * accounts.LONGEST
+    assert rights.holder(rights.give(accounts.written_name(name), "T20260301T100000-abcdef")) == name
 
 
 def test_half_a_character_is_refused(http: httpx.Client) -> None:

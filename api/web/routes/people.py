@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstra
 from stimrig.api.clock import utc_label
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.outbox import receipts
-from stimrig.api.people import names
+from stimrig.api.people import accounts
 from stimrig.api.people.auth import Principal, Scope, unauthorized
 from stimrig.api.sessions.requests import TokenIn
 from stimrig.api.store import seen
@@ -28,7 +28,7 @@ router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 Name = Annotated[
     str,
     StringConstraints(min_length=1, max_length=320),
-    AfterValidator(names.written),
+    AfterValidator(accounts.written_name),
     Field(
         description="letters of any language, digits, spaces and . _ @ - ' , ( ), at most 80", examples=["Ada Çelik"]
     ),
