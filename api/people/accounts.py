@@ -51,7 +51,7 @@ class People:
     def _add(self, name: str, hashed: str, scopes: list[Scope], by: str) -> User:
         now = self.clock.utc()
         with self.store.write() as session:
-            taken = _of_name(session, name)
+            taken = _user_named(session, name)
             if taken is not None:
                 raise ApiError(409, "exists", "The name is taken", f"User {taken.name!r} exists. Take another name.")
             token = self.auth.token_of_person(session, name, scopes)
@@ -89,7 +89,7 @@ class People:
 
     def _look_up(self, name: str, place: str) -> tuple[User | None, bool]:
         with self.store.read() as session:
-            row = _of_name(session, name)
+            row = _user_named(session, name)
             return row, row is not None and session.get(KnownPlace, (row.name, place)) is not None
 
     def _remember(self, name: str, place: str) -> None:
@@ -207,7 +207,7 @@ class People:
 
     def _change_password(self, name: str, hashed: str, who: Principal) -> str | None:
         with self.store.write() as session:
-            row = _found(session, name)
+            row = _known_user(session, name)
             seen.check(session, seen.account(row.name))
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
@@ -218,7 +218,7 @@ class People:
     def remove(self, name: str, by: str) -> None:
         """Let nobody sign in under this name any more; the name stays taken, as the audit trail speaks of it."""
         with self.store.write() as session:
-            row = _found(session, name)
+            row = _known_user(session, name)
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             self.auth.end_sessions(session, row.token_hash)
             self.auth.revoke_within(session, row.token_hash[:16], by)
@@ -239,7 +239,7 @@ class People:
 
     def _store_password(self, name: str, hashed: str) -> None:
         with self.store.write() as session:
-            row = _found(session, name)
+            row = _known_user(session, name)
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
 
     def _note(self, who: str, action: str, **detail: Any) -> None:
@@ -247,7 +247,7 @@ class People:
             audit.write(session, self.clock.utc(), who, action, "page", **detail)
 
 
-def _of_name(session: Session, name: str) -> User | None:
+def _user_named(session: Session, name: str) -> User | None:
     """The person of a name as it was typed; the exact one first, as names from before were told apart by case."""
     if "\0" in name:  # PostgreSQL takes no such text, and nobody is called so
         return None
@@ -255,8 +255,8 @@ def _of_name(session: Session, name: str) -> User | None:
     return session.get(User, name) or session.scalars(same).first()
 
 
-def _found(session: Session, name: str) -> User:
-    row = _of_name(session, name)
+def _known_user(session: Session, name: str) -> User:
+    row = _user_named(session, name)
     if row is None:
         raise NotFoundError("user", name, "GET /v1/users lists them.")
     return row

@@ -110,17 +110,17 @@ class Guesses:
 
     def password(self, name: str, place: str, known: bool) -> None:
         """Admit a password for a name, and count it. Raises ApiError: 429 with `Retry-After`."""
-        self._admit(*self._of_password(name, place, known))
+        self._admit(*self._password_paces(name, place, known))
 
     def password_was_right(self, name: str, place: str, known: bool) -> None:
         """The pair starts anew; what strangers did under the name, or from the place, still counts."""
         with self._lock:
-            (pace, key), *others = self._of_password(name, place, known)
+            (pace, key), *others = self._password_paces(name, place, known)
             pace.forget(key)
             for pace, key in others:
                 pace.give_back(key)
 
-    def _of_password(self, name: str, place: str, known: bool) -> list[tuple[Pace, str]]:
+    def _password_paces(self, name: str, place: str, known: bool) -> list[tuple[Pace, str]]:
         pair = f"{place} {name}"
         return [(self._own, pair)] if known else [(self._pairs, pair), (self._names, name), (self._places, place)]
 

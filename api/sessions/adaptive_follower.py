@@ -161,7 +161,7 @@ class Follower(Watcher):
     async def _ask(self, turn: Turn, event: LiveEvent) -> None:
         heard_s = self._heard_s
         news, self._new = self._new, {name: [] for name in self._new}
-        widths, segments = self._laid(event)
+        widths, segments = self._played_so_far(event)
         said = await self.adviser.ask(
             "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
             late=[(pulse.index, pulse.by_s) for pulse in event.late],
@@ -227,7 +227,7 @@ class Follower(Watcher):
         left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
         return "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"
 
-    def _laid(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
+    def _played_so_far(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
         """Width of each pulse that is laid, and the segments."""
         rate_hz = self.plan.pulse_rate_hz
         sources = {"plan": iter(self._fixed), "extension": iter(self._added), "end": iter(())}

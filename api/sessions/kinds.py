@@ -278,7 +278,7 @@ class Watched(Kind):
 
     def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
         """As `Kind`."""
-        rigs, told = str(event.summary.get("ended_by") or event.outcome), self._told(row)
+        rigs, told = str(event.summary.get("ended_by") or event.outcome), self._standing(row)
         ended = told["ended"] if rigs == "enough" and told["ended"] else self.ends.get(rigs, rigs)
         ended = self.end_of(row, event, rigs, told) or ended
         measured = event.summary.get("torque_time_nms", told["torque_time_nm_s"])
@@ -290,9 +290,9 @@ class Watched(Kind):
 
     def document(self, row: Test) -> dict[str, Any] | None:
         """As `Kind`."""
-        return row.summary.get(self.part) or self._told(row)
+        return row.summary.get(self.part) or self._standing(row)
 
-    def _told(self, row: Test) -> dict[str, Any]:
+    def _standing(self, row: Test) -> dict[str, Any]:
         watcher = self._watcher_of(row.id)
         return watcher.document() if watcher is not None else self.unwatched(row)
 

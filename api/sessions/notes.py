@@ -26,11 +26,11 @@ class Notes:
     def __init__(self, store: Store, clock: Clock) -> None:
         self.store, self.clock = store, clock
 
-    def of(self, participant: str) -> list[Note]:
+    def participant_notes(self, participant: str) -> list[Note]:
         """A participant's notes, newest first, the struck ones among them."""
         return self.store.all(Note, Note.participant == participant, order=Note.at_utc.desc())
 
-    def of_test(self, test_id: str) -> list[Note]:
+    def test_notes(self, test_id: str) -> list[Note]:
         """The notes of one test by their time in it; those on the whole of it first."""
         found = self.store.all(Note, Note.test_id == test_id, order=Note.at_utc)
         return sorted(found, key=lambda note: -1.0 if note.at_s is None else note.at_s)
@@ -108,7 +108,7 @@ class Notes:
 
 def about(participant: str, note_id: str | None = None) -> seen.About:
     """Entries of the trail about a participant's notes; of one note, that it was struck."""
-    entries = seen.of(participant, *(("note", "strike note") if note_id is None else ("strike note",)))
+    entries = seen.actions_on(participant, *(("note", "strike note") if note_id is None else ("strike note",)))
     return entries if note_id is None else and_(entries, AuditEntry.detail["note"].as_string() == note_id)
 
 

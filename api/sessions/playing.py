@@ -90,7 +90,7 @@ class Playing:
         """What was changed since its intent was written, with which it would not have been begun."""
         with self.store.read() as session:
             if current.since is None and current.started:  # it plays although this service was restarted
-                current.since = seen.newest(session, "", seen.of(current.test_id, "start test"))
+                current.since = seen.newest(session, "", seen.actions_on(current.test_id, "start test"))
                 current.until_utc = self.until_utc(current.tokens)
             return [] if current.since is None else seen.since(session, current.since, *current.rests_on)
 

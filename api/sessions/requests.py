@@ -235,7 +235,7 @@ class TestIn(Body):
     )
 
     @model_validator(mode="after")
-    def _of_its_kind(self) -> TestIn:
+    def _check_kind(self) -> TestIn:
         sent = {name for name in self.model_fields_set if getattr(self, name) is not None}
         others = set().union(*OWN_FIELDS.values()) - OWN_FIELDS.get(self.kind, set())
         planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING)

@@ -149,7 +149,7 @@ class RigClient:
         request = line_of(message)
         try:
             async with asyncio.timeout(timeout_s):
-                reader, writer = await _opened(self.path, isinstance(message, requests.StopRequest))
+                reader, writer = await _open(self.path, isinstance(message, requests.StopRequest))
                 try:
                     writer.write(request)
                     line = await reader.readline()
@@ -239,7 +239,7 @@ class RigClient:
                 self.status = messages.Status.model_validate(reply.body)
 
 
-async def _opened(path: Path, stops: bool) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+async def _open(path: Path, stops: bool) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     """A connection to the rig; for a stop at the door for stops, or at the other where that one does not open."""
     if stops:
         with contextlib.suppress(OSError):

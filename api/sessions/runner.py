@@ -432,10 +432,10 @@ class Runner(Playing):
 
     def announce(self, test_id: str) -> None:
         """Tell the listeners of the live channel how the test stands; in the order in which it is called."""
-        read = asyncio.get_running_loop().run_in_executor(self._telling, self._told, test_id)
+        read = asyncio.get_running_loop().run_in_executor(self._telling, self._read_document, test_id)
         read.add_done_callback(self._tell)
 
-    def _told(self, test_id: str) -> dict[str, Any] | None:
+    def _read_document(self, test_id: str) -> dict[str, Any] | None:
         row = self.store.get(Test, test_id)
         return None if row is None else self.document(row)
 

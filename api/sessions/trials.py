@@ -114,13 +114,13 @@ class Trials(Kind):
                 trial = await asyncio.to_thread(self.tracked.opened, test_id)
                 if trial is None:
                     return None
-                found = await self._found(trial)
+                found = await self._examine(trial)
                 row = await asyncio.to_thread(self.tracked.keep, trial, found, last_sample_unix_s)
         if row is not None:
             log.info("trial %d: %s %s", row.number, row.outcome, row.reason, extra={"test_id": test_id})
         return row
 
-    async def _found(self, trial: Trial) -> dict[str, Any]:
+    async def _examine(self, trial: Trial) -> dict[str, Any]:
         """What the worker found, or why it found nothing: no trial is lost by that."""
         recording: Recording | None = await asyncio.to_thread(self.store.get, Recording, trial.test.recording_id or "")
         if recording is None or trial.problem:

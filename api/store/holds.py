@@ -160,7 +160,7 @@ class Among(Holds):
             self._alive = None
 
 
-def of(store: Store) -> Holds:
+def open_holds(store: Store) -> Holds:
     """What a service on this database has."""
     return Among(store.engine) if store.several else Holds()
 

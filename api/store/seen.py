@@ -111,14 +111,14 @@ def accounts() -> About:
     return AuditEntry.action.in_(ACCOUNTS)
 
 
-def of(subject: str, *actions: str) -> About:
+def actions_on(subject: str, *actions: str) -> About:
     """Some actions on one subject."""
     return and_(AuditEntry.subject == subject, AuditEntry.action.in_(actions))
 
 
 def poses() -> About:
     """Where the angle sensor's zero and scale come from."""
-    return of("rig", *POSES)
+    return actions_on("rig", *POSES)
 
 
 def last(session: Session, *about: About) -> AuditEntry | None:
@@ -170,8 +170,8 @@ def check(session: Session, *about: About) -> None:
 
 def change(session: Session, seen: Seen, entry: AuditEntry) -> dict[str, Any]:
     """A change, beside what was there when the page was shown."""
-    was = last(session, and_(of(entry.subject, *_alike(entry.action)), AuditEntry.seq <= seen.entry))
-    return {"now": told(entry), "seen": None if was is None else told(was)}
+    was = last(session, and_(actions_on(entry.subject, *_alike(entry.action)), AuditEntry.seq <= seen.entry))
+    return {"now": entry_document(entry), "seen": None if was is None else entry_document(was)}
 
 
 def _alike(action: str) -> tuple[str, ...]:
@@ -181,7 +181,7 @@ def _alike(action: str) -> tuple[str, ...]:
     return next((group for group in groups if action in group), (action,))
 
 
-def told(entry: AuditEntry) -> dict[str, Any]:
+def entry_document(entry: AuditEntry) -> dict[str, Any]:
     """An entry, as a problem tells it."""
     return {name: getattr(entry, name) for name in ("at_utc", "who", "action", "subject", "detail")}
 
@@ -210,7 +210,7 @@ class ChangedError(ApiError):
 
 def overtaken(changed: list[AuditEntry]) -> ChangedError:
     """What a decision rests on was changed while it was carried out: nobody was shown a page between."""
-    return ChangedError([{"now": told(entry), "seen": None} for entry in changed], None)
+    return ChangedError([{"now": entry_document(entry), "seen": None} for entry in changed], None)
 
 
 def another_document(document: str) -> ChangedError:

@@ -126,7 +126,7 @@ class Context(Parts):
         pool = self.pool = Pool(settings.workers, worker, places(settings, store))
         self.analyses = Analyses(store, clock, pool, self.versions, settings)
         self.tracked = TrackedVersions(store, clock, self.versions)
-        self.holds = holds.of(store)
+        self.holds = holds.open_holds(store)
         adviser, tracker = (Adviser(worker, places(settings, store)) for _ in range(2))  # a folder that the pool learns
         trials = Trials(rig, store, clock, self.tracked, tracker)  # ends no test
         self.runner = Runner(
@@ -214,14 +214,14 @@ def in_limits_turn(
     return changed
 
 
-def of(connection: HTTPConnection) -> Context:
+def context_of(connection: HTTPConnection) -> Context:
     """The application's context."""
     return connection.app.state.context
 
 
 async def from_request(request: Request) -> Context:
     """The application's context, as a dependency; not in a worker thread: a stop waits for none of them."""
-    return of(request)
+    return context_of(request)
 
 
 Ctx = Annotated[Context, Depends(from_request)]

@@ -74,7 +74,7 @@ async def identified(request: Request) -> Principal:
     if principal.participant is not None:
         await asyncio.to_thread(refuse_outside, context.versions, principal, request.method, request.url.path)
     request.state.who = principal
-    if principal.page_session is not None and by_a_person(request):
+    if principal.page_session is not None and is_action(request):
         auth.idle.acted(principal.page_session.hash)
     if wants_html(request) or not request.url.path.startswith("/v1/"):
         # before anything of the page is read: what it shows is not older
@@ -82,7 +82,7 @@ async def identified(request: Request) -> Principal:
     return principal
 
 
-def by_a_person(request: Request) -> bool:
+def is_action(request: Request) -> bool:
     """Whether a person did something, as far as a request tells: what scripts read by themselves is nobody's action."""
     if request.method not in SAFE_METHODS:
         return True

@@ -93,7 +93,7 @@ def test_a_whole_number_is_one() -> None:
 
 @given(st.floats(0, 500, exclude_min=True))
 def test_a_field_shows_exactly_what_is_saved(value: float) -> None:
-    assert float(typed.shown(value)) == value and not re.search("[^0-9.]", typed.shown(value))
+    assert float(typed.number_text(value)) == value and not re.search("[^0-9.]", typed.number_text(value))
 
 
 def test_no_field_of_a_person_is_read_by_the_browsers_own_rules() -> None:

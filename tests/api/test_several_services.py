@@ -167,7 +167,7 @@ def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, addre
         "asyncio.run(main())\n"
     )
     store = Store(address)
-    held = holds.of(store)
+    held = holds.open_holds(store)
     assert isinstance(held, holds.Among)
     process = subprocess.Popen([sys.executable, "-c", taking, address], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     try:

@@ -39,10 +39,10 @@ MAY: dict[str, Any] = {
 @router.get("")
 async def show(request: Request, context: Ctx, _who: Administrator) -> Response:
     """The page."""
-    return await shown(request, context)
+    return await show_page(request, context)
 
 
-async def shown(request: Request, context: Context, key: dict[str, Any] | None = None) -> Response:
+async def show_page(request: Request, context: Context, key: dict[str, Any] | None = None) -> Response:
     """The page; with a key that was just made, the only time its text is seen."""
 
     def gather() -> dict[str, Any]:
@@ -84,7 +84,7 @@ async def add_user(
 async def set_password(context: Ctx, who: Administrator, name: str, password: Text = "") -> Response:
     """A new password."""
     body = typed.checked(people.PasswordIn, password=password)
-    return await people.with_new_password(context, who, name, body.password, back())
+    return await people.renew_password(context, who, name, body.password, back())
 
 
 @router.post("/users/{name}/remove")
@@ -102,7 +102,7 @@ async def make_key(
     """A key for a controller; its text is shown on the answering page only."""
     body = typed.checked(people.KeyIn, name=name.strip(), days=typed.whole(days))
     made = await asyncio.to_thread(people.controller_key, context, who, body)
-    return await shown(request, context, {**made, "name": body.name})
+    return await show_page(request, context, {**made, "name": body.name})
 
 
 @router.post("/tokens/{token_id}/revoke")
@@ -121,14 +121,14 @@ async def export(context: Ctx, _who: Administrator) -> Response:
     return PlainTextResponse(lines, media_type="application/x-ndjson", headers=headers)
 
 
-def told(detail: dict[str, Any]) -> str:
+def detail_words(detail: dict[str, Any]) -> str:
     """An entry's details on one line; hashes shortened, the export has them whole."""
     parts = []
     for name, value in detail.items():
         if value in (None, "", [], {}):
             continue
         if isinstance(value, dict):
-            value = told(value)
+            value = detail_words(value)
         elif isinstance(value, list):
             value = ", ".join(str(item) for item in value)
         text = str(value)
@@ -137,7 +137,7 @@ def told(detail: dict[str, Any]) -> str:
     return " · ".join(parts)
 
 
-environment.filters["told"] = told
+environment.filters["told"] = detail_words
 
 
 def back() -> Response:

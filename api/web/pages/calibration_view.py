@@ -40,10 +40,10 @@ FINE_US = (1.0, 25.0)
 @router.get("")
 async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
     """Where the calibration stands; the form that begins one where none is open."""
-    return await shown(request, context, code)
+    return await show_page(request, context, code)
 
 
-async def shown(
+async def show_page(
     request: Request, context: Context, code: str, texts: dict[str, str] | None = None,
     errors: dict[str, str] | None = None, problem: ApiError | None = None,
 ) -> Response:  # fmt: skip
@@ -57,7 +57,7 @@ async def shown(
         found = None
     kept = context.rig.status.calibrated if context.rig.status and found is None else None
     waits = kept if kept is not None and kept.participant == code else None
-    own = {"current_ma": typed.shown(row.profile["current_ma"]), "step_us": typed.shown(DEFAULTS.step_us)}
+    own = {"current_ma": typed.number_text(row.profile["current_ma"]), "step_us": typed.number_text(DEFAULTS.step_us)}
     limits = context.rig.status.limits if context.rig.status else {}
     low_us, high_us = fine_range(context.rig.status)
     status = problem.status if problem else 422 if errors else 200
@@ -91,7 +91,7 @@ async def attempt(request: Request, context: Context, code: str, done: Awaitable
     except seen.ChangedError:  # it has a page of its own
         raise
     except ApiError as error:
-        return await shown(request, context, code, problem=error)
+        return await show_page(request, context, code, problem=error)
     return RedirectResponse(leads, 303)
 
 
@@ -103,7 +103,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     texts = {name: str(sent.get(name, ""))[:60] for name in ("current_ma", "step_us")}
     values, errors = read(texts, row, context.rig.status)
     if errors:
-        return await shown(request, context, code, texts, errors)
+        return await show_page(request, context, code, texts, errors)
     body = typed.checked(CalibrationIn, **values, large_steps=True)
 
     async def open_it() -> str:

@@ -112,7 +112,7 @@ def read_tracking(sent: FormData) -> Limits:
 
 def tracking_fields(sent: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
     """The form's fields, with what was typed in them."""
-    given = {name: typed.shown(percent) for name, percent in Limits().to_dict().items()} | dict(sent or {})
+    given = {name: typed.number_text(percent) for name, percent in Limits().to_dict().items()} | dict(sent or {})
     return [{"name": name, "label": str(label), "text": str(given[name])[:5]} for name, label in LABELS.items()]
 
 
@@ -134,7 +134,7 @@ def tracking_words(limits: Mapping[str, Any] | None, threshold_us: float | None)
     if not bounds:
         return _("The model does not follow the muscle from trial to trial: all stays as approved.")
     said = {
-        quantity: f"±{localised(typed.shown(percent))}\u00a0%" if quantity in bounds else _("as approved")
+        quantity: f"±{localised(typed.number_text(percent))}\u00a0%" if quantity in bounds else _("as approved")
         for quantity, percent in zip(QUANTITIES, allowed.to_dict().values(), strict=True)
     }
     if shift_us := bounds.get("threshold_shift_us", (0.0, 0.0))[1]:

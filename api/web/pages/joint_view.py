@@ -140,7 +140,7 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
     sent = await request.form()
     text, first = str(sent.get("angle_deg") or "")[:60], bool(sent.get("first"))
     try:
-        angle_rad = limits_form.of_pose(text, context.rig.status)
+        angle_rad = limits_form.read_pose(text, context.rig.status)
     except ValueError as error:
         return await sensor_page(request, context, text, str(error), again=first)
     body = typed.checked(PoseIn, angle_rad=angle_rad, first=first)

@@ -51,7 +51,7 @@ class LimitsForm:
 
 def fresh(profile: Mapping[str, Any], status: Status | None) -> LimitsForm:
     """The form with what is saved."""
-    texts = {name: typed.shown(profile[name]) for name in profiles.LIMITS} | angle_texts(profile, status)
+    texts = {name: typed.number_text(profile[name]) for name in profiles.LIMITS} | angle_texts(profile, status)
     return LimitsForm(texts, dict(texts))
 
 
@@ -124,12 +124,12 @@ def angle_texts(profile: Mapping[str, Any], status: Status | None) -> dict[str, 
     range_rad = profiles.range_of(profile)
     if range_rad is None or (has_sensor(status) and profiles.range_outdated(profile, calibrated_utc(status))):
         return dict.fromkeys(ANGLES, "")
-    return {name: angle_shown(angle) for name, angle in zip(ANGLES, range_rad, strict=True)}
+    return {name: angle_text(angle) for name, angle in zip(ANGLES, range_rad, strict=True)}
 
 
-def angle_shown(angle_rad: float) -> str:
+def angle_text(angle_rad: float) -> str:
     """An angle as a person would type it."""
-    return typed.shown(round(math.degrees(angle_rad), 2) + 0.0)
+    return typed.number_text(round(math.degrees(angle_rad), 2) + 0.0)
 
 
 def has_sensor(status: Status | None) -> bool:
@@ -146,7 +146,7 @@ def angle_fields(status: Status | None) -> list[dict[str, str]]:
     return [{"name": name, "label": ANGLE_LABELS[name], "help": help_of[name]} for name in ANGLES]
 
 
-def of_pose(text: str, status: Status | None) -> float:
+def read_pose(text: str, status: Status | None) -> float:
     """The angle that a goniometer shows, rad, from its text in degrees.
 
     Raises
@@ -157,7 +157,7 @@ def of_pose(text: str, status: Status | None) -> float:
     angle_rad = math.radians(typed.signed(text))
     rigs = status.angle.range_rad if status else None
     if rigs is not None and not (rigs[0] <= angle_rad <= rigs[1]):
-        raise ValueError(f"{angle_shown(angle_rad) + '°'} is not within {profiles.range_words(rigs)}, as this rig asks")
+        raise ValueError(f"{angle_text(angle_rad) + '°'} is not within {profiles.range_words(rigs)}, as this rig asks")
     return angle_rad
 
 

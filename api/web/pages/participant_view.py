@@ -41,10 +41,10 @@ router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
 @router.get("")
 async def participant(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """A participant: limits, start, history of tests and models."""
-    return await shown(request, context, who, code)
+    return await show_page(request, context, who, code)
 
 
-async def shown(
+async def show_page(
     request: Request, context: Context, who: Principal, code: str, form: LimitsForm | None = None, status: int = 200,
     made: dict[str, Any] | None = None,
 ) -> Response:  # fmt: skip
@@ -58,7 +58,7 @@ async def shown(
         history = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc(), limit=200)
         return {
             "participant": row,
-            "notes": context.notes.of(code),
+            "notes": context.notes.participant_notes(code),
             "calibrated": starting.calibrated(context, row),
             "step": next_view.step(context, row),
             "form": form or limits_form.fresh(row.profile, context.rig.status),
@@ -100,7 +100,7 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
     sent = await request.form()
     form = limits_form.read(sent, row.profile, status)
     if form.errors:
-        return await shown(request, context, who, code, form, 422)
+        return await show_page(request, context, who, code, form, 422)
     wanted = asked_test(sent, code) if start else None
 
     async def on() -> str:
@@ -228,7 +228,7 @@ async def make_key(
     text, made = await asyncio.to_thread(
         controllers.make_key, context.auth, body.name, code, plan, who.name, who.token_hash
     )
-    return await shown(request, context, who, code, made={"text": text, "name": made.name})
+    return await show_page(request, context, who, code, made={"text": text, "name": made.name})
 
 
 @router.post("/keys/{key_id}/revoke")

@@ -81,7 +81,7 @@ def session_of(context: Context, recording: Recording) -> dict[str, Any]:
 
 def _notes(context: Context, recording: Recording, test: Test | None) -> list[Note]:
     """The test's by their time in it, then those on the day as a whole."""
-    standing = [note for note in context.notes.of(recording.participant) if note.struck_utc is None]
+    standing = [note for note in context.notes.participant_notes(recording.participant) if note.struck_utc is None]
     own = [note for note in standing if test is not None and note.test_id == test.id]
     today = local_day(test.requested_utc if test else recording.created_utc)
     general = [note for note in standing if note.test_id is None and local_day(note.at_utc) == today]

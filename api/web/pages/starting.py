@@ -43,7 +43,7 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
         required = bool(context.rig.status and context.rig.status.require_calibration)
         return Calibrated(state, _("not calibrated"), not required)
     with context.store.read() as session:
-        entry = seen.last(session, seen.of(row.code, "finish calibration"))
+        entry = seen.last(session, seen.actions_on(row.code, "finish calibration"))
     said = {"time": when(row.profile.get("set_at_utc")), "end": until(row.profile.get("expires_at_utc"))}
     said["name"] = entry.who if entry else "–"
     if state == "expired":
@@ -114,7 +114,7 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
     long = number(preview["duration_s"], 0, "s")
     more = []
     if joint := preview.get("joint"):
-        long, dose, more = of_joint(joint, row.profile, long, dose)
+        long, dose, more = joint_rows(joint, row.profile, long, dose)
     elif bounds := preview.get("bounds"):
         reach, most = preview["reach"], number(bounds["max_torque_time_nms"], 0, "N·m·s")
         long = _("at most %(most)s", most=number(bounds["max_duration_s"], 0, "s"))
@@ -150,7 +150,9 @@ def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
     return round(middle - half, 2), round(middle + half, 2)
 
 
-def of_joint(joint: Mapping[str, Any], profile: Mapping[str, Any], long: str, dose: str) -> tuple[str, str, list[Row]]:
+def joint_rows(
+    joint: Mapping[str, Any], profile: Mapping[str, Any], long: str, dose: str
+) -> tuple[str, str, list[Row]]:
     """How long a guided test of a joint takes, at what dose, and the rows about the angle."""
     range_rad = profiles.range_of(profile)
     more = [

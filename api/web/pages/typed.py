@@ -63,7 +63,7 @@ def whole(text: str) -> int | None:
     return int(text) if re.fullmatch(r"[1-9][0-9]{0,4}", text.strip()) else None
 
 
-def shown(value: float) -> str:
+def number_text(value: float) -> str:
     """A number as it stands in a field: exactly, and as a person would type it."""
     text = format(Decimal(repr(float(value))), "f")
     return text.rstrip("0").rstrip(".") if "." in text else text

@@ -43,8 +43,10 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
         "test": document, "planned_us": fixed, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
         "sensor": joint is not None or (status is not None and status.angle.present),
     }  # fmt: skip
-    shown: dict[str, Any] = await drawn(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
-    notes = await asyncio.to_thread(context.notes.of_test, test_id)
+    shown: dict[str, Any] = (
+        await draw_ended(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
+    )
+    notes = await asyncio.to_thread(context.notes.test_notes, test_id)
     missing = missing_words(((joint or {}).get("coverage") or {}).get("missing"))
     return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, missing=missing, **shown)
 
@@ -93,7 +95,7 @@ def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
     }
 
 
-async def drawn(context: Context, row: Test) -> dict[str, Any]:
+async def draw_ended(context: Context, row: Test) -> dict[str, Any]:
     """A test that is over as a still picture: beside its model where there is one, else what was recorded."""
     picture, problem = None, None
     try:

@@ -38,7 +38,7 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
     profile = body.profile.model_dump(exclude_none=True)
     if "profile" in body.model_fields_set:
         check_asked(context, profile, profile)
-        profile = with_calibration(context, profile)
+        profile = add_calibration_time(context, profile)
     with context.store.write() as session:
         if session.get(Participant, body.code) is not None:
             raise ApiError(409, "exists", "The code is taken", f"Participant {body.code!r} exists. Take another code.")
@@ -84,7 +84,7 @@ def change_profile(
         poses = [] if asked.get(profiles.RANGE) is None else [seen.poses()]
         seen.check(session, seen.participant(code), *poses)
         check_asked(context, row.profile, asked)
-        profile, voids = profiles.changed(row.profile, with_calibration(context, asked))
+        profile, voids = profiles.changed(row.profile, add_calibration_time(context, asked))
         if voids and not may_void:
             detail = (
                 f"{voids[0].upper()}{voids[1:]}. To set it and make the calibration invalid: ?void_calibration=true."
@@ -111,7 +111,7 @@ def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]
         raise ApiError(422, "invalid-input", "These limits cannot be used", detail, errors=errors)
 
 
-def with_calibration(context: Context, asked: dict[str, Any]) -> dict[str, Any]:
+def add_calibration_time(context: Context, asked: dict[str, Any]) -> dict[str, Any]:
     """What is asked for; a range of joint angles holds as long as the angle sensor's calibration of now."""
     if asked.get(profiles.RANGE) is None:
         return asked
@@ -299,7 +299,7 @@ def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> lis
     """A participant's notes, newest first, the struck ones among them."""
     response.headers["ETag"] = context.store.etag(context.clock, f"/v1/participants/{code}/notes", notes.about(code))
     find(context, code)
-    return [note.as_dict() for note in context.notes.of(code)]
+    return [note.as_dict() for note in context.notes.participant_notes(code)]
 
 
 @notes_router.post("", status_code=201, **answers(NoteOut, 201, "written"))

@@ -93,10 +93,10 @@ def list_users(context: Ctx, _who: Administrator, response: Response) -> list[di
 @router.put("/users/{name}/password", status_code=204)
 async def set_password(context: Ctx, who: Administrator, name: str, body: PasswordIn) -> Response:
     """A new password; the person's sessions end. One that changes its own goes on under the cookie of the answer."""
-    return await with_new_password(context, who, name, body.password, Response(status_code=204))
+    return await renew_password(context, who, name, body.password, Response(status_code=204))
 
 
-async def with_new_password(context: Context, who: Principal, name: str, password: str, answer: Response) -> Response:
+async def renew_password(context: Context, who: Principal, name: str, password: str, answer: Response) -> Response:
     """Change it; the answer carries the cookie of the session that made the change, where it is the person's own."""
     cookie = await context.people.change_password(name, password, who)
     if cookie is not None:

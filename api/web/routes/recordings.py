@@ -124,7 +124,7 @@ async def take_in(
     whole = await asyncio.to_thread(_write, context, data, ".csv" if columns else _suffix(data))
     part = uploads.part_of(whole)
     try:
-        assumed, data = await _with_our_columns(context, part, columns, data)
+        assumed, data = await _rename_columns(context, part, columns, data)
         found, warning = await _identified(context, code, part)
         of = await asyncio.to_thread(_whose, context, code, who, found.get("of") or "", data, of)
     except BaseException:  # refused, or nobody waits for it any more
@@ -152,9 +152,7 @@ def _whose(context: Context, code: str, who: Principal, says: str, data: bytes, 
     raise ApiError(409, "other-participant", "This is another participant's recording", detail, of=own)
 
 
-async def _with_our_columns(
-    context: Context, path: Path, columns: Sequence[str], data: bytes
-) -> tuple[list[str], bytes]:
+async def _rename_columns(context: Context, path: Path, columns: Sequence[str], data: bytes) -> tuple[list[str], bytes]:
     """What was assumed, and the bytes that are kept: the upload's own, or the table of ours that was made of it."""
     if not columns:
         return [], data

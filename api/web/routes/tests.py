@@ -21,7 +21,7 @@ from stimrig.api.sessions.requests import RanByIn, TestIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import KEY_TURN
 from stimrig.api.store.tables import Test
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, of
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, context_of
 from stimrig.api.web.guards import refuse_outside
 from stimrig.api.web.middleware import chosen_language
 from stimrig.api.web.responses.base import answers
@@ -62,7 +62,9 @@ def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str
 @router.get("/{test_id}", **answers(TestOut))
 def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
-    response.headers["ETag"] = context.store.etag(context.clock, f"/v1/tests/{test_id}", seen.of(test_id, RAN_BY))
+    response.headers["ETag"] = context.store.etag(
+        context.clock, f"/v1/tests/{test_id}", seen.actions_on(test_id, RAN_BY)
+    )
     return context.runner.document(find(context, test_id))
 
 
@@ -73,7 +75,7 @@ def set_ran_by(context: Ctx, who: Tester, test_id: str, body: RanByIn) -> dict[s
         row = session.get(Test, test_id)
         if row is None:
             raise NotFoundError("test", test_id, "GET /v1/tests lists them.")
-        seen.check(session, seen.of(test_id, RAN_BY))
+        seen.check(session, seen.actions_on(test_id, RAN_BY))
         row.ran_by = other_than(row.requested_by, body.ran_by)
         audit.write(session, context.clock.utc(), who.name, RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
     return context.runner.document(row)
@@ -103,7 +105,7 @@ async def live(socket: WebSocket, test_id: str) -> None:
     The socket closes (1000) once the test has ended and its last `test` message was sent; it closes (4401, after a
     `problem`) within two seconds once its session or token is no longer valid.
     """
-    context = of(socket)
+    context = context_of(socket)
     await socket.accept()
     try:
         who = await asyncio.to_thread(_admit, socket, context)
@@ -165,13 +167,13 @@ async def _pump(
         await socket.send_json(history)
     document = await asyncio.to_thread(lambda: context.runner.document(find(context, row.id)))
     words = chosen_language(socket.headers)
-    await socket.send_json(_told(document, words))
+    await socket.send_json(_test_message(document, words))
     while not document["done"]:
         message = await _next(queue) or {"type": "idle", "rig_connected": context.rig.connected}
         if message["type"] == "test":
             if message["test"]["id"] != row.id:
                 continue
-            document, message = message["test"], _told(message["test"], words)
+            document, message = message["test"], _test_message(message["test"], words)
         if message["type"] in ("live", "adaptive", "joint") and message["test_id"] != row.id:
             continue
         if by_key and message["type"] == "state" and message["rig"]["test_id"] != row.id:
@@ -206,7 +208,7 @@ async def _until_refused(socket: WebSocket, context: Context) -> None:
             log.warning("whether a live channel is still allowed could not be read")
 
 
-def _told(document: dict[str, Any], language_code: str) -> dict[str, Any]:
+def _test_message(document: dict[str, Any], language_code: str) -> dict[str, Any]:
     """How the test stands; `words`: what a page shows of it, in the language of the page."""
     work = (document["identification"] or {}).get("text") or ""
     with language.using(language_code):
