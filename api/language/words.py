@@ -83,7 +83,10 @@ def code() -> str:
 
 def locale() -> Locale:
     """How the language writes numbers and the names of months."""
-    return Locale.parse(code())
+    return _locale(code())
+
+
+_locale = cache(Locale.parse)
 
 
 @contextmanager
@@ -128,7 +131,12 @@ _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 
 def decimal() -> str:
     """The decimal sign."""
-    return str(locale().number_symbols["latn"]["decimal"])
+    return _decimal(code())
+
+
+@cache
+def _decimal(code: str) -> str:
+    return str(_locale(code).number_symbols["latn"]["decimal"])
 
 
 def localised(text: str) -> str:
