@@ -6,6 +6,7 @@ import struct
 import time
 from collections.abc import Callable
 from itertools import pairwise
+from typing import NamedTuple
 
 import can
 import numpy as np
@@ -23,7 +24,6 @@ PULSES = 12
 PERIOD_S = 0.025
 ENOUGH_NM = 1.0
 Play = Callable[[serial.Serial], None]
-Decode = Callable[[bytes], tuple[list[float], int | None]]
 
 
 def paced(line: serial.Serial, frames: list[bytes], ack_bytes: int) -> None:
@@ -50,32 +50,31 @@ def rehastim2(line: serial.Serial) -> None:
     paced(line, frames, 9)
 
 
-def plain(data: bytes) -> tuple[list[float], int | None]:
-    torque_nm, counter, *_ = struct.unpack("<fHBB", data)
-    return [torque_nm], counter
+class Cell(NamedTuple):
+    """How to ask for a cell, and how its frames read: the values' places and the counter's."""
 
+    options: str
+    can_id: int
+    layout: str
+    values: int = 1
+    counter: int | None = 1
+    scale: float = 1.0
+    zero: int = 0
 
-def with_angle(data: bytes) -> tuple[list[float], int | None]:
-    torque_nm, _, counter, _ = struct.unpack("<fhBB", data)
-    return [torque_nm], counter
-
-
-def packed(data: bytes) -> tuple[list[float], int | None]:
-    *counts, counter = struct.unpack("<hhhH", data)
-    return [0.002 * count for count in counts], counter
-
-
-def counts(data: bytes) -> tuple[list[float], int | None]:
-    return [(count - 32768) * 50 / 32767 for count in struct.unpack(f">{len(data) // 2}H", data)], None
+    def decode(self, data: bytes) -> tuple[list[float], int | None]:
+        """Torques, N·m, and the counter of a frame."""
+        row = struct.unpack(self.layout, data)
+        counter = None if self.counter is None else row[self.counter]
+        return [self.scale * (value - self.zero) for value in row[: self.values]], counter
 
 
 PLAYERS: dict[str, tuple[int, str, Play]] = {"p24": (3_000_000, "N", p24), "rehastim2": (460_800, "E", rehastim2)}
-CELLS: dict[str, tuple[list[str], int, int, Decode]] = {
-    "plain": (["--cell", "plain"], 0x181, 1, plain),
-    "plain of 3": (["--cell", "plain", "--samples-per-frame", "3"], 0x181, 3, packed),
-    "counts": (["--cell", "counts"], 610, 1, counts),
-    "canopen": (["--cell", "canopen"], 0x181, 1, plain),
-    "with_angle": (["--arm", "held", "--arm-law", "passive=none", "--angle", "in-cell"], 0x181, 1, with_angle),
+CELLS = {
+    "plain": Cell("--cell plain", 0x181, "<fHBB"),
+    "plain of 3": Cell("--cell plain --samples-per-frame 3", 0x181, "<hhhH", values=3, counter=3, scale=0.002),
+    "counts": Cell("--cell counts", 610, ">H", counter=None, scale=50 / 32767, zero=32768),
+    "canopen": Cell("--cell canopen", 0x181, "<fHBB"),
+    "with_angle": Cell("--arm held --arm-law passive=none --angle in-cell", 0x181, "<fhBB", counter=2),
 }
 
 
@@ -99,9 +98,12 @@ PAIRS = [
 @pytest.mark.parametrize(("stimulator", "cell", "transport"), PAIRS)
 def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None:
     baud, parity, play = PLAYERS[stimulator]
-    options, can_id, samples_per_frame, decode = CELLS[cell]
+    made = CELLS[cell]
     devices = ["--load-cell", transport, "--stimulator", stimulator]
-    with emulated("--rate-hz", "400", "--noise-nm", "0", *devices, *options) as rig, can.Bus(**rig.ready["can"]) as bus:
+    with (
+        emulated("--rate-hz", "400", "--noise-nm", "0", *devices, *made.options.split()) as rig,
+        can.Bus(**rig.ready["can"]) as bus,
+    ):
         if cell == "canopen":
             bus.send(can.Message(arbitration_id=0, data=[1, 0], is_extended_id=False))
         first = bus.recv(10.0)
@@ -110,22 +112,22 @@ def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None
             play(line)
             end_s = time.monotonic() + 20
             messages = [first]
-            while decode(bytes(messages[-1].data))[0][-1] <= ENOUGH_NM and time.monotonic() < end_s:
+            while made.decode(bytes(messages[-1].data))[0][-1] <= ENOUGH_NM and time.monotonic() < end_s:
                 messages += [message for message in [bus.recv(0.1)] if message is not None]
         pulses = rig.ask(cmd="pulses")["pulses"]
         state = rig.ask(cmd="state")
         assert rig.ready["stimulator_device"] == stimulator
-        assert rig.ready["samples_per_frame"] == samples_per_frame
+        assert rig.ready["samples_per_frame"] == made.values
         angle = ("in_cell", 0x181, 400.0) if cell == "with_angle" else None
         told = rig.ready.get("angle_sensor")
         assert angle == (told and (told["kind"], told["frame_id"], told["rate_hz"]))
     assert [(pulse["width_us"], pulse["current_ma"], pulse["delivered"]) for pulse in pulses] == [(300, 20, True)] * 12
     assert state["unbalanced_pulses"] == 0
 
-    assert {(message.arbitration_id, message.is_extended_id) for message in messages} == {(can_id, False)}
-    decoded = [decode(bytes(message.data)) for message in messages]
+    assert {(message.arbitration_id, message.is_extended_id) for message in messages} == {(made.can_id, False)}
+    decoded = [made.decode(bytes(message.data)) for message in messages]
     values = np.array([value for torques, _ in decoded for value in torques])
-    assert values.size == samples_per_frame * len(messages)
+    assert values.size == made.values * len(messages)
     counters = [counter for _, counter in decoded if counter is not None]
     wraps_at = 0x100 if cell == "with_angle" else 0x10000
     assert {(after - before) % wraps_at for before, after in pairwise(counters)} <= {1}
@@ -138,5 +140,5 @@ def test_it_starts_and_plays(stimulator: str, cell: str, transport: str) -> None
     errors_nm = [np.abs(torque_nm[k : k + values.size] - values).max() for k in offsets]
     assert min(errors_nm) < 2e-3  # one count of the coarsest cell
     assert values.max() > ENOUGH_NM
-    if counters and samples_per_frame == 1:
+    if counters and made.values == 1:
         assert int(np.argmin(errors_nm)) % wraps_at == pytest.approx(counters[0], abs=1)

@@ -14,7 +14,8 @@ from stimrig.hardware_sim.hidden.chain import Chain, split
 from stimrig.hardware_sim.hidden.scenario import Scenario
 from stimrig.identify.experiments.adaptive import Decision, Target, decide
 from stimrig.identify.records.record import Record
-from tests.harness.muscle import FINE_HZ, Patient, second_order
+from tests.harness.muscle import FINE_HZ, Patient, second_order, torque_after
+from tests.harness.patients import as_record
 
 PULSE_RATE_HZ = 40.0
 HIDDEN_STEP_S = 1.0 / 1600.0
@@ -43,12 +44,7 @@ class Muscle:
 
     def torque(self, widths_us: np.ndarray, rate_hz: float) -> np.ndarray:
         """Clean torque at the samples, N·m."""
-        drive = np.repeat(self.curve(widths_us), round(FINE_HZ / PULSE_RATE_HZ))
-        late = round(self.delay_s * FINE_HZ)
-        drive = np.r_[np.zeros(late), drive][: drive.size]
-        torque = second_order(drive, self.time_constant_s, self.damping, FINE_HZ)
-        size = round(widths_us.size / PULSE_RATE_HZ * rate_hz)
-        return torque[np.round(np.arange(size) * FINE_HZ / rate_hz).astype(int)]
+        return torque_after(self.curve(widths_us), rate_hz, self.time_constant_s, self.damping, self.delay_s)
 
     def another_day(self, rng: np.random.Generator) -> Muscle:
         """The same muscle in another session: gain, threshold, width of the rise and speed have changed."""
@@ -127,10 +123,7 @@ def recorded(
 ) -> Record:
     """The record of a muscle; `noise_nm` holds at least as many samples as the record."""
     clean = muscle.torque(widths_us, rate_hz)
-    size = clean.size
-    slot = np.minimum((np.arange(size) * PULSE_RATE_HZ / rate_hz + 1e-9).astype(int), widths_us.size - 1)
-    measured = clean + noise_nm[:size]
-    return Record.from_arrays(np.arange(size) / rate_hz, widths_us[slot], measured, np.array(names)[slot])
+    return as_record(clean + noise_nm[: clean.size], widths_us, rate_hz, names)
 
 
 @dataclass

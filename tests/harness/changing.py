@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from stimrig.identify.records.record import Record
-from tests.harness.muscle import FINE_HZ, Patient, second_order
+from tests.harness.muscle import Patient, torque_after
+from tests.harness.patients import as_record
 
 PULSE_RATE_HZ = 40.0
-
-
-def _none(_trial: float) -> float:
-    return 0.0
-
-
-def _one(_trial: float) -> float:
-    return 1.0
-
-
-def _quiet(_trial: int, time_s: np.ndarray) -> np.ndarray:
-    return np.zeros(time_s.size)
 
 
 @dataclass(frozen=True)
@@ -34,10 +23,10 @@ class Changing:
     """
 
     patient: Patient
-    gain: Callable[[float], float] = _one
-    shift_us: Callable[[float], float] = _none
-    time_scale: Callable[[float], float] = _one
-    added: Callable[[int, np.ndarray], np.ndarray] = field(default=_quiet)
+    gain: Callable[[float], float] = lambda _trial: 1.0
+    shift_us: Callable[[float], float] = lambda _trial: 0.0
+    time_scale: Callable[[float], float] = lambda _trial: 1.0
+    added: Callable[[int, np.ndarray], np.ndarray] = lambda _trial, time_s: np.zeros(time_s.size)
 
     def play(
         self,
@@ -56,16 +45,11 @@ class Changing:
         moved = np.array([self.shift_us(a) for a in at])
         gain = np.array([self.gain(a) for a in at])
         drive = gain * self.patient.recruitment(np.where(widths_us > 0.0, np.maximum(widths_us - moved, 0.0), 0.0))
-        late = round(self.patient.delay_s * FINE_HZ)
-        fine = np.r_[np.zeros(late), np.repeat(drive, round(FINE_HZ / PULSE_RATE_HZ))]
-        fine = fine[: round(FINE_HZ / PULSE_RATE_HZ) * widths_us.size]
         constant_s = self.patient.time_constant_s * self.time_scale(trial + 0.5)
-        clean = second_order(fine, constant_s, self.patient.damping, FINE_HZ)
-        time_s = np.arange(round(widths_us.size / PULSE_RATE_HZ * rate_hz)) / rate_hz
-        torque = clean[np.round(time_s * FINE_HZ).astype(int)] + self.added(trial, time_s)
-        slot = np.minimum((time_s * PULSE_RATE_HZ + 1e-9).astype(int), widths_us.size - 1)
-        seen = sign * torque + baseline_nm + noise_nm * rng.standard_normal(time_s.size)
-        return Record.from_arrays(start_s + time_s, widths_us[slot], seen)
+        clean = torque_after(drive, rate_hz, constant_s, self.patient.damping, self.patient.delay_s)
+        torque = clean + self.added(trial, np.arange(clean.size) / rate_hz)
+        seen = sign * torque + baseline_nm + noise_nm * rng.standard_normal(torque.size)
+        return as_record(seen, widths_us, rate_hz, start_s=start_s)
 
 
 def reach_widths(patient: Patient, share: float = 0.4, seconds: float = 10.0) -> np.ndarray:

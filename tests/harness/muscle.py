@@ -26,6 +26,22 @@ def second_order(drive_nm: np.ndarray, time_constant_s: float, damping: float, r
     return np.asarray(lfilter(np.ravel(b), np.ravel(a), drive_nm))
 
 
+def torque_after(
+    drive_nm: np.ndarray,
+    rate_hz: float,
+    time_constant_s: float,
+    damping: float,
+    delay_s: float = 0.0,
+    pulse_rate_hz: float = 40.0,
+) -> np.ndarray:
+    """Clean torque from rest, sampled at `rate_hz`, of one recruited torque a pulse that comes after a delay, N·m."""
+    fine = np.repeat(drive_nm, round(FINE_HZ / pulse_rate_hz))
+    late = round(delay_s * FINE_HZ)
+    torque = second_order(np.r_[np.zeros(late), fine][: fine.size], time_constant_s, damping, FINE_HZ)
+    at = np.arange(round(drive_nm.size / pulse_rate_hz * rate_hz)) * FINE_HZ / rate_hz
+    return torque[np.round(at).astype(int)]
+
+
 @dataclass(frozen=True)
 class Patient:
     """The paper's muscle unless told otherwise; `gain` in N·m, `a2` per µs."""
@@ -61,10 +77,5 @@ class Patient:
 
     def torque(self, widths_us: np.ndarray, rate_hz: float, pulse_rate_hz: float = 40.0) -> np.ndarray:
         """Clean torque sampled at rate_hz for one width a pulse."""
-        fine = round(FINE_HZ / pulse_rate_hz)
-        drive = np.repeat(self.recruitment(widths_us), fine)
-        late = round(self.delay_s * FINE_HZ)
-        drive = np.r_[np.zeros(late), drive][: drive.size]
-        torque = second_order(drive, self.time_constant_s, self.damping, FINE_HZ)
-        at = np.round(np.arange(round(widths_us.size / pulse_rate_hz * rate_hz)) * FINE_HZ / rate_hz).astype(int)
-        return torque[at]
+        drive_nm = self.recruitment(widths_us)
+        return torque_after(drive_nm, rate_hz, self.time_constant_s, self.damping, self.delay_s, pulse_rate_hz)

@@ -39,6 +39,15 @@ def protocol(rng: np.random.Generator, top_us: float = 300.0, validate: bool = T
     return np.concatenate([p for _, p in parts]), [name for name, p in parts for _ in p]
 
 
+def as_record(
+    torque_nm: np.ndarray, widths_us: np.ndarray, rate_hz: float, names: list[str] | None = None, start_s: float = 0.0
+) -> Record:
+    """The record of a torque; with a width, and a segment, for each pulse."""
+    slot = np.minimum((np.arange(torque_nm.size) * 40 / rate_hz + 1e-9).astype(int), widths_us.size - 1)
+    segments = None if names is None else np.array(names)[slot]
+    return Record.from_arrays(start_s + np.arange(torque_nm.size) / rate_hz, widths_us[slot], torque_nm, segments)
+
+
 def make_record(
     patient: Patient,
     rng: np.random.Generator,
@@ -54,10 +63,7 @@ def make_record(
     """A record and its clean torque; `pulses`: a width and a segment for each pulse, drawn if None."""
     widths, names = pulses or protocol(rng, top_us, validate)
     clean = patient.torque(widths, rate_hz) + baseline_nm
-    n = clean.size
-    slot = np.minimum((np.arange(n) * 40 / rate_hz + 1e-9).astype(int), widths.size - 1)
-    noise = rng.standard_normal(n) * noise_nm
+    noise = rng.standard_normal(clean.size) * noise_nm
     if ar1:
         noise = lfilter([np.sqrt(1 - ar1**2)], [1, -ar1], noise)
-    record = Record.from_arrays(np.arange(n) / rate_hz, widths[slot], clean + noise, np.array(names)[slot])
-    return record, clean
+    return as_record(clean + noise, widths, rate_hz, names), clean
