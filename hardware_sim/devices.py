@@ -14,7 +14,6 @@ from typing import Any
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.limb import Limb
-from stimrig.hardware_sim.electrodes import Electrodes
 from stimrig.hardware_sim.faults import Faults
 from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
@@ -22,7 +21,7 @@ from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.sampling import take_in_order
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators import STIMULATORS
-from stimrig.hardware_sim.stimulators.board import Board, Firmware
+from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware
 from stimrig.hardware_sim.tables import pick
 from stimrig.hardware_sim.timeline import Timeline
 

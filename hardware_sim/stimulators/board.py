@@ -4,14 +4,83 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
-from stimrig.hardware_sim.electrodes import Electrodes
+from stimrig.hardware_sim.patients.muscle import Muscle
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode
 from stimrig.hardware_sim.timeline import Timeline
 
 FrameHook = Callable[[bytes], bytes | None]
 """A fault on the line: takes a frame and returns what is sent instead; None sends nothing."""
+Point = tuple[int, float]
+"""One piece of a pulse's shape: duration in µs, current in mA."""
+
+
+@dataclass(frozen=True)
+class FiredPulse:
+    """A pulse that the stimulator fired, as the muscle sees it: one phase's width and current."""
+
+    time_s: float
+    width_us: float
+    current_ma: float
+    delivered: bool
+    balanced: bool
+    source: str
+
+
+class Electrodes:
+    """One pair on one muscle, at one of the stimulator's outputs.
+
+    `raise_sync` is called for each pulse that flows. `cut` is the emergency switch: some devices report it, to the
+    others it looks like an open electrode.
+    """
+
+    def __init__(self, muscle: Muscle, raise_sync: Callable[[], None] = lambda: None) -> None:
+        self.attached = True
+        self.cut = False
+        self.output = (0, 0)
+        self.unbalanced_pulses = 0
+        self.delivered_pulses = 0
+        self.log: list[FiredPulse] = []
+        self._muscle = muscle
+        self._raise_sync = raise_sync
+
+    def closed_circuit(self, output: tuple[int, int]) -> bool:
+        """Whether current can flow at this (connector, channel)."""
+        return self.attached and not self.cut and output == self.output
+
+    def fire(self, time_s: float, points: Sequence[Point], output: tuple[int, int], source: str) -> bool:
+        """One pulse of this shape; True if it flowed through the muscle."""
+        width_us, current_ma, balanced = phase(points)
+        flows = self.closed_circuit(output) and width_us > 0
+        self.log.append(FiredPulse(time_s, width_us, current_ma, flows, balanced, source))
+        if not balanced:
+            self.unbalanced_pulses += 1
+        if flows:
+            self.delivered_pulses += 1
+            self._muscle.pulse(time_s, width_us, current_ma)
+            self._raise_sync()
+        return flows
+
+    def pulses(self, since: int = 0) -> list[dict[str, Any]]:
+        """The log from entry `since` on, as plain values."""
+        return [asdict(pulse) for pulse in self.log[since:]]
+
+
+def phase(points: Sequence[Point]) -> tuple[float, float, bool]:
+    """Width (µs) and mean current (mA) of a shape's positive phase, and whether its charge sums to zero.
+
+    The negative phase counts if there is no positive one: nerves respond to both.
+    """
+    net_us_ma = sum(width * current for width, current in points)
+    for sign in (1, -1):
+        width_us = sum(width for width, current in points if sign * current > 0)
+        if width_us > 0:
+            charge = sum(width * abs(current) for width, current in points if sign * current > 0)
+            return float(width_us), charge / width_us, net_us_ma == 0
+    return 0.0, 0.0, True
 
 
 class Board:
@@ -50,9 +119,11 @@ class Firmware(ABC):
     """What every stimulator's firmware offers, by the commands that it takes."""
 
     device: ClassVar[str]
+    wire: ClassVar[type[ScienceMode]]
 
     def __init__(self, board: Board) -> None:
         self._board = board
+        self._wire: Any = self.wire()
         self.commands: Counter[int] = Counter()
         """How often each came."""
 
@@ -68,11 +139,14 @@ class Firmware(ABC):
     def state(self) -> dict[str, Any]:
         """For the control line: at least `mode` and `high_voltage_on`."""
 
-    def _describe(self, mode: str, high_voltage_on: bool, corrupt_frames: int) -> dict[str, Any]:
+    def _send(self, number: int, command: int, data: bytes) -> None:
+        self._board.send(self._wire.encode(Packet(number, command, data)))
+
+    def _describe(self, mode: str, high_voltage_on: bool) -> dict[str, Any]:
         return {
             "device": self.device,
             "mode": mode,
             "high_voltage_on": high_voltage_on,
-            "corrupt_frames": corrupt_frames,
+            "corrupt_frames": self._wire.corrupt_frames,
             "commands": {str(command): count for command, count in sorted(self.commands.items())},
         }

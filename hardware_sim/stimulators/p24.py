@@ -9,9 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from stimrig.hardware_sim.stimulators import sciencemode4
 from stimrig.hardware_sim.stimulators.board import Board, Firmware
-from stimrig.hardware_sim.stimulators.framing import Packet
 from stimrig.hardware_sim.stimulators.p24_mid_level import (
     ELECTRODE,
     ELECTRODE_DETECTION_MA,
@@ -25,6 +23,7 @@ from stimrig.hardware_sim.stimulators.p24_mid_level import (
     parse_points,
     within_limits,
 )
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
 from stimrig.hardware_sim.timeline import Event, cancel
 
 LL_INIT, LL_CHANNEL_CONFIG, LL_STOP = 0, 2, 4
@@ -43,11 +42,10 @@ SOURCE_VOLT = 150.0
 class P24(Firmware):
     """The P24's state machine; commands are done one after another, in the order they came."""
 
-    device = "P24"
+    device, wire = "P24", ScienceMode4
 
     def __init__(self, board: Board) -> None:
         super().__init__(board)
-        self._decoder = sciencemode4.Decoder()
         self._queue: deque[Packet] = deque()
         self._doing: Event | None = None
         self._level = NO_LEVEL
@@ -82,10 +80,10 @@ class P24(Firmware):
 
     def received(self, data: bytes) -> None:
         """Bytes from the host; a corrupt frame is answered with a general error."""
-        corrupt = self._decoder.corrupt_frames
-        packets = self._decoder.feed(data, self._board.timeline.now_s)
-        if self._decoder.corrupt_frames > corrupt:
-            self._send(Packet(0, GENERAL_ERROR, bytes((TRANSFER,))))
+        corrupt = self._wire.corrupt_frames
+        packets = self._wire.feed(data, self._board.timeline.now_s)
+        if self._wire.corrupt_frames > corrupt:
+            self._send(0, GENERAL_ERROR, bytes((TRANSFER,)))
         self._queue.extend(packets)
         self._work()
 
@@ -98,7 +96,7 @@ class P24(Firmware):
 
     def state(self) -> dict[str, Any]:
         """For the control line."""
-        return self._describe(MODES[self.level], self.high_voltage_on, self._decoder.corrupt_frames)
+        return self._describe(MODES[self.level], self.high_voltage_on)
 
     def _work(self) -> None:
         while self._queue and self._doing is None:
@@ -116,18 +114,15 @@ class P24(Firmware):
 
         self._doing = self._board.timeline.after(delay_s, done)
 
-    def _send(self, packet: Packet) -> None:
-        self._board.send(sciencemode4.encode(packet))
-
     def _ack(self, packet: Packet, data: bytes) -> None:
-        self._send(Packet(packet.number, packet.command + 1, data))
+        self._send(packet.number, packet.command + 1, data)
 
     def _end_levels(self) -> None:
         self._mid_level.stop()
         self._level = NO_LEVEL
 
     def _unknown(self, packet: Packet) -> None:
-        self._send(Packet(packet.number, UNKNOWN_COMMAND, bytes((INVALID_COMMAND,))))
+        self._send(packet.number, UNKNOWN_COMMAND, bytes((INVALID_COMMAND,)))
 
     def _stim_status(self, packet: Packet) -> None:
         high_voltage = HIGH_VOLTAGE_ON_CODE if self.high_voltage_on else 0

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from stimrig.hardware_sim.electrodes import Point
-from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.board import Board, Point
 from stimrig.hardware_sim.timeline import Event, cancel
 
 OK, TRANSFER, PARAMETER, NOT_INITIALISED, HIGH_VOLTAGE = 0, 1, 2, 7, 8

@@ -15,9 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from stimrig.hardware_sim.stimulators import sciencemode2
 from stimrig.hardware_sim.stimulators.board import Board, Firmware
-from stimrig.hardware_sim.stimulators.framing import Packet
 from stimrig.hardware_sim.stimulators.rehastim2_channels import (
     CHANNELS,
     NO_ERROR,
@@ -30,6 +28,7 @@ from stimrig.hardware_sim.stimulators.rehastim2_channels import (
     parse_pulse,
     parse_start,
 )
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2
 from stimrig.hardware_sim.timeline import Event, cancel
 
 INIT, INIT_ACK, UNKNOWN_COMMAND, WATCHDOG = 1, 2, 3, 4
@@ -45,7 +44,7 @@ MODES = {NOT_CONNECTED: "none", START_MODE: "start", INITIALISED: "initialised",
 class RehaStim2(Firmware):
     """The RehaStim 2's state machine; each command is executed and acknowledged when it arrives."""
 
-    device = "RehaStim 2"
+    device, wire = "RehaStim 2", ScienceMode2
 
     def __init__(self, board: Board) -> None:
         super().__init__(board)
@@ -64,26 +63,26 @@ class RehaStim2(Firmware):
 
     def received(self, data: bytes) -> None:
         """Bytes from the host; a damaged command that can still be read is answered with a transfer error."""
-        for packet in self._decoder.feed(data, self._board.timeline.now_s):
+        for packet in self._wire.feed(data, self._board.timeline.now_s):
             self.commands[packet.command] += 1
             if packet.command == INIT_ACK:
                 self._connect(packet)
             elif self._mode != NOT_CONNECTED:
                 self._obey(packet)
-        for packet in self._decoder.take_damaged():
+        for packet in self._wire.take_damaged():
             if self._mode != NOT_CONNECTED and packet.command in self._handlers and packet.command != WATCHDOG:
                 self._ack(packet, TRANSFER)
 
     def reset(self) -> None:
         """Power lost and back: no stimulation, no connection; Init from number 0."""
-        self._decoder = sciencemode2.Decoder()
+        self._wire = self.wire()
         self._number = 0
         self._single_ends_s = 0.0
         self._disconnect()
 
     def state(self) -> dict[str, Any]:
         """For the control line."""
-        return self._describe(MODES[self._mode], self._mode == STARTED, self._decoder.corrupt_frames)
+        return self._describe(MODES[self._mode], self._mode == STARTED)
 
     def _connect(self, packet: Packet) -> None:
         """Accept an InitAck if it answers an Init that was sent since the connection was lost."""
@@ -103,7 +102,7 @@ class RehaStim2(Firmware):
     def _offer_connection(self) -> None:
         if self._board.unread() == 0:  # on hardware a closed port drops it; here it would wait for the next client
             self._offered.add(self._number)
-            self._send(INIT, bytes((PROTOCOL_VERSION,)))
+            self._say(INIT, bytes((PROTOCOL_VERSION,)))
         self._offer = self._board.timeline.after(INIT_PERIOD_S, self._offer_connection)
 
     def _alive(self) -> None:
@@ -113,25 +112,24 @@ class RehaStim2(Firmware):
     def _obey(self, packet: Packet) -> None:
         handler = self._handlers.get(packet.command)
         if handler is None:
-            self._board.send(sciencemode2.encode(Packet(packet.number, UNKNOWN_COMMAND, b"")))
+            self._send(packet.number, UNKNOWN_COMMAND, b"")
             return
         self._alive()
         handler(packet)
 
     def _ack(self, packet: Packet, result: int, data: bytes = b"") -> None:
-        body = bytes((result & 0xFF,)) + data
-        self._board.send(sciencemode2.encode(Packet(packet.number, packet.command + 1, body)))
+        self._send(packet.number, packet.command + 1, bytes((result & 0xFF,)) + data)
 
-    def _send(self, command: int, data: bytes) -> None:
+    def _say(self, command: int, data: bytes) -> None:
         """Send a packet that answers no command, with the device's own packet number."""
-        self._board.send(sciencemode2.encode(Packet(self._number, command, data)))
+        self._send(self._number, command, data)
         self._number = (self._number + 1) & 0xFF
 
     def _stimulation_failed(self, error: int) -> None:
         """Stop, go back to start mode and report the error."""
         self._channels.stop()
         self._mode = START_MODE
-        self._send(STIMULATION_ERROR, bytes((error & 0xFF,)))
+        self._say(STIMULATION_ERROR, bytes((error & 0xFF,)))
 
     def _init_channel_list(self, packet: Packet) -> None:
         wanted = parse_init(packet.data)

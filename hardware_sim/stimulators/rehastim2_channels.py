@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from stimrig.hardware_sim.electrodes import Point
-from stimrig.hardware_sim.stimulators.board import Board
+from stimrig.hardware_sim.stimulators.board import Board, Point
 from stimrig.hardware_sim.timeline import Event, cancel
 
 OK, PARAMETER = 0, -2

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
-from stimrig.hardware_sim.electrodes import Electrodes, Point
-from stimrig.hardware_sim.stimulators import sciencemode4
-from stimrig.hardware_sim.stimulators.board import Board
-from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware, Point
 from stimrig.hardware_sim.stimulators.p24 import P24
+from stimrig.hardware_sim.stimulators.sciencemode import Packet
 from stimrig.hardware_sim.timeline import Timeline
 
 LL_INIT, LL_CONFIG, LL_STOP = 0, 2, 4
@@ -28,23 +23,23 @@ class NotingMuscle:
 
 
 class Bench:
-    def __init__(self, firmware: Callable[[Board], Any] = P24, wire: Any = sciencemode4) -> None:
+    def __init__(self, firmware: type[Firmware] = P24) -> None:
         self.timeline = Timeline()
         self.muscle = NotingMuscle()
         self.syncs: list[float] = []
         self.electrodes = Electrodes(self.muscle, lambda: self.syncs.append(self.timeline.now_s))
         self.sent: list[tuple[float, Packet]] = []
         self.unread = 0
-        self._wire, self._decoder = wire, wire.Decoder()
+        self._decoder = firmware.wire()
         self.board = Board(self.timeline, self.electrodes, self._take, lambda: self.unread)
-        self.firmware = firmware(self.board)
+        self.firmware: Any = firmware(self.board)
 
     def _take(self, frame: bytes) -> None:
         now_s = self.timeline.now_s
         self.sent += [(now_s, packet) for packet in self._decoder.feed(frame, now_s)]
 
     def send(self, command: int, data: bytes = b"", number: int = 9) -> None:
-        self.firmware.received(self._wire.encode(Packet(number, command, data)))
+        self.firmware.received(self._decoder.encode(Packet(number, command, data)))
 
     def run(self, seconds: float) -> None:
         self.timeline.run_until(self.timeline.now_s + seconds)

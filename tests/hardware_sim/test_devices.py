@@ -11,8 +11,7 @@ import pytest
 
 from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.settings import Settings
-from stimrig.hardware_sim.stimulators.framing import Packet
-from stimrig.hardware_sim.stimulators.sciencemode4 import encode
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import ROOT
 from tests.hardware_sim.virtual_host import VirtualHost
@@ -25,11 +24,11 @@ def played(step_s: float, arm: str | None = None, faults: tuple[str, ...] = (), 
     """A digest of all that devices do in a second of pulses, advanced by steps."""
     devices = make_devices(Settings(noise_seed=7, **settings), arm, epoch_us=1)  # pyright: ignore[reportArgumentType]
     written, frames = [], []
-    devices.received(0.0, encode(Packet(1, LL_INIT, b"\x00")))
+    devices.received(0.0, ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")))
     for name in faults:
         devices.faults.on(name, {}, for_s=0.7)
     for k in range(1, 40):
-        devices.received(0.025 * k, encode(Packet(k, LL_CONFIG, PULSE)))
+        devices.received(0.025 * k, ScienceMode4.encode(Packet(k, LL_CONFIG, PULSE)))
         for n in range(1, int(0.025 / step_s)):
             devices.advance(0.025 * k + n * step_s)
             written += devices.take_bytes()
@@ -69,11 +68,11 @@ def test_a_processs_hash_seed_decides_nothing() -> None:
 def test_bytes_carry_the_time_at_which_they_were_written() -> None:
     devices = make_devices(Settings())
     assert devices.next_s() is None
-    devices.received(1.0, encode(Packet(1, LL_INIT, b"\x00")))
+    devices.received(1.0, ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")))
     assert devices.take_bytes() == []
     assert devices.next_s() == pytest.approx(1.0 + INIT_TO_ACK_S)
     devices.advance(2.0)
-    devices.received(0.5, encode(Packet(2, LL_CONFIG, PULSE)))  # late: it comes now
+    devices.received(0.5, ScienceMode4.encode(Packet(2, LL_CONFIG, PULSE)))  # late: it comes now
     devices.advance(3.0)
     times_s = [time_s for time_s, _ in devices.take_bytes()]
     assert times_s == pytest.approx([1.0 + INIT_TO_ACK_S, 2.0 + PULSE_TO_ACK_S])
@@ -106,7 +105,7 @@ def test_nothing_passes_while_a_cable_is_unplugged() -> None:
     devices.faults.on("cell_unplugged", {}, for_s=1.0)
     assert (devices.stimulator_plugged, devices.cell_plugged) == (False, False)
     assert devices.take_bytes() == [(0.0, bytes.fromhex("f0815581"))]
-    devices.received(0.5, encode(Packet(1, LL_INIT, b"\x00")))
+    devices.received(0.5, ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")))
     devices.frame_received(0.5, 0, b"\x02\x00")
     devices.advance(1.5)
     assert devices.take_frames()[0].time_s == pytest.approx(1.0)  # it was not stopped
@@ -127,7 +126,7 @@ def test_a_rehastim_offers_a_connection_only_to_a_host_that_reads() -> None:
 def test_a_power_cycle_forgets_all_but_what_has_happened() -> None:
     host = VirtualHost()
     assert (host.result(LL_INIT, b"\x00"), host.result(LL_CONFIG, PULSE)) == (0, 0)
-    host.devices.received(0.6, encode(Packet(1, LL_CONFIG, PULSE)))
+    host.devices.received(0.6, ScienceMode4.encode(Packet(1, LL_CONFIG, PULSE)))
     host.devices.power_cycle()
     assert host.ask(62)[0].data == b"\x00\x00\x00"
     assert host.samples()[0][1] == pytest.approx(400, abs=1)  # its counter began at 0

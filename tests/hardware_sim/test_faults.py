@@ -14,8 +14,7 @@ import pytest
 import serial
 
 from stimrig.hardware_sim.faults import library
-from stimrig.hardware_sim.stimulators.framing import Packet
-from stimrig.hardware_sim.stimulators.sciencemode4 import encode
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 from tests.hardware_sim.virtual_host import VirtualHost
@@ -171,7 +170,7 @@ def test_unplugged_mid_frame_and_back(rig: Emulated) -> None:
 
     def initialised(port: str) -> bool:
         with serial.Serial(port, 3_000_000, timeout=20) as line:
-            line.write(encode(Packet(1, LL_INIT, b"\x00")))
+            line.write(ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")))
             return len(line.read(13)) == 13
 
     with serial.Serial(rig.ready["stimulator"], 3_000_000, timeout=0.25) as line:
@@ -179,7 +178,7 @@ def test_unplugged_mid_frame_and_back(rig: Emulated) -> None:
         time.sleep(0.02)
         with pytest.raises((OSError, serial.SerialException)):
             for _ in range(10):
-                line.write(encode(Packet(1, LL_CONFIG, PULSE)))
+                line.write(ScienceMode4.encode(Packet(1, LL_CONFIG, PULSE)))
                 line.read(1)
         assert rig.ask(cmd="state")["stimulator"] is None
         assert not link.exists()
@@ -242,7 +241,7 @@ def test_the_control_line_tells_what_is_wrong(rig: Emulated, request_: dict[str,
 def test_pulses_carry_the_hosts_monotonic_time(rig: Emulated) -> None:
     before_s = time.monotonic()
     with serial.Serial(rig.ask(cmd="state")["stimulator"], 3_000_000, timeout=20) as line:
-        line.write(encode(Packet(1, LL_INIT, b"\x00")) + encode(Packet(2, LL_CONFIG, PULSE)))
+        line.write(ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")) + ScienceMode4.encode(Packet(2, LL_CONFIG, PULSE)))
         wait_for(lambda: len(rig.ask(cmd="pulses")["pulses"]) == 1)
     (pulse,) = rig.ask(cmd="pulses")["pulses"]
     assert before_s <= pulse["monotonic_s"] <= time.monotonic()

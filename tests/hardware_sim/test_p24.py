@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators.sciencemode import Packet
 from tests.hardware_sim.bench_board import (
     LL_CONFIG,
     LL_INIT,

@@ -15,7 +15,8 @@ import serial
 
 from stimrig.hardware_sim import load_cells, patients
 from stimrig.hardware_sim.offline import simulate
-from stimrig.hardware_sim.stimulators import STIMULATORS, sciencemode2, sciencemode4
+from stimrig.hardware_sim.stimulators import STIMULATORS
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2, ScienceMode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import emulated
 
@@ -35,18 +36,18 @@ def paced(line: serial.Serial, frames: list[bytes], ack_bytes: int) -> None:
 
 
 def p24(line: serial.Serial) -> None:
-    line.write(sciencemode4.encode(sciencemode4.Packet(1, LL_INIT, b"\x00")))
+    line.write(ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")))
     assert line.read(13)[-2:] == b"\x00\x0f"
-    frames = [sciencemode4.encode(sciencemode4.Packet(k, LL_CONFIG, config(*biphasic(300, 20)))) for k in range(PULSES)]
+    frames = [ScienceMode4.encode(Packet(k, LL_CONFIG, config(*biphasic(300, 20)))) for k in range(PULSES)]
     paced(line, frames, 15)
 
 
 def rehastim2(line: serial.Serial) -> None:
     line.reset_input_buffer()
-    (init,) = sciencemode2.Decoder().feed(line.read(10), 0.0)
-    line.write(sciencemode2.encode(sciencemode2.Packet(init.number, 2, b"\x00")))
+    (init,) = ScienceMode2().feed(line.read(10), 0.0)
+    line.write(ScienceMode2.encode(Packet(init.number, 2, b"\x00")))
     pulse = bytes.fromhex("00012c14")
-    frames = [sciencemode2.encode(sciencemode2.Packet(k, 36, pulse)) for k in range(PULSES)]
+    frames = [ScienceMode2.encode(Packet(k, 36, pulse)) for k in range(PULSES)]
     paced(line, frames, 9)
 
 

@@ -6,10 +6,8 @@ from itertools import pairwise
 
 import pytest
 
-from stimrig.hardware_sim.stimulators import sciencemode2
-from stimrig.hardware_sim.stimulators.framing import Packet
 from stimrig.hardware_sim.stimulators.rehastim2 import RehaStim2
-from stimrig.hardware_sim.stimulators.sciencemode2 import encode
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2
 from tests.hardware_sim.bench_board import Bench
 
 INIT, INIT_ACK, UNKNOWN, WATCHDOG, GET_MODE, INIT_LIST, START, STOP, SINGLE, ERROR = 1, 2, 3, 4, 10, 30, 32, 34, 36, 38
@@ -21,7 +19,7 @@ class Host(Bench):
     """A RehaStim 2's, which acknowledges at once."""
 
     def __init__(self) -> None:
-        super().__init__(RehaStim2, sciencemode2)
+        super().__init__(RehaStim2)
 
     def packets(self, command: int) -> list[Packet]:
         return [packet for _, packet in self.sent if packet.command == command]
@@ -129,7 +127,7 @@ class TestConnection:
         connected.send(command, setup() if command == INIT_LIST else b"")
         connected.run(1.0)
         assert connected.firmware.state()["mode"] != "none"
-        connected.firmware.received(encode(Packet(1, WATCHDOG, b""))[:2] + b"\x00\x81\x57\x01\x04\x0f")
+        connected.firmware.received(ScienceMode2.encode(Packet(1, WATCHDOG, b""))[:2] + b"\x00\x81\x57\x01\x04\x0f")
         connected.run(0.3)
         assert connected.firmware.state()["mode"] == "none"
 
@@ -138,7 +136,7 @@ class TestConnection:
         assert connected.sent[-1][1] == Packet(5, UNKNOWN, b"")
 
     def test_a_damaged_command_is_a_transfer_error(self, connected: Host) -> None:
-        frame = bytearray(encode(Packet(6, SINGLE, pulse(300, 24))))
+        frame = bytearray(ScienceMode2.encode(Packet(6, SINGLE, pulse(300, 24))))
         frame[-2] ^= 0x40
         connected.firmware.received(bytes(frame))
         assert connected.sent[-1][1] == Packet(6, SINGLE + 1, bytes((TRANSFER & 0xFF,)))

@@ -11,8 +11,7 @@ import time
 import pytest
 import serial
 
-from stimrig.hardware_sim.stimulators.framing import Packet
-from stimrig.hardware_sim.stimulators.sciencemode2 import Decoder, encode
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2
 from tests.hardware_sim.emulated import emulated, wait_for
 
 pytestmark = pytest.mark.wire
@@ -20,7 +19,7 @@ pytestmark = pytest.mark.wire
 
 def pulse_for_ever(path: str) -> None:
     """Connect, start a channel list, and tell each ack of its pulses."""
-    line, decoder, packets = serial.Serial(path, 460_800, parity=serial.PARITY_EVEN), Decoder(), list[Packet]()
+    line, decoder, packets = serial.Serial(path, 460_800, parity=serial.PARITY_EVEN), ScienceMode2(), list[Packet]()
 
     def wait(command: int) -> Packet:
         while not [packet for packet in packets if packet.command == command]:
@@ -29,11 +28,11 @@ def pulse_for_ever(path: str) -> None:
         packets.clear()
         return found
 
-    line.write(encode(Packet(wait(1).number, 2, b"\x00")))
-    line.write(encode(Packet(5, 30, bytes.fromhex("00 01 00 0d 0030 00"))))
+    line.write(ScienceMode2.encode(Packet(wait(1).number, 2, b"\x00")))
+    line.write(ScienceMode2.encode(Packet(5, 30, bytes.fromhex("00 01 00 0d 0030 00"))))
     assert wait(31).data == b"\x00"
     while True:
-        line.write(encode(Packet(5, 32, bytes.fromhex("00 00fa 14"))))
+        line.write(ScienceMode2.encode(Packet(5, 32, bytes.fromhex("00 00fa 14"))))
         assert wait(33).data == b"\x00"
         print(time.monotonic(), flush=True)
         time.sleep(0.02)

@@ -9,8 +9,7 @@ from typing import Any
 from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.settings import Settings
-from stimrig.hardware_sim.stimulators.framing import Packet
-from stimrig.hardware_sim.stimulators.sciencemode4 import Decoder, encode
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
 
 LAYOUT = struct.Struct("<fHBB")
 
@@ -19,10 +18,10 @@ class VirtualHost:
     def __init__(self, arm: str | None = None, **settings: Any) -> None:
         self.devices = make_devices(Settings(**settings), arm)
         self.answered_s = 0.0
-        self._decoder = Decoder()
+        self._decoder = ScienceMode4()
 
     def ask(self, command: int, data: bytes = b"", wait_s: float = 0.25) -> list[Packet]:
-        self.devices.received(self.devices.timeline.now_s, encode(Packet(1, command, data)))
+        self.devices.received(self.devices.timeline.now_s, ScienceMode4.encode(Packet(1, command, data)))
         return self.read(wait_s)
 
     def read(self, wait_s: float = 0.25) -> list[Packet]:

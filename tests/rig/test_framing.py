@@ -10,10 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stimrig.hardware_sim.stimulators import framing
-from stimrig.hardware_sim.stimulators import sciencemode2 as emulated2
-from stimrig.hardware_sim.stimulators import sciencemode4 as emulated4
-from stimrig.hardware_sim.stimulators.framing import Packet
+from stimrig.hardware_sim.stimulators import sciencemode
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2, ScienceMode4
 from stimrig.rig.devices import p24, rehastim2
 from stimrig.rig.devices._line import Packet as RigsPacket
 from stimrig.rig.errors import WireError
@@ -84,8 +82,8 @@ def of_rig(version: int, module: Any) -> Codec:
 CODECS = {
     "rig 2": of_rig(2, rehastim2),
     "rig 4": of_rig(4, p24),
-    "emulator 2": Codec(2, emulated2.encode, emulated2.Decoder, 0, "corrupt_frames"),
-    "emulator 4": Codec(4, emulated4.encode, emulated4.Decoder, 0, "corrupt_frames"),
+    "emulator 2": Codec(2, ScienceMode2.encode, ScienceMode2, 0, "corrupt_frames"),
+    "emulator 4": Codec(4, ScienceMode4.encode, ScienceMode4, 0, "corrupt_frames"),
 }
 EACH = pytest.mark.parametrize("codec", CODECS.values(), ids=CODECS)
 VECTORS = [
@@ -161,16 +159,16 @@ def test_after_garbage_frames_are_found_again(codec: Codec, garbage: bytes):
     assert read(decoder, (400 if codec.lost else 1) * codec.encode(NEXT), 1.0)[-1:] == [NEXT]
 
 
-@pytest.mark.parametrize("module", [emulated2, emulated4])
-def test_half_a_frame_of_a_dead_client_does_not_swallow_the_next(module: Any):
-    decoder, frame = module.Decoder(), module.encode(Packet(3, 2, bytes(32)))
+@pytest.mark.parametrize("wire", [ScienceMode2, ScienceMode4])
+def test_half_a_frame_of_a_dead_client_does_not_swallow_the_next(wire: Any):
+    decoder, frame = wire(), wire.encode(Packet(3, 2, bytes(32)))
     assert decoder.feed(frame[:20], 0.0) == []
-    assert decoder.feed(module.encode(NEXT), 0.5) == [NEXT]
+    assert decoder.feed(wire.encode(NEXT), 0.5) == [NEXT]
     assert decoder.corrupt_frames == 1
 
 
 def test_a_damaged_frame_is_kept_as_it_reads():
-    decoder, frame = emulated2.Decoder(), bytearray(emulated2.encode(Packet(4, 32, bytes.fromhex("0000fa14"))))
+    decoder, frame = ScienceMode2(), bytearray(ScienceMode2.encode(Packet(4, 32, bytes.fromhex("0000fa14"))))
     frame[-2] ^= 0x02
     assert decoder.feed(bytes(frame), 0.0) == []
     assert decoder.take_damaged() == [Packet(4, 32, bytes.fromhex("0000fa16"))]
@@ -180,8 +178,8 @@ def test_a_damaged_frame_is_kept_as_it_reads():
 @given(st.binary(max_size=300))
 @settings(max_examples=200, deadline=None)
 def test_stuffing_is_reversible_and_hides_borders(data: bytes):
-    stuffed = framing.stuff(data)
-    assert framing.unstuff(stuffed) == data
+    stuffed = sciencemode.stuff(data)
+    assert sciencemode.unstuff(stuffed) == data
     assert not {0xF0, 0x0F} & set(stuffed)
 
 

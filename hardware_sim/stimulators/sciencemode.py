@@ -1,10 +1,11 @@
-"""The line layer that ScienceMode 2 and 4 share: byte stuffing, and finding frames in a stream of bytes.
+"""ScienceMode 2 and 4 as the devices see them: frames on the line to commands, and acks back.
 
 A frame is F0, a header of a fixed length, the stuffed body, 0F. Each byte of the header goes as `81, byte ^ 55`.
 """
 
 from __future__ import annotations
 
+import binascii
 from abc import ABC, abstractmethod
 from typing import ClassVar, NamedTuple
 
@@ -48,8 +49,10 @@ def frame(header: bytes, body: bytes) -> bytes:
     return b"%c%b%b%c" % (START, escaped, body, STOP)
 
 
-class FrameDecoder(ABC):
-    """Bytes in, packets out; bytes that form no frame are skipped and counted in `corrupt_frames`.
+class ScienceMode(ABC):
+    """What both versions share: byte stuffing, and finding frames in a stream of bytes.
+
+    Bytes in, packets out; bytes that form no frame are skipped and counted in `corrupt_frames`.
 
     A piece of a frame after which nothing comes for `PATIENCE_S` is dropped. A client that dies in the middle of a
     frame therefore does not cost the next client its first command.
@@ -62,6 +65,11 @@ class FrameDecoder(ABC):
         self.corrupt_frames = 0
         self._buffer = bytearray()
         self._last_byte_s = 0.0
+
+    @staticmethod
+    @abstractmethod
+    def encode(packet: Packet) -> bytes:
+        """The frame of one packet."""
 
     @abstractmethod
     def body_bytes(self, header: bytes) -> int | None:
@@ -120,3 +128,91 @@ class FrameDecoder(ABC):
         """Skip this start byte: another frame may begin inside what looked like one."""
         self.corrupt_frames += 1
         del self._buffer[:1]
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8 with polynomial 07, from 0, most significant bit first."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x07 if crc & 0x80 else crc << 1) & 0xFF
+    return crc
+
+
+class ScienceMode2(ScienceMode):
+    """The header is a CRC and the length of the stuffed body, one byte each. The body is packet number, command, data.
+
+    CRC-8 (poly 07, init 0, not reflected) is taken over the stuffed body. Frames with intact borders but a wrong CRC
+    are kept until `take_damaged`.
+    """
+
+    SHORTEST_BODY = 2
+    LONGEST_BODY = 2 * (2 + 8 * 4)
+    """A Start of 8 channels, every byte stuffed."""
+    HEADER_BYTES = 2
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._damaged: list[Packet] = []
+
+    @staticmethod
+    def encode(packet: Packet) -> bytes:
+        """Number and command have a byte each."""
+        body = stuff(bytes((packet.number, packet.command)) + packet.data)
+        return frame(bytes((crc8(body), len(body))), body)
+
+    def take_damaged(self) -> list[Packet]:
+        """The damaged frames since the last call, as they read."""
+        damaged, self._damaged = self._damaged, []
+        return damaged
+
+    def body_bytes(self, header: bytes) -> int | None:
+        """From the body's length."""
+        return header[1] if self.SHORTEST_BODY <= header[1] <= self.LONGEST_BODY else None
+
+    def parse(self, header: bytes, stuffed: bytes) -> Packet | None:
+        """None if the body is too short or the CRC is wrong."""
+        body = unstuff(stuffed)
+        if body is None or len(body) < self.SHORTEST_BODY:
+            return None
+        packet = Packet(body[0], body[1], body[2:])
+        if header[0] != crc8(stuffed):
+            self._damaged.append(packet)
+            return None
+        return packet
+
+
+class ScienceMode4(ScienceMode):
+    """The header is the length of the whole frame and a CRC, two bytes each.
+
+    CRC-16/XMODEM is taken over the stuffed payload: u16 big endian, number << 10 | command, then data.
+    """
+
+    AROUND_BODY = 10
+    """Start, escaped header and stop."""
+    SHORTEST_FRAME = 12
+    LONGEST_FRAME = 2 * (3 + 8 * (3 + 16 * 4)) + AROUND_BODY
+    """A mid-level update of 8 channels with 16 points each, every byte stuffed."""
+    HEADER_BYTES = 4
+
+    @staticmethod
+    def encode(packet: Packet) -> bytes:
+        """The number has 6 bits, the command 10."""
+        head = packet.number << 10 | packet.command
+        payload = stuff(head.to_bytes(2, "big") + packet.data)
+        length = len(payload) + ScienceMode4.AROUND_BODY
+        return frame(length.to_bytes(2, "big") + binascii.crc_hqx(payload, 0).to_bytes(2, "big"), payload)
+
+    def body_bytes(self, header: bytes) -> int | None:
+        """From the length of the whole frame."""
+        length = int.from_bytes(header[:2], "big")
+        return length - self.AROUND_BODY if self.SHORTEST_FRAME <= length <= self.LONGEST_FRAME else None
+
+    def parse(self, header: bytes, stuffed: bytes) -> Packet | None:
+        """None if the CRC is wrong or the payload too short."""
+        payload = unstuff(stuffed)
+        if int.from_bytes(header[2:], "big") != binascii.crc_hqx(stuffed, 0) or payload is None or len(payload) < 2:
+            return None
+        head = int.from_bytes(payload[:2], "big")
+        return Packet(head >> 10, head & 0x3FF, payload[2:])
