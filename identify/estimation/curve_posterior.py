@@ -14,8 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack, solve_triangular
 
+from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.recruitment.near_shape import NearShape
 
+DAMPING = Damping(first=1e-4, less=8.0, more=8.0, least=1e-7)
 STEPS = 40
 """Newton steps at most."""
 ENOUGH = 0.02
@@ -116,24 +118,23 @@ class CurvePosterior:
 
     def mode(self, z: np.ndarray, kind: int) -> Mode:
         """The mode nearest to a start, by damped Gauss-Newton steps."""
-        value, damping, trial = self.value(z, kind), 1e-4, 0.0
-        for _ in range(STEPS):
-            gradient, information, by_z = self._bent(z, kind)
-            moved = None
-            while damping < 1e8:
+
+        def trials(at: tuple[np.ndarray, float], _step: int, _damping: float) -> Trial[tuple[np.ndarray, float]]:
+            gradient, information, by_z = self._bent(at[0], kind)
+
+            def trial(damping: float) -> tuple[np.ndarray, float]:
                 step = _solve(information, gradient, damping)[0]
                 # What is negligible may change as it likes.
                 step = step / max(float(np.max(np.abs(by_z @ step[: 3 + self.n]))) / LARGEST_LOG, 1.0)
-                trial = self.value(z + step, kind)
-                if trial > value - 1e-9:
-                    moved = step
-                    break
-                damping *= 8.0
-            if moved is None:
-                break
-            gain, z, value, damping = trial - value, z + moved, trial, max(damping / 8.0, 1e-7)
-            if gain < ENOUGH:
-                break
+                return at[0] + step, self.value(at[0] + step, kind)
+
+            return trial
+
+        def gain(at: tuple[np.ndarray, float], trial: tuple[np.ndarray, float]) -> float | None:
+            return trial[1] - at[1] if trial[1] > at[1] - 1e-9 else None
+
+        search = Search(DAMPING, trials, gain, lambda gained, _step: gained < ENOUGH)
+        z, value = descend(search, (z, self.value(z, kind)), STEPS).at
         root = _solve(self._bent(z, kind)[1], np.zeros(z.size), 1e-9)[1]
         evidence = value + 0.5 * float(np.linalg.slogdet(self.precision)[1]) - float(np.sum(np.log(np.diag(root))))
         return Mode(kind, z, evidence, root)

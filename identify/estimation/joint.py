@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numba import njit
 
 from stimrig.identify.effects import get, registry
 from stimrig.identify.effects.base import Form
+from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.noise import NoiseLevel, band_part, profile, whitened
 from stimrig.identify.simulation.problem import Problem
 
@@ -28,6 +30,9 @@ def gram(rows):  # pragma: no cover
     return out
 
 
+DAMPING = Damping(first=1e-3, less=6.0, more=8.0, least=1e-7, raised=1e-3, patience=6)
+LARGEST_FIRST = 1e-3
+"""Damping of the step by which the promised gain is judged, at most."""
 OPTIMISM = 3.0
 """A run is stopped only if it stays below the floor even with this many times the gain that a parabola predicts."""
 
@@ -143,62 +148,76 @@ def solve(
     floor : float or None
         Stop after the first step if this log evidence is out of reach.
     """
-    at = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
-    assert at is not None
-    frozen = np.zeros(problem.size, bool)
-    for chosen in problem.chosen:
-        if chosen.form.fixed:
-            frozen[chosen.places.start : chosen.places.stop] = True
-    damping, iterations = 1e-3, 0
-    prior_mean, precision = problem.prior
-    hessian = None
-    while iterations < most:
-        iterations += 1
-        products = gram(_whiten(problem, np.vstack([at.residual, at.slopes]), at.noise))
-        gradient = products[0, 1:] - precision @ (at.theta - prior_mean)
-        hessian = products[1:, 1:] + precision
-        step, shortened = _step(hessian, gradient, min(damping, 1e-3), at.theta, problem, frozen)
+    start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
+    assert start is not None
+
+    def trials(at: _Point, step: int, damping: float) -> Trial[_Point] | None:
+        first = min(damping, LARGEST_FIRST)
+        change, shortened = _step(at, first)
         # Gain of the whole step if the log posterior were a parabola; later steps do what a shortened one leaves.
-        promised = 0.5 * float(gradient @ step) * shortened
+        promised = 0.5 * float(at.gradient @ change) * shortened
         # The start of an effect may be a point where the gradient is zero at first.
-        if (iterations > 1 or not problem.chosen) and promised < 0.5 * tolerance:
-            break
+        if (step > 1 or not problem.chosen) and promised < 0.5 * tolerance:
+            return None
         # The first step predicts too little from a distant start: in a trial, a sixth of the final gain.
-        if floor is not None and iterations > 1:
-            reached = at.value - 0.5 * _log_det_ratio(problem, hessian)
-            if reached + OPTIMISM * (promised + 1.0) < floor:
-                break
-        found, damping = _advance(problem, at, hessian, gradient, damping, frozen, step)
-        if found is None:
-            break
-        gain, at, hessian = found.value - at.value, found, None
-        if gain < tolerance and iterations >= 2:
-            break
-    if hessian is None:
-        hessian = gram(_whiten(problem, at.slopes, at.noise)) + precision
+        if floor is not None and step > 1 and at.log_evidence + OPTIMISM * (promised + 1.0) < floor:
+            return None
+
+        def trial(damping: float) -> _Point:
+            moved = change if damping == first else _step(at, damping)[0]
+            there = np.clip(at.theta + moved, problem.lower, problem.upper)
+            return _at(problem, there, at.noise) or replace(at, value=-np.inf)
+
+        return trial
+
+    def gain(at: _Point, trial: _Point) -> float | None:
+        return trial.value - at.value if trial.value > at.value - 1e-9 else None
+
+    search = Search(DAMPING, trials, gain, lambda gained, step: gained < tolerance and step >= 2)
+    found = descend(search, start, most)
+    at = found.at
     return Fitted(
         problem=problem,
         theta=at.theta,
         noise=at.noise,
         log_likelihood=at.log_likelihood,
-        log_evidence=at.value - 0.5 * _log_det_ratio(problem, hessian),
+        log_evidence=at.log_evidence,
         residual_nm=at.residual,
         slopes=at.slopes,
-        hessian=hessian,
-        converged=most == 0 or iterations < most,
+        hessian=at.hessian,
+        converged=most == 0 or found.steps < most,
     )
 
 
 @dataclass(frozen=True)
 class _Point:
-    """The present point: parameters, residual, slopes, noise, log-likelihood, and log posterior (`value`)."""
+    """A point of the search: parameters, residual, slopes, noise, log-likelihood, and log posterior (`value`)."""
 
+    problem: Problem
     theta: np.ndarray
     residual: np.ndarray
     slopes: np.ndarray
     noise: NoiseLevel
     log_likelihood: float
     value: float
+
+    @cached_property
+    def _products(self) -> np.ndarray:
+        return gram(_whiten(self.problem, np.vstack([self.residual, self.slopes]), self.noise))
+
+    @cached_property
+    def gradient(self) -> np.ndarray:
+        mean, precision = self.problem.prior
+        return self._products[0, 1:] - precision @ (self.theta - mean)
+
+    @cached_property
+    def hessian(self) -> np.ndarray:
+        return self._products[1:, 1:] + self.problem.prior[1]
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """By Laplace's approximation."""
+        return self.value - 0.5 * (float(np.linalg.slogdet(self.hessian)[1]) - self.problem.prior_log_det)
 
 
 def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = False) -> _Point | None:
@@ -207,34 +226,15 @@ def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = Fal
         return None
     residual = problem.setup.target_nm - mean
     level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
-    return _Point(theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
+    return _Point(problem, theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
 
 
-def _advance(
-    problem: Problem,
-    at: _Point,
-    hessian: np.ndarray,
-    gradient: np.ndarray,
-    damping: float,
-    frozen: np.ndarray,
-    step: np.ndarray,
-) -> tuple[_Point | None, float]:
-    """The next point that is not worse, and the damping to continue with; None if none is found."""
-    for attempt in range(6):
-        if attempt or damping > 1e-3:
-            step, _ = _step(hessian, gradient, damping, at.theta, problem, frozen)
-        trial = _at(problem, np.clip(at.theta + step, problem.lower, problem.upper), at.noise)
-        if trial is not None and trial.value > at.value - 1e-9:
-            return trial, max(damping / 6.0, 1e-7)
-        damping = max(damping * 8.0, 1e-3)
-    return None, damping
-
-
-def _step(
-    hessian: np.ndarray, gradient: np.ndarray, damping: float, theta: np.ndarray, problem: Problem, frozen: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _step(at: _Point, damping: float) -> tuple[np.ndarray, float]:
     """Damped Newton step, and the factor by which it was shortened. Parameters at a bound do not leave it."""
-    stuck = frozen | ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
+    problem, theta, gradient, hessian = at.problem, at.theta, at.gradient, at.hessian
+    stuck = ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
+    for chosen in problem.chosen:
+        stuck[chosen.places.start : chosen.places.stop] |= chosen.form.fixed
     free = np.flatnonzero(~stuck)
     scale = np.sqrt(np.diag(hessian)[free])
     system = hessian[np.ix_(free, free)] / scale[:, None] / scale[None, :]
@@ -253,10 +253,6 @@ def _step(
             limit[place] = (problem.upper[place] - problem.lower[place]) / 3.0
     shortened = max(float(np.max(np.abs(step) / limit)), 1.0)
     return step / shortened, shortened
-
-
-def _log_det_ratio(problem: Problem, hessian: np.ndarray) -> float:
-    return float(np.linalg.slogdet(hessian)[1]) - problem.prior_log_det
 
 
 def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:

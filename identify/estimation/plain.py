@@ -14,7 +14,7 @@ from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.joint import Fitted, solve
-from stimrig.identify.estimation.projection import Projection, Solution, State, bounded, descend, search
+from stimrig.identify.estimation.projection import Projection, Solution, State, bounded, descend_from, search
 from stimrig.identify.estimation.samples import Raw, inspect, white_noise
 from stimrig.identify.noise import NoiseLevel, ar1_or_white, whiten
 from stimrig.identify.records.record import HELD_OUT, Record
@@ -193,7 +193,7 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
     delay = 0.0 if delay_s is None else delay_s
     starts = [State(projection, bounded(projection, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
     best = min(starts, key=lambda state: state.cost)
-    return descend(best, most=12, tolerance=0.5)
+    return descend_from(best, most=12, tolerance=0.5)
 
 
 def designed(first: Solution, count: int | None = None) -> tuple[Projection, SecondOrder]:

@@ -16,6 +16,7 @@ from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUND
 from stimrig.identify.dynamics.second_order import Core, step_matrix
 from stimrig.identify.dynamics.states import held_states, read_means
 from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.noise import whiten
 from stimrig.identify.recruitment import Basis
 from stimrig.identify.recruitment.smoothing import choose_weight, straight_lines
@@ -174,6 +175,9 @@ class Solution:
         return self.projection.target - self.columns @ self.coefficients
 
 
+DAMPING = Damping(first=0.0, less=10.0, more=10.0, raised=1e-2)
+NEGLIGIBLE = 1e-5
+"""Damping below which there is none."""
 REWEIGHTED = 2
 """After this many steps the weight of the penalty is kept, since a cost that changes has no minimum."""
 
@@ -199,32 +203,36 @@ def search(
         Largest number of steps.
     """
     target = whiten(projection.target, projection.stretches, ar1)
-    return descend(State(projection, bounded(projection, start), target, ar1, None), most, tolerance=0.01)
+    return descend_from(State(projection, bounded(projection, start), target, ar1, None), most, tolerance=0.01)
 
 
-def descend(state: State, most: int, tolerance: float) -> Solution:
+def descend_from(start: State, most: int, tolerance: float) -> Solution:
     """The same from a state. It ends when a step is smaller than `tolerance` standard errors."""
-    projection, linear, target, ar1 = state.projection, state.linear, state.target, state.ar1
-    damping, taken = 0.0, 0
-    while taken < most:
-        taken += 1
-        step = state.step(damping)
-        trial = bounded(projection, _moved(linear, step))
-        moved = _difference(linear, trial)[: projection.searched]
-        # Size of the step in standard errors, from the information matrix.
-        size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * target.size / state.squares))
-        if size < tolerance or np.max(np.abs(moved)) < 1e-9:
-            break
-        keep = None if taken <= REWEIGHTED else state.weight
-        attempt = State(projection, trial, target, ar1, keep)
-        against = state.cost if keep is not None else state.cost_at(attempt.weight)
-        if attempt.cost <= against * (1 + 1e-9):
-            linear, state, damping = trial, attempt, damping / 10 if damping > 1e-4 else 0.0
-        else:
-            damping = max(10 * damping, 1e-2)
-            if damping > 1e8:
-                break
-    return state.solution()
+    projection, target, ar1 = start.projection, start.target, start.ar1
+    taken = 0
+
+    def trials(state: State, _step: int, _damping: float) -> Trial[State]:
+        def trial(damping: float) -> State | None:
+            nonlocal taken
+            taken += 1
+            if taken > most:
+                return None
+            step = state.step(damping if damping > NEGLIGIBLE else 0.0)
+            there = bounded(projection, _moved(state.linear, step))
+            moved = _difference(state.linear, there)[: projection.searched]
+            # Size of the step in standard errors, from the information matrix.
+            size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * target.size / state.squares))
+            if size < tolerance or np.max(np.abs(moved)) < 1e-9:
+                return None
+            return State(projection, there, target, ar1, None if taken <= REWEIGHTED else state.weight)
+
+        return trial
+
+    def gain(state: State, trial: State) -> float | None:
+        against = state.cost if taken > REWEIGHTED else state.cost_at(trial.weight)
+        return against - trial.cost if trial.cost <= against * (1 + 1e-9) else None
+
+    return descend(Search(DAMPING, trials, gain, lambda _gained, _step: False), start, most).at.solution()
 
 
 def project(projection: Projection, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:

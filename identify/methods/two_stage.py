@@ -27,6 +27,7 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.dynamics.second_order import recursion
 from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.estimation.finish import finish, finish_discrete
 from stimrig.identify.estimation.plain import pilot_curve, pilot_solution, to_fitted
 from stimrig.identify.estimation.projection import Projection, Solution, project, search
@@ -38,6 +39,7 @@ from stimrig.identify.recruitment.smoothing import KNOTS, PILOT_KNOTS, adapted_k
 
 LARGEST_POLE = 0.9995
 MOST_DELAYS = 4
+DAMPING = Damping(first=1e-3, less=10.0, more=10.0, least=1e-12)
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,17 @@ def stable(a: np.ndarray) -> np.ndarray:
     return np.real(np.poly(roots))
 
 
+@dataclass(frozen=True)
+class _Run:
+    """A denominator, what it makes of the inputs, the rest solved for, the output, and its squared error."""
+
+    a: np.ndarray
+    columns: list[np.ndarray]
+    theta: np.ndarray
+    fitted: np.ndarray
+    cost: float
+
+
 def equation_error(
     torque: np.ndarray, drive: np.ndarray, rows: np.ndarray, order: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -133,44 +146,40 @@ def output_error(
         raise NotIdentifiable("the input of the linear block never changes", fix="Record a PRBS.")
     target = np.where(rows, np.nan_to_num(torque), 0.0)
 
-    def solve(a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    def solve(a: np.ndarray) -> _Run:
         columns = [recursion(a, shifted(drive, delay + j).copy()) for j in range(zeros + 1)]
         design = np.stack([*columns, np.ones(drive.size)], axis=1)
         theta = np.linalg.lstsq(design[rows], target[rows], rcond=None)[0]
         fitted = design @ theta
         error = (target - fitted)[rows]
-        return theta, fitted, float(error @ error)
+        return _Run(a, columns, theta, fitted, float(error @ error))
+
+    def trials(at: _Run, _step: int, _damping: float) -> Trial[_Run]:
+        inner = at.fitted - at.theta[-1]
+        slopes = [-recursion(at.a, shifted(inner, j).copy()) for j in range(1, poles + 1)]
+        jacobian = np.stack([*slopes, *at.columns, np.ones(drive.size)], axis=1)[rows]
+        scale = np.linalg.norm(jacobian, axis=0) + 1e-300
+        jacobian /= scale
+        gram, right = jacobian.T @ jacobian, jacobian.T @ (target - at.fitted)[rows]
+
+        def trial(damping: float) -> _Run:
+            step = np.linalg.solve(gram + damping * np.eye(len(gram)), right) / scale
+            return solve(stable(np.r_[1.0, at.a[1:] + step[:poles]]))
+
+        return trial
+
+    def gain(at: _Run, trial: _Run) -> float | None:
+        return (at.cost - trial.cost) / max(at.cost, 1e-300) if trial.cost <= at.cost else None
 
     if start is None:
         rough = equation_error(torque - _rest_level(torque, drive, rows), drive, rows, order)[1]
-        a = _steiglitz_mcbride(target, drive, rows, order, stable(rough))
-    else:
-        a = start
-    theta, fitted, cost = solve(a)
-    damping = 1e-3
-    for _ in range(most if poles else 0):
-        inner = fitted - theta[-1]
-        columns = [recursion(a, shifted(drive, delay + j).copy()) for j in range(zeros + 1)]
-        slopes = [-recursion(a, shifted(inner, j).copy()) for j in range(1, poles + 1)]
-        jacobian = np.stack([*slopes, *columns, np.ones(drive.size)], axis=1)[rows]
-        scale = np.linalg.norm(jacobian, axis=0) + 1e-300
-        jacobian /= scale
-        gram, right = jacobian.T @ jacobian, jacobian.T @ (target - fitted)[rows]
-        improved = False
-        while damping < 1e8:
-            step = np.linalg.solve(gram + damping * np.eye(len(gram)), right) / scale
-            trial = stable(np.r_[1.0, a[1:] + step[:poles]])
-            new = solve(trial)
-            if new[2] <= cost:
-                improved = cost - new[2] > 1e-9 * cost
-                a, (theta, fitted, cost), damping = trial, new, max(damping / 10, 1e-12)
-                break
-            damping *= 10
-        if not improved:
-            break
+        start = _steiglitz_mcbride(target, drive, rows, order, stable(rough))
+    search = Search(DAMPING, trials, gain, lambda gained, _step: not gained > 1e-9)
+    found = descend(search, solve(start), most if poles else 0).at
+    theta, cost = found.theta, found.cost
     count, free = int(rows.sum()), poles + zeros + 2
     bic = count * np.log(max(cost / count, 1e-300)) + free * np.log(count)
-    return OutputError(theta[:-1], a, delay, float(theta[-1]), fitted, cost, float(bic))
+    return OutputError(theta[:-1], found.a, delay, float(theta[-1]), found.fitted, cost, float(bic))
 
 
 def _rest_level(torque: np.ndarray, drive: np.ndarray, rows: np.ndarray) -> float:
