@@ -18,13 +18,8 @@ LONGEST_NAME = 63
 def write(path: Path, variables: Mapping[str, Any]) -> None:
     """Write variables as a MAT file.
 
-    Objects become structs, lists of numbers columns, tables of numbers matrices, other lists cell arrays, null an empty
-    matrix. A name that MATLAB does not take loses its other signs.
-
-    Raises
-    ------
-    OSError
-        It cannot be written.
+    Objects become structs, lists of numbers columns, tables of numbers matrices, other lists cell arrays, null an
+    empty matrix. A name that MATLAB does not take loses its other signs. Raises OSError: it cannot be written.
     """
     values = {_name(name): _value(json_value(value)) for name, value in variables.items()}
     with path.open("wb") as file:

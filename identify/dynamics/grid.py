@@ -306,10 +306,7 @@ def runs(flags: np.ndarray) -> list[slice]:
 def make_grid(record: Record) -> Grid:
     """Put a record on the grid of its pulses.
 
-    Raises
-    ------
-    BadRecord
-        Fewer than eight pulse intervals, or sampled more slowly than the pulses.
+    Raises BadRecord: fewer than eight pulse intervals, or sampled more slowly than the pulses.
     """
     check_arrays(record)
     step_s = 1.0 / record.pulse_rate_hz
@@ -422,10 +419,8 @@ LONGEST_DELAY_S = 0.25
 def check_arrays(record: Record) -> None:
     """Refuse arrays that no measurement gives, wherever they come from.
 
-    Raises
-    ------
-    BadRecord
-        Not finite, negative widths, time that does not rise, an impossible pulse rate, or longer than a day.
+    Raises BadRecord: not finite, negative widths, time that does not rise, an impossible pulse rate, or longer than
+    a day.
     """
     bounds.check_rate(record.pulse_rate_hz, "pulse_rate_hz")
     columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}

@@ -136,10 +136,7 @@ def _positive(matrix: np.ndarray) -> np.ndarray:
 def near_sigmoid(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
     """A curve that never falls, near a sigmoid or near the person's last curve, and why it is as it is.
 
-    Raises
-    ------
-    BadRequest
-        Options that belong to another kind of curve, or an earlier model that is none.
+    Raises BadRequest: options that belong to another kind of curve, or an earlier model that is none.
     """
     others = sorted(set(options) - NEAR_SIGMOID_OPTIONS)
     if others or options.get("recruitment", "near-sigmoid") != "near-sigmoid":

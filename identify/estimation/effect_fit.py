@@ -195,13 +195,9 @@ def detected_effects(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
 def with_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[str], None] | None = None) -> Fitted:
     """The model with the named effects, each in its most likely form or in the one given after a colon.
 
-    Of several forms, `id:one|another`, the first is fitted; when all effects are there, the likeliest of them is taken.
-    `tell` is called with the id of each effect before it is fitted.
-
-    Raises
-    ------
-    BadRequest, NotIdentifiable
-        As `add_effect`; or no effect has that name.
+    Of several forms, `id:one|another`, the first is fitted; when all effects are there, the likeliest of them is
+    taken. `tell` is called with the id of each effect before it is fitted. Raises BadRequest, NotIdentifiable: as
+    `add_effect`; or no effect has that name.
     """
     chosen = [(identifier, forms.split("|")) for identifier, _, forms in (name.partition(":") for name in wanted)]
     for identifier, forms in chosen:
@@ -220,10 +216,7 @@ def with_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[
 def in_form(base: Fitted, effect: str, form: str) -> Fitted:
     """The model with one of its effects in another form, fitted from what both forms share.
 
-    Raises
-    ------
-    BadRequest
-        The effect has no such form.
+    Raises BadRequest: the effect has no such form.
     """
     other = _form(get(effect), form)
     problem = Problem(base.problem.setup, [(name, other if name == effect else own) for name, own in base.effects])

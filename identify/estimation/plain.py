@@ -69,13 +69,7 @@ def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
 
 
 def refuse_few(rows: np.ndarray) -> None:
-    """Refuse too few rows to fit.
-
-    Raises
-    ------
-    NotIdentifiable
-        With their number.
-    """
+    """Refuse too few rows to fit. Raises NotIdentifiable: with their number."""
     if rows.sum() < LEAST_ROWS:
         raise NotIdentifiable(
             f"only {int(rows.sum())} pulse intervals may be fitted", fix="Give rows of segments other than `validate`."
@@ -85,10 +79,7 @@ def refuse_few(rows: np.ndarray) -> None:
 def check_segments(grid: Grid, names: Sequence[str]) -> None:
     """Refuse names of segments that the record does not have, and the held-out one.
 
-    Raises
-    ------
-    BadRequest
-        With the names that can be used.
+    Raises BadRequest: with the names that can be used.
     """
     there = tuple(dict.fromkeys(grid.record.segment_names))
     for name in names:
@@ -172,10 +163,7 @@ CURVE_POINTS = 201
 def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Solution:
     """A first fit with few knots, from the best of several starting values of the time constant.
 
-    Raises
-    ------
-    NotIdentifiable
-        The pulse width or the torque never changes.
+    Raises NotIdentifiable: the pulse width or the torque never changes.
     """
     largest = float(np.max(grid.pulse_width_us))
     seen = grid.pulse_width_us[rows]
@@ -276,10 +264,8 @@ def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
 def prepare(record: Record) -> tuple[Grid, Raw]:
     """Put a record on its grid, without hum and with its white noise; and what its samples show.
 
-    Raises
-    ------
-    BadRecord, NotIdentifiable
-        No grid can be made, too few rows may be fitted, there is no pulse, or the torque never changes.
+    Raises BadRecord, NotIdentifiable: no grid can be made, too few rows may be fitted, there is no pulse, or the
+    torque never changes.
     """
     grid = make_grid(record)
     refuse_few(grid.fitted)

@@ -61,10 +61,7 @@ def _joint(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
 def range_warnings(model: Model, record: Record) -> list[str]:
     """Warnings if a record is outside the model's range of validity; otherwise empty.
 
-    Raises
-    ------
-    BadModel
-        The pulse rate differs too much: recruitment and dynamics both change with it.
+    Raises BadModel: the pulse rate differs too much: recruitment and dynamics both change with it.
     """
     refuse_rate(model, record)
     warnings = []

@@ -73,12 +73,8 @@ def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray)
 def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Pointwise 95 % band on the predicted torque without noise, N·m: lower and upper, each of shape (N,).
 
-    It contains the uncertainty of the model, not the noise of the measurement.
-
-    Raises
-    ------
-    ValueError
-        The model has no covariance (another method).
+    It contains the uncertainty of the model, not the noise of the measurement. Raises ValueError: the model has no
+    covariance (another method).
     """
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):

@@ -76,10 +76,7 @@ def method_of(name: str) -> Method:
 def check_options(chosen: Method, options: Mapping[str, Any]) -> None:
     """Refuse options that a method does not have.
 
-    Raises
-    ------
-    BadRequest
-        With the name of the option, and the known ones.
+    Raises BadRequest: with the name of the option, and the known ones.
     """
     for name in options:
         if name not in chosen.options:

@@ -10,13 +10,7 @@ from stimrig.identify.estimation.plain import rows_of
 
 
 def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarray:
-    """Rows of the named segments, without held-out ones.
-
-    Raises
-    ------
-    NotIdentifiable
-        The record has no such segment.
-    """
+    """Rows of the named segments, without held-out ones. Raises NotIdentifiable: the record has no such segment."""
     there = tuple(dict.fromkeys(grid.record.segment_names))
     rows = grid.fitted & rows_of(grid, names)
     if not rows.any():
@@ -61,13 +55,7 @@ def quiet_level(grid: Grid) -> float:
 
 
 def order_option(value: object) -> str | tuple[int, int, int]:
-    """`second-order`, `auto`, or (l, n, d) from `2,1,1` or a sequence.
-
-    Raises
-    ------
-    BadRequest
-        It is none of these.
-    """
+    """`second-order`, `auto`, or (l, n, d) from `2,1,1` or a sequence. Raises BadRequest: it is none of these."""
     if value in ("second-order", "auto"):
         return str(value)
     parts = value.split(",") if isinstance(value, str) else list(value) if isinstance(value, (list, tuple)) else []
@@ -86,13 +74,7 @@ def order_option(value: object) -> str | tuple[int, int, int]:
 
 
 def flag(value: object, name: str) -> bool:
-    """True or False, from a bool or from text.
-
-    Raises
-    ------
-    BadRequest
-        It is neither.
-    """
+    """True or False, from a bool or from text. Raises BadRequest: it is neither."""
     text = str(value).lower()
     if text not in {"true", "false", "1", "0", "yes", "no"}:
         raise BadRequest(f"invalid value {value!r}", place=name, fix="Give true or false.")

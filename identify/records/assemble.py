@@ -135,13 +135,7 @@ class Found:
 
 
 def record_of(found: Found) -> Record:
-    """The record, with notes on all that was assumed.
-
-    Raises
-    ------
-    BadRecord
-        With the place and what to do.
-    """
+    """The record, with notes on all that was assumed. Raises BadRecord: with the place and what to do."""
     check_numbers(found.columns, found.at)
     found = _from_zero(without_holes(found))
     check_widths(found.columns, found.at)
@@ -176,10 +170,7 @@ def optional(columns: Columns) -> dict[str, Any]:
 def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
     """Refuse numbers that no measurement gives; NaN stands where there is none, in the columns that may lack one.
 
-    Raises
-    ------
-    BadRecord
-        Infinite, or beyond what is measured.
+    Raises BadRecord: infinite, or beyond what is measured.
     """
     for name, column in columns.items():
         missing = np.isnan(column) if name in MAY_LACK else False
@@ -192,10 +183,7 @@ def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
 def without_holes(found: Found) -> Found:
     """Without the rows in which a number is missing: they are gaps like any other.
 
-    Raises
-    ------
-    BadRecord
-        Too many of them.
+    Raises BadRecord: too many of them.
     """
     holes = {name: np.isnan(column) for name, column in found.columns.items()}
     rows = np.logical_or.reduce(list(holes.values()))
@@ -233,10 +221,7 @@ def _from_zero(found: Found) -> Found:
 def check_widths(columns: Columns, at: Callable[[int, str], str]) -> None:
     """Refuse widths and flags that no measurement gives.
 
-    Raises
-    ------
-    BadRecord
-        Negative widths, widths in another unit, flags that are neither 0 nor 1.
+    Raises BadRecord: negative widths, widths in another unit, flags that are neither 0 nor 1.
     """
     width_us = columns["pulse_width_us"]
     if (negative := np.flatnonzero(width_us < 0)).size:

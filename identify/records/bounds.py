@@ -39,13 +39,7 @@ PULSE_RATES_HZ = (1.0, 200.0)
 
 
 def content_of(path: Path) -> bytes:
-    """A file's bytes, at most as many as a record can have.
-
-    Raises
-    ------
-    BadRecord
-        It cannot be read, or is larger.
-    """
+    """A file's bytes, at most as many as a record can have. Raises BadRecord: it cannot be read, or is larger."""
     try:
         with path.open("rb") as file:
             pieces, size = [], 0
@@ -78,13 +72,7 @@ def fix_of(column: str, wrong: np.ndarray, otherwise: str) -> str:
 
 
 def check_rate(pulse_rate_hz: float, place: str) -> None:
-    """Refuse a pulse rate that no stimulator has.
-
-    Raises
-    ------
-    BadRecord
-        Outside 1 to 200 Hz, or no number.
-    """
+    """Refuse a pulse rate that no stimulator has. Raises BadRecord: outside 1 to 200 Hz, or no number."""
     lo, hi = PULSE_RATES_HZ
     if not (lo <= pulse_rate_hz <= hi):
         raise BadRecord(f"{pulse_rate_hz:g} pulses a second", place=place, fix=f"Give {lo:g} to {hi:g} Hz.")
@@ -93,10 +81,7 @@ def check_rate(pulse_rate_hz: float, place: str) -> None:
 def check_sampling(rate_hz: float, place: str) -> None:
     """Refuse a rate of sampling at which no muscle is identified.
 
-    Raises
-    ------
-    BadRecord
-        Below 40 Hz or above 2 kHz, by more than rounding.
+    Raises BadRecord: below 40 Hz or above 2 kHz, by more than rounding.
     """
     if not (LOWEST_HZ <= rate_hz <= HIGHEST_HZ):
         raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, fix="40 Hz to 2 kHz can be used.")
@@ -105,10 +90,7 @@ def check_sampling(rate_hz: float, place: str) -> None:
 def check_name(name: str, place: str) -> None:
     """Refuse a segment's name that is no name.
 
-    Raises
-    ------
-    BadRecord
-        Empty, too long, or with signs that cannot be printed.
+    Raises BadRecord: empty, too long, or with signs that cannot be printed.
     """
     if not name.strip():
         raise BadRecord("empty", place=place, fix="Name it: rest, prbs, ramp, validate…")
@@ -120,13 +102,7 @@ def check_name(name: str, place: str) -> None:
 
 
 def check_span(time_s: np.ndarray, place: str) -> None:
-    """Refuse a record that no session lasts.
-
-    Raises
-    ------
-    BadRecord
-        Longer than a day.
-    """
+    """Refuse a record that no session lasts. Raises BadRecord: longer than a day."""
     span_s = float(time_s[-1] - time_s[0])
     if not (span_s <= LONGEST_S):
         fix = f"At most {LONGEST_S / 3600:g} h in one record; is the time in seconds?"

@@ -106,10 +106,7 @@ Given = Mapping[str, Asked]
 def parsed(given: Mapping[str, str] | Iterable[str] | None) -> Given:
     """What `--map` says, by target: a mapping, or texts `target=name` or `target=name:unit`.
 
-    Raises
-    ------
-    BadRecord
-        No such target, no name, or one target twice.
+    Raises BadRecord: no such target, no name, or one target twice.
     """
     if given is None:
         return {}
@@ -161,10 +158,8 @@ def complete(found: Mapping[str, list[int]]) -> bool:
 def columns(header: Sequence[str], given: Given, units_row: Sequence[str], place: str) -> dict[str, Column]:
     """The columns of a header with their units; `units_row` is a row of units below it, empty without one.
 
-    Raises
-    ------
-    BadRecord
-        A column is missing, there twice, or of a unit that is unknown; with the `--map` that would do.
+    Raises BadRecord: a column is missing, there twice, or of a unit that is unknown; with the `--map` that would
+    do.
     """
     plain = [cell.strip() for cell in header]
     found = places(plain, given)

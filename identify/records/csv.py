@@ -38,10 +38,7 @@ Row = tuple[int, list[str]]
 def encoding_of(content: bytes, name: str) -> tuple[str, str]:
     """The codec of a text, and what of it was assumed (empty where the text says it itself).
 
-    Raises
-    ------
-    BadRecord
-        No text.
+    Raises BadRecord: no text.
     """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", ""
@@ -71,10 +68,7 @@ def _is_utf8(content: bytes) -> bool:
 def text_lines(content: bytes, encoding: str, name: str) -> Iterator[str]:
     """The file's lines, none too long and not too many.
 
-    Raises
-    ------
-    BadRecord
-        Too long, too many, or bytes that are no text.
+    Raises BadRecord: too long, too many, or bytes that are no text.
     """
     file = io.TextIOWrapper(io.BytesIO(content), encoding, newline="")
     number = 0
@@ -105,10 +99,7 @@ class Layout:
 def find_layout(content: bytes, encoding: str, given: Given, name: str) -> Layout:
     """Find header and separator among the first lines.
 
-    Raises
-    ------
-    BadRecord
-        No line names the columns that a record needs, or the rows do not stand under it.
+    Raises BadRecord: no line names the columns that a record needs, or the rows do not stand under it.
     """
     source = text_lines(content, encoding, name)
     before: list[str] = []
@@ -285,13 +276,7 @@ class Table:
         """The decimal sign, once one was met."""
 
     def fill(self, rows: Iterable[Row]) -> None:
-        """Take all rows in.
-
-        Raises
-        ------
-        BadRecord
-            With file, line and column.
-        """
+        """Take all rows in. Raises BadRecord: with file, line and column."""
         source = iter(rows)
         while block := list(islice(source, BLOCK)):
             self._take([row for _, row in block], [line for line, _ in block])
@@ -406,12 +391,8 @@ def _shown(cell: str) -> str:
 def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, given: Given | None = None) -> Record:
     """A record of a table from its bytes; `path` is how it is called, `given` what `--map` says.
 
-    Pulses come at 40 Hz, unless it or the caller says else.
-
-    Raises
-    ------
-    BadRecord
-        With file, line and column, and what to do.
+    Pulses come at 40 Hz, unless it or the caller says else. Raises BadRecord: with file, line and column, and what
+    to do.
     """
     name = str(path)
     encoding, encoded = encoding_of(content, name)

@@ -29,13 +29,7 @@ class BadChunk(Exception):
 
 
 def file_piece(content: bytes, offset: int | None, size: int) -> memoryview:
-    """A stretch of the file.
-
-    Raises
-    ------
-    BadChunk
-        It was never written, or lies outside.
-    """
+    """A stretch of the file. Raises BadChunk: it was never written, or lies outside."""
     if offset is None:
         raise BadChunk("values are declared and were never written")
     if not (offset >= 0 and offset + size <= len(content)):
@@ -48,10 +42,7 @@ def read_chunks(
 ) -> np.ndarray:
     """The values of a dataset in chunks of `length` values, each chunk written.
 
-    Raises
-    ------
-    BadChunk
-        Too large, too many, not written, or not what was declared.
+    Raises BadChunk: too large, too many, not written, or not what was declared.
     """
     full = length * dtype.itemsize
     count = -(-size // length)
@@ -73,10 +64,7 @@ def read_chunks(
 def unpacked(data: Any, filters: Sequence[int], skipped: int, itemsize: int, full: int) -> Any:
     """A chunk's bytes with its filters undone, the last one first.
 
-    Raises
-    ------
-    BadChunk
-        They do not give the chunk's size, or a checksum does not hold.
+    Raises BadChunk: they do not give the chunk's size, or a checksum does not hold.
     """
     for index in reversed(range(len(filters))):
         if skipped >> index & 1:
@@ -95,13 +83,7 @@ def unpacked(data: Any, filters: Sequence[int], skipped: int, itemsize: int, ful
 
 
 def inflated(data: Any, most: int) -> bytes:
-    """What gzip's filter packed, at most so many bytes.
-
-    Raises
-    ------
-    BadChunk
-        Damaged, or longer.
-    """
+    """What gzip's filter packed, at most so many bytes. Raises BadChunk: damaged, or longer."""
     packer = zlib.decompressobj()
     try:
         found = packer.decompress(data, most)
@@ -143,13 +125,7 @@ class StrictFile:
             self._root = h5g.open(self._file, b"/")
 
     def text(self, name: str, default: str | None = None) -> str:
-        """A text attribute of the root.
-
-        Raises
-        ------
-        BadRecord
-            Not there and no default, or no text.
-        """
+        """A text attribute of the root. Raises BadRecord: not there and no default, or no text."""
         value = self._attribute(name, default)
         if not isinstance(value, str | bytes) or len(value) > LONGEST_TEXT:
             raise self._bad("no text, or one without an end", f"attribute {name}")
@@ -175,10 +151,7 @@ class StrictFile:
     def numbers(self, path: str) -> np.ndarray:
         """A dataset of one dimension as float64.
 
-        Raises
-        ------
-        BadRecord
-            Not there, not inside the file, not plain numbers, or longer than any record.
+        Raises BadRecord: not there, not inside the file, not plain numbers, or longer than any record.
         """
         dataset = self._dataset(path)
         with self._asking(path):
@@ -190,13 +163,7 @@ class StrictFile:
             return np.asarray(self._values(dataset, path, kind.dtype, size), float)
 
     def names(self, path: str) -> list[str]:
-        """A dataset of one dimension of texts.
-
-        Raises
-        ------
-        BadRecord
-            As for `numbers`.
-        """
+        """A dataset of one dimension of texts. Raises BadRecord: as for `numbers`."""
         dataset = self._dataset(path)
         with self._asking(path):
             kind = dataset.get_type()

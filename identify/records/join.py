@@ -29,10 +29,7 @@ FIX = "Join the recordings again."
 def write_joined(record: Record, path: Path) -> None:
     """Write a record with its parts as CSV (docs/recording.md).
 
-    Raises
-    ------
-    BadRecord
-        The file would be larger than what can be read.
+    Raises BadRecord: the file would be larger than what can be read.
     """
     names = [_cell(name) for name in record.segment_names]
     header = ("time_s", "pulse_width_us", "torque_nm", "segment", *record.columns(), "part", *CELLS)
@@ -88,10 +85,7 @@ def parsed(
 ) -> Parts:
     """The parts of a file from its columns `part` and `time_s` and the cells of each part's first row, by row.
 
-    Raises
-    ------
-    BadRecord
-        Parts are not numbered 0, 1, 2…, time does not rise, or a cell is not what it must be.
+    Raises BadRecord: parts are not numbered 0, 1, 2…, time does not rise, or a cell is not what it must be.
     """
     time_s, found = columns["time_s"], []
     _check_time(time_s, list(cells), lines, name)

@@ -87,10 +87,7 @@ class Variable:
     def numbers(self) -> np.ndarray:
         """Its numbers, as float64 in one dimension.
 
-        Raises
-        ------
-        BadMat
-            Not real numbers in a row or a column, or not all there.
+        Raises BadMat: not real numbers in a row or a column, or not all there.
         """
         if self.kind not in NUMERIC:
             raise BadMat(f"{KINDS.get(self.kind, 'no numbers')}. {OBJECTS}")
@@ -107,10 +104,7 @@ class Variable:
     def texts(self) -> list[str]:
         """Its texts: of a cell array each element's, of a character array each row's.
 
-        Raises
-        ------
-        BadMat
-            No texts, or not all there.
+        Raises BadMat: no texts, or not all there.
         """
         if self.kind not in (CHAR, CELL):
             raise BadMat(f"{KINDS.get(self.kind, 'no texts')}. {OBJECTS}")
@@ -127,13 +121,7 @@ class Variable:
         return found
 
     def fields(self) -> dict[str, Variable]:
-        """The fields of a struct of one element; nothing for anything else.
-
-        Raises
-        ------
-        BadMat
-            Damaged.
-        """
+        """The fields of a struct of one element; nothing for anything else. Raises BadMat: damaged."""
         if self.kind != STRUCT or self.size != 1:
             return {}
         here = self._opened()
@@ -153,10 +141,7 @@ class Variable:
 def variables(content: bytes, name: str) -> dict[str, Variable]:
     """The variables of a MAT file by name, none of them unpacked.
 
-    Raises
-    ------
-    BadRecord
-        No MAT file of version 5 to 7, or damaged.
+    Raises BadRecord: no MAT file of version 5 to 7, or damaged.
     """
     order = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}.get(content[124:HEADER_BYTES])
     if order is None:
@@ -277,10 +262,7 @@ MOST_TOLD = 12
 def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None = None, given: Given | None = None) -> Record:
     """A record of a MAT file from its bytes; `path` is how it is called, `given` what `--map` says.
 
-    Raises
-    ------
-    BadRecord
-        With the file and the variable, and what to do.
+    Raises BadRecord: with the file and the variable, and what to do.
     """
     name = str(path)
     scope, known, given = _scope(variables(content, name), given or {}, name)

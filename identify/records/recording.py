@@ -54,10 +54,7 @@ class _Sent:
 def read_pulses(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: float) -> tuple[Pulses, np.ndarray]:
     """The pulses on their even slots with what they were late, and the samples that are doubted, bool, (N,).
 
-    Raises
-    ------
-    BadRecord
-        Columns of different lengths, no widths, or out of order.
+    Raises BadRecord: columns of different lengths, no widths, or out of order.
     """
     sent = _sent(file, name, 1.0 / pulse_rate_hz)
     if not sent.planned.size:
@@ -206,10 +203,7 @@ GROUP = "/angle"
 def attributes(path: Path, names: Sequence[str]) -> dict[str, str]:
     """What a sealed recording says of itself, by the names of its root's attributes.
 
-    Raises
-    ------
-    BadRecord
-        Unreadable, no sealed recording, or one of them is not there.
+    Raises BadRecord: unreadable, no sealed recording, or one of them is not there.
     """
     file = StrictFile(bounds.content_of(path), str(path))
     _check_format(file)
@@ -220,13 +214,9 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     """A sealed recording from its bytes; `path` is how it is called.
 
     The width in force at a sample is that of the last pulse due before it, and how late that was felt stands beside
-    it; a pulse that was dropped or refused counts as none. Samples outside every segment are left out.
-    An angle sensor's angles are brought to the times of the torque; rows in its long gaps are doubted.
-
-    Raises
-    ------
-    BadRecord
-        Unreadable, half-written, with data outside the file, or without samples.
+    it; a pulse that was dropped or refused counts as none. Samples outside every segment are left out. An angle
+    sensor's angles are brought to the times of the torque; rows in its long gaps are doubted. Raises BadRecord:
+    unreadable, half-written, with data outside the file, or without samples.
     """
     name = str(path)
     file = StrictFile(content, name)

@@ -113,13 +113,7 @@ class FixedShape:
 
 
 def basis_from_dict(data: dict[str, Any]) -> Basis:
-    """The basis that `to_dict` describes.
-
-    Raises
-    ------
-    BadModel
-        Its kind is unknown.
-    """
+    """The basis that `to_dict` describes. Raises BadModel: its kind is unknown."""
     from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis, SplineBasis
 
     kinds = {"cubic-spline": SplineBasis, "power-series": PowerBasis, "sigmoid": SigmoidBasis}

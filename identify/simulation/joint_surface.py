@@ -52,10 +52,7 @@ class Acting:
     def of(cls, entry: Mapping[str, Any]) -> Acting:
         """From its row in MODEL.json.
 
-        Raises
-        ------
-        BadModel
-            The effect or its form is unknown here, or a parameter is missing.
+        Raises BadModel: the effect or its form is unknown here, or a parameter is missing.
         """
         try:
             effect = get(entry["id"])
@@ -89,10 +86,8 @@ class Surfaces:
     def of(cls, effects: Sequence[Mapping[str, Any]]) -> Surfaces | None:
         """Those of a model's effects; None if none of them depends on the joint.
 
-        Raises
-        ------
-        BadModel
-            An effect or its form is unknown here, or an older version fitted it, without its own angle.
+        Raises BadModel: an effect or its form is unknown here, or an older version fitted it, without its own
+        angle.
         """
         acting = [one for one in map(Acting.of, effects) if one.effect.moves_with_joint]
         if not acting:

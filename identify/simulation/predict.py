@@ -154,10 +154,7 @@ def moves_with_joint(model: Muscle) -> bool:
 def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The reference angle and the range of fitted angles; a model of an older version knows them of its own record.
 
-    Raises
-    ------
-    BadModel
-        The model depends on the joint and does not say at which angle its curve holds.
+    Raises BadModel: the model depends on the joint and does not say at which angle its curve holds.
     """
     if "reference_rad" in settings:
         return {"reference_rad": settings["reference_rad"], "angle_range_rad": angle_range(settings)}
@@ -173,10 +170,7 @@ def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> d
 def states_of(model: Muscle) -> dict[str, float]:
     """By effect id, where its slow state is at the begin of what is predicted; rested effects need not be there.
 
-    Raises
-    ------
-    BadModel
-        A state is not a number from 0 to 1.
+    Raises BadModel: a state is not a number from 0 to 1.
     """
     given = {entry["id"]: entry["state"] for entry in model.effects if "state" in entry}
     for effect, value in given.items():
@@ -211,10 +205,7 @@ def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:
 def refuse_rate(model: Muscle, record: Record) -> None:
     """Refuse a record whose pulse rate is outside the model's range.
 
-    Raises
-    ------
-    BadModel
-        The rates differ by more than 25 %.
+    Raises BadModel: the rates differ by more than 25 %.
     """
     if not abs(record.pulse_rate_hz / model.pulse_rate_hz - 1.0) <= LARGEST_RATE_CHANGE:
         raise BadModel(
