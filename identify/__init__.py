@@ -9,25 +9,27 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stimrig.identify.criticism import compare
-    from stimrig.identify.diagnosis import diagnose, next_experiment
-    from stimrig.identify.diagnosis.carrying import carry
-    from stimrig.identify.diagnosis.improvement import improve
-    from stimrig.identify.errors import (
-        BadModel,
-        BadRecord,
-        BadRequest,
-        Cancelled,
-        IdentifyError,
-        NotIdentifiable,
-    )
-    from stimrig.identify.experiments import Experiment
-    from stimrig.identify.fitting import fit
-    from stimrig.identify.model import Model
-    from stimrig.identify.records import read
-    from stimrig.identify.records.record import Record
-    from stimrig.identify.results import Carried, Comparison, Diagnosis, Improvement
-    from stimrig.identify.simulation.predict import predict
+    from stimrig.identify.criticism import compare as compare
+    from stimrig.identify.diagnosis import diagnose as diagnose
+    from stimrig.identify.diagnosis import next_experiment as next_experiment
+    from stimrig.identify.diagnosis.carrying import carry as carry
+    from stimrig.identify.diagnosis.improvement import improve as improve
+    from stimrig.identify.errors import BadModel as BadModel
+    from stimrig.identify.errors import BadRecord as BadRecord
+    from stimrig.identify.errors import BadRequest as BadRequest
+    from stimrig.identify.errors import Cancelled as Cancelled
+    from stimrig.identify.errors import IdentifyError as IdentifyError
+    from stimrig.identify.errors import NotIdentifiable as NotIdentifiable
+    from stimrig.identify.experiments import Experiment as Experiment
+    from stimrig.identify.fitting import fit as fit
+    from stimrig.identify.model import Model as Model
+    from stimrig.identify.records import read as read
+    from stimrig.identify.records.record import Record as Record
+    from stimrig.identify.results import Carried as Carried
+    from stimrig.identify.results import Comparison as Comparison
+    from stimrig.identify.results import Diagnosis as Diagnosis
+    from stimrig.identify.results import Improvement as Improvement
+    from stimrig.identify.simulation.predict import predict as predict
 
 _PLACES = {
     name: f"stimrig.identify.{module}"
@@ -49,29 +51,7 @@ _PLACES = {
 }
 _MODULES = {"effects", "methods"}
 
-__all__ = [
-    "BadModel",
-    "BadRecord",
-    "BadRequest",
-    "Cancelled",
-    "Carried",
-    "Comparison",
-    "Diagnosis",
-    "Experiment",
-    "IdentifyError",
-    "Improvement",
-    "Model",
-    "NotIdentifiable",
-    "Record",
-    "carry",
-    "compare",
-    "diagnose",
-    "fit",
-    "improve",
-    "next_experiment",
-    "predict",
-    "read",
-]
+__all__ = [*_PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
