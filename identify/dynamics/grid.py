@@ -125,6 +125,11 @@ class Grid:
         """Intervals at whose start the state is unknown, shape (S,): the starts of parts, and `resumed`."""
         return np.union1d(self.begins, self.resumed)
 
+    @cached_property
+    def widths_us(self) -> tuple[np.ndarray, np.ndarray]:
+        """The different widths, rising, µs, and the index of each interval's."""
+        return np.unique(self.pulse_width_us, return_inverse=True)
+
     @property
     def delay_bounds_s(self) -> tuple[float, float]:
         """Bounds of the delay in every model, s: one sample in both directions. A longer delay is an effect."""

@@ -60,7 +60,7 @@ class Projection:
     @cached_property
     def rows_nm(self) -> np.ndarray:
         """Held drive of each interval, one row per coefficient: basis functions, then zeros for the initial states."""
-        widths, place = np.unique(self.grid.pulse_width_us, return_inverse=True)
+        widths, place = self.grid.widths_us
         rows = np.zeros((self.basis.size + 2 * self.grid.starts.size, self.grid.size))
         rows[: self.basis.size] = self.grid.held(self.basis.design(widths)[place].T, axis=1)
         return rows

@@ -116,6 +116,8 @@ def find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> dict[str, f
 
 def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: float) -> float:
     """Power of a line divided by the mean power of its neighbours."""
+    near = slice(*np.searchsorted(frequency, (centre_hz - 8.1, centre_hz + 8.1)))
+    frequency, power = frequency[near], power[near]
     inside = np.abs(frequency - centre_hz) <= reach_hz
     # Neighbours within 8 Hz only, since the pulses at 40 Hz have harmonics, too.
     around = (np.abs(frequency - centre_hz) <= 8.0) & (np.abs(frequency - centre_hz) > 2 * reach_hz + 0.2)

@@ -93,18 +93,20 @@ def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 
         return scaled[:, :-1] - scaled[:, 1:]
     size = padded.size - degree - 1
     span = np.clip(np.searchsorted(padded, at, side="right") - 1, degree, size - 1)
-    local = np.zeros((at.size, degree + 1))
-    local[:, 0] = 1.0
+    near = padded[span + np.arange(1 - degree, degree + 1)[:, None]]
+    ahead, behind = near[degree:] - at, at - near[:degree]
+    local = np.zeros((degree + 1, at.size))
+    local[0] = 1.0
     for order in range(1, degree + 1):
-        carried = np.zeros(at.size)
+        carried = 0.0
         for j in range(order):
-            right, left = padded[span + j + 1], padded[span + j + 1 - order]
-            share = local[:, j] / (right - left)
-            local[:, j] = carried + (right - at) * share
-            carried = (at - left) * share
-        local[:, order] = carried
+            left = degree + j - order
+            share = local[j] / (near[degree + j] - near[left])
+            local[j] = carried + ahead[j] * share
+            carried = behind[left] * share
+        local[order] = carried
     values = np.zeros((at.size, size))
-    np.put_along_axis(values, span[:, None] - degree + np.arange(degree + 1), local, axis=1)
+    values[np.arange(at.size), span - degree + np.arange(degree + 1)[:, None]] = local
     return values
 
 
