@@ -399,7 +399,13 @@ class Effect:
 
 def form(stage: str, equation: str, *parameters: Parameter, name: str = "", **more: Any) -> Callable[[Apply], Form]:
     """Decorator that makes a function of all rows at once (`batched`) a form, which is called as the function is."""
-    return lambda apply: Form(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
+
+    def made(apply: Apply) -> Form:
+        found = Form(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
+        apply.__qualname__ += ".apply"  # under the function's name stands the form: so a pickle finds the function
+        return found
+
+    return made
 
 
 def slow_gain(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
 
 SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
 """Of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
@@ -79,15 +79,17 @@ def _surface(_: None, p: Values, scene: Scene) -> np.ndarray:
     return elastic + viscous * velocity + dry + p["inertia_nm_s2_per_rad"] * acceleration
 
 
-surface = form(
+surface = Form(
+    "surface",
     "additive",
     "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
     "inertia·acceleration, x: place in the fitted range, -1 to 1",
-    *_FREE,
-    name="surface",
+    _FREE,
+    _surface,
+    batched=True,
     fine=True,
     source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
-)(_surface)
+)
 
 
 @njit(cache=True, nogil=True)

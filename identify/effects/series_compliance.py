@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
 
 Motion = tuple[np.ndarray, np.ndarray]
 """Torque and its rate."""
@@ -101,7 +101,7 @@ def _series(x: Motion, p: Values, scene: Scene) -> Motion:
     return _follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)
 
 
-series = form("filter", "z'' + 2 ζ ω z' + ω² z = ω² y", *_RESONANCE, name="series", restarts=_RESTARTS)(_series)
+series = Form("series", "filter", "z'' + 2 ζ ω z' + ω² z = ω² y", _RESONANCE, _series, batched=True, restarts=_RESTARTS)
 
 
 @form(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
 
 _PARABOLA = (
     Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
@@ -19,16 +21,22 @@ def _parabola(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     return y * np.maximum(1.0 + p["slope_per_rad"] * away + p["bend_per_rad2"] * away * away, 0.0)
 
 
-parabola = form(
+parabola = Form(
+    "parabola",
     "output",
     "y (1 + slope·Δ + bend·Δ²), Δ = angle - reference angle",
-    *_PARABOLA,
-    name="parabola",
+    _PARABOLA,
+    _parabola,
+    batched=True,
     source="Marion, Wexler, Hull: 1 - 4.49e-4 Δθ² + 0.0344 Δθ, in degrees",
-)(_parabola)
-drive = form(
-    "gain", "w = f(u) (1 + slope·Δ + bend·Δ²): acts on the force, before the dynamics", *_PARABOLA, name="drive"
-)(_parabola)
+)
+drive = replace(
+    parabola,
+    name="drive",
+    stage="gain",
+    equation="w = f(u) (1 + slope·Δ + bend·Δ²): acts on the force, before the dynamics",
+    source="",
+)
 
 
 @form(
