@@ -36,7 +36,6 @@ SLOW = (
     *(
         f"tests/identify/test_{name}.py"
         for name in (
-            "carried_answers",
             "carrying",
             "examples",
             "invariance",

@@ -16,8 +16,6 @@ from stimrig.identify.dynamics.variable_speed import SpeedLaw
 STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
-JOINT = ("angle_rad", "velocity_rad_s")
-"""Columns that tell where the joint is."""
 LEAST_RANGE_RAD = 0.1
 """A smaller range of angles counts as this one: of a joint that is held, noise is no shape."""
 
@@ -231,18 +229,16 @@ class Form:
         `propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
         there are none. `previous` holds the parameters of the form before it in a chain.
     restarts : tuple of dict
-        Further starts that also set T and ζ of the linear dynamics (`base.time_constant_s`, `base.damping`): for cases
-        in which the model without the effect has imitated it by its linear dynamics.
+        Further starts that also set `base.time_constant_s` and `base.damping`, of the linear dynamics, by which the
+        model without the effect may have imitated it.
     accept : callable or None
         `accept(parameters, scene)`: whether the result of a fit is plausible.
     grows : bool
         Whether the form is the next in a chain. It is tried only while the forms before it gain.
     fixed : bool
-        Whether its parameters are found in the samples before the fit, and are not fitted. The fitted torque is
-        corrected for it beforehand.
+        Whether its parameters are found in the samples before the fit, and the torque is corrected for it then.
     fine : bool
-        For "additive" only: whether it changes so fast that it is averaged over each pulse interval in the fit, instead
-        of taken in its middle.
+        For "additive" only: whether it is averaged over each pulse interval in the fit, not taken in its middle.
     source : str
         Publication.
     state : callable or None
@@ -328,11 +324,10 @@ class Effect:
     raw : bool
         Whether it is detected in the samples, before the means over pulse intervals are taken.
     band : bool
-        Whether it is a narrow band of noise: it is found in the residual's spectrum, and is part of the noise while
-        other effects are compared.
+        Whether it is a narrow band of noise: found in the residual's spectrum, part of the noise beside other effects.
     detect : callable or None
-        `detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. `raw`
-        is the result of `inspect` in `stimrig.identify.estimation`. A detected effect is added before any fit.
+        `detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. Such
+        an effect is added before any fit. `raw` is what `stimrig.identify.estimation.samples.inspect` gives.
     prior : float
         Logarithm of its prior odds, relative to other effects.
     """
@@ -360,7 +355,7 @@ class Effect:
     @property
     def moves_with_joint(self) -> bool:
         """Whether it depends on the angle or the velocity of the joint."""
-        return any(need in JOINT for need in self.needs)
+        return not {"angle_rad", "velocity_rad_s"}.isdisjoint(self.needs)
 
     @property
     def part(self) -> str:
@@ -419,10 +414,9 @@ def slow_gain(
     constant: bool = False,
     source: str = "",
 ) -> Form:
-    """A gain with a slow state (`adapt`) that fills with torque, or by pulses of any width.
+    """A gain with a slow state (`adapt`) that fills with torque, or by pulses of any width; `factor(p, x)` is the gain.
 
-    Its second parameter is the time constant of filling, its third that of recovery, `recovery_s`. `factor(p, x)` is
-    the gain at a state.
+    Its second parameter is the time constant of filling, its third that of recovery, `recovery_s`.
     """
 
     def used(drive: np.ndarray, p: Values, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -485,10 +479,9 @@ def adapt(
 def activate(
     drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float
 ) -> np.ndarray:  # pragma: no cover
-    """First-order activation with time constants for rise and fall; mean over each interval, from 0.
+    """Mean over each interval of a, from 0; a' = (w - a)/τ, τ = rise if w > a, else fall; shapes (M, K), (M,).
 
-    a' = (w - a)/τ, τ = rise if the drive is above the activation, else fall. With τ = 0, a follows w at once.
-    Shapes (M, K), (M,).
+    With τ = 0, a follows w at once.
     """
     rows, size = drive.shape
     out = np.empty((rows, size))

@@ -12,7 +12,7 @@ from stimrig import identify
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.errors import BadModel, BadRequest, IdentifyError
 from stimrig.identify.inversion import Inversion, Reference, invert
-from stimrig.identify.inversion.demand import BEND, RIDGE, Banded, best_demand
+from stimrig.identify.inversion.demand import BEND, RIDGE, best_demand
 from stimrig.identify.inversion.plant import on_pulses
 from stimrig.identify.inversion.reference import read_reference
 from stimrig.identify.model import Model
@@ -88,18 +88,6 @@ def test_the_bounded_optimum_is_that_of_dense_least_squares():
 
     assert cost(found) <= cost(best.x) * (1 + 1e-5) and np.min(found) >= 0.0 and np.max(found) <= largest
     assert np.any(found > 0.999 * largest) and np.any(found < 0.001)
-
-
-def test_banded_products_are_those_of_the_matrix():
-    taps, size = np.array([0.0, 1.0, -0.4, 2.0]), 9
-    T = Banded(taps, size)
-    full = sum(np.diag(np.full(size - i, x), -i) for i, x in enumerate(taps))
-    v, weight = np.random.default_rng(0).standard_normal((2, size))
-    np.testing.assert_allclose(T(v), full @ v)
-    np.testing.assert_allclose(T.transposed(v), full.T @ v)
-    gram, bands = full.T @ np.diag(weight) @ full, T.gram(weight, 4)
-    for j in range(4):
-        np.testing.assert_allclose(bands[j, : size - j], np.diag(gram, -j))
 
 
 def test_a_muscle_that_pulls_the_other_way_gets_the_same_pulses():

@@ -125,6 +125,7 @@ def test_a_sudden_change_is_followed_when_the_next_trial_says_the_same(model: Mo
     muscle = Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else 0.7)
     steps = followed(model, session(muscle, 6))
     assert steps[3].outcome is Outcome.ODD
+    assert steps[3].disturbed_s == [[0.0, steps[3].seen.duration_s]], "from an odd trial nothing is learnt"
     assert np.all(moves(steps[:4]) < 1.0)
     assert steps[4].outcome is Outcome.FOLLOWED
     gains = [step.after.values.gain for step in steps]
@@ -141,11 +142,6 @@ def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model, left:
         assert step.disturbed_s == [[0.0, step.seen.duration_s]]
         assert np.array_equal(step.after.mean, step.before.mean)
     assert np.all(moves(steps) < 1.0)
-
-
-def test_from_an_odd_trial_nothing_is_learnt(model: Model) -> None:
-    (*_, odd) = followed(model, session(Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else 0.6), 4))
-    assert odd.outcome is Outcome.ODD and odd.disturbed_s == [[0.0, odd.seen.duration_s]]
 
 
 @pytest.mark.parametrize("gain", [0.6, 0.45, 0.3])
