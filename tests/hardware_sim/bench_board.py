@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware, Point
 from stimrig.hardware_sim.stimulators.p24 import P24
 from stimrig.hardware_sim.stimulators.sciencemode import Packet
