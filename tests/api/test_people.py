@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import argon2
 import httpx
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from sqlalchemy import inspect
 
 from stimrig.api.cli import main
-from stimrig.api.clock import Clock
 from stimrig.api.people import accounts
-from stimrig.api.people.pace import Guesses, Pace
-from stimrig.api.sessions.stops import StopRights
+from stimrig.api.people.pace import Pace
 from stimrig.api.settings import Settings
 from stimrig.api.web.server import configuration, loopback, refuse_open_door
-from tests.api.centre.conftest import run_centre
-from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Service, SetClock, run_service, run_test
+from tests.api.conftest import PATIENCE_S, Service, SetClock, run_test
 
 PASSWORD = "correct horse battery"
 
@@ -202,130 +195,3 @@ def test_audit_is_verified_and_exported_by_a_command(
 @pytest.mark.sqlite
 def test_an_audit_of_no_database_is_told(tmp_path: Path) -> None:
     assert main.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2
-
-
-JOERG = "Jörg Müller-Lüdenscheidt"
-DECOMPOSED = " Jo\u0308rg\u00a0 Mu\u0308ller-Lüdenscheidt "
-SAME = [
-    JOERG,
-    "jörg müller-lüdenscheidt",
-    "  JO\u0308RG\u00a0 MU\u0308LLER-LÜDENSCHEIDT ",
-    "Jörg\u3000Müller-Lüdenscheidt",
-]
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    for service in run_service(tmp_path_factory.mktemp("names"), short_dir, STUB):
-        with service.client() as http:
-            answer = http.post("/v1/users", json={"name": DECOMPOSED, "password": PASSWORD})
-            assert answer.status_code == 201 and answer.json()["name"] == JOERG
-        yield service
-
-
-@pytest.fixture
-def http(service: Service) -> Iterator[httpx.Client]:
-    """What other tests guessed in vain counts no more: they may come in any order."""
-    guesses = service.app.state.context.people.guesses
-    vars(guesses).update(vars(Guesses(Clock())))
-    with service.client() as client:
-        yield client
-
-
-@pytest.mark.parametrize("name", SAME)
-def test_a_name_means_one_person_however_it_is_typed(service: Service, http: httpx.Client, name: str) -> None:
-    taken = http.post("/v1/users", json={"name": name, "password": PASSWORD})
-    assert taken.status_code == 409 and JOERG in taken.json()["detail"]
-    with service.client(token=None) as browser:
-        signed = browser.post("/v1/sessions", json={"name": name, "password": PASSWORD})
-        assert signed.status_code == 201 and signed.json()["name"] == JOERG
-        page = browser.post("/sign-in", data={"name": name, "password": PASSWORD})
-        assert page.status_code == 303
-        assert JOERG in browser.get("/", headers={"Accept": "text/html"}).text
-    last = http.get("/v1/audit").json()["entries"][-1]
-    assert (last["who"], last["action"]) == (JOERG, "sign in")
-
-
-def test_a_name_stands_in_addresses(service: Service, http: httpx.Client) -> None:
-    http.post("/v1/users", json={"name": "Zoë O’Brien", "password": PASSWORD})
-    new = "another long password"
-    assert http.put(f"/v1/users/{quote('zoë o’brien')}/password", json={"password": new}).status_code == 204
-    with service.client(token=None) as browser:
-        assert browser.post("/v1/sessions", json={"name": "Zoë O’Brien", "password": new}).status_code == 201
-    shown = http.get("/administration", headers={"Accept": "text/html"}).text
-    assert f"/administration/users/{quote('Zoë O’Brien')}/remove" in shown
-    assert http.post(f"/administration/users/{quote('Zoë O’Brien')}/remove").status_code == 303
-    with service.client(token=None) as browser:
-        assert browser.post("/v1/sessions", json={"name": "Zoë O’Brien", "password": new}).status_code == 401
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["", " ", "..", "\u3164", "a\u202eb", "a\u200bb", "a\x00b", "a\nb", "a/b", "<b>", "Аda", "x" * 81, "x" * 100_000],
-    ids=lambda name: ascii(name)[:20],
-)
-def test_what_is_no_name_is_refused_and_signs_nobody_in(service: Service, http: httpx.Client, name: str) -> None:
-    refused = http.post("/v1/users", json={"name": name, "password": PASSWORD})
-    assert refused.status_code == 422 and len(refused.text) < 1500
-    form = http.post("/administration/users", data={"name": name, "role": "reader", "password": PASSWORD})
-    assert form.status_code == 422
-    with service.client(token=None) as browser:
-        assert browser.post("/v1/sessions", json={"name": name, "password": PASSWORD}).status_code == 401
-
-
-def test_a_try_under_a_name_that_postgresql_takes_not_is_written_down(service: Service, http: httpx.Client) -> None:
-    with service.client(token=None) as browser:
-        assert browser.post("/v1/sessions", json={"name": "a\x00b", "password": PASSWORD}).status_code == 401
-    trail = http.get("/v1/audit").json()
-    last = trail["entries"][-1]
-    assert (last["who"], last["action"]) == ("a\ufffdb", "sign in refused") and trail["whole"]
-
-
-@given(st.text(max_size=90))
-def test_a_written_name_stays_as_it_is(text: str) -> None:
-    try:
-        once = accounts.written_name(text)
-    except ValueError as error:
-        assert str(error) and str(error).isprintable()
-        return
-    assert accounts.written_name(once) == once and accounts.folded_name(once) == accounts.folded_name(text)
-    assert once == once.strip() and len(once) <= accounts.LONGEST
-
-
-def test_a_page_of_the_longest_name_may_stop() -> None:
-    rights = StopRights(b"k" * 32, Clock())
-    name = "𐓏" * accounts.LONGEST
-    assert rights.holder(rights.give(accounts.written_name(name), "T20260301T100000-abcdef")) == name
-
-
-def test_half_a_character_is_refused(http: httpx.Client) -> None:
-    body = '{"name": "\\ud800", "password": "long enough, I think"}'
-    headers = {"Content-Type": "application/json"}
-    for path in ("/v1/users", "/v1/sessions"):
-        assert http.post(path, content=body, headers=headers).status_code in (400, 401, 422)
-
-
-@pytest.fixture
-def urls(tmp_path: Path, short_dir: Path) -> Iterator[list[str]]:
-    """Services of two rigs, and a centre."""
-    for one in run_service(tmp_path / "a", short_dir, STUB):
-        for other in run_service(tmp_path / "b", tmp_path, STUB):
-            for centre in run_centre(tmp_path / "centre"):
-                yield [one.url, other.url, centre.url]
-
-
-def test_one_browser_stays_signed_in_at_every_service_of_a_host(urls: list[str]) -> None:
-    for url in urls:
-        answer = httpx.post(
-            f"{url}/v1/users", headers={"Authorization": f"Bearer {TOKEN}"}, timeout=60,
-            json={"name": "Ada", "password": PASSWORD, "scopes": ["administer"]},
-        )  # fmt: skip
-        assert answer.status_code == 201, answer.text
-    with httpx.Client(timeout=60) as browser:
-        csrf = {}
-        for url in urls:
-            csrf[url] = browser.post(f"{url}/v1/sessions", json={"name": "Ada", "password": PASSWORD}).json()["csrf"]
-        assert len(browser.cookies) == len(urls)
-        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [200, 200, 200]
-        browser.delete(f"{urls[0]}/v1/sessions/current", headers={"X-CSRF-Token": csrf[urls[0]]}).raise_for_status()
-        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [401, 200, 200]
