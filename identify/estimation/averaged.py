@@ -15,7 +15,7 @@ from stimrig.identify.estimation.joint import Fitted, gram
 from stimrig.identify.estimation.plain import joint_of
 from stimrig.identify.estimation.short_record import Short, fit_short
 from stimrig.identify.model import Model
-from stimrig.identify.noise import profile, whitened
+from stimrig.identify.noise import profile
 from stimrig.identify.recruitment.near_shape import DEVIATIONS
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
@@ -63,7 +63,7 @@ def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
     first = Problem(setup, [])
     mean, slopes = first.run(np.clip(theta, first.lower, first.upper), derivatives=True)
     assert slopes is not None
-    white = whitened(slopes, setup.stretches, short.noise)
+    white = setup.whitened(slopes, short.noise)
     information = gram(white)
     at = first.coefficients
     covariance = np.cov(draws.T)

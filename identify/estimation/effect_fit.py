@@ -14,7 +14,7 @@ from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.joint import Fitted, gram, solve, start_from
 from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare, still_rows
 from stimrig.identify.estimation.samples import Raw
-from stimrig.identify.noise import find_band, whitened
+from stimrig.identify.noise import find_band
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import (
@@ -304,8 +304,7 @@ def _precision(problem: Problem, theta: np.ndarray, base: Fitted, roughness: np.
     others = np.delete(np.arange(problem.size), curve)
     # what the curve and the others' changes have to explain: the residual, and the curve itself
     left = setup.target_nm - mean + theta[place] @ slopes[place]
-    rows = np.vstack([left, slopes[curve], slopes[others]]) / setup.spread
-    products = gram(whitened(rows, setup.stretches, base.noise))
+    products = gram(setup.whitened(np.vstack([left, slopes[curve], slopes[others]]), base.noise))
     inner = 1 + curve.size
     bound = products[inner:, inner:] + problem.prior[1][np.ix_(others, others)]
     own = products[:inner, :inner] - products[:inner, inner:] @ np.linalg.solve(bound, products[inner:, :inner])

@@ -14,11 +14,11 @@ from stimrig.identify.dynamics.grid import Grid, runs
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
 from stimrig.identify.estimation.fit_statistics import evaluate, fit_statistics, white_sd
 from stimrig.identify.estimation.joint import Fitted, band_as_effect
+from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.uncertainty import bands
 from stimrig.identify.model import Covariance, Model, Noise
-from stimrig.identify.noise import ar1_or_white, whitened
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.simulation.joint_surface import Surfaces, joint_tables
 from stimrig.identify.simulation.predict import fingerprint, predict_on
@@ -103,8 +103,7 @@ def _clustered_covariance(fitted: Fitted) -> np.ndarray:
     model has wrong lasts longer than a sample and makes them vary more (White 1982; Liang and Zeger 1986, clusters).
     """
     problem, setup = fitted.problem, fitted.problem.setup
-    rows = np.vstack([fitted.residual_nm, fitted.slopes]) / setup.spread
-    white = whitened(rows, setup.stretches, fitted.noise)
+    white = setup.whitened(np.vstack([fitted.residual_nm, fitted.slopes]), fitted.noise)
     at = np.concatenate([np.arange(start, stop) for start, stop in zip(*setup.stretches, strict=True)])
     block = (at * setup.grid.step_s / BLOCK_S).astype(np.int64) + 10**6 * setup.grid.part[at]
     borders = np.flatnonzero(np.r_[True, block[1:] != block[:-1]])

@@ -11,7 +11,7 @@ from numba import njit
 from stimrig.identify.effects import get, registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
-from stimrig.identify.noise import NoiseLevel, band_part, profile, whitened
+from stimrig.identify.noise import NoiseLevel, band_part, profile
 from stimrig.identify.simulation.problem import Problem
 
 
@@ -112,10 +112,6 @@ class Fitted:
         return inverse * slope[:, None] * slope[None, :]
 
 
-def _whiten(problem: Problem, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
-    return whitened(rows / problem.setup.spread, problem.setup.stretches, noise)
-
-
 def _penalty(problem: Problem, theta: np.ndarray) -> float:
     mean, precision = problem.prior
     away = theta - mean
@@ -203,7 +199,7 @@ class _Point:
 
     @cached_property
     def _products(self) -> np.ndarray:
-        return gram(_whiten(self.problem, np.vstack([self.residual, self.slopes]), self.noise))
+        return gram(self.problem.setup.whitened(np.vstack([self.residual, self.slopes]), self.noise))
 
     @cached_property
     def gradient(self) -> np.ndarray:
@@ -290,7 +286,7 @@ def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.n
     mean, jacobian = problem.run(theta, derivatives=True)
     assert jacobian is not None
     free = np.arange(problem.baselines.start, problem.coefficients.stop)
-    white = _whiten(problem, np.vstack([problem.setup.target_nm - mean, jacobian[free]]), noise)
+    white = problem.setup.whitened(np.vstack([problem.setup.target_nm - mean, jacobian[free]]), noise)
     prior_mean, precision = problem.prior
     part = precision[np.ix_(free, free)]
     products = gram(white)

@@ -14,9 +14,18 @@ from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.joint import Fitted, solve
-from stimrig.identify.estimation.projection import Projection, Solution, State, bounded, descend_from, search
+from stimrig.identify.estimation.projection import (
+    Projection,
+    Solution,
+    State,
+    ar1_or_white,
+    bounded,
+    descend_from,
+    search,
+    whiten,
+)
 from stimrig.identify.estimation.samples import Raw, inspect, white_noise
-from stimrig.identify.noise import NoiseLevel, ar1_or_white, whiten
+from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import HELD_OUT, Record
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import (

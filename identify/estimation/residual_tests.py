@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.noise import correlation_slopes, whitened
+from stimrig.identify.noise import correlation_slopes
 
 LAGS = 20
 ALARM = 0.01
@@ -44,7 +44,7 @@ def residual_tests(fitted: Fitted) -> dict[str, Any]:
     setup = fitted.problem.setup
     if not fitted.rms_nm > 1e-12 * setup.scale_nm:
         return {}
-    white = whitened(fitted.residual_nm[None, :] / setup.spread, setup.stretches, fitted.noise)[0]
+    white = setup.whitened(fitted.residual_nm[None, :], fitted.noise)[0]
     taken = _smoother_rows(fitted)
     return {"whiteness": _whiteness(fitted, white, taken), "structure": _structure(fitted, white, taken)}
 
@@ -56,7 +56,7 @@ def _smoother_rows(fitted: Fitted) -> np.ndarray:
     """
     problem, setup = fitted.problem, fitted.problem.setup
     free = np.flatnonzero((fitted.theta > problem.lower) & (fitted.theta < problem.upper))
-    own = whitened(fitted.slopes[free] / setup.spread, setup.stretches, fitted.noise)
+    own = setup.whitened(fitted.slopes[free], fitted.noise)
     hessian, prior = (matrix[np.ix_(free, free)] for matrix in (fitted.hessian, problem.prior[1]))
     size = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     both = size[:, None] * size[None, :]
@@ -151,7 +151,7 @@ def _structure(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str
     signals = np.stack([time, time * mean, mean**2, np.abs(rate), np.abs(drive - mean) * mean, time * drive])
     scale = np.linalg.norm(signals, axis=1)
     signals = signals[scale > 0] / scale[scale > 0][:, None]
-    extra = whitened(signals / setup.spread, setup.stretches, fitted.noise)
+    extra = setup.whitened(signals, fitted.noise)
     # The same smoother is applied to the signals, since a penalised fit removes less than a projection. The fit stops
     # near its optimum; what it leaves along the model's own slopes is not tested.
     left = extra - (extra @ taken.T) @ taken

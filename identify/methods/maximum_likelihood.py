@@ -19,11 +19,10 @@ from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import estimate, fitted_rows, still_rows, to_fitted
-from stimrig.identify.estimation.projection import Projection, Solution, project, search
+from stimrig.identify.estimation.projection import Projection, Solution, log_likelihood, project, search, whiten
 from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.two_stage import general
 from stimrig.identify.model import Model
-from stimrig.identify.noise import log_likelihood, whiten
 from stimrig.identify.recruitment import basis_at
 from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis
 from stimrig.identify.recruitment.smoothing import KNOTS

@@ -18,9 +18,9 @@ from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import completed
+from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.methods.common import near_rest, quiet_level, segment_rows
 from stimrig.identify.model import Model, Noise
-from stimrig.identify.noise import ar1_or_white
 from stimrig.identify.recruitment import fit_points
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import choose_weight

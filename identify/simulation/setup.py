@@ -11,6 +11,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.effects.base import Scene
+from stimrig.identify.noise import NoiseLevel, whitened
 from stimrig.identify.recruitment import Basis
 
 WITHIN = 5
@@ -81,6 +82,10 @@ class Setup:
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
         """Starts and ends of the runs of fitted intervals, each within one part."""
         return ends_of(self.grid.stretches(self.fitted))
+
+    def whitened(self, rows: np.ndarray, noise: NoiseLevel) -> np.ndarray:
+        """Rows, shape (M, K), over the noise of their part, whitened to unit variance; fitted intervals in order."""
+        return whitened(rows / self.spread, self.stretches, noise)
 
     def part_of(self, at_samples: bool) -> np.ndarray | None:
         """Index of the part of each sample or interval; None if there is one part only."""

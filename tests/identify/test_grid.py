@@ -14,7 +14,7 @@ from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.second_order import transition
 from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.noise import best_ar1, log_likelihood, whiten
+from stimrig.identify.estimation.projection import best_ar1, log_likelihood, whiten
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
 

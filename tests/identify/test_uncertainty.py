@@ -10,9 +10,10 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.estimation.projection import ar1_or_white, best_ar1, log_likelihood, whiten
 from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p
 from stimrig.identify.estimation.uncertainty import prediction_band
-from stimrig.identify.noise import NoiseLevel, ar1_or_white, best_ar1, correlation_slopes, log_likelihood, whiten
+from stimrig.identify.noise import NoiseLevel, correlation_slopes
 from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 
@@ -180,7 +181,7 @@ def test_chi_square_tail_against_scipy():
 def test_starting_is_cheap():
     code = (
         "import sys, stimrig.identify; assert 'numpy' not in sys.modules;"
-        "import stimrig.identify.records.read, stimrig.identify.records.csv, stimrig.identify.model;"
+        "import stimrig.identify.records.csv, stimrig.identify.model;"
         "slow = [m for m in ('scipy.signal', 'scipy.optimize', 'scipy.stats', 'scipy.interpolate', 'numba', 'h5py')"
         " if m in sys.modules]; assert not slow, slow"
     )
