@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.second_order import Core, transition
 
 if TYPE_CHECKING:
