@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
 
 from stimrig.rig import plan
+from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibration import Calibration
-from stimrig.rig.control.memory import Rest, Result
-from stimrig.rig.control.pair import Pair
+from stimrig.rig.control.memory import Result
 from stimrig.rig.control.playing import Player, check_names
-from stimrig.rig.control.sealing import RecordingStore
-from stimrig.rig.control.state import State
 from stimrig.rig.errors import BusyError, PlanError
 from stimrig.rig.limits import Limit
-from stimrig.rig.machine import Machine
 from stimrig.rig.messages import Calibrated, CalibrationResult
 from stimrig.rig.requests import (
     CalibrateFinishRequest,
@@ -31,13 +27,11 @@ class Calibrations:
     """Opens, plays step by step, marks and closes a calibration. Every answer but that of `finish` is the status."""
 
     def __init__(
-        self, state: State, pair: Pair, player: Player, rest: Rest, store: RecordingStore, result: Result,
-        machine: Machine, table: dict[str, Limit], angle: Callable[[], dict[str, Any] | None],
-        publish: Callable[[], None],
-    ) -> None:  # fmt: skip
-        self._state, self._pair, self._player, self._rest = state, pair, player, rest
-        self._store, self._result, self._tasks = store, result, machine.tasks
-        self._table, self._angle, self._publish = table, angle, publish
+        self, player: Player, joint: Joint, result: Result, table: dict[str, Limit], publish: Callable[[], None]
+    ) -> None:
+        self._player, self._joint, self._result, self._table, self._publish = player, joint, result, table, publish
+        self._state, self._pair, self._rest = player.state, player.pair, player.rest
+        self._store, self._tasks = player.store, player.tasks
 
     async def start(self, request: CalibrateStartRequest) -> None:
         """Open a guided calibration; nothing is sent yet.
@@ -80,7 +74,7 @@ class Calibrations:
             await self._tasks.work(self._store.check_room, train.test_id)
             self._open()  # a stop may have come meanwhile
             following = self._state.trial.train(train.test_id)
-            await self._player.launch(test, calibration.table, following, self._angle())
+            await self._player.launch(test, calibration.table, following, self._joint.described())
 
     async def mark(self, request: CalibrateMarkRequest) -> None:
         """Mark the last train's width as a threshold. Raises PlanError, BusyError, RefusedError (its day is over)."""

@@ -14,6 +14,10 @@ from stimrig.rig.acquire.run import TestRun
 from stimrig.rig.messages import LatePulse, LiveEvent, TorqueSamples
 
 BIN_S = 0.01
+IDLE = {
+    "test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "pulse_time_s": [], "pulse_width_us": [],
+    "dropped_pulses": 0,
+}  # fmt: skip
 
 
 def live_event(
@@ -49,22 +53,15 @@ def live_event(
         lost_samples=receiver.counts.lost_samples,
         samples=_samples(found, origin_s) if samples else None,
         **({} if angle is None else _of_angle(angle, origin_s, samples)),
-        **(_idle() if run is None else _of_run(run, now_s, samples)),
+        **(IDLE if run is None else _of_run(run, now_s, samples)),
     )
-
-
-def _idle() -> dict[str, Any]:
-    return {
-        "test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "pulse_time_s": [],
-        "pulse_width_us": [], "dropped_pulses": 0,
-    }  # fmt: skip
 
 
 def _of_run(run: TestRun, now_s: float, samples: bool) -> dict[str, Any]:
     rate_hz, laid = run.plan.pulse_rate_hz, run.score.laid
     reached = 0 if run.t0_s is None else int(np.floor((now_s - run.t0_s) * rate_hz)) + 1
     pulses = range(run.told_pulses, max(run.told_pulses, min(reached, len(laid))))
-    return {
+    found: dict[str, Any] = {
         "test_id": run.plan.test_id,
         "segment": run.segment(),
         "elapsed_s": run.elapsed_s(),
@@ -78,14 +75,13 @@ def _of_run(run: TestRun, now_s: float, samples: bool) -> dict[str, Any]:
         "laid": len(laid),
         "boundary_s": len(laid) / rate_hz,
         "ended_by": run.ended_by,
-        **(_of_adaptive(run, samples) if run.score.adaptive else {}),
     }
-
-
-def _of_adaptive(run: TestRun, chooses: bool) -> dict[str, Any]:
-    """What whoever chooses its pieces needs. The segments last: they hold every pulse that is told before."""
-    late = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in tuple(run.gate.late)] if chooses else []
-    return {"not_sent": list(run.gate.not_sent), "late": late, "laid_segments": run.score.segments()}
+    if run.score.adaptive:  # whoever chooses its pieces needs these; the segments last: they hold every pulse before
+        late = tuple(run.gate.late) if samples else ()
+        found["not_sent"] = list(run.gate.not_sent)
+        found["late"] = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in late]
+        found["laid_segments"] = run.score.segments()
+    return found
 
 
 def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:

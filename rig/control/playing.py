@@ -43,8 +43,8 @@ class Player:
         self, state: State, pair: Pair, rest: Rest, store: RecordingStore, machine: Machine, watch: Watch,
         publish: Callable[[Event], None],
     ) -> None:  # fmt: skip
-        self._state, self._pair, self._rest, self._store = state, pair, rest, store
-        self._machine, self._tasks, self._clock, self._watch = machine, machine.tasks, machine.tasks.clock, watch
+        self.state, self.pair, self.rest, self.store = state, pair, rest, store
+        self._machine, self.tasks, self._clock, self._watch = machine, machine.tasks, machine.tasks.clock, watch
         self._publish = publish
         self.run: TestRun | None = None
         self.playing: Task[None] | None = None
@@ -78,15 +78,15 @@ class Player:
         key
             What extensions of an adaptive test must know.
         """
-        state, before, halt = self._state, self._state.trial, Halt(self._clock)
+        state, before, halt = self.state, self.state.trial, Halt(self._clock)
         halt.on_set(lambda: self._ending(halt))
         self._halt, self.evidence, self._key = halt, None, key
         self.evidence_ready.clear()
         state.change(following)
         try:
             await state.file.write("running", f"test {following.test_id} of participant {following.participant}")
-            journal = await self._tasks.work(self._store.begin, test, self._pair.identity, angle)
-            gate, receiver, sensor = self._pair.gate, self._pair.receiver, self._pair.angle
+            journal = await self.tasks.work(self.store.begin, test, self.pair.identity, angle)
+            gate, receiver, sensor = self.pair.gate, self.pair.receiver, self.pair.angle
             if gate is None or receiver is None:
                 raise DeviceError("the devices were disconnected before the test began")
         except Exception:
@@ -94,22 +94,22 @@ class Player:
             raise
         self.run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, sensor)
         self.run.on_evidence = self._take_evidence
-        self.playing = self._tasks.spawn(self._execute(self.run), "test")
+        self.playing = self.tasks.spawn(self._execute(self.run), "test")
 
     def end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
         """End the running test, or latch; True if a test runs."""
-        self._state.count_stop()
-        runs = self._state.trial.busy and self._halt is not None
+        self.state.count_stop()
+        runs = self.state.trial.busy and self._halt is not None
         if not runs or self._halt is None:
             if latch_idle:
-                self._state.halted(reason)
+                self.state.halted(reason)
         elif not self._halt.set(cause, reason) and latch_idle:
-            self._state.halted(reason)  # it was ending: both reasons are told
+            self.state.halted(reason)  # it was ending: both reasons are told
         return runs
 
     def trouble(self) -> str | None:
         """That the task of the test has died; None: it has not."""
-        trial = self._state.trial
+        trial = self.state.trial
         if trial.busy and self.run is not None and (self.playing is None or self.playing.done.is_set()):
             return f"the task of test {trial.test_id} ended, but its test did not"
         return None
@@ -118,8 +118,8 @@ class Player:
         """See `WithdrawRequest`. Like a stop it waits for no turn, and for nothing else. Raises PlanError (its id)."""
         test_id, reason = request.test_id, f"withdrawn: {request.reason:.{LONGEST_WORDS}}"
         check_names("withdraw", test_id=test_id)
-        present, run = self._state.trial.test_id == test_id, self.run
-        ending = present and self._state.trial.state not in ("arming", "running")
+        present, run = self.state.trial.test_id == test_id, self.run
+        ending = present and self.state.trial.state not in ("arming", "running")
         begun = present and run is not None and run.begun
         over = self.finished is not None and self.finished.test_id == test_id
         if ending or over or (begun and not request.begun):
@@ -171,13 +171,13 @@ class Player:
 
     def _ending(self, halt: Halt) -> None:
         if halt.cause == "withdrawn":
-            self._state.change(self._state.trial.withdrawn())
+            self.state.change(self.state.trial.withdrawn())
         else:
-            self._state.halted(halt.reason)
+            self.state.halted(halt.reason)
 
     async def _not_begun(self, before: Trial) -> None:
         """No pulse was sent. A stop that came meanwhile counts as one of an idle rig."""
-        state, halted = self._state, self._state.trial
+        state, halted = self.state, self.state.trial
         state.change(before)
         if halted.lost:
             state.change(before.disconnected(halted.lost))
@@ -193,26 +193,26 @@ class Player:
         self.evidence_ready.set()
 
     async def _execute(self, run: TestRun) -> None:
-        self._tasks.spawn(self._announce(run), "announce")
+        self.tasks.spawn(self._announce(run), "announce")
         try:
             result = await run.execute()
             if result.last_pulse_s is not None:  # stored before another test may start; an unconfirmed end is one now
                 confirmed = result.evidence.confirmed
-                await self._rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
-            self._state.change(self._state.trial.ended())
-            finished = await self._tasks.work(self._store.finish, run.journal.path, run.plan.test_id, result)
+                await self.rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
+            self.state.change(self.state.trial.ended())
+            finished = await self.tasks.work(self.store.finish, run.journal.path, run.plan.test_id, result)
             await self._finish(run, result, finished)
         except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
             log.exception("the test could not be ended properly")
             await self._broken(f"internal: {type(error).__name__}: {error}")
 
     async def _announce(self, run: TestRun) -> None:
-        await self._tasks.wait(math.inf, run.started, run.halt.signal)
-        if run.started.is_set() and self._state.trial.state == "arming":
-            self._state.change(self._state.trial.armed())
+        await self.tasks.wait(math.inf, run.started, run.halt.signal)
+        if run.started.is_set() and self.state.trial.state == "arming":
+            self.state.change(self.state.trial.armed())
 
     async def _finish(self, run: TestRun, result: RunResult, finished: FinishedEvent) -> None:
-        state, train = self._state, self._state.trial.calibrating
+        state, train = self.state, self.state.trial.calibrating
         if finished.recording_path is None and run.t0_s is not None:  # only a journal: needs a person
             state.change(state.trial.halted(finished.reason))
         await state.settle()
@@ -228,9 +228,9 @@ class Player:
     async def _broken(self, reason: str) -> None:
         self.evidence_ready.set()
         self.run = None
-        self._state.change(Trial("latched", reason, lost=reason))
-        await self._state.remember(Trial("uncertain", reason))
-        await self._rest.pulse_at(self._clock.now_s(), ended=False)
+        self.state.change(Trial("latched", reason, lost=reason))
+        await self.state.remember(Trial("uncertain", reason))
+        await self.rest.pulse_at(self._clock.now_s(), ended=False)
 
 
 def check_names(place: str, **names: str) -> None:

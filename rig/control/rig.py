@@ -72,10 +72,7 @@ class Rig:
         self.store = RecordingStore(config, machine)
         self._result = Result(config.data_dir, machine)
         self.player = Player(self.state, self.pair, self.rest, self.store, machine, config.watch, publish)
-        self.calibrations = Calibrations(
-            self.state, self.pair, self.player, self.rest, self.store, self._result, machine, self.table,
-            self.joint.described, self._tell,
-        )  # fmt: skip
+        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self._tell)
 
     @property
     def latch(self) -> str:

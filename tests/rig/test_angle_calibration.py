@@ -22,7 +22,7 @@ from stimrig.rig.journal import Kind
 from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.messages import AngleCalibration, AnglePlan, Profile, Status, TestPlan
 from stimrig.rig.requests import AnglePoseRequest
-from tests.rig.angle import FakeSensor, OpenedSensor
+from tests.rig.fakes import FakeSensor, OpenedSensor
 from tests.rig.live import SPEED, LiveRig
 from tests.simulator.virtual_time import VirtualMachine
 

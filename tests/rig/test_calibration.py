@@ -23,9 +23,9 @@ from stimrig.rig.requests import CalibrateStartRequest
 NOON_S = datetime(2026, 3, 4, 12, tzinfo=UTC).timestamp()
 
 
-def opened(**fields: Any) -> Calibration:
+def opened(steps: Steps | None = None, **fields: Any) -> Calibration:
     request = CalibrateStartRequest(calibration_id="c1", participant="P01", by="therapist", **fields)
-    return Calibration(request, HARD_LIMITS, NOON_S)
+    return Calibration(request, HARD_LIMITS, NOON_S, steps or Steps())
 
 
 def play(calibration: Calibration, *directions: str) -> float:
@@ -229,10 +229,7 @@ def known(sensory: float = 60, motor: float = 100, comfort: float = 300, current
 
 
 def stepped(steps: Steps | None = None, **fields: Any) -> Calibration:
-    request = CalibrateStartRequest(
-        **{"calibration_id": "c1", "participant": "P01", "by": "t", "large_steps": True, **fields}
-    )
-    return Calibration(request, HARD_LIMITS, NOON_S, steps or Steps())
+    return opened(steps, **{"large_steps": True, **fields})
 
 
 def widths(calibration: Calibration) -> list[float]:

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
-from stimrig.rig import journal as jn
 from stimrig.rig.clock import utc_text
 from stimrig.rig.control.calibration import end_of_day_s
 from stimrig.rig.control.replies import previewed
 from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from stimrig.rig.messages import AdaptivePlan, Extended, LiveEvent, Profile, SegmentPlan, TestPlan
 from stimrig.rig.requests import EnoughRequest, ExtendRequest, PreviewRequest  # fmt: skip
-from stimrig.rig.signals import PulseStatus
-from tests.rig.fakes import VirtualRig, hold, rest
+from tests.rig.fakes import hold, rest
 from tests.rig.live import LiveRig
 
 KEY = "0123456789abcdef"
@@ -92,15 +89,6 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     with h5py.File(str(finished.recording_path)) as file:
         assert set(file["segments/name"].asstr()[:]) == {"rest", "added"}
         assert KEY not in str(dict(file.attrs))
-
-
-def test_what_the_muscle_did_not_feel_is_known_by_its_index(tmp_path: Path):
-    rig = VirtualRig(tmp_path, [hold()])
-    rig.stimulator.ack_delay_s = 0.06  # the two pulses that come due meanwhile are dropped
-    assert rig.execute().outcome == "completed"
-    skipped = [jn.SKIPPED.unpack(p) for kind, p in jn.read(rig.path).blocks if kind == jn.Kind.SKIPPED]
-    dropped = [index for index, status, _ in skipped if status == PulseStatus.DROPPED]
-    assert len(dropped) > 20 and rig.gate.not_sent == dropped
 
 
 def test_neither_before_nor_after_a_test_nor_when_it_is_stopped(make: Make):

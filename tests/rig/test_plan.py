@@ -132,20 +132,6 @@ def test_a_segment_without_a_pulse_is_a_mistake_in_the_plan(sequence: str):
             built(segments)
 
 
-@pytest.mark.parametrize(
-    ("sequence", "settings"),
-    [
-        ("steps", {"on_s": True}),
-        ("rest", {"duration_s": "2"}),
-        ("widths", {"pulse_width_us": [True]}),
-        ("prbs", {"bits": True}),
-    ],
-)
-def test_what_is_no_number_is_no_setting(sequence: str, settings: dict[str, object]):
-    with pytest.raises(PlanError, match="valid"):
-        built([SegmentPlan(name="x", sequence=sequence, settings=settings)])
-
-
 def test_mistakes_name_the_segment():
     with pytest.raises(PlanError, match="segments is empty"):
         built([])

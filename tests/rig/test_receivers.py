@@ -15,8 +15,7 @@ from stimrig.rig.acquire.angle_receiver import REOPEN_S, AngleReceiver
 from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.stream import LONGEST_READ_S, LOOK_S, SILENCE_S, CounterUnwrapper
 from stimrig.rig.signals import SAMPLE, AngleScale, Block
-from tests.rig.angle import OpenedSensor
-from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, journal_at
+from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, OpenedSensor, journal_at
 from tests.simulator.virtual_time import VirtualMachine
 
 

@@ -113,6 +113,10 @@ def test_dose_and_torque_time():
         ("widths", {"pulse_width_us": [1, "wide"]}, "widths.pulse_width_us.1"),
         ("multilevel", {"min_hold_s": 2.0}, "min_hold_s must not exceed max_hold_s"),
         ("ramp", {"up_s": 0.001}, "at least one pulse"),
+        ("steps", {"on_s": True}, "valid"),
+        ("rest", {"duration_s": "2"}, "valid"),
+        ("widths", {"pulse_width_us": [True]}, "valid"),
+        ("prbs", {"bits": True}, "valid"),
     ],
 )
 def test_mistakes_name_the_setting(name: str, settings: dict[str, object], words: str):

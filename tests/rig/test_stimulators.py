@@ -1,24 +1,22 @@
-"""The two stimulators: the pulses that the rig asks for, what the device answers, and cables on the wrong device.
-
-Their frames: test_framing.py.
-"""
+"""The two stimulators: their frames against vectors of published clients, their pulses and answers, swapped cables."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stimrig.hardware_sim.stimulators import sciencemode
+from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2, ScienceMode4
 from stimrig.rig.devices import p24, rehastim2
-from stimrig.rig.devices._line import Packet
+from stimrig.rig.devices._line import Packet as RigsPacket
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.machine import Told
-from tests.rig.test_framing import FRAMES_4
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 
@@ -61,8 +59,8 @@ def test_every_answer_but_the_good_one_is_an_error(data: bytes, monkeypatch: pyt
     monkeypatch.setattr(machine, "port", lambda *_, **__: SimpleNamespace())
     device = p24.P24(p24.Settings(device="p24", port="/dev/p24"), machine)
 
-    async def ask(*_: object) -> Packet:
-        return Packet(0, 1, data)
+    async def ask(*_: object) -> RigsPacket:
+        return RigsPacket(0, 1, data)
 
     monkeypatch.setattr(device._line, "ask", ask)
     monkeypatch.setattr(device._line, "discard", lambda: None)
@@ -79,7 +77,7 @@ def test_results_are_signed():
 
 
 def test_a_single_pulse_and_what_cannot_be_one():
-    assert rehastim2.single_pulse(9, 0, 300, 24.0) == rehastim2.FRAMING.encode(Packet(9, 36, bytes((0, 1, 44, 24))))
+    assert rehastim2.single_pulse(9, 0, 300, 24.0) == rehastim2.FRAMING.encode(RigsPacket(9, 36, bytes((0, 1, 44, 24))))
     for wrong in ((0, 19, 20), (0, 501, 20), (0, 300, 25), (0, 300, 128), (0, 300, -2), (8, 300, 20), (-1, 300, 20)):
         with pytest.raises(WireError):
             rehastim2.single_pulse(1, *wrong)
@@ -164,3 +162,186 @@ def test_a_mistake_in_a_driver_is_told_at_once():
         line.run(device.open())
     assert line.clock.now_s() - asked_s < 0.01
     assert "internal: ZeroDivisionError: a mistake" in told[0]
+
+
+FRAMES_2 = {
+    "InitAck": ("f0 81 7f 81 56 00 02 00 0f", Packet(0, 2, b"\x00")),
+    "Watchdog": ("f0 81 5c 81 57 01 04 0f", Packet(1, 4, b"")),
+    "InitList ch1 8 ms 25 ms": (
+        "f0 81 35 81 5c 03 1e 00 01 00 0d 00 30 00 0f",
+        Packet(3, 30, bytes.fromhex("00 01 00 0d 0030 00")),
+    ),
+    "Start 250 us 20 mA": ("f0 81 6f 81 53 04 20 00 00 fa 14 0f", Packet(4, 32, bytes.fromhex("00 00fa 14"))),
+    "Start 271 us 20 mA": ("f0 81 50 81 52 05 20 00 01 81 5a 14 0f", Packet(5, 32, bytes.fromhex("00 010f 14"))),
+    "Start 129 us 15 mA": ("f0 81 0c 81 5d 07 20 00 00 81 d4 81 5a 0f", Packet(7, 32, bytes.fromhex("00 0081 0f"))),
+    "Stop": ("f0 81 13 81 57 08 22 0f", Packet(8, 34, b"")),
+    "SinglePulse 300 us 25 mA": ("f0 81 ae 81 53 09 24 00 01 2c 19 0f", Packet(9, 36, bytes.fromhex("00 012c 19"))),
+    "Watchdog 15": ("f0 81 a7 81 56 81 5a 04 0f", Packet(15, 4, b"")),
+    "GetMode": ("f0 81 49 81 57 02 0a 0f", Packet(2, 10, b"")),
+    "Init": ("f0 81 47 81 56 00 01 01 0f", Packet(0, 1, b"\x01")),
+    "StartAck": ("f0 81 45 81 56 04 21 00 0f", Packet(4, 33, b"\x00")),
+    "StimulationError electrode": ("f0 81 1a 81 56 01 26 fe 0f", Packet(1, 38, b"\xfe")),
+}
+FRAMES_4 = {
+    "GetStimStatus": ("f0 81 55 81 59 81 4e 81 0c 04 3e 0f", Packet(1, 62, b"")),
+    "LLInit": ("f0 81 55 81 58 81 16 81 36 10 00 00 0f", Packet(4, 0, b"\x00")),
+    "LLConfig 250 us 20 mA": (
+        "f0 81 55 81 4e 81 cd 81 ae 14 02 82 81 5a a5 50 00 06 44 b0 00 81 5a a4 10 00 0f",
+        Packet(5, 2, bytes.fromhex("82 0fa55000 0644b000 0fa41000")),
+    ),
+    "LLConfig 300 us 20.5 mA": (
+        "f0 81 55 81 4c 81 e5 81 94 18 02 82 12 c5 54 00 06 44 b0 00 12 c4 0c 00 0f",
+        Packet(6, 2, bytes.fromhex("82 12c55400 0644b000 12c40c00")),
+    ),
+    "LLConfig 240 us 20 mA": (
+        "f0 81 55 81 4e 81 0f 81 21 3c 02 82 81 5a 05 50 00 06 44 b0 00 81 5a 04 10 00 0f",
+        Packet(15, 2, bytes.fromhex("82 0f055000 0644b000 0f041000")),
+    ),
+    "LLStop": ("f0 81 55 81 59 81 13 81 37 20 04 0f", Packet(8, 4, b"")),
+    "MLUpdate 25 ms": (
+        "f0 81 55 81 4b 81 22 81 bc 28 20 01 20 00 64 81 5a a5 50 00 06 44 b0 00 81 5a a4 10 00 0f",
+        Packet(10, 32, bytes.fromhex("01 20 0064 0fa55000 0644b000 0fa41000")),
+    ),
+    "MLStop": ("f0 81 55 81 59 81 54 81 e0 30 22 0f", Packet(12, 34, b"")),
+    "LLInitAck": ("f0 81 55 81 58 81 25 81 07 10 01 00 0f", Packet(4, 1, b"\x00")),
+    "LLConfigAck": ("f0 81 55 81 5a 81 43 81 d5 14 03 00 00 00 0f", Packet(5, 3, bytes(3))),
+    "LLConfigAck electrode": ("f0 81 55 81 5a 81 84 81 14 14 03 0a 00 00 0f", Packet(5, 3, b"\x0a\x00\x00")),
+}
+
+
+class Codec(NamedTuple):
+    """Of the rig or of the emulator."""
+
+    version: int
+    encode: Callable[[Packet], bytes]
+    decoder: Callable[[], Any]
+    lost: int
+    """Most frames behind a damaged one that are lost with it."""
+    damaged: str
+    """Name of the decoder's count."""
+
+
+def of_rig(version: int, module: Any) -> Codec:
+    return Codec(
+        version, lambda packet: module.FRAMING.encode(RigsPacket(*packet)), module.FRAMING.reader, 1, "damaged"
+    )
+
+
+CODECS = {
+    "rig 2": of_rig(2, rehastim2),
+    "rig 4": of_rig(4, p24),
+    "emulator 2": Codec(2, ScienceMode2.encode, ScienceMode2, 0, "corrupt_frames"),
+    "emulator 4": Codec(4, ScienceMode4.encode, ScienceMode4, 0, "corrupt_frames"),
+}
+EACH = pytest.mark.parametrize("codec", CODECS.values(), ids=CODECS)
+VECTORS = [
+    pytest.param(codec, bytes.fromhex(text), packet, id=f"{of} {name}")
+    for of, codec in CODECS.items()
+    for name, (text, packet) in {2: FRAMES_2, 4: FRAMES_4}[codec.version].items()
+]
+NEXT = Packet(1, 4, b"")
+
+
+def read(decoder: Any, data: bytes, time_s: float = 0.0) -> list[Packet]:
+    """The rig's knows no time."""
+    found = decoder.feed(data, time_s) if hasattr(decoder, "corrupt_frames") else decoder.feed(data)
+    return [Packet(packet.number, packet.command, packet.data) for packet in found]
+
+
+def packet_of(codec: Codec) -> st.SearchStrategy[Packet]:
+    number, command, size = {2: (255, 255, 32), 4: (63, 1023, 80)}[codec.version]
+    return st.builds(Packet, st.integers(0, number), st.integers(0, command), st.binary(max_size=size))
+
+
+@pytest.mark.parametrize(("codec", "frame", "packet"), VECTORS)
+def test_vectors_both_ways_also_byte_by_byte_and_after_noise(codec: Codec, frame: bytes, packet: Packet):
+    assert codec.encode(packet) == frame
+    assert read(codec.decoder(), frame) == [packet]
+    decoder = codec.decoder()
+    assert [p for byte in b"\x0f\xf0\x81\x00\xf0" + frame for p in read(decoder, bytes([byte]))] == [packet]
+
+
+@EACH
+@given(data=st.data())
+@settings(max_examples=100, deadline=None)
+def test_any_packets_in_any_pieces(codec: Codec, data: st.DataObject):
+    sent = data.draw(st.lists(packet_of(codec), max_size=5))
+    line, decoder, found = b"".join(map(codec.encode, sent)), codec.decoder(), list[Packet]()
+    assert line == b"".join(map(CODECS[f"emulator {codec.version}"].encode, sent)), "the two agree"
+    while line:
+        size = data.draw(st.integers(1, 40))
+        found += read(decoder, line[:size])
+        line = line[size:]
+    assert found == sent
+    assert getattr(decoder, codec.damaged) == 0
+
+
+@EACH
+@given(stray=st.binary(max_size=30).filter(lambda b: b"\xf0" not in b))
+def test_stray_bytes_before_a_frame_cost_nothing(codec: Codec, stray: bytes):
+    assert read(codec.decoder(), stray + codec.encode(NEXT)) == [NEXT]
+
+
+@EACH
+@given(data=st.data(), place=st.integers(0, 10**6), change=st.integers(1, 255))
+@settings(max_examples=150, deadline=None)
+def test_a_wrong_byte_is_never_taken_and_costs_its_frame_only(
+    codec: Codec, data: st.DataObject, place: int, change: int
+):
+    """Of one bit in ScienceMode 2: its sum has eight."""
+    frame = bytearray(codec.encode(data.draw(packet_of(codec))))
+    frame[place % len(frame)] ^= 1 << change % 8 if codec.version == 2 else change
+    decoder = codec.decoder()
+    assert read(decoder, bytes(frame)) == []
+    found = read(decoder, 2 * codec.encode(NEXT), 1.0) + read(decoder, bytes(4100), 1.0)  # of a length that is wrong
+    assert found in ([NEXT] * (2 - lost) for lost in range(codec.lost + 1))
+
+
+@EACH
+@given(garbage=st.binary(max_size=600))
+@settings(max_examples=60, deadline=None)
+def test_after_garbage_frames_are_found_again(codec: Codec, garbage: bytes):
+    """The rig's waits for as many bytes as a length in it says, the emulator's for a moment."""
+    decoder = codec.decoder()
+    read(decoder, garbage)
+    assert read(decoder, (400 if codec.lost else 1) * codec.encode(NEXT), 1.0)[-1:] == [NEXT]
+
+
+@pytest.mark.parametrize("wire", [ScienceMode2, ScienceMode4])
+def test_half_a_frame_of_a_dead_client_does_not_swallow_the_next(wire: Any):
+    decoder, frame = wire(), wire.encode(Packet(3, 2, bytes(32)))
+    assert decoder.feed(frame[:20], 0.0) == []
+    assert decoder.feed(wire.encode(NEXT), 0.5) == [NEXT]
+    assert decoder.corrupt_frames == 1
+
+
+def test_a_damaged_frame_is_kept_as_it_reads():
+    decoder, frame = ScienceMode2(), bytearray(ScienceMode2.encode(Packet(4, 32, bytes.fromhex("0000fa14"))))
+    frame[-2] ^= 0x02
+    assert decoder.feed(bytes(frame), 0.0) == []
+    assert decoder.take_damaged() == [Packet(4, 32, bytes.fromhex("0000fa16"))]
+    assert decoder.take_damaged() == []
+
+
+@given(st.binary(max_size=300))
+@settings(max_examples=200, deadline=None)
+def test_stuffing_is_reversible_and_hides_borders(data: bytes):
+    stuffed = sciencemode.stuff(data)
+    assert sciencemode.unstuff(stuffed) == data
+    assert not {0xF0, 0x0F} & set(stuffed)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "f0", "f0 81 5c 81 57 01 04 0e", "f0 81 5d 81 57 01 04 0f", "f0 00 5c 81 57 01 04 0f"]
+)
+def test_what_is_no_frame_is_told(text: str):
+    with pytest.raises(WireError):
+        rehastim2.FRAMING.decode(bytes.fromhex(text))
+
+
+def test_a_body_longer_than_its_length_field_is_refused():
+    longest = Packet(1, 36, bytes(253))
+    rigs = CODECS["rig 2"]
+    assert read(rigs.decoder(), rigs.encode(longest)) == [longest]
+    with pytest.raises(WireError):
+        rigs.encode(Packet(1, 36, bytes(254)))
