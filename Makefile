@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: demo centre test check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
+.PHONY: demo centre test frozen check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -55,6 +55,9 @@ late: setup-test ## the page's tests with answers that come late and in pieces; 
 
 pauses: setup-test ## every test while its processes are stopped and continued at random; SEED=2 for other times, PYTEST_ARGS
 	@$(BIN)/python -m tests.harness.pauses $(if $(SEED),--seed $(SEED)) -- $(BIN)/python -m $(if $(PYTEST_ARGS),pytest $(PYTEST_ARGS),tests)
+
+frozen: setup-test ## what users hold, compared with golden files (tests/frozen/README.md); ONLY=PATTERN
+	@$(BIN)/python -m tests.frozen check --only '$(ONLY)'
 
 simulate: setup-test ## lives of a rig in simulated time; MINUTES=10 or LIVES=1000, SEED=1 (docs/simulator.md)
 	@$(BIN)/python -m tests.simulator --seed $(or $(SEED),1) $(if $(LIVES),--lives $(LIVES),--minutes $(or $(MINUTES),10))

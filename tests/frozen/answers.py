@@ -1,0 +1,280 @@
+"""Calls the command line, condenses what it gives, and compares two of these."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+HERE = Path(__file__).resolve().parents[2]
+PACKAGE = "stimrig.api" if (HERE / "stimrig" / "api").exists() else "api"
+NUMBER = re.compile(r"[-−+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+LONG = 12
+"""Of longer rows of numbers only their shape, ends and moments are kept."""
+VOLATILE = (
+    (re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[.\d]*(?:\+00:00|Z)?"), "<time>"),
+    (re.compile(r"\bm-[0-9a-f]{6,}\b|\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f-]{22}\b"), "<id>"),
+    (re.compile(r"\b[0-9a-f]{64}\b"), "<digest>"),
+    (re.compile(r"(done before, |in )\d+(?:\.\d+)? m?s\b"), r"\1<duration>"),
+    (re.compile(r"(stimrig_rig_|Model )(?:[\w-]{30,}|[0-9a-f]{8}\b)"), r"\1<id>"),
+    (re.compile(r"\b(?:stimrig )?\d+\.\d+\.\d+(?:[.+]\w+)*\b"), "<version>"),
+    (re.compile(r"\b(?:stimrig\.)?((?:identify|api|rig|hardware_sim)\.[a-z_.]+)"), r"\1"),
+)
+NEW_EACH_TIME = {"model_id", "created", "software", "elapsed_s", "took_s", "age_s", "torque_age_s", "uptime_s", "csrf"}
+
+
+class CommandLine:
+    """The command line in a folder; all calls in one process, but for Python itself (`-c`) and the
+    emulator, which becomes another program.
+
+    Parameters
+    ----------
+    folder
+        Where the calls work.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("STIMRIG_")}
+        self._environment = kept | {"PYTHONPATH": str(HERE), "COLUMNS": "100", "OPENBLAS_NUM_THREADS": "1", "TZ": "UTC"}
+        self._session = self._begin("-m", "tests.frozen.session")
+
+    def __enter__(self) -> CommandLine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._session.communicate()
+
+    def call(self, line: str) -> dict[str, Any]:
+        """Exit code, standard output and error, and every file that is new in the folder after it."""
+        before = self._files()
+        done = self.run(line)
+        new = [path for path, changed in self._files().items() if before.get(path) != changed]
+        names = {path: _plain(str(path.relative_to(self.folder)), self.folder) for path in sorted(new)}
+        answer = {
+            "exit": done["exit"],
+            "out": _text(done["out"], self.folder),
+            "error": _text(done["error"], self.folder) if done["exit"] else "",  # else progress
+            "files": {name: condensed_file(path, self.folder) for path, name in names.items()},
+        }
+        for name, document in answer["files"].items():
+            if document == answer["out"]:
+                answer["out"] = f"<as {name}>"
+        return answer
+
+    def run(self, line: str) -> dict[str, Any]:
+        """Exit code, standard output and error as they are."""
+        if line.startswith(("-c", "emulate")):
+            done = self._begin("-c", line[2:]) if line[0] == "-" else self._begin("-m", f"{PACKAGE}.cli", *line.split())
+            out, error = done.communicate(timeout=900)
+            return {"exit": done.returncode, "out": out, "error": error}
+        assert self._session.stdin is not None
+        assert self._session.stdout is not None
+        self._session.stdin.write(json.dumps(line.split()) + "\n")
+        self._session.stdin.flush()
+        if told := self._session.stdout.readline():
+            return json.loads(told)
+        code = self._session.wait()
+        self._session = self._begin("-m", "tests.frozen.session")
+        return {"exit": f"the process died: {code}", "out": "", "error": ""}
+
+    def _begin(self, *arguments: str) -> subprocess.Popen[str]:
+        pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        error = None if "tests.frozen.session" in arguments else subprocess.PIPE
+        command = [sys.executable, *arguments]
+        return subprocess.Popen(command, cwd=self.folder, env=self._environment, stderr=error, **pipes)
+
+    def _files(self) -> dict[Path, int]:
+        return {path: path.stat().st_mtime_ns for path in self.folder.rglob("*") if path.is_file()}
+
+
+def _text(text: str, folder: Path) -> Any:
+    try:
+        return condensed(json.loads(text), folder)
+    except ValueError:
+        return words_of(text, folder) if "<div" in text else [_plain(line, folder) for line in text.split("\n")]
+
+
+def _plain(text: str, folder: Path) -> str:
+    text = text.replace(str(folder), "<folder>")
+    for pattern, word in VOLATILE:
+        text = pattern.sub(word, text)
+    return text
+
+
+def condensed(value: Any, folder: Path, key: str = "") -> Any:
+    """A document without what differs from call to call, its long rows of numbers as shape, ends and moments."""
+    if key in NEW_EACH_TIME:
+        return "<new each time>"
+    if isinstance(value, dict):
+        return {_plain(str(name), folder): condensed(one, folder, name) for name, one in value.items()}
+    if isinstance(value, list):
+        if len(value) > 4 and all(isinstance(one, dict) and one.keys() == value[0].keys() for one in value):
+            return {f"{name}[]": condensed([one[name] for one in value], folder, name) for name in value[0]}
+        try:
+            numbers = np.asarray(value, float)
+        except (ValueError, TypeError):
+            return [condensed(one, folder) for one in value]
+        return _row(numbers) if numbers.size > LONG else [condensed(one, folder) for one in value]
+    if isinstance(value, float):
+        return _short(value)
+    return _plain(value, folder) if isinstance(value, str) else value
+
+
+def _row(numbers: np.ndarray) -> dict[str, Any]:
+    flat = numbers.ravel()[np.isfinite(numbers.ravel())]
+    if not flat.size:
+        return {"shape": list(numbers.shape), "known": 0}
+    weights = 1 + (np.arange(flat.size) * 0.618034) % 1  # so that an exchange of two shows
+    return {
+        "shape": list(numbers.shape), "known": int(flat.size), "ends": [_short(flat[0]), _short(flat[-1])],
+        "rms": _short(np.sqrt(np.mean(flat**2))), "mean": _short(flat.mean()),
+        "weighted": _short(np.sqrt(np.mean(weights * flat**2))),
+    }  # fmt: skip
+
+
+def _short(number: float) -> float:
+    return float(f"{number:.6g}")
+
+
+def condensed_file(path: Path, folder: Path) -> Any:
+    """What a file holds."""
+    if path.suffix in (".json", ".jsonl") or not path.stat().st_size:
+        return _text(path.read_text("utf-8", "replace"), folder)
+    if path.suffix == ".csv":
+        return _table(path)
+    if path.suffix == ".parquet":
+        import pyarrow.parquet as pq
+
+        return condensed(json.loads(json.dumps(pq.read_table(path).to_pydict(), default=str)), folder)
+    if path.suffix == ".h5" and h5py.is_hdf5(path):
+        return _hdf5(path, folder)
+    if path.suffix == ".gz":
+        lines = gzip.decompress(path.read_bytes()).decode().split("\n")
+        return [_column(list(column)) for column in zip(*(line.split("\t") for line in lines if line), strict=True)]
+    if path.suffix in ("", ".tsv", ".html"):
+        return words_of(path.read_text("utf-8", "replace"), folder)
+    return f"<{path.suffix} file>"
+
+
+def _hdf5(path: Path, folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+
+    def look(name: str, one: Any) -> None:
+        attributes = {key: _plain(str(value), folder) for key, value in sorted(one.attrs.items())}
+        found[name] = {"attributes": attributes | ({"software": "<new each time>"} if "software" in attributes else {})}
+        if isinstance(one, h5py.Dataset):
+            text = h5py.check_string_dtype(one.dtype) is not None
+            column = [str(word) for word in one.asstr()[:]] if text else np.asarray(one, float)
+            found[name] |= {"type": str(one.dtype), "column": column if text else _row(np.asarray(column))}
+
+    with h5py.File(path) as file:
+        look("/", file)
+        file.visititems(look)
+    return found
+
+
+class _Words(HTMLParser):
+    """What is seen or chosen on a page: texts, links, and the fields and buttons of forms."""
+
+    CHOSEN = "href", "action", "method", "name", "value", "type"
+    SAID = "title", "aria-label", "placeholder", "alt", "lang"
+    SHOWN = "a", "form", "input", "button", "select", "option", "textarea", "html", "img"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.silent = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        names = (*self.CHOSEN, *self.SAID) if tag in self.SHOWN else self.SAID
+        words = " ".join(f"{name}={given[name]}" for name in names if given.get(name))
+        if words and not self.silent:
+            self.found.append(f"<{tag} {words}>")
+        if tag in ("script", "style", "svg"):
+            self.silent = self.silent or tag
+
+    def handle_endtag(self, tag: str) -> None:
+        self.silent = "" if tag == self.silent else self.silent
+
+    def handle_data(self, data: str) -> None:
+        if not self.silent and data.strip():
+            self.found.append(" ".join(data.split()))
+
+
+def words_of(html: str, folder: Path) -> list[str]:
+    """The words, links and fields of a page or a text, one each."""
+    reader = _Words()
+    reader.feed(html)
+    return [_plain(line, folder) for line in reader.found]
+
+
+def _table(path: Path) -> Any:
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        head, *rows = list(csv.reader(file)) or [[]]
+    columns = dict(zip(head, zip(*rows, strict=False), strict=False))
+    return {"rows": len(rows)} | {name: _column(list(values)) for name, values in columns.items()}
+
+
+def _column(values: list[str]) -> Any:
+    try:
+        return _row(np.asarray(values, float))
+    except ValueError:
+        return sorted(set(values))[:20]
+
+
+LOOSE: tuple[tuple[str, float, float], ...] = (("", 1e-4, 1e-9),)
+"""Pattern of a place, and how much a number there may differ: relative, absolute. The last that fits counts."""
+
+
+def differences(kept: Any, now: Any, place: str = "") -> Iterator[tuple[str, str]]:
+    """Each place where two answers are not equal, and what is there; a document in a text is compared as one."""
+    if isinstance(kept, str) and isinstance(now, str) and kept[:1] == now[:1] == "{":
+        kept, now = json.loads(kept), json.loads(now)
+    if isinstance(kept, dict) and isinstance(now, dict):
+        for name in sorted({*kept, *now}):
+            if name not in kept or name not in now:
+                yield f"{place}/{name}", f"new: {str(now[name])[:200]!r}" if name in now else "gone"
+            else:
+                yield from differences(kept[name], now[name], f"{place}/{name}")
+    elif isinstance(kept, list) and isinstance(now, list) and len(kept) == len(now):
+        for k, (one, other) in enumerate(zip(kept, now, strict=True)):
+            yield from differences(one, other, f"{place}/{k}")
+    elif isinstance(kept, list) and isinstance(now, list):
+        k = next((k for k, (one, other) in enumerate(zip(kept, now, strict=False)) if one != other), len(kept))
+        yield f"{place}/{k}", f"was {len(kept)} with {str(kept[k:])[:300]}, is {len(now)} with {str(now[k:])[:300]}"
+    elif not _same(kept, now, place):
+        yield place, f"was {str(kept)[:300]!r}, is {str(now)[:300]!r}"
+
+
+def _same(kept: Any, now: Any, place: str) -> bool:
+    """Numbers may differ by 1e-4 of their size, also those in a text, and there by one in their last digit."""
+    if isinstance(kept, str) and isinstance(now, str):
+        numbers = NUMBER.findall(kept), NUMBER.findall(now)
+        if NUMBER.sub("#", kept) != NUMBER.sub("#", now) or len(numbers[0]) != len(numbers[1]):
+            return False
+        pairs = ((one.replace("−", "-"), other.replace("−", "-")) for one, other in zip(*numbers, strict=True))
+        return all(one == other or _close(float(one), float(other), place, one) for one, other in pairs)
+    plain = isinstance(kept, int | float) and isinstance(now, int | float)
+    if plain and not isinstance(kept, bool) and not isinstance(now, bool):
+        return _close(float(kept), float(now), place)
+    return type(kept) is type(now) and kept == now
+
+
+def _close(one: float, other: float, place: str, written: str = "") -> bool:
+    _, relative, absolute = next(loose for loose in reversed(LOOSE) if re.search(loose[0], place))
+    last = 10.0 ** -len(written.partition(".")[2]) if "." in written and "e" not in written else 0.0
+    known = one == other or (np.isnan(one) and np.isnan(other))
+    return bool(known or abs(one - other) <= max(relative * max(abs(one), abs(other)), absolute, 1.01 * last))

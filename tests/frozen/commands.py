@@ -1,0 +1,140 @@
+"""What is called on the command line: on each recording, and without one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.frozen.answers import CommandLine, condensed_file
+from tests.frozen.records import MORE_WORDS, RECORDS
+from tests.frozen.rig_records import of_kind
+from tests.harness import cohort_records
+
+METHODS = ("two-stage", "ramp-deconvolution", "separable-least-squares", "narx")
+IN_FULL = ("fatigue", "plain", "electromechanical_delay", "sealed", "rig_plain")
+VERBS = (
+    "", "fit", "predict", "compare", "diagnose", "improve", "invert", "export", "recover", "audit", "audit verify",
+    "audit heads", "audit export", "effects", "schema", "table1", "test", "doctor", "demo", "serve", "emulate",
+    "cohort", "cohort fit", "cohort diagnose", "cohort improve", "cohort changed", "cohort figures", "centre",
+    "centre add-rig", "centre revoke-rig", "centre check",
+)  # fmt: skip
+REFUSED = (
+    "fly", "fit", "fit none.csv", "fit plain.csv --effects no_such_effect", "fit plain.csv --effects fatigue:none",
+    "fit plain.csv --fit-on validate", "fit plain.csv --fit-on nowhere", "fit plain.csv --method magic",
+    "fit plain.csv --method narx --effects fatigue", "fit plain.csv -o none/model.json", "fit plain.csv --map x",
+    "fit plain.csv --map torque_nm=force:N", "fit plain.csv --carry plain.csv", "fit model.json", "fit plain.csv --fly",
+    "predict plain.csv plain.csv -o p.csv", "predict future.json plain.csv -o p.csv",
+    "predict cut.json plain.csv -o p.csv",
+    "predict model.json none.csv -o p.csv", "compare model.json plain.csv --html none/c.html", "compare model.json",
+    "diagnose plain.csv --model none.json", "improve plain.csv -o model.txt", "invert model.json plain.csv -o i.csv",
+    "invert model.json reference.csv -o i.csv --largest-us 9000", "export cohort", "export cohort --parquet new/p",
+    "export cohort --bids b --select day", "recover none.journal", "recover plain.csv", "recover cut.journal",
+    "audit verify", "audit heads", "audit export -o a.jsonl", "audit verify --file plain.csv", "schema nothing",
+    "table1 --trials 0", "test --protocol none", "test --rig none.toml", "cohort fit",
+    "cohort fit nowhere -o r.parquet",
+    "cohort fit cohort -o r.parquet --select day", "cohort fit cohort -o r.parquet --workers 0",
+    "cohort changed plain.csv plain.csv", "cohort figures plain.csv -o f.html", "serve --port 99999",
+    "emulate --patient none", "emulate --fault none", "centre add-rig --data none x",
+    "doctor --rig none.toml --json",
+)  # fmt: skip
+DONE = (
+    "--version", "effects", "effects --json", "table1 --trials 2", "table1 --trials 1 --json",
+    "fit plain.csv again.csv -o both.json --json", "fit plain.csv -o model.mat", "fit plain.csv --effects auto --json",
+    "predict model.json plain.csv -o p.mat", "invert model.json reference.csv -o i.csv",
+    "recover T1.journal -o recovered --json", "recover cut_end.journal -o again",
+    "export cohort --parquet parquet --json", "export cohort --bids bids --no-dates",
+    "export cohort --bids shifted --shift-days 30",
+    "cohort fit cohort -o fit.parquet --workers 1 --json", "cohort fit cohort -o fit.parquet --workers 1",
+    "cohort fit cohort -o tired.parquet --workers 1 --effects fatigue",
+    "cohort diagnose cohort -o diagnosed.parquet --workers 1 --json --select participant=='P001'",
+    "cohort changed fit.parquet tired.parquet", "cohort changed fit.parquet tired.parquet --json",
+    "cohort figures fit.parquet -o figures.html --json",
+)  # fmt: skip
+SHAPES = ("doctor --json", "test --protocol short --json")
+"""Answers whose values are the machine's: only what stands where is kept."""
+SCRIPT = """
+import stimrig
+record = stimrig.read("plain.csv")
+model, other = stimrig.fit(record), stimrig.fit(record, effects=["fatigue"])
+found = [record, model, other, stimrig.predict(model, record), stimrig.compare(model, record), stimrig.effects()]
+found += [stimrig.diagnose(record, progress=False), stimrig.improve(record, progress=False)]
+found += [stimrig.next_experiment(record, ["threshold_drift", "recruitment_hysteresis"])]
+print(dir(stimrig), stimrig.Model.from_json(model.to_json()).to_dict() == model.to_dict())
+for one in found:
+    print(type(one).__name__, one, sorted(one.to_dict()) if hasattr(one, "to_dict") else "", sep="\\n")
+    print(one._repr_html_() if hasattr(one, "_repr_html_") else "no HTML")
+"""
+
+
+def of_record(name: str, folder: Path) -> dict[str, Any]:
+    """The recording itself, and what fits, compares and predicts."""
+    path = RECORDS[name](folder)
+    data = path.name
+    calls = [
+        f"fit {data} -o model.json --json", f"fit {data}", f"compare model.json {data} --json",
+        f"predict model.json {data} -o predicted.csv --json",
+    ]  # fmt: skip
+    if name in IN_FULL:
+        calls += [f"fit {data} --method {method} -o {method}.json --json" for method in METHODS]
+        calls += [
+            f"compare model.json {data} --html compared.html", f"compare model.json {data}",
+            f"fit {data} --effects fatigue -o tired.json --json", f"compare tired.json {data} --json",
+            "invert model.json reference.csv -o inverted.csv --json",
+        ]  # fmt: skip
+    return {"recording": condensed_file(path, folder)} | _all_of(name, calls, folder)
+
+
+def diagnosed(name: str, folder: Path) -> dict[str, Any]:
+    """What is missing in its model; this takes longer."""
+    data = RECORDS[name](folder).name
+    calls = [f"diagnose {data} --json"]
+    if name in IN_FULL:
+        calls += [
+            f"diagnose {data}", f"improve {data} -o improved.json --html improved.html --json", f"improve {data}",
+            f"fit {data} --carry improved.json -o carried.json --json", f"diagnose {data} --model improved.json",
+        ]  # fmt: skip
+    return _all_of(name, calls, folder)
+
+
+def _all_of(name: str, calls: list[str], folder: Path) -> dict[str, Any]:
+    _reference(folder)
+    with CommandLine(folder) as line:
+        return {call: line.call(f"{call} {MORE_WORDS.get(name, '')}") for call in calls}
+
+
+def without_record(folder: Path) -> dict[str, Any]:
+    """Calls that make or take their files themselves, help, refusals, schemas, and the Python module."""
+    RECORDS["plain_short"](folder).rename(folder / "plain.csv")
+    RECORDS["fatigue"](folder).rename(folder / "again.csv")
+    _reference(folder)
+    for name in ("recovered", "again"):
+        (folder / name).mkdir()
+    journal = of_kind("journal")["T1.journal"]
+    for name, content in (("T1", journal), ("cut_end", journal[:-40_000]), ("cut", journal[:300])):
+        (folder / f"{name}.journal").write_bytes(content)
+    cohort_records.cohort(folder / "cohort", 2, people=2)
+    (folder / "cohort" / "broken.h5").write_bytes(b"")
+    with CommandLine(folder) as line:
+        line.run("fit plain.csv -o model.json")
+        model = (folder / "model.json").read_text()
+        (folder / "cut.json").write_text(model[:500])
+        (folder / "future.json").write_text(json.dumps(json.loads(model) | {"schema_version": "9.0"}))
+        schemas = [address.split(":")[-2] for address in line.run("schema")["out"].split()]
+        more = [*(f"schema {name}" for name in schemas), *(f"{verb} --help" for verb in VERBS)]
+        calls = [*REFUSED, *DONE, "schema", *more]
+        answers = {call: line.call(call) for call in calls}
+        answers |= {call: shape(line.call(call)["out"]) for call in SHAPES}
+        return answers | {"import stimrig": line.call(f"-c{SCRIPT}")}
+
+
+def shape(value: Any) -> Any:
+    """A document's keys, and the kinds of its values."""
+    if isinstance(value, dict):
+        return {name: shape(one) for name, one in value.items()}
+    return [shape(one) for one in value[:1]] if isinstance(value, list) else type(value).__name__
+
+
+def _reference(folder: Path) -> None:
+    rows = [f"{k / 40:.4f},{1.5 if 80 < k < 240 else 0.5}" for k in range(320)]
+    (folder / "reference.csv").write_text("\n".join(["time_s,torque_nm", *rows, ""]))

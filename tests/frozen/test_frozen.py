@@ -1,0 +1,20 @@
+"""A part of what is frozen at each run of the tests; `make frozen` compares all of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.frozen.__main__ import HERE, PARTS, found
+
+PARTS_HERE = ("fitted/plain_short", "fitted/rig_adaptive", "fitted/broken_word", "fitted/other_words")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", PARTS_HERE)
+def test_what_users_hold_is_as_it_was(part: str) -> None:
+    assert found(part, HERE / "kept")[0] == []
+
+
+def test_what_is_kept_is_compared() -> None:
+    kept = HERE / "kept"
+    assert {str(path.relative_to(kept)).removesuffix(".json.gz") for path in kept.rglob("*.gz")} <= set(PARTS)
