@@ -19,7 +19,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from stimrig.api.clock import Clock
-from stimrig.api.people import passwords
+from stimrig.api.people import accounts
 from tests.api import thread_process
 from tests.api.conftest import STUB, Service, let_go, run_service, wait_done
 from tests.api.fake_arm import still
@@ -49,7 +49,7 @@ def served(folder: Path) -> Iterator[Service]:
     quick = partial(PasswordHasher, time_cost=1, memory_cost=64, parallelism=1)
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory(prefix="stimrig-") as short:
         patch.setattr(asyncio, "create_subprocess_exec", thread_process.start)
-        patch.setattr(passwords, "PasswordHasher", quick)
+        patch.setattr(accounts, "PasswordHasher", quick)
         patch.setattr(Clock, "unix_s", lambda _clock: time.time() + ahead_s)
         patch.setenv("TZ", "UTC")
         time.tzset()
