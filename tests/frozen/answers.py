@@ -241,7 +241,7 @@ LOOSE: tuple[tuple[str, float, float], ...] = (("", 1e-4, 1e-9),)
 
 def differences(kept: Any, now: Any, place: str = "") -> Iterator[tuple[str, str]]:
     """Each place where two answers are not equal, and what is there; a document in a text is compared as one."""
-    if isinstance(kept, str) and isinstance(now, str) and kept[:1] == now[:1] == "{":
+    if isinstance(kept, str) and isinstance(now, str) and kept[:2] == now[:2] == '{"':
         kept, now = json.loads(kept), json.loads(now)
     if isinstance(kept, dict) and isinstance(now, dict):
         for name in sorted({*kept, *now}):
