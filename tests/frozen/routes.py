@@ -295,7 +295,7 @@ def joint(day: Day) -> None:
 
 def everything(day: Day) -> None:
     """Every GET of the document, now that there is something to tell."""
-    for path, methods in day.http.get("/openapi.json").json()["paths"].items():
+    for path, methods in sorted(day.http.get("/openapi.json").json()["paths"].items()):
         if "get" not in methods or path == "/v1/schemas/{name}":
             continue
         for which in ("first", "second") if "_id}" in path else ("",):
@@ -370,9 +370,9 @@ def refusals(day: Day) -> None:
     token = {name: value for value, name in day.names.items()}["<token>"]
     document = day.http.get("/openapi.json").json()
     with day.service.client(None) as nobody, day.service.client(token) as reader:
-        for path, methods in document["paths"].items():
+        for path, methods in sorted(document["paths"].items()):
             gone = re.sub(r"\{\w+\}", "none", path)
-            for method in methods:
+            for method in sorted(methods):
                 if path not in ("/v1/sessions/current", "/v1/stop"):
                     day.ask(method.upper(), gone, note="nobody", http=nobody)
                     day.ask(method.upper(), gone, note="reader", http=reader)
