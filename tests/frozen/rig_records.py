@@ -12,6 +12,7 @@ from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.settings import Settings
 from stimrig.rig import config
 from stimrig.rig import messages as m
+from stimrig.rig import requests as r
 from stimrig.rig.control.rig import Rig
 from tests.simulator.clinic import Clinic
 from tests.simulator.disk import SimulatedDisk
@@ -64,7 +65,7 @@ class QuietRig:
     def start(self, **plan: Any) -> None:
         profile = m.Profile(max_torque_nm=30.0)
         plan = {"test_id": "T1", "participant": "P1", "profile": profile, "protocol": "short"} | plan
-        reply = self.ask(m.StartRequest(plan=m.TestPlan(**plan), key=KEY))
+        reply = self.ask(r.StartRequest(plan=m.TestPlan(**plan), key=KEY))
         assert reply.ok, reply
         self.until(lambda: self.clinic.state == "running")
 
@@ -90,7 +91,7 @@ def stopped() -> QuietRig:
     rig = QuietRig()
     rig.start()
     rig.world.run(rig.world.now_s + 12.0)
-    rig.ask(m.StopRequest(reason="somebody pressed", by="nurse"))
+    rig.ask(r.StopRequest(reason="somebody pressed", by="nurse"))
     rig.ended()
     return rig
 
@@ -103,11 +104,11 @@ def adaptive() -> QuietRig:
     laid = 40
     for name, sequence in (("prbs", "prbs"), ("validate", "multilevel")):
         more = [segment(name, sequence, **({"chips": 60} if sequence == "prbs" else {"duration_s": 6.0}))]
-        reply = rig.ask(m.ExtendRequest(test_id="T1", key=KEY, after=laid, segments=more))
+        reply = rig.ask(r.ExtendRequest(test_id="T1", key=KEY, after=laid, segments=more))
         assert reply.ok, reply
         laid = reply.body["laid"]
     rig.world.run(rig.world.now_s + 15.0)
-    rig.ask(m.EnoughRequest(test_id="T1", by="clinician"))
+    rig.ask(r.EnoughRequest(test_id="T1", by="clinician"))
     rig.ended()
     return rig
 
@@ -133,13 +134,13 @@ def trial() -> QuietRig:
 
 def calibration() -> QuietRig:
     rig = QuietRig()
-    rig.ask(m.CalibrateStartRequest(calibration_id="C1", participant="P1", by="nurse", step_us=25.0))
+    rig.ask(r.CalibrateStartRequest(calibration_id="C1", participant="P1", by="nurse", step_us=25.0))
     for marks, threshold in ((2, "sensory"), (3, "motor"), (3, "comfort")):
         for _ in range(marks):
-            assert rig.ask(m.CalibrateStepRequest()).ok
+            assert rig.ask(r.CalibrateStepRequest()).ok
             rig.until(lambda: rig.clinic.state == "calibrating")
-        rig.ask(m.CalibrateMarkRequest(threshold=threshold))
-    assert rig.ask(m.CalibrateFinishRequest(by="nurse", calibration_id="C1")).ok
+        rig.ask(r.CalibrateMarkRequest(threshold=threshold))
+    assert rig.ask(r.CalibrateFinishRequest(by="nurse", calibration_id="C1")).ok
     return rig
 
 
