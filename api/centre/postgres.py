@@ -20,6 +20,7 @@ PROGRAMS = Path("/usr/lib/postgresql")
 UNPRIVILEGED = "postgres"
 """Debian's user, for who is root: PostgreSQL refuses to be."""
 USER, DATABASE = "stimrig", "centre"
+LOCAL = ("listen_addresses=127.0.0.1", "unix_socket_directories=")
 STARTS_S, ENDS_S = 60.0, 30.0
 
 
@@ -44,6 +45,9 @@ class Cluster:
         Where it listens, on 127.0.0.1 only.
     """
 
+    SETTINGS: tuple[str, ...] = ()
+    """More of PostgreSQL's own."""
+
     def __init__(self, folder: Path, port: int) -> None:
         self.folder, self.port, self.place = folder.absolute(), port, programs()
         self.user = UNPRIVILEGED if os.getuid() == 0 else None
@@ -53,7 +57,11 @@ class Cluster:
     @property
     def url(self) -> str:
         """The database's URL."""
-        return f"postgresql+psycopg://{USER}:{self._secret.read_text('utf-8')}@127.0.0.1:{self.port}/{DATABASE}"
+        return self.address(DATABASE).replace("postgresql:", "postgresql+psycopg:")
+
+    def address(self, database: str) -> str:
+        """The URL of a database, as PostgreSQL's own programs take it."""
+        return f"postgresql://{USER}:{self._secret.read_text('utf-8')}@127.0.0.1:{self.port}/{database}"
 
     def start(self) -> None:
         """Make it where it is not there yet; start it and wait until it answers. Raises SettingsError."""
@@ -63,7 +71,7 @@ class Cluster:
         with log:
             self.process = subprocess.Popen(
                 [str(self.place / "postgres"), "-D", str(self.folder / "data"), "-p", str(self.port),
-                 "-c", "listen_addresses=127.0.0.1", "-c", "unix_socket_directories="],
+                 *(word for one in (*LOCAL, *self.SETTINGS) for word in ("-c", one))],
                 user=self.user, cwd="/", stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
                 preexec_fn=_end_with_parent,
             )  # fmt: skip
@@ -104,10 +112,10 @@ class Cluster:
         import psycopg
 
         assert self.process is not None
-        end, address = time.monotonic() + STARTS_S, self.url.replace("+psycopg", "").removesuffix(DATABASE)
+        end = time.monotonic() + STARTS_S
         while True:
             try:
-                with psycopg.connect(f"{address}postgres", autocommit=True) as connection:
+                with psycopg.connect(self.address("postgres"), autocommit=True) as connection:
                     known = connection.execute("SELECT 1 FROM pg_database WHERE datname = %s", (DATABASE,)).fetchone()
                     if known is None:
                         connection.execute(f"CREATE DATABASE {DATABASE}")
@@ -119,12 +127,12 @@ class Cluster:
                     raise SettingsError(f"{self.folder}: PostgreSQL does not start (log: {log})") from error
                 time.sleep(0.1)
 
-    def stop(self) -> None:
-        """End it, what is written kept."""
+    def stop(self, how: signal.Signals = signal.SIGINT) -> None:
+        """End it, what is written kept; by a fast shutdown, or another signal."""
         if self.process is None:
             return
         if self.process.poll() is None:
-            self.process.send_signal(signal.SIGINT)  # its fast shutdown
+            self.process.send_signal(how)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(ENDS_S)
         if self.process.poll() is None:

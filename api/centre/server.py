@@ -20,7 +20,7 @@ from stimrig.api import logs
 from stimrig.api.centre.app import create_app
 from stimrig.api.centre.context import CentreSettings
 from stimrig.api.errors import ApiError, SettingsError
-from stimrig.api.web.server import address_of, bind, configuration, raise_file_limit, refuse_open_door, serve
+from stimrig.api.web import server
 
 
 def main() -> int:
@@ -43,14 +43,10 @@ def prepared(settings: CentreSettings) -> tuple[FastAPI, socket.socket]:
     ApiError, SettingsError, OSError
         One line each: what is wrong, and the fix.
     """
-    raise_file_limit()
+    server.raise_file_limit()
     os.umask(os.umask(0o077) | 0o077)  # what the centre writes is for its user only
-    try:
-        refuse_open_door(settings)
-    except OSError as error:
-        fixed = str(error).replace("STIMRIG_", "STIMRIG_CENTRE_")
-        raise OSError(fixed) from error
-    listener = bind(settings.host, settings.port)
+    server.refuse_open_door(settings)
+    listener = server.bind(settings.host, settings.port)
     try:
         return create_app(settings), listener
     except BaseException:
@@ -60,16 +56,13 @@ def prepared(settings: CentreSettings) -> tuple[FastAPI, socket.socket]:
 
 def run(app: FastAPI, listener: socket.socket, ready: Callable[[str], object] | None = None) -> None:
     """Serve until SIGTERM or Ctrl-C; `ready` is told the address, else a JSON line."""
-    url = address_of(listener)
-    line = {"url": url, "port": listener.getsockname()[1], "drawn_token": app.state.context.drawn_token}
-    server = uvicorn.Server(configuration(app))
     signal.signal(signal.SIGTERM, lambda _number, _frame: None)  # uvicorn ends in order, and raises it once more
+    if ready is None:
+        server.run(app, listener)
+        return
+    ready(server.address_of(listener))
     with contextlib.suppress(KeyboardInterrupt):
-        if ready is None:
-            asyncio.run(serve(server, listener, line))
-        else:
-            ready(url)
-            asyncio.run(server.serve(sockets=[listener]))
+        asyncio.run(uvicorn.Server(server.configuration(app)).serve(sockets=[listener]))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import sys
 
 import h11
 import uvicorn
+from fastapi import FastAPI
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -36,17 +37,22 @@ def main() -> int:
         refuse_open_door(settings)
         lock = ServiceLock(settings)  # before the port: who runs already says more than a port that is taken
         listener = bind(settings.host, settings.port)
-        url = address_of(listener)
-        lock.tell(url)
+        lock.tell(address_of(listener))
         asyncio.run(carried_structure.refuse_unknown(settings))  # before a first token is drawn: it is told only once
         app = create_app(settings, lock=lock)
     except (ApiError, SettingsError, OSError) as error:
         print(f"stimrig: {error}", file=sys.stderr)
         return 2
-    ready = {"url": url, "port": listener.getsockname()[1], "drawn_token": app.state.context.drawn_token}
+    run(app, listener)
+    return 0
+
+
+def run(app: FastAPI, listener: socket.socket) -> None:
+    """Serve until SIGTERM or Ctrl-C; a JSON line says so once the first request would be answered."""
+    port, drawn = listener.getsockname()[1], app.state.context.drawn_token
+    ready = {"url": address_of(listener), "port": port, "drawn_token": drawn}
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(uvicorn.Server(configuration(app)), listener, ready))
-    return 0
 
 
 def configuration(app: ASGIApp) -> uvicorn.Config:
@@ -71,9 +77,10 @@ def refuse_open_door(settings: ServerSettings) -> None:
     """
     if loopback(settings.host) or (settings.tls_proxy and settings.secure_cookies):
         return
+    prefix = settings.model_config.get("env_prefix", "")
     fix = (
         "listen on 127.0.0.1 and put the TLS proxy of deploy/nginx in front; if one stands in front on another "
-        "machine, set STIMRIG_TLS_PROXY=true and STIMRIG_SECURE_COOKIES=true"
+        f"machine, set {prefix}TLS_PROXY=true and {prefix}SECURE_COOKIES=true"
     )
     raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {fix}")
 

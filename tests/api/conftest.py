@@ -21,7 +21,9 @@ import uvicorn
 from argon2 import PasswordHasher
 from sqlalchemy import text
 
+from stimrig.api.centre.postgres import programs
 from stimrig.api.clock import Clock
+from stimrig.api.errors import SettingsError
 from stimrig.api.people import accounts
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, database
@@ -29,10 +31,9 @@ from stimrig.api.web.app import create_app
 from stimrig.api.web.server import protocol
 from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
-from tests.harness import postgres
 from tests.harness.late_answers import LateAnswers
 from tests.harness.looks_first import LooksFirst
-from tests.harness.postgres import Cluster
+from tests.harness.postgres import Cluster, running
 
 TOKEN = "administrator-token-of-the-tests"
 PATIENCE_S = 60.0
@@ -100,9 +101,11 @@ def databases_that_need_not_last() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[Cluster]:
     """PostgreSQL, of this test process's own."""
-    if postgres.programs() is None:
-        pytest.skip("Debian's PostgreSQL is not installed (apt-get install postgresql)")
-    with postgres.running() as cluster:
+    try:
+        programs()
+    except SettingsError as error:
+        pytest.skip(str(error))
+    with running() as cluster:
         yield cluster
 
 
