@@ -9,7 +9,8 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +38,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture(scope="module")
 def computing() -> Iterator[Computing]:
-    one = Computing(MEMORY)
-    yield one
-    one.close()
+    with closing(Computing(MEMORY)) as one:
+        yield one
 
 
 def entry(name: str = "good.h5", **known: Any) -> Entry:
@@ -130,25 +130,18 @@ def test_a_process_that_ended_between_records_costs_none(computing: Computing, g
 def test_a_record_beyond_the_memory_is_a_row(good: bytes) -> None:
     table = b"time_s,pulse_width_us,torque_nm,segment\n"
     table += b"".join(b"%.4f,%d,%.3f,prbs\n" % (k / 400, 100 * (k // 200 % 2), k % 7) for k in range(400_000))
-    small = Computing(24 * 2**20)
-    try:
+    with closing(Computing(24 * 2**20)) as small:
         found = row(small, table, name="large.csv")
-        assert found["error_kind"] in ("out of memory", "killed"), found
-        assert "\n" not in found["error"]
-    finally:
-        small.close()
+    assert found["error_kind"] in ("out of memory", "killed") and "\n" not in found["error"], found
 
 
 def test_a_process_is_renewed_after_some_records(good: bytes) -> None:
-    computing = Computing(MEMORY, records=2)
-    try:
-        pids = []
+    pids = []
+    with closing(Computing(MEMORY, records=2)) as computing:
         for _ in range(5):
             assert row(computing, good)["status"] == "ok"
             pids.append(pid(computing))
-        assert len(set(pids)) == 3
-    finally:
-        computing.close()
+    assert len(set(pids)) == 3
 
 
 def test_hostile_files_are_rows_and_give_nothing_away(computing: Computing, tmp_path: Path) -> None:
@@ -213,68 +206,50 @@ def test_no_other_worker_takes_away_a_folder_that_is_being_made(
     assert list(tmp_path.iterdir()) == []
 
 
-EVIL = """
-import json, sys
-print('{"ready": true, "left_open": {}}', flush=True)
-for line in sys.stdin:
-    print(sys.argv[1].replace("'", '"').replace("CALL", json.loads(line)["call"]), flush=True)
-"""
+@pytest.fixture
+def taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Makes of the process one that gives these answers on each call, CALL in them its number and N how many."""
+
+    def take(*answers: str) -> None:
+        script = tmp_path / "evil.py"
+        script.write_text(
+            'import json, sys\nprint(\'{"ready": true, "left_open": {}}\', flush=True)\n'
+            f"for number, line in enumerate(sys.stdin):\n    for answer in {answers!r}:\n"
+            "        answer = answer.replace('CALL', json.loads(line)['call']).replace('NUMBER', str(number))\n"
+            "        print(answer, flush=True)\n"
+        )
+        monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
+
+    return take
+
+
+def told(row: str) -> str:
+    return f'{{"call": "CALL", "result": {{"row": {row}}}}}'
 
 
 @pytest.mark.parametrize(
     "said",
     [
-        "no JSON",
-        "{}",
-        "[1]",
-        "{'call': 'CALL', 'result': {'row': 3}}",
-        "{'call': 'CALL', 'result': {'row': {'status': 'copy'}}}",
-        "[" * 100_000,
-        "x" * 17_000_000,
-        "\\xff",
-        "{'call': 'CALL', 'result': {'row': {'status': 'ok', 'notes': " + "[" * 700 + "]" * 700 + "}}}",
+        "no JSON", "{}", "[1]", told("3"), told('{"status": "copy"}'), "[" * 100_000, "x" * 17_000_000, "\\xff",
+        told('{"status": "ok", "notes": ' + "[" * 700 + "]" * 700 + "}"),
     ],
     ids=lambda said: said[:20],
-)
-def test_a_process_that_was_taken_over_cannot_end_a_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: str
-) -> None:
-    script = tmp_path / "evil.py"
-    script.write_text(EVIL.replace("sys.argv[1]", repr(said)))
-    monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
-    computing = Computing(MEMORY)
-    try:
+)  # fmt: skip
+def test_a_process_that_was_taken_over_cannot_end_a_run(taken_over: Callable[..., None], said: str) -> None:
+    taken_over(said)
+    with closing(Computing(MEMORY)) as computing:
         found = row(computing, b"")
-        assert (found["status"], found["error_kind"]) == ("error", "unexpected")
-    finally:
-        computing.close()
+    assert (found["status"], found["error_kind"]) == ("error", "unexpected")
 
 
-def test_a_second_answer_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    twice = """
-import json, sys
-print('{"ready": true, "left_open": {}}', flush=True)
-for number, line in enumerate(sys.stdin):
-    answer = {"status": "ok", "participant": f"P{number}"}
-    print((json.dumps({"call": json.loads(line)["call"], "result": {"row": answer}}) + "\\n") * 2, end="", flush=True)
-"""
-    script = tmp_path / "twice.py"
-    script.write_text(twice)
-    monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
-    computing = Computing(MEMORY)
-    try:
-        found = [row(computing, b"")["participant"] for _ in range(3)]
-        assert found == ["P0", "P1", "P2"]
-    finally:
-        computing.close()
+def test_a_second_answer_is_nobody_elses(taken_over: Callable[..., None]) -> None:
+    taken_over(*[told('{"status": "ok", "participant": "PNUMBER"}')] * 2)
+    with closing(Computing(MEMORY)) as computing:
+        assert [row(computing, b"")["participant"] for _ in range(3)] == ["P0", "P1", "P2"]
 
 
-def test_a_process_has_no_say_in_which_record_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = '{"status": "ok", "sha256": "x", "address": "x", "other_version": "9", "software": "9"}'
-    forged = f'{{"call": "CALL", "result": {{"row": {row}}}}}'
-    script = tmp_path / "evil.py"
-    script.write_text(EVIL.replace("sys.argv[1]", repr(forged)))
-    monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
+def test_a_process_has_no_say_in_which_record_it_was(taken_over: Callable[..., None]) -> None:
+    taken_over(told('{"status": "ok", "sha256": "x", "address": "x", "other_version": "9", "software": "9"}'))
     try:
         found = of_worker(b"abc", Entry("address", "a", "a"))
         assert found["address"] == "address" and found["software"] == software_version()
