@@ -51,7 +51,6 @@ class CentreStrictBody(StrictBody):
     """What rigs send is read strictly by its route: in a thread, and only after the key."""
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """As the base class."""
         await (self.app if scope["path"].startswith(RIG_SIDE) else super().serve)(scope, receive, send)
 
 

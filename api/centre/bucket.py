@@ -59,7 +59,6 @@ class Bucket:
         """Why the last try failed."""
 
     def name(self, sha256: str) -> str:
-        """Where a file lies."""
         return f"{self.root}/{sha256[:2]}/{sha256}"
 
     def ready(self, begin: bool = False) -> None:
@@ -135,7 +134,6 @@ class Bucket:
 
 
 def first_line(error: BaseException) -> str:
-    """An error in one line."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]

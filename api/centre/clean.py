@@ -20,14 +20,12 @@ NUMBERS = (
 
 
 def text(value: Any, most: int = 200) -> str | None:
-    """A line of text, or None."""
     if not isinstance(value, str):
         return None
     return CONTROL.sub(" ", value.encode(errors="replace").decode())[:most]
 
 
 def code(value: Any) -> str | None:
-    """A participant's code, or None."""
     return value if isinstance(value, str) and CODE.fullmatch(value) else None
 
 
@@ -60,7 +58,6 @@ def current_ma(plan: Any) -> float | None:
 
 
 def effects(value: Any) -> list[str]:
-    """Ids of effects, each once."""
     listed = value[: 10 * MOST_EFFECTS] if isinstance(value, list) else []
     named = [one for one in listed if isinstance(one, str) and EFFECT.fullmatch(one)]
     return list(dict.fromkeys(named))[:MOST_EFFECTS]
@@ -88,7 +85,6 @@ def fit(value: Any) -> dict[str, Any]:
 
 
 def days_later(given: str, days: int) -> str:
-    """A day so many days later."""
     return (date.fromisoformat(given) + timedelta(days=days)).isoformat()
 
 

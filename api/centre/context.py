@@ -55,7 +55,6 @@ class CentreSettings(ServerSettings):
 
     @property
     def database(self) -> str:
-        """The database's SQLAlchemy URL."""
         return self.database_url or f"sqlite:///{self.data_dir.absolute() / 'centre.db'}"
 
     @property
@@ -65,7 +64,6 @@ class CentreSettings(ServerSettings):
 
     @property
     def spool_dir(self) -> Path:
-        """Where a file lies until it is whole."""
         return self.data_dir / "spool"
 
 
@@ -122,7 +120,6 @@ class Context(Parts):
         self.waiting_warnings = await asyncio.to_thread(warnings.open_count, self.store)
 
     async def close(self) -> None:
-        """Let everything go."""
         self.bucket_threads.shutdown(wait=False, cancel_futures=True)
         await super().close()
 

@@ -59,7 +59,6 @@ class Heads:
 
 
 def readable(said: dict[str, Any]) -> bool:
-    """Whether a receipt can be made of it."""
     try:
         Receipt(seq=said["seq"], hash=said["hash"], noted_utc="", at_utc=said["at_utc"])
     except (KeyError, ValueError):

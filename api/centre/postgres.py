@@ -56,7 +56,6 @@ class Cluster:
 
     @property
     def url(self) -> str:
-        """The database's URL."""
         return self.address(DATABASE).replace("postgresql:", "postgresql+psycopg:")
 
     def address(self, database: str) -> str:

@@ -67,11 +67,9 @@ class Rigs:
                 audit.write(session, now, by, "revoke rig", name)
 
     def all(self) -> list[CentreRig]:
-        """All rigs, by name."""
         return self.store.all(CentreRig, order=CentreRig.name)
 
     def named(self, name: str) -> CentreRig | None:
-        """A rig by its name."""
         found = self.store.all(CentreRig, CentreRig.name == name, limit=1)
         return found[0] if found else None
 

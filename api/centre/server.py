@@ -24,7 +24,6 @@ from stimrig.api.web import server
 
 
 def main() -> int:
-    """Run the centre; the exit code."""
     logs.configure()
     try:
         app, listener = prepared(CentreSettings())

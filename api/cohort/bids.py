@@ -238,7 +238,6 @@ def cell(value: Any) -> str:
 
 
 def tsv(columns: Iterable[str], rows: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """Lines of a table with a header."""
     columns = list(columns)
     yield "\t".join(columns) + "\n"
     for row in rows:

@@ -264,7 +264,6 @@ class Computing:
         return code
 
     def close(self) -> None:
-        """End the process and take away its folder."""
         self.close_process()
         self._lock.close()
         shutil.rmtree(self._folder, ignore_errors=True)

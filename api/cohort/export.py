@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 
 from stimrig.api.cohort.export_state import State
+from stimrig.api.cohort.record import describe
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import Entry, Source, SourceError
 from stimrig.api.cohort.tasks import CutOffError
-from stimrig.api.cohort.whole_record import WholeRecord, read_whole, said_of
+from stimrig.api.cohort.whole_record import WholeRecord, read_whole
 from stimrig.api.whole_file import whole_file
 from stimrig.identify.errors import IdentifyError
 from stimrig.identify.records.bounds import LARGEST_FILE_BYTES
@@ -97,9 +98,7 @@ class Writer(Protocol):
         """Write a record's files; its row for `finish`. Raises NoExport."""
         ...
 
-    def finish(self, state: State, put: Put) -> None:
-        """Write what is made of all records."""
-        ...
+    def finish(self, state: State, put: Put) -> None: ...
 
 
 def hidden(record: WholeRecord, days: Days) -> WholeRecord:
@@ -222,10 +221,12 @@ class Export:
             path.unlink(missing_ok=True)
 
     def _write(self, entry: Entry, content: bytes, sha256: str, path: Path) -> None:
-        if self.selection(said_of(content, path, entry.known)) is False:
+        said = dict(entry.known)
+        describe(path, said)
+        if self.selection(said) is False:
             self.tally.left_out += 1
             return
-        record = read_whole(content, path, entry.known, self.columns)
+        record = read_whole(content, path, said, self.columns)
         if self.selection(record.about) is False:
             self.tally.left_out += 1
             return

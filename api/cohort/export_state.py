@@ -89,7 +89,6 @@ class State:
             )
 
     def failed(self, address: str, kind: str, reason: str) -> None:
-        """A record cannot be exported."""
         with self._db:
             self._db.execute(
                 "INSERT OR REPLACE INTO failed VALUES (?, ?, ?)", (address, kind, " ".join(reason.split()))
@@ -114,7 +113,6 @@ class State:
         return label
 
     def labels(self) -> Iterator[tuple[str, str]]:
-        """Labels and their codes, in order."""
         yield from self._db.execute("SELECT label, code FROM labels ORDER BY label")
 
     def rows(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -129,10 +127,8 @@ class State:
         yield from self._db.execute("SELECT address, kind, reason FROM failed ORDER BY address")
 
     def count(self, table: str) -> int:
-        """Number of rows of `done` or `failed`."""
         assert table in ("done", "failed")
         return int(self._db.execute(f"SELECT count(*) FROM {table}").fetchone()[0])
 
     def close(self) -> None:
-        """Let it go."""
         self._db.close()

@@ -22,8 +22,6 @@ Kind = Literal["text", "number", "integer", "true or false", "time"]
 
 @dataclass(frozen=True)
 class Column:
-    """One column."""
-
     table: str
     name: str
     type: Kind
@@ -110,7 +108,6 @@ COLUMNS: dict[str, tuple[tuple[str, Kind, str, str, str, str], ...]] = {
 
 
 def columns_of(table: str) -> list[Column]:
-    """The columns of a table."""
     return [Column(table, *entry) for entry in COLUMNS[table]]
 
 
@@ -180,7 +177,6 @@ def finish(state: State, put: Put) -> None:
 
 
 def samples(record: WholeRecord, who: Who) -> pa.Table:
-    """The table of a record's samples."""
     columns, size = record.samples, len(record.samples["time_s"])
     index = columns["segment"].astype(int)
     names = record.about["segment_names"]
@@ -224,7 +220,6 @@ def segment_at(record: WholeRecord, time_s: np.ndarray) -> np.ndarray:
 
 
 def record_row(record: WholeRecord, who: Who) -> dict[str, Any]:
-    """A record's row of `records`."""
     about = record.about
     plan = _plan(about.get("configuration"))
     row = {column.name: about.get(column.name) for column in columns_of("records")}

@@ -7,7 +7,7 @@ it ends, and `api.cohort.computing` makes a row of how.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -84,21 +84,12 @@ def compute(progress: Callable[..., None], file: str, name: str, known: Row, tas
 
 def add_answer(path: Path, task: Task, row: dict[str, Any]) -> bool:
     """Read, judge and do the verb, into the row; False where the selection does not mean the record."""
-    with path.open("rb") as file:
-        sealed = file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
     selection = Selection(task.select)
-    if sealed:
-        row |= about(path)
-        row |= {name: row.get(name) for name in SAID}  # what it does not say is known not to be said
-        if selection(row) is False:
-            return False
-    record = identify.read(path, map=list(task.columns) if task.columns and not sealed else None)
-    row |= {name: row.get(name) for name in SAID}
-    row |= {
-        "duration_s": round(float(record.time_s[-1] - record.time_s[0]), 4),
-        "rate_hz": round(float(record.sample_rate_hz), 4),
-        "notes": list(record.notes),
-    }
+    sealed = describe(path, row)
+    if selection(row) is False:
+        return False
+    record = read(path, () if sealed else task.columns, row)
+    row["notes"] = list(record.notes)
     if selection(row) is False:
         return False
     row |= ANSWERS[task.verb](record, task)
@@ -106,16 +97,29 @@ def add_answer(path: Path, task: Task, row: dict[str, Any]) -> bool:
     return True
 
 
-def about(path: Path) -> dict[str, Any]:
-    """What a sealed recording says of itself."""
+def describe(path: Path, row: Row) -> bool:
+    """Whether it is a sealed recording; then what it says of itself, into the row, before all of it is read."""
+    with path.open("rb") as start:
+        if start.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
+            return False
     file = StrictFile(bounds.content_of(path), str(path))
-    given: dict[str, Any] = {column: file.text(name, "") for name, column in ABOUT.items()}
+    given: Row = {column: file.text(name, "") for name, column in ABOUT.items()}
     given["day"] = as_day(given["begun_utc"])
-    return {name: value for name, value in given.items() if value}
+    row |= {name: value for name, value in given.items() if value}
+    row |= {name: row.get(name) for name in SAID}  # what it does not say is known not to be said
+    return True
+
+
+def read(path: Path, columns: Sequence[str], row: Row) -> Any:
+    """The record; what is known once it is read goes into the row. Raises BadRecord."""
+    record = identify.read(path, map=list(columns) or None)
+    row |= {name: row.get(name) for name in SAID}
+    row["duration_s"] = round(float(record.time_s[-1] - record.time_s[0]), 4)
+    row["rate_hz"] = round(float(record.sample_rate_hz), 4)
+    return record
 
 
 def failed(kind: str, line: str) -> dict[str, Any]:
-    """The columns of a record that failed."""
     return {"status": "error", "error_kind": kind, "error": " ".join(line.split())[:1000]}
 
 

@@ -63,7 +63,6 @@ class Parcels:
         self._came = as_completed()  # with results it would never give back what a lost worker took along
 
     def __len__(self) -> int:
-        """Parcels on their way."""
         return len(self._sent)
 
     def send(self, records: list[Record], tries: int = 1) -> None:

@@ -143,7 +143,6 @@ def _bad(node: ast.AST, says: str) -> CohortError:
 
 
 def _test(node: ast.expr) -> Test:
-    """The test that a part of the expression stands for."""
     if isinstance(node, ast.BoolOp):
         tests = [_test(value) for value in node.values]
         return _joined(tests, isinstance(node.op, ast.And))

@@ -94,7 +94,6 @@ class Source(Protocol):
 
 
 def is_record(name: str) -> bool:
-    """Whether a file in a folder counts as a record."""
     return not name.startswith((".", "_")) and name.lower().endswith(SUFFIXES)
 
 
@@ -144,7 +143,6 @@ class Folder:
         return Entry(address, name, os.fspath(whole), found.st_size, stamp, known={**known, "bytes": found.st_size})
 
     def open(self, entry: Entry, most_bytes: int) -> bytes:
-        """The file's bytes."""
         try:
             # Not blocking: a pipe that took the file's place since would never end.
             with os.fdopen(os.open(entry.key, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
@@ -202,7 +200,6 @@ class Bucket(Source):
         return Entry(files.unstrip_protocol(item["name"]), name, item["name"], size, stamp, known=known)
 
     def open(self, entry: Entry, most_bytes: int) -> bytes:
-        """The object's bytes."""
         if entry.bytes == 0:
             return b""  # a part of nothing cannot be asked for
         try:
@@ -270,7 +267,6 @@ class Centre(Source):
         return Entry(address, name, str(number), size, sha256, sha256, known)
 
     def open(self, entry: Entry, most_bytes: int) -> bytes:
-        """The recording's bytes."""
         try:
             with Connection(self.url, self.token) as line:
                 return _bounded(line, f"/v1/recordings/{entry.key}", most_bytes)

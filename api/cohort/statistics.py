@@ -132,7 +132,6 @@ class Statistics:
 
     @property
     def ok(self) -> int:
-        """Records with a result."""
         return self.records - self.errors.total()
 
     def prevalence(self) -> tuple[str, int, list[tuple[str, int]]]:
@@ -173,7 +172,6 @@ def read_statistics(file: Path) -> Statistics:
 
 
 def _take(found: Statistics, row: Mapping[str, Any], numbers: dict[str, int]) -> None:
-    """One record with a result."""
     who = row["participant"]
     found.verdicts[row["verdict"] or "none"] += 1
     if who:

@@ -187,7 +187,6 @@ def rows_of(file: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def rows_in(file: Path) -> int:
-    """How many rows a table has."""
     return pq.read_metadata(file).num_rows
 
 

@@ -58,7 +58,6 @@ class Task:
 
     @classmethod
     def of(cls, document: dict[str, Any]) -> Task:
-        """The task of a document that came as JSON."""
         given: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in document.items()
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig import identify
-from stimrig.api.cohort.record import SAID, about
+from stimrig.api.cohort.record import read
 from stimrig.api.cohort.select import Known
 from stimrig.identify.records import HDF5_MAGIC
 from stimrig.identify.records.hdf5 import StrictFile
@@ -67,23 +66,17 @@ class WholeRecord:
         return float(len(steps) / np.sum(steps))
 
 
-def read_whole(
-    content: bytes, path: Path, known: Mapping[str, Any], columns: Sequence[str] | None = None
-) -> WholeRecord:
-    """Read a record whose bytes lie at `path`, too.
+def read_whole(content: bytes, path: Path, known: Known, columns: Sequence[str] = ()) -> WholeRecord:
+    """Read a record whose bytes lie at `path`, too, and of which this is known (`describe`).
 
     Raises
     ------
     BadRecord
         As `identify.read` does.
     """
-    sealed = content.startswith(HDF5_MAGIC)
-    record = identify.read(path, map=list(columns) if columns and not sealed else None)
-    said: dict[str, Any] = {**known, **(about(path) if sealed else {})}
-    said |= {name: said.get(name) for name in SAID}
+    said, sealed = dict(known), content.startswith(HDF5_MAGIC)
+    record = read(path, () if sealed else columns, said)
     said |= {
-        "duration_s": round(float(record.time_s[-1] - record.time_s[0]), 4),
-        "rate_hz": round(float(record.sample_rate_hz), 4),
         "pulse_rate_hz": float(record.pulse_rate_hz),
         "bytes": len(content),
         "format": "sealed recording" if sealed else "table",
@@ -94,14 +87,6 @@ def read_whole(
     else:
         _table(found, record)
     return found
-
-
-def said_of(content: bytes, path: Path, known: Known) -> dict[str, Any]:
-    """What is known of a record before all of it is read."""
-    if not content.startswith(HDF5_MAGIC):
-        return dict(known)
-    said = {**known, **about(path)}
-    return {**said, **{name: said.get(name) for name in SAID}}
 
 
 def _sealed(found: WholeRecord, record: Any, content: bytes, path: Path) -> None:

@@ -24,7 +24,6 @@ NICENESS = 10
 
 
 def main() -> int:
-    """Run the pusher; the exit code."""
     logs.configure()
     os.umask(os.umask(0o077) | 0o077)
     os.nice(NICENESS)

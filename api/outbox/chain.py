@@ -63,7 +63,6 @@ class Telling:
 
 
 def item_hash(fields: dict[str, Any]) -> str:
-    """The hash that an item must have."""
     return digest(canonical({name: fields[name] for name in HASHED}))
 
 

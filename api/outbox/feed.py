@@ -206,7 +206,6 @@ def _with_document(row: Model | Tracked) -> Telling:
 
 
 def _without(row: Table, *columns: str) -> dict[str, Any]:
-    """The row as a plain object but for some columns."""
     return {name: value for name, value in row.as_dict().items() if name not in columns}
 
 
@@ -235,7 +234,6 @@ def _plain(value: Any, depth: int = 0) -> Any:
 
 
 def _shortened(value: Any) -> Any:
-    """Long lists left out."""
     if isinstance(value, dict):
         return {name: _shortened(each) for name, each in value.items()}
     if isinstance(value, list):

@@ -79,7 +79,6 @@ class Link:
         return found
 
     def wanted(self, limit: int) -> list[LackingOut]:
-        """The files that the centre lacks."""
         return read(LackingFilesOut, self._ask("GET", "/v1/rig/files", params={"limit": limit}), limit).files
 
     def send(self, sha256: str, offset: int, pieces: Iterator[bytes], length: int) -> PieceOut:
@@ -89,7 +88,6 @@ class Link:
         return read(PieceOut, self._ask("PUT", where, params={"offset": offset}, content=pieces, headers=headers))
 
     def close(self) -> None:
-        """Let the line go."""
         self.http.close()
 
     def _ask(self, method: str, path: str, **given: Any) -> dict[str, Any]:

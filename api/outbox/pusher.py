@@ -56,13 +56,11 @@ class Backoff:
         self.chance, self.failures = chance, 0
 
     def next_s(self) -> float:
-        """The next wait, s."""
         wait_s = min(LONGEST_S, FIRST_S * 2.0 ** min(self.failures, 20))
         self.failures += 1
         return max(FIRST_S, wait_s * self.chance.uniform(0.5, 1.0))
 
     def reset(self) -> None:
-        """It went well."""
         self.failures = 0
 
 

@@ -56,7 +56,6 @@ class Receipt(BaseModel):
 
     @property
     def signed(self) -> bytes:
-        """What the signature is of."""
         return canonical(self.model_dump(exclude={"signature"})).encode(errors="replace")
 
     @property

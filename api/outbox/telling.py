@@ -48,7 +48,6 @@ class Telling:
         """Files that the items after a place name: counted once for each."""
 
     def head(self) -> Head | None:
-        """The newest item."""
         with self.store.read() as session:
             return chain.head(session)
 

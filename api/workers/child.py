@@ -47,7 +47,6 @@ def own_output() -> TextIO:
 
 
 def parsed() -> argparse.Namespace:
-    """The command line."""
     parser = argparse.ArgumentParser(prog="api.workers.child")
     parser.add_argument("--reads", type=Path, action="append", default=[])
     parser.add_argument("--writes", type=Path, action="append", default=[])
@@ -96,12 +95,10 @@ def describe(error: Exception) -> dict[str, Any]:
 
 
 def one_line(error: Exception) -> str:
-    """An error's message on one line."""
     return " ".join(str(error).split())
 
 
 def say(out: TextIO, message: dict[str, Any]) -> None:
-    """One object, one line."""
     out.write(json.dumps(message, allow_nan=True) + "\n")
     out.flush()
 

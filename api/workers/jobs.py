@@ -42,7 +42,6 @@ class Job:
     done: asyncio.Event = field(default_factory=asyncio.Event)
 
     def take(self, call: Call) -> None:
-        """What a worker does for it now."""
         self.call = call
 
     def document(self) -> dict[str, Any]:
@@ -102,7 +101,6 @@ class Jobs:
             job.done.set()
 
     def get(self, job_id: str) -> Job:
-        """A job by its id."""
         job = self.all.get(job_id)
         if job is None:
             raise NotFoundError("job", job_id, "A restart of the service forgets jobs; ask for the result again.")
@@ -114,7 +112,6 @@ class Jobs:
             self.pool.cancel(job.call)
 
     async def close(self) -> None:
-        """Let everything go."""
         for running in list(self._running):
             running.cancel()
         await asyncio.gather(*self._running, return_exceptions=True)

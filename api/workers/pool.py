@@ -133,7 +133,6 @@ class Pool:
             self._dispatch()
 
     async def close(self) -> None:
-        """End all workers; what is queued is left."""
         self.queue.clear()
         for task in list(self._tasks):
             task.cancel()
@@ -182,5 +181,4 @@ class Adviser:
             return found
 
     async def close(self) -> None:
-        """End the process."""
         await self.worker.close()

@@ -71,7 +71,6 @@ class Places:
         self.reads, self.writes = {path.absolute() for path in reads}, {path.absolute() for path in writes}
 
     def arguments(self) -> tuple[str, ...]:
-        """For the worker's command line."""
         sides = (("--reads", self.reads), ("--writes", self.writes))
         return tuple(part for option, paths in sides for path in sorted(paths) for part in (option, str(path)))
 
@@ -206,13 +205,11 @@ class Worker:
         return None
 
     def kill(self) -> None:
-        """End the process at once."""
         if self.process is not None and self.process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
                 self.process.kill()
 
     async def close(self) -> None:
-        """End the process and wait for it."""
         self.kill()
         if self.process is not None:
             await self.process.wait()
@@ -228,7 +225,6 @@ def call_error(verb: str, error: dict[str, Any]) -> ApiError:
 
 
 def cancelled() -> ApiError:
-    """A call that somebody cancelled."""
     return ApiError(409, "cancelled", "The job was cancelled", "Start it again if it is still wanted.")
 
 

@@ -94,7 +94,6 @@ def diagnosed(record: Any, progress: Progress, model_json: str | None = None) ->
 
 
 def mentioned(found: dict[str, Any]) -> set[str]:
-    """Ids of all effects that a diagnosis speaks of."""
     named = {entry["effect"] for entry in found["missing"]}
     named |= {rival for entry in found["missing"] for rival in entry.get("confused_with") or []}
     return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
@@ -198,7 +197,6 @@ def invert(
 
 
 def effects(progress: Progress) -> dict[str, Any]:
-    """The library of effects."""
     from stimrig.identify import effects as library
 
     progress(0.5, "reading the library")
