@@ -89,13 +89,6 @@ def test_frames_carry_the_time_of_their_last_sample_whatever_the_sensors_clock_s
     assert devices.take_frames() == []
 
 
-def test_a_frame_from_the_host_starts_the_cell() -> None:
-    devices = make_devices(Settings(cell="canopen"))
-    devices.frame_received(0.1, 0, b"\x01\x00")
-    devices.advance(0.2)
-    assert devices.take_frames()[0].time_s == pytest.approx(0.1)
-
-
 def test_nothing_passes_while_a_cable_is_unplugged() -> None:
     host = VirtualHost(cell="canopen")
     devices, heard = host.devices, []

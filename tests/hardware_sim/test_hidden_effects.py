@@ -26,11 +26,8 @@ CONTRACT = {
 }  # fmt: skip
 STEP_S = 1.0 / 1600.0
 NOISE_SD_NM = 0.04
-ALL = [
-    pytest.param(effect, index, id=f"{effect}-{index}")
-    for effect in (*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK)
-    for index in range(len(find_forms(effect)))
-]
+NAMES = [*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK]
+ALL = [(effect, index) for effect in NAMES for index in range(len(find_forms(effect)))]
 # noise drawn at each step, or a moment that is rounded to a step and changes all that follows
 RANDOM_BY_STEP = {
     ("voluntary_effort", "effort whenever a slow random drive is high"),
@@ -56,8 +53,7 @@ def test_every_id_of_the_contract_has_its_file_and_some_are_foreign() -> None:
     assert set(EFFECTS) == CONTRACT
     assert {"rate_dependent_recruitment", "antagonist", "slipped_electrode"} <= set(OUTSIDERS)
     assert len(OUTSIDERS) >= 8 and len(OUTSIDERS_HELD_BACK) >= 5
-    foreign = [*OUTSIDERS, *OUTSIDERS_HELD_BACK]
-    assert len(set(foreign)) == len(foreign) and not set(foreign) & CONTRACT
+    assert len(set(NAMES)) == len(NAMES)
 
 
 @pytest.mark.parametrize(("effect", "index"), ALL)
@@ -78,10 +74,10 @@ def depends_on_the_step(effect: str, index: int) -> bool:
 def test_what_depends_on_the_step_is_there() -> None:
     known = {(effect, form.name) for effect in EFFECTS for form in find_forms(effect)}
     assert known >= RANDOM_BY_STEP
-    assert {*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK} >= BY_STEP
+    assert set(NAMES) >= BY_STEP
 
 
-@pytest.mark.parametrize(("effect", "index"), [p for p in ALL if not depends_on_the_step(*p.values)])
+@pytest.mark.parametrize(("effect", "index"), [p for p in ALL if not depends_on_the_step(*p)])
 def test_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
     base, formulation = written(effect, index)
     design = make_design("full", rng_of(2), float(base.largest_width_us), moving=True, validate_s=4.0)
@@ -102,7 +98,7 @@ BY_TURNS = [("weak", KEPT_BACK), ("strong", DEVELOPMENT)]
     ("effect", "strength", "seed"),
     [
         pytest.param(effect, *drawn, marks=[] if drawn == BY_TURNS[place % 2] else [pytest.mark.campaign])
-        for place, effect in enumerate([*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK])
+        for place, effect in enumerate(NAMES)
         for drawn in DRAWN
     ],
 )
@@ -129,13 +125,10 @@ def test_a_base_muscle_leaves_the_yardstick_almost_nothing(steep: bool) -> None:
     left = []
     for seed in range(220, 250):
         scenario = draw_scenario((), "weak", seed, steep=steep)
-        torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)[::40]
         held_out = scenario.design.held_out
-        left.append(
-            np.sqrt(
-                np.mean(EffectFreeFit(scenario.base, scenario.design.width_us, held_out).fit(torque)[held_out] ** 2)
-            )
-        )
+        yardstick = EffectFreeFit(scenario.base, scenario.design.width_us, held_out)
+        torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)[::40]
+        left.append(np.sqrt(np.mean(yardstick.fit(torque)[held_out] ** 2)))
     assert np.median(left) < 0.5 * NOISE_SD_NM
     # within a steep rise the ramp leaves one pulse every 1.5 µs: nobody could know the curve better
     assert np.percentile(left, 80 if steep else 95) < 1.5 * NOISE_SD_NM

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -41,15 +40,6 @@ class TestPaper:
         np.testing.assert_allclose(curve, PAPER.recruitment(widths), atol=1e-12)
         assert PaperMuscle().recruitment_nm(4095.0, 130.0) == pytest.approx(6.8994)
 
-    def test_an_equal_train_is_the_step_response(self) -> None:
-        widths = np.full(400, 250.0)
-        torque = simulate(PaperMuscle(), train(widths), widths, 20.0, 1600.0, 10.0)
-        t = np.arange(16000) / 1600
-        wd = math.sqrt(1 - ZETA**2) / T
-        decay = np.exp(-ZETA / T * t)
-        step = 1 - decay * (np.cos(wd * t) + ZETA / math.sqrt(1 - ZETA**2) * np.sin(wd * t))
-        np.testing.assert_allclose(torque, PAPER.recruitment(np.array(250.0)) * step, atol=1e-9)
-
     @pytest.mark.parametrize("damping", [ZETA, 0.3, 1.0, 1.7])
     def test_prbs_against_scipy(self, damping: float) -> None:
         widths = np.repeat(np.random.default_rng(1).integers(0, 2, 40) * 300.0, 4)
@@ -79,12 +69,6 @@ class TestPaper:
     def test_charge_scales_the_width(self) -> None:
         muscle = PaperMuscle()
         assert muscle.recruitment_nm(200.0, 30.0) == muscle.recruitment_nm(300.0, 20.0)
-
-    def test_the_times_of_reading_do_not_matter(self) -> None:
-        times, widths = train(np.full(20, 200.0)), np.full(20, 200.0)
-        coarse = simulate(PaperMuscle(), times, widths, 20.0, 100.0, 1.0)
-        fine = simulate(PaperMuscle(), times, widths, 20.0, 1600.0, 1.0)
-        np.testing.assert_allclose(coarse, fine[::16], atol=1e-9)
 
 
 class TestCalcium:

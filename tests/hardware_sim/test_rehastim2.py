@@ -92,14 +92,6 @@ class TestConnection:
         assert len(bench.packets(INIT)) == 3
         assert bench.muscle.pulses == []
 
-    def test_no_init_piles_up_where_nobody_reads(self, bench: Host) -> None:
-        bench.unread = 9
-        bench.run(60.0)
-        assert bench.sent == []
-        bench.unread = 0
-        bench.run(0.5)
-        assert len(bench.packets(INIT)) == 1
-
     def test_watchdog_command_keeps_the_connection_without_an_ack(self, connected: Host) -> None:
         have = len(connected.sent)
         for _ in range(5):
