@@ -15,7 +15,7 @@ NAMED_LETTERS = 60
 """Letters of the versions' names up to which they stand below their chart on a tablet."""
 
 
-def of_why(
+def diagnosis_figures(
     comparison: dict[str, Any] | None,
     segments: list[dict[str, Any]],
     view: dict[str, Any] | None,

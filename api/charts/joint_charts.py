@@ -41,7 +41,7 @@ WAYS = (
 )
 
 
-def of_joint(document: dict[str, Any]) -> dict[str, Any]:
+def joint_figures(document: dict[str, Any]) -> dict[str, Any]:
     """Both figures of a model with a moving joint; none of another one, nor where it is not known what was seen."""
     joint = document.get("joint") or {}
     if not (joint.get("seen_h") and joint.get("seen_g")):

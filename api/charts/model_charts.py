@@ -22,7 +22,7 @@ LARGE = "comparison"
 """The figure with all lines."""
 
 
-def of_model(
+def model_figures(
     document: dict[str, Any], curves: dict[str, Any] | None, comparison: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """All figures of a model's page; those that need the measurement only if there is one."""

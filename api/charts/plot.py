@@ -79,7 +79,7 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
         residual = diagnosis_charts.residual(thinned(found), segments, diagnosis_charts.places_of(found))
         return LocalFigure(in_light(residual))
     if isinstance(what, Improvement):
-        rows = explanation.of_steps({**what.to_dict(), "models": []})
+        rows = explanation.step_versions({**what.to_dict(), "models": []})
         return LocalFigure(in_light(diagnosis_charts.falling(rows)))
     message = "plot takes a model and its record, a comparison, or what improve found: plot(model, record)"
     raise BadRequest(message, place="plot")

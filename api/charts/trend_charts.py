@@ -35,7 +35,7 @@ def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     Parameters
     ----------
     sessions : sequence of dict
-        As `Session.shown` gives them, the oldest first.
+        As `Session.page_document` gives them, the oldest first.
     """
     return [panel(name, sessions) for name in order(sessions)]
 
@@ -240,7 +240,7 @@ def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[di
     Parameters
     ----------
     trials : sequence of mapping
-        As `api.models.tracked.told` gives them, the oldest first.
+        As `api.models.tracked.trial_document` gives them, the oldest first.
     bounds : Bounds
         What a person allowed, drawn as lines.
     """

@@ -128,7 +128,7 @@ async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -
         raise OSError(f"STIMRIG_STRUCTURE: no effect is called {', '.join(unknown)}. Take some of {', '.join(known)}.")
 
 
-def shown(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> dict[str, Any] | None:
+def carried_context(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> dict[str, Any] | None:
     """What `model.html` shows of what was carried over: to the plain version, or to its child in that structure.
 
     None where its recording was asked nothing of the kind. `new` is None as long as there is no diagnosis; `again`:

@@ -299,7 +299,7 @@ def label(row: dict[str, Any]) -> str:
     return _("with %(effects)s", effects=begun_with) if begun_with else _("base model")
 
 
-def of_steps(found: dict[str, Any]) -> list[dict[str, Any]]:
+def step_versions(found: dict[str, Any]) -> list[dict[str, Any]]:
     """The steps of an improvement as versions."""
     steps = [
         {"id": str(number), "added_effect": step["added"], "noise_sd_nm": found["noise_sd_nm"], "served": False, **step}

@@ -22,7 +22,7 @@ from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
 
 log = logging.getLogger("stimrig.models")
-TOLD = (
+COLUMNS = (
     "id", "participant", "recording_id", "parent_id", "added_effect", "carried_from_id", "carried", "method", "effects",
     "created_utc", "created_by",
 )  # fmt: skip
@@ -155,7 +155,7 @@ class Versions:
             newest = {decision.model_id: decision for decision in session.scalars(decided)}
         holding = self.approved(participant)
         rows = [row if "verdict" in row.fit else self.get(row.id) for row in rows]
-        return [self._told(row, newest.get(row.id), holding) for row in rows]
+        return [self._document(row, newest.get(row.id), holding) for row in rows]
 
     def child_with(self, parent: Model, effects: list[str]) -> Model | None:
         """A version of the same recording, made from `parent`, that holds exactly these effects."""
@@ -349,12 +349,12 @@ class Versions:
 
     def document(self, row: Model) -> dict[str, Any]:
         """A version as clients see it, without the model itself."""
-        return self._told(row, self.decision(row.id), self.approved(row.participant))
+        return self._document(row, self.decision(row.id), self.approved(row.participant))
 
-    def _told(self, row: Model, decision: Approval | None, holding: Approval | None) -> dict[str, Any]:
+    def _document(self, row: Model, decision: Approval | None, holding: Approval | None) -> dict[str, Any]:
         return {
             "model_id": row.id,
-            **{name: getattr(row, name) for name in TOLD},
+            **{name: getattr(row, name) for name in COLUMNS},
             **row.fit,
             **self.quality(row),
             "decision": None if decision is None else ("approved" if decision.approved else "rejected"),

@@ -69,7 +69,7 @@ class TrackedVersions:
         approval = self.versions.approved(participant)
         return approval if approval is not None and approval.tracking and Limits(**approval.tracking).allows else None
 
-    def opened(self, test_id: str) -> Trial | None:
+    def open_trial(self, test_id: str) -> Trial | None:
         """A trial with all that is needed to follow it; None: it has been noted, or was played without an approval."""
         test: Test | None = self.store.get(Test, test_id)
         if test is None or self.store.get(Tracked, test_id) is not None:
@@ -268,11 +268,11 @@ class TrackedVersions:
             "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0) if served else None,
             "etag": served.etag if served else None,
             "ask": self.asks(approval.id),
-            "trials": [told(row) for row in rows],
+            "trials": [trial_document(row) for row in rows],
         }
 
 
-def told(row: Tracked) -> dict[str, Any]:
+def trial_document(row: Tracked) -> dict[str, Any]:
     """A trial as clients see it."""
     step = row.step or {}
     found = ("now", "coming", "effects", "error_nm", "expected_error_nm", "disturbed_s", "distance")

@@ -195,7 +195,7 @@ def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
     Parameters
     ----------
     trials : sequence of mapping
-        As `stimrig.api.models.tracked.told` gives them, the oldest first.
+        As `stimrig.api.models.tracked.trial_document` gives them, the oldest first.
     since_utc : str
         When the approved model's recording was made.
     """

@@ -81,7 +81,7 @@ class Session:
             "notes": [{name: getattr(note, name) for name in OF_NOTE} for note in self.notes],
         }
 
-    def shown(self) -> dict[str, Any]:
+    def page_document(self) -> dict[str, Any]:
         """As pages show it: `document`, with one fit, `follows_percent`; its `where` says on which pulses."""
         document = self.document()
         found = followed(self.model.fit)
@@ -102,7 +102,7 @@ class Trend:
         await self._complete(found)
         return found
 
-    async def of_models(self, participant: str, model_ids: Sequence[str]) -> list[Session]:
+    async def for_models(self, participant: str, model_ids: Sequence[str]) -> list[Session]:
         """Of each model the session in which its recording was made, with this model for it."""
         sessions, models = await asyncio.to_thread(self._read, participant)
         found = [_with_model(sessions, models, model_id) for model_id in model_ids]

@@ -20,7 +20,7 @@ from tests.api.test_export import measured
 def figures() -> dict[str, Any]:
     """All figures of a made-up muscle's model page."""
     document, drawn = measured()
-    found = model_charts.of_model(document, drawn)
+    found = model_charts.model_figures(document, drawn)
     rows = [{"label": label, "rms_nm": rms, "held_out_rms_nm": rms, "noise_sd_nm": 0.04, "current": False}
             for label, rms in (("base", 0.12), ("+ fatigue", 0.05))]  # fmt: skip
     signatures = {"seen_nm": [0.1, 0.2], "expected_nm": [0.1, 0.1]}
@@ -61,7 +61,7 @@ def test_no_line_goes_through_the_pause_between_two_recordings() -> None:
               for place, t in enumerate(drawn["time_s"])]  # fmt: skip
     assert model_charts.broken_at_pauses({**drawn, "time_s": slow_s})["time_s"] == slow_s
     paused = {**drawn, "time_s": [t + 600.0 * (place >= half) for place, t in enumerate(drawn["time_s"])]}
-    figure = model_charts.of_model(document, paused)["comparison"]
+    figure = model_charts.model_figures(document, paused)["comparison"]
     for trace in figure["data"]:
         assert len(trace["x"]) == len(trace["y"]) == len(drawn["time_s"]) + 1
         middle_s = sum(paused["time_s"][half - 1 : half + 1]) / 2

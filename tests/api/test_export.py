@@ -123,7 +123,7 @@ def test_a_recording_without_a_ramp_has_no_directions() -> None:
 
 def test_still_pictures_are_whole_svg_with_the_values_in_their_place() -> None:
     document, drawn = measured()
-    for name, figure in model_charts.of_model(document, drawn).items():
+    for name, figure in model_charts.model_figures(document, drawn).items():
         picture = ElementTree.fromstring(str(svg(figure, 600.0, label=f"<{name}> & more")))
         texts = {text.text for text in picture.iter("{http://www.w3.org/2000/svg}text")}
         assert figure["layout"]["xaxis"]["title"]["text"] in texts

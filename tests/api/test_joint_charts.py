@@ -29,7 +29,7 @@ NEAR_DEG = 3.0
 @pytest.fixture(scope="module")
 def figures() -> dict[str, Any]:
     with using("en"):
-        return joint_charts.of_joint({"joint": JOINT})
+        return joint_charts.joint_figures({"joint": JOINT})
 
 
 def drawn(figure: dict[str, Any]) -> dict[str, list[float | None]]:
@@ -94,7 +94,7 @@ def test_all_seen_needs_no_dots_and_no_band_none_of_it() -> None:
     bare = {key: value for key, value in JOINT.items() if "lower" not in key and "upper" not in key}
     ones = [[1] * len(row) for row in JOINT["seen_g"]]
     with using("en"):
-        found = joint_charts.of_joint({"joint": {**bare, "seen_g": ones, "seen_h": ones}})
+        found = joint_charts.joint_figures({"joint": {**bare, "seen_g": ones, "seen_h": ones}})
     for figure in found.values():
         assert len(figure["data"]) == 5 and "dash" not in str(figure["data"])
         assert all("±" not in each["hovertemplate"] for each in figure["data"])
@@ -102,13 +102,13 @@ def test_all_seen_needs_no_dots_and_no_band_none_of_it() -> None:
 
 @pytest.mark.parametrize("document", [{}, {"joint": {}}, {"joint": {"g": [[1.0]]}}])
 def test_a_model_of_a_joint_at_rest_has_none(document: dict[str, Any]) -> None:
-    assert joint_charts.of_joint(document) == {}
+    assert joint_charts.joint_figures(document) == {}
 
 
 def test_the_pointer_reads_value_and_band_in_the_pages_language() -> None:
     with using("de"):
         line = next(
-            each for each in joint_charts.of_joint({"joint": JOINT})["joint_h"]["data"] if "hovertemplate" in each
+            each for each in joint_charts.joint_figures({"joint": JOINT})["joint_h"]["data"] if "hovertemplate" in each
         )
     assert line["hovertemplate"].endswith("%{y:.2f} N·m ± %{customdata}<extra></extra>")
     assert line["customdata"][0] == f"{made_up_joint.half(math.radians(20)):.2f}".replace(".", ",")

@@ -72,9 +72,9 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
 
 def drawn(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
     """The model's own figures; the first one low enough for the first screen."""
-    figures = model_charts.of_model(document, measured["curves"], measured["comparison"])
+    figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
     first = {"overview": model_charts.overview(figures[model_charts.LARGE])} if model_charts.LARGE in figures else {}
-    return figures | first | joint_charts.of_joint(document)
+    return figures | first | joint_charts.joint_figures(document)
 
 
 async def next_step_of(context: Context, row: Model, version: dict[str, Any], may_test: bool) -> next_view.Step | None:
@@ -137,8 +137,8 @@ def gather(
         "splits": explanation.splits(comparison),
         "tests": view["tests"] if view else [],
         "versions": rows,
-        "carried": carried_structure.shown(context.versions, row, found),
-        "figures": diagnosis_charts.of_why(comparison, segments, view, signatures, rows),
+        "carried": carried_structure.carried_context(context.versions, row, found),
+        "figures": diagnosis_charts.diagnosis_figures(comparison, segments, view, signatures, rows),
     }
 
 

@@ -46,9 +46,9 @@ def comparison_html(
         dynamics=stored_model.dynamics(document),
         test=test,
         figures={
-            **model_charts.of_model(document, curves, comparison),
-            **joint_charts.of_joint(document),
-            **diagnosis_charts.of_why(comparison, curves["segments"], None, {}, []),
+            **model_charts.model_figures(document, curves, comparison),
+            **joint_charts.joint_figures(document),
+            **diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, []),
         },
         plain=(comparison or {}).get("plain") or [],
         places=diagnosis_charts.places_of(comparison or {}),
@@ -80,9 +80,11 @@ def improvement_html(
     segments : list of dict or None
         The record's, as `stimrig.api.workers.curves.runs` gives them.
     """
-    rows = explanation.of_steps(found)
+    rows = explanation.step_versions(found)
     view = explanation.view(diagnosis, before, []) if diagnosis else None
-    drawn = diagnosis_charts.of_why(before, segments or [], view, (diagnosis or {}).get("signatures") or {}, rows)
+    drawn = diagnosis_charts.diagnosis_figures(
+        before, segments or [], view, (diagnosis or {}).get("signatures") or {}, rows
+    )
     if after:
         places = diagnosis_charts.places_of(after)
         shown = places if explanation.noisy(after) else []

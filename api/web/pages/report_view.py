@@ -35,8 +35,8 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
     measured = await measurement(context, row)
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
-    figures = model_charts.of_model(document, measured["curves"], measured["comparison"])
-    figures |= joint_charts.of_joint(document)
+    figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
+    figures |= joint_charts.joint_figures(document)
     words = {
         "comparison": _("Torque measured and predicted, what is left, and the pulse width, over time"),
         "recruitment": _("Steady torque over pulse width"),

@@ -38,7 +38,7 @@ async def compare(
     """Models of one participant, the oldest first; differences are to `reference`, or to the oldest."""
     rows = await chosen(context, list(dict.fromkeys(model or [])))
     participant = rows[0].participant
-    sessions = await context.trend.of_models(participant, [row.id for row in rows])
+    sessions = await context.trend.for_models(participant, [row.id for row in rows])
     at = next((number for number, row in enumerate(rows) if row.id == reference), 0)
     sides = await asyncio.gather(*(side(context, rows, number) for number in range(len(rows))))
     names = [language.when(row.created_utc) for row in rows]
@@ -96,7 +96,7 @@ async def side(context: Context, rows: Sequence[Model], number: int) -> dict[str
 
 def comparison(sessions: Sequence[Session], reference: int) -> list[dict[str, Any]]:
     """The figures, a row each: the value of every model, and how far it is from the reference's."""
-    documents = [one.shown()["figures"] for one in sessions]
+    documents = [one.page_document()["figures"] for one in sessions]
     known = dict.fromkeys(name for figures in documents for name in figures)
     order = [*(name for name in changes.NAMES if name in known), *(name for name in known if "." in name)]
     return [compared(name, sessions, documents, reference) for name in order]
@@ -133,7 +133,7 @@ def apart(figure: str, before: Session, now: Session, name: changes.Name) -> dic
 async def trend(request: Request, context: Ctx, _who: ModelReader, code: str) -> Response:
     """All sessions in one picture."""
     found = await rest.sessions(context, code)
-    documents = [one.shown() for one in found]
+    documents = [one.page_document() for one in found]
     return page(
         request,
         "trend.html",

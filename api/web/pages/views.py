@@ -113,7 +113,7 @@ async def measured(context: Context, model_id: str) -> Markup | None:
     found = await measurement(context, row)
     if found["curves"] is None:
         return None
-    figure = model_charts.of_model(stored_model.read(row), found["curves"], found["comparison"])["comparison"]
+    figure = model_charts.model_figures(stored_model.read(row), found["curves"], found["comparison"])["comparison"]
     return svg(figure, 1160.0, 520.0, _("Torque measured and predicted, what is left, and the pulse width, over time"))
 
 
