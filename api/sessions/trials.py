@@ -111,7 +111,7 @@ class Trials(Kind):
         """
         with self.ending():
             async with self._turn:
-                trial = await asyncio.to_thread(self.tracked.opened, test_id)
+                trial = await asyncio.to_thread(self.tracked.open_trial, test_id)
                 if trial is None:
                     return None
                 found = await self._examine(trial)

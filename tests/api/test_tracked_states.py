@@ -99,7 +99,7 @@ def test_a_model_without_such_effects_reads_no_further_recording(
     assert read == [Path(trial)]
 
 
-# ---- from a trial to the tracked model that is served; nothing is stubbed but the rig ----------------------------------
+# ---- from a trial to the tracked model that is served; nothing is stubbed but the rig ----------------------------
 
 PERSON = "/v1/participants/P1"
 WIDTHS = np.r_[np.zeros(40), np.linspace(0, 160, 100), np.full(60, 160.0), np.linspace(160, 0, 100), np.zeros(40)]
