@@ -203,7 +203,7 @@ def step(context: Context, row: Participant) -> Step:
         running=test.id if test is not None and mine and not (served and test.kind == SEQUENCE) else "",
         identifying=test.id if test is not None and open_test and not mine else "",
         ended=test.state if test is not None and test.state in NO_MODEL and test.kind != SEQUENCE else "",
-        model=kept and Today(kept["id"], kept["verdict"], kept["decision"] == "approved"),
+        model=Today(kept["id"], kept["verdict"], kept["decision"] == "approved") if kept else None,
         rejected=bool(models) and kept is None,
         served_until=language.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
         archived_since=language.when(row.archived_utc) if row.archived_utc else "",
