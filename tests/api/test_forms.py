@@ -276,6 +276,6 @@ def test_every_button_that_stimulates_looks_like_it() -> None:
         if count:
             with_class[path.name] = count
     assert with_class == {
-        "next.html": 1, "participant.html": 1, "calibration.html": 1, "question.html": 1, "why_details.html": 1,
+        "next.html": 1, "participant.html": 1, "calibration.html": 1, "question.html": 1, "model.html": 1,
         "trials.html": 1,
     }  # fmt: skip

@@ -162,7 +162,7 @@ def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, addre
     taking = (
         "import asyncio, sys\nfrom stimrig.api.store import Store, holds\n"
         "async def main():\n"
-        "    async with holds.of(Store(sys.argv[1])).turn('limits'):\n"
+        "    async with holds.open_holds(Store(sys.argv[1])).turn('limits'):\n"
         "        print('had', flush=True)\n        await asyncio.sleep(600)\n"
         "asyncio.run(main())\n"
     )
