@@ -26,11 +26,13 @@ VOLATILE = (
     (re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[.\d]*(?:\+00:00|Z)?"), "<time>"),
     (re.compile(r"\bm-[0-9a-f]{6,}\b|\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f-]{22}\b"), "<id>"),
     (re.compile(r"\b[0-9a-f]{64}\b"), "<digest>"),
+    (re.compile(r"\bses-s[0-9a-f]{10}\b"), "ses-<hidden>"),
     (re.compile(r"(done before, |in )\d+(?:\.\d+)? m?s\b"), r"\1<duration>"),
     (re.compile(r"(stimrig_rig_|Model )(?:[\w-]{30,}|[0-9a-f]{8}\b)"), r"\1<id>"),
     (re.compile(r"\b(?:stimrig )?\d+\.\d+\.\d+(?:[.+]\w+)*\b"), "<version>"),
     (re.compile(r"\b(?:stimrig\.)?((?:identify|api|rig|hardware_sim)\.[a-z_.]+)"), r"\1"),
 )
+ALONE = f"import sys; sys.argv[0] = 'stimrig'; from {PACKAGE}.cli.main import main; main()"
 NEW_EACH_TIME = {"model_id", "created", "software", "elapsed_s", "took_s", "age_s", "torque_age_s", "uptime_s", "csrf"}
 
 
@@ -76,7 +78,7 @@ class CommandLine:
     def run(self, line: str) -> dict[str, Any]:
         """Exit code, standard output and error as they are."""
         if line.startswith(("-c", "emulate")):
-            done = self._begin("-c", line[2:]) if line[0] == "-" else self._begin("-m", f"{PACKAGE}.cli", *line.split())
+            done = self._begin("-c", line[2:]) if line[0] == "-" else self._begin("-c", ALONE, *line.split())
             out, error = done.communicate(timeout=900)
             return {"exit": done.returncode, "out": out, "error": error}
         assert self._session.stdin is not None
@@ -153,7 +155,7 @@ def condensed_file(path: Path, folder: Path) -> Any:
     if path.suffix in (".json", ".jsonl") or not path.stat().st_size:
         return _text(path.read_text("utf-8", "replace"), folder)
     if path.suffix == ".csv":
-        return _table(path)
+        return _table(path, folder)
     if path.suffix == ".parquet":
         import pyarrow.parquet as pq
 
@@ -161,8 +163,8 @@ def condensed_file(path: Path, folder: Path) -> Any:
     if path.suffix == ".h5" and h5py.is_hdf5(path):
         return _hdf5(path, folder)
     if path.suffix == ".gz":
-        lines = gzip.decompress(path.read_bytes()).decode().split("\n")
-        return [_column(list(column)) for column in zip(*(line.split("\t") for line in lines if line), strict=True)]
+        rows = [line.split("\t") for line in gzip.decompress(path.read_bytes()).decode().split("\n") if line]
+        return [_column(list(column), folder) for column in zip(*rows, strict=True)]
     if path.suffix in ("", ".tsv", ".html"):
         return words_of(path.read_text("utf-8", "replace"), folder)
     return f"<{path.suffix} file>"
@@ -221,22 +223,26 @@ def words_of(html: str, folder: Path) -> list[str]:
     return [_plain(line, folder) for line in reader.found]
 
 
-def _table(path: Path) -> Any:
+def _table(path: Path, folder: Path) -> Any:
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
         head, *rows = list(csv.reader(file)) or [[]]
     columns = dict(zip(head, zip(*rows, strict=False), strict=False))
-    return {"rows": len(rows)} | {name: _column(list(values)) for name, values in columns.items()}
+    return {"rows": len(rows)} | {name: _column(list(values), folder) for name, values in columns.items()}
 
 
-def _column(values: list[str]) -> Any:
+def _column(values: list[str], folder: Path) -> Any:
     try:
         return _row(np.asarray(values, float))
     except ValueError:
-        return sorted(set(values))[:20]
+        return sorted({_plain(one, folder) for one in values})[:20]
 
 
+WEAK = "as_real|as_gap|as_start|arm_moving|rig_stopped|rig_adaptive|rig_trial|rig_calibration"
+"""Recordings that say too little, or too much that no model explains: an older processor moves their answers, too."""
 LOOSE: tuple[tuple[str, float, float], ...] = (
     ("", 1e-4, 1e-9),
+    (f"/({WEAK})/(?!recording/)", 0.05, 0.01),
+    ("/(processor_s|worker_memory_mb)/", 1.0, 0.0),  # the machine's
     ("^routes/.*(last_sample_to_model_s|/delay_s)$", 1.0, 0.0),  # the fake rig's clock is the world's, not the day's
 )
 """Pattern of a place, and how much a number there may differ: relative, absolute. The last that fits counts."""

@@ -6,7 +6,7 @@ import pytest
 
 from tests.frozen.__main__ import HERE, PARTS, found
 
-PARTS_HERE = ("fitted/plain_short", "fitted/rig_adaptive", "fitted/broken_word", "fitted/other_words")
+PARTS_HERE = ("fitted/plain_short", "fitted/rig_held", "fitted/broken_word", "fitted/other_words")
 
 
 @pytest.mark.slow
