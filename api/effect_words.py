@@ -71,10 +71,10 @@ def within(effect: str) -> str:
 
 def effects_words(effects: Iterable[str]) -> str:
     """Titles, one after the other; each effect may have its form (`fatigue:fitness`)."""
-    return ", ".join(_with_form(effect) for effect in effects)
+    return ", ".join(_form_words(effect) for effect in effects)
 
 
-def _with_form(effect: str) -> str:
+def _form_words(effect: str) -> str:
     identity, _colon, form = effect.partition(":")
     return f"{within(identity)} ({form.replace('_', ' ')})" if form else within(identity)
 

@@ -63,7 +63,7 @@ def _muscle(patient: str) -> Muscle:
 def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:
     """The arm asked for; a hidden patient brings all that its joint does, and how it moves if asked for by `design`."""
     if hidden_seed is None:
-        return arms.with_laws(arms.read(text), laws)
+        return arms.set_laws(arms.read(text), laws)
     if laws:
         raise ArmError("--arm-law: what the arm of a hidden patient does is hidden, too")
     if text == DESIGN:

@@ -10,7 +10,7 @@ import numpy as np
 
 from stimrig.identify.effects import get
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.effect_fit import effect_names, renewed_curve, with_effects
+from stimrig.identify.estimation.effect_fit import add_effects, effect_names, renewed_curve
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.plain import fitted_rows, prepare
 from stimrig.identify.methods import check_options, method_of
@@ -83,7 +83,7 @@ def fit(
             if against:
                 message = f"effects cannot be fitted with {' and '.join(against)}"
                 raise BadRequest(message, place="effects", fix="Use maximum-likelihood without this option.")
-            return _with_effects(record, wanted, names, options, progress or (lambda _share, _text: None))
+            return _fit_effects(record, wanted, names, options, progress or (lambda _share, _text: None))
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
             f"{method} finds no solution on this record ({error})", fix="Check that torque follows the pulses."
@@ -95,7 +95,7 @@ def fit(
         raise
 
 
-def _with_effects(
+def _fit_effects(
     record: Record, wanted: Sequence[str], fit_on: tuple[str, ...] | None, options: dict[str, Any], progress: Progress
 ) -> Model:
     """Maximum likelihood with the named effects, each in its most likely form or in the one given after a colon."""
@@ -128,7 +128,7 @@ def _with_effects(
     def tell(effect: str) -> None:
         progress(min(next(steps), len(wanted)) / (len(wanted) + 2), f"fitting {effect.replace('_', ' ')}")
 
-    base = with_effects(base, wanted, raw, tell)
+    base = add_effects(base, wanted, raw, tell)
     if "knots" not in options and (renewed := renewed_curve(base)) is not base:
         base, size = renewed, renewed.problem.setup.basis.size
         reasons[0] = f"spline of {size} coefficients, chosen again with the rows in which the joint moves"

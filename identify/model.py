@@ -13,7 +13,7 @@ from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, line
 from stimrig.identify.errors import BadModel
 from stimrig.identify.json_text import BadJson, json_value, parse
 from stimrig.identify.recruitment import Curve, basis_from_dict, landmarks
-from stimrig.identify.summary import Sheet, Shown, estimate, fit_words, held_out_label, quantity
+from stimrig.identify.summary import Sheet, Summarised, estimate, fit_words, held_out_label, quantity
 
 if TYPE_CHECKING:
     from stimrig.identify.records.record import Record
@@ -72,7 +72,7 @@ class Covariance:
 
 
 @dataclass(frozen=True, repr=False)
-class Model(Shown):
+class Model(Summarised):
     """A Hammerstein model, with or without effects.
 
     Parameters

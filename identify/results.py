@@ -13,7 +13,7 @@ from typing import Any, TypedDict
 from stimrig.identify.caution import caution
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
-from stimrig.identify.summary import Sheet, Shown, both_words, estimate, fit_words, probability, quantity, torque
+from stimrig.identify.summary import Sheet, Summarised, both_words, estimate, fit_words, probability, quantity, torque
 
 Row = Mapping[str, Any]
 VERDICTS = {
@@ -38,7 +38,7 @@ class FitStatistics(TypedDict):
     samples: int
 
 
-class Result(Shown):
+class Result(Summarised):
     """A dataclass that is shown, and written as JSON."""
 
     def to_dict(self) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class Diagnosis(Result):
         rows = [
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')} white, {slow} slow, sd"),
             ("the model", both_words(self.base)),
-            *[(str(row["effect"]), _found(row)) for row in self.missing],
+            *[(str(row["effect"]), _read_row(row)) for row in self.missing],
         ]
         if self.missing:
             rows.append(("with all", both_words(self.with_all)))
@@ -314,7 +314,7 @@ def _shares(rows: Sequence[Row]) -> str:
     return f"{', '.join(parts)} of the error above the noise" if parts else "nothing above the noise"
 
 
-def _found(row: Row) -> str:
+def _read_row(row: Row) -> str:
     text = (
         f"probability {probability(row['probability'])}, rms from {torque(row, 'rms_before_nm')} to "
         f"{torque(row, 'rms_after_nm')}, held out from {torque(row, 'held_out_rms_before_nm')} to "

@@ -71,7 +71,7 @@ def register_plotter(plotter: Plotter) -> None:
     _plotters[:] = [plotter]
 
 
-class Shown:
+class Summarised:
     """Base class of results that are printed and shown in notebooks."""
 
     def _sheet(self) -> Sheet:

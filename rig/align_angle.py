@@ -98,14 +98,14 @@ def _slopes(value: Array, half: int) -> Array:
     """Slope per sample at each one of an even stretch, by a parabola through `half` neighbours on either side."""
     width = 2 * half + 1
     if len(value) < width:
-        return _of_parabola(value, np.arange(len(value)))
+        return _parabola_slope(value, np.arange(len(value)))
     x = np.arange(-half, half + 1)
     middle = np.convolve(value, -x / np.sum(x * x), "valid")  # a parabola's slope in its centre is that of a line
     before, after = np.arange(half), np.arange(half + 1, width)
-    return np.concatenate([_of_parabola(value[:width], before), middle, _of_parabola(value[-width:], after)])
+    return np.concatenate([_parabola_slope(value[:width], before), middle, _parabola_slope(value[-width:], after)])
 
 
-def _of_parabola(value: Array, at: Numbers) -> Array:
+def _parabola_slope(value: Array, at: Numbers) -> Array:
     """Slope per sample of the parabola through these values, at some of them."""
     if len(value) < 2:
         return np.zeros(len(at))
@@ -165,29 +165,29 @@ def beside(
     if len(samples) < 2:
         return host_s, Alignment("regression", float("nan"), 0.0, 0.0)
     sensor_s = align.cell_time(samples["counter"].astype(np.int64), samples["stamp_s"], rate_hz)
-    if of_the_cell and (same := _of_same_frames(samples, torque)) is not None:
+    if of_the_cell and (same := _match_frames(samples, torque)) is not None:
         which, known_s = same
         line = align.robust_line(sensor_s[which], known_s)
         off_s = np.interp(sensor_s, sensor_s[which], known_s - line.at(sensor_s[which]))
         time_s = line.at(sensor_s) + off_s
         time_s[which] = known_s
-        return time_s, _told("cell", torque.error_ms, host_s, time_s, line.rate)
-    found, error_s, method = (one_bus and _by_order(samples, sensor_s, torque)) or _by_arrival(host_s, sensor_s)
+        return time_s, _attributes("cell", torque.error_ms, host_s, time_s, line.rate)
+    found, error_s, method = (one_bus and _align_order(samples, sensor_s, torque)) or _align_arrival(host_s, sensor_s)
     if one_bus and _stamped(samples) and _stamped(torque.samples):
-        line, stamps_error_s = _by_stamps(samples["stamp_s"], sensor_s, torque)
+        line, stamps_error_s = _align_stamps(samples["stamp_s"], sensor_s, torque)
         ends_s = sensor_s[[0, -1]]
         if np.max(np.abs(line.at(ends_s) - found.at(ends_s))) <= max(ONE_CLOCK_S, error_s):
             found, error_s, method = line, stamps_error_s, "stamps"
     time_s = found.at(sensor_s)
     error_ms = float(np.hypot(torque.error_ms, error_s * 1e3))
-    return time_s, _told(method, error_ms, host_s, time_s, found.rate)
+    return time_s, _attributes(method, error_ms, host_s, time_s, found.rate)
 
 
-def _told(method: Method, error_ms: float, host_s: Array, time_s: Array, rate: float) -> Alignment:
+def _attributes(method: Method, error_ms: float, host_s: Array, time_s: Array, rate: float) -> Alignment:
     return Alignment(method, error_ms, float(np.median(host_s - time_s)) * 1e3, (rate - 1) * 1e6)
 
 
-def _of_same_frames(samples: NDArray[Any], torque: Reference) -> tuple[NDArray[np.bool_], Array] | None:
+def _match_frames(samples: NDArray[Any], torque: Reference) -> tuple[NDArray[np.bool_], Array] | None:
     """Which samples came in the frame of a torque sample, and its time; None: fewer than two did.
 
     Both were read at once, so they have the same time of arrival. A frame with several torques was sent with the last.
@@ -203,7 +203,7 @@ def _stamped(samples: NDArray[Any]) -> bool:
     return len(samples) > 1 and bool(np.all(np.isfinite(stamp_s))) and bool(np.all(np.diff(stamp_s) >= 0))
 
 
-def _by_stamps(stamp_s: Array, sensor_s: Array, torque: Reference) -> tuple[Line, float]:
+def _align_stamps(stamp_s: Array, sensor_s: Array, torque: Reference) -> tuple[Line, float]:
     """Through the interface's stamps of both: a line from the sensor's clock to the stamps, one on to the test's."""
     on = align.robust_line(torque.samples["stamp_s"], torque.time_s)
     of = align.robust_line(sensor_s, stamp_s)
@@ -212,7 +212,7 @@ def _by_stamps(stamp_s: Array, sensor_s: Array, torque: Reference) -> tuple[Line
     return line, float(np.hypot(on.error_s, of.error_s))
 
 
-def _by_order(samples: NDArray[Any], sensor_s: Array, torque: Reference) -> tuple[Line, float, Method] | None:
+def _align_order(samples: NDArray[Any], sensor_s: Array, torque: Reference) -> tuple[Line, float, Method] | None:
     """Through the torques that came right before and after each angle; None: too few did, or too far apart.
 
     A sensor may keep step with the cell, so the place between the two does not average out.
@@ -247,7 +247,7 @@ def _fitted(sensor_s: Array, time_s: Array, period_s: float) -> Line:
     return line
 
 
-def _by_arrival(host_s: Array, sensor_s: Array) -> tuple[Line, float, Method]:
+def _align_arrival(host_s: Array, sensor_s: Array) -> tuple[Line, float, Method]:
     """Below the times of arrival, as `stimrig.rig.align` does without a sync line."""
     points = align.earliest(sensor_s, host_s)
     line = align.line_below(*points)
@@ -261,7 +261,7 @@ LARGEST_RAD = 2 * np.pi
 """No joint turns farther, however its sensor is mounted."""
 
 
-def of_journal(
+def read_angles(
     contents: JournalContents, header: dict[str, Any], torque: Reference, end_s: float
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Datasets by path and the attributes of their group; both empty without a sensor.

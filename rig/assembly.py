@@ -90,7 +90,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     pulse_times = np.sort(written_s[np.isfinite(written_s)])
     reference, alignment, measured_hz = _aligned(contents, t0_s, pulse_times, float(header["sample_rate_hz"]))
     columns.update(_torque(reference, end_s))
-    of_angle, angle = align_angle.of_journal(contents, header, reference, end_s)
+    of_angle, angle = align_angle.read_angles(contents, header, reference, end_s)
     columns.update(of_angle)
     segments = [s for s in segments if s.start / rate_hz < played_s]
     columns["segments/start_s"] = np.array([s.start / rate_hz for s in segments])
@@ -318,7 +318,7 @@ def read_intents(contents: JournalContents) -> list[Intent]:
 
 
 def laid_blocks(contents: JournalContents) -> list[LaidBlock]:
-    return [LaidBlock.of_bytes(payload) for kind, payload in contents.blocks if kind == Kind.LAID]
+    return [LaidBlock.from_bytes(payload) for kind, payload in contents.blocks if kind == Kind.LAID]
 
 
 def planned_pulses(contents: JournalContents, header: dict[str, Any], notes: list[str]) -> tuple[Floats, list[Segment]]:
@@ -342,7 +342,7 @@ def _growth(contents: JournalContents) -> Iterator[tuple[int, LaidBlock | None]]
     """Pulses up to which all stayed as it was, and what was laid after them; None: only the end was written."""
     for kind, payload in contents.blocks:
         if kind == Kind.LAID:
-            block = LaidBlock.of_bytes(payload)
+            block = LaidBlock.from_bytes(payload)
             yield block.segment.start, block
         elif kind == Kind.EVENT and (event := json.loads(payload))["event"] == "ended":
             yield event["index"], None

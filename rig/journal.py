@@ -96,7 +96,7 @@ class LaidBlock:
         return _LENGTH.pack(len(described)) + described + self.pulse_width_us.astype("<f8").tobytes()
 
     @staticmethod
-    def of_bytes(payload: bytes) -> LaidBlock:
+    def from_bytes(payload: bytes) -> LaidBlock:
         start = _LENGTH.size + _LENGTH.unpack_from(payload)[0]
         content = json.loads(payload[_LENGTH.size : start])
         segment = Segment(content["name"], content["start"], content["end"], content["by"])

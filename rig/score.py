@@ -33,7 +33,7 @@ SAFE_END = SegmentPlan(name="rest", sequence="rest", settings={})
 
 
 @dataclass(frozen=True, slots=True)
-class Laid:
+class Layout:
     """Everything that is laid: widths in µs and whether each may jump there, shape (n,), and the segments."""
 
     pulse_width_us: NDArray[np.float64]
@@ -43,14 +43,14 @@ class Laid:
     def __len__(self) -> int:
         return len(self.pulse_width_us)
 
-    def cut(self, end: int) -> Laid:
+    def cut(self, end: int) -> Layout:
         kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
-        return Laid(self.pulse_width_us[:end], self.jumps[:end], tuple(kept))
+        return Layout(self.pulse_width_us[:end], self.jumps[:end], tuple(kept))
 
-    def with_piece(self, piece: Piece, by: jn.LaidBy) -> Laid:
+    def add_piece(self, piece: Piece, by: jn.LaidBy) -> Layout:
         end = len(self) + len(piece.pulse_width_us)
         added = jn.Segment(piece.of.name, len(self), end, by)
-        return Laid(
+        return Layout(
             np.concatenate([self.pulse_width_us, piece.pulse_width_us]),
             np.concatenate([self.jumps, np.full(len(piece.pulse_width_us), piece.jumps)]),
             (*self.segments, added),
@@ -77,9 +77,9 @@ class Score:
         self._checking = False
         at_start = test.pieces[:1] if self.adaptive else test.pieces
         self._fixed = deque(test.pieces[len(at_start) :])
-        self.laid = Laid(plan.NOTHING, np.empty(0, bool), ())
+        self.laid = Layout(plan.NOTHING, np.empty(0, bool), ())
         for piece in at_start:
-            self.laid = self.laid.with_piece(piece, "plan")
+            self.laid = self.laid.add_piece(piece, "plan")
         self._reached = -1
         self._end_at: int | None = None
         self._checked = 0
@@ -213,7 +213,7 @@ class Score:
         if after != len(self.laid):
             raise TooLateError(f"extend.after: {after}, but {len(self.laid)} pulses are laid; look again, then decide")
 
-    def _built_and_checked(self, laid: Laid, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
+    def _built_and_checked(self, laid: Layout, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
         """Behind what is laid; changes nothing, since it runs beside the sender."""
         before = len(laid)
         most = min(MAX_EXTENSION_SEGMENTS, plan.MAX_SEGMENTS - len(laid.segments) - len(self._fixed) - 1)
@@ -228,7 +228,7 @@ class Score:
         self._check(laid, built)
         return built
 
-    def _check(self, laid: Laid, added: Sequence[Piece]) -> None:
+    def _check(self, laid: Layout, added: Sequence[Piece]) -> None:
         """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
         before_us = laid.pulse_width_us
         plan.check_pieces(added, self.plan, self._table, before_us)
@@ -262,10 +262,10 @@ class Score:
             self._lay(Piece(SAFE_END, np.zeros(missing), jumps=False), "end", kept)
         self.ended_by, self._end_at = by, len(kept)
 
-    def _lay(self, piece: Piece, by: jn.LaidBy, before: Laid | None = None) -> None:
+    def _lay(self, piece: Piece, by: jn.LaidBy, before: Layout | None = None) -> None:
         """Write a piece to the journal, then show it to the sender."""
         before = self.laid if before is None else before
-        following = before.with_piece(piece, by) if len(piece.pulse_width_us) else before
+        following = before.add_piece(piece, by) if len(piece.pulse_width_us) else before
         block = jn.LaidBlock(
             jn.Segment(piece.of.name, len(before), len(following), by),
             piece.of.sequence,

@@ -41,7 +41,7 @@ class Trial:
     calibrating: bool = False
 
     @property
-    def told(self) -> str:
+    def reason_stopped(self) -> str:
         """Why it is stopped, and which device is gone, in words."""
         return self.reason if self.lost in self.reason else f"{self.reason}; {self.lost}".lstrip("; ")
 

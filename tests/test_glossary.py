@@ -19,6 +19,23 @@ ROWS = [
 ]
 
 
+RIDDLES = {
+    "laid",
+    "flight",
+    "handed",
+    "gathered",
+    "drawn",
+    "felt",
+    "told",
+    "tells",
+    "shown",
+    "found",
+    "opened",
+    "answers",
+}
+"""Words that no room is called by: they say nothing of what is in it."""
+
+
 @lru_cache
 def names() -> dict[str, set[str]]:
     """The words of which names of modules, classes and functions are made, and where each stands."""
@@ -60,3 +77,9 @@ def test_every_term_is_in_use() -> None:
         if not all(word.rstrip("s") in used or word in used for word in re.split(r"[ -]", row[0]))
     ]
     assert unused == []
+
+
+def test_rooms_are_called_by_what_is_in_them() -> None:
+    rooms = {path.stem for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
+    riddles = {room for room in rooms if set(room.split("_")) & RIDDLES or room.startswith(("by_", "of_", "with_"))}
+    assert riddles == set()

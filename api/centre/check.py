@@ -24,7 +24,7 @@ UNSEEN_S = 24 * 3600.0
 
 
 @dataclass(frozen=True)
-class Found:
+class CheckedFile:
     """One file that was read again."""
 
     sha256: str
@@ -45,7 +45,7 @@ def left_bytes(store: Store, before_utc: str) -> int:
 
 def check(
     store: Store, bucket: Bucket, clock: Clock, before_utc: str, seen: Callable[[int], object] | None = None
-) -> Iterator[Found]:
+) -> Iterator[CheckedFile]:
     """Check all files that were not checked since `before_utc`; each is noted when it is done, so a cut run goes on.
 
     Raises
@@ -61,7 +61,7 @@ def check(
             except MissingError:
                 ok, words = False, "it is not in the bucket"
             note(store, clock, after, ok, words)
-            yield Found(after, ok, "" if ok else words)
+            yield CheckedFile(after, ok, "" if ok else words)
 
 
 def note(store: Store, clock: Clock, sha256: str, ok: bool, words: str = "") -> None:

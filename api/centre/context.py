@@ -146,7 +146,7 @@ def build(settings: CentreSettings, clock: Clock | None = None) -> Context:
     if settings.time_zone:
         set_zone(settings.time_zone)
     bucket = ready_bucket(settings)
-    return Context(settings, clock, opened(settings), bucket)
+    return Context(settings, clock, open_store(settings), bucket)
 
 
 def ready_bucket(settings: CentreSettings) -> Bucket:
@@ -161,7 +161,7 @@ def ready_bucket(settings: CentreSettings) -> Bucket:
     return bucket
 
 
-def opened(settings: CentreSettings) -> Store:
+def open_store(settings: CentreSettings) -> Store:
     """The database. Raises ApiError, in whose line the centre's settings stand."""
     try:
         return Store(settings.database)

@@ -179,7 +179,7 @@ class Ingest:
 
     def _keep(self, session: Session, rig_id: int, chain: str, items: list[Item], now: str) -> None:
         """The items as they came; of a body that was told before, only its hash."""
-        known = _told(session, rig_id, [item.sent for item in items])
+        known = _known_items(session, rig_id, [item.sent for item in items])
         rows = []
         for item in items:
             sent = item.sent
@@ -213,7 +213,7 @@ def at(session: Session, rig_id: int, chain: str) -> Position:
     return Position(row.seq, row.hash) if row else NOWHERE
 
 
-def _told(session: Session, rig_id: int, sent: list[ItemIn]) -> set[tuple[str, str, str]]:
+def _known_items(session: Session, rig_id: int, sent: list[ItemIn]) -> set[tuple[str, str, str]]:
     """Kind, key and hash of what was told before, on this chain or another."""
     keys = sorted({storable(one.key) for one in sent})
     columns = (CentreItem.kind, CentreItem.key, CentreItem.sha256)

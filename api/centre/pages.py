@@ -64,10 +64,10 @@ async def rigs(request: Request, context: Ctx) -> Response:
         return await sign_in_page(request, context, "/")  # pyright: ignore[reportArgumentType]
     if not who.may(Scope.READ_MODEL):
         return problem_page(request, ApiError(403, "forbidden", "Not allowed", "This needs the scope read-model."))
-    return await shown(request, context)
+    return await rig_page(request, context)
 
 
-async def shown(request: Request, context: Context, key: dict[str, Any] | None = None) -> Response:
+async def rig_page(request: Request, context: Context, key: dict[str, Any] | None = None) -> Response:
     """The page; with a key that was just made, the only time its text is seen."""
     rows = await asyncio.to_thread(context.rigs.all)
     await context.count_warnings()
@@ -95,7 +95,7 @@ async def add(request: Request, context: Ctx, who: Administrator, name: Annotate
     """A new rig; its key is shown on the answering page only."""
     name = name.strip()[:80]
     key = await asyncio.to_thread(context.rigs.add, name, who.name)
-    return await shown(request, context, {"name": name, "key": key})
+    return await rig_page(request, context, {"name": name, "key": key})
 
 
 @router.post("/rigs/{name}/revoke")

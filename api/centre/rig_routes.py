@@ -15,7 +15,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.outbox.messages import BatchIn, HeadsOut, HelloIn, HelloOut, LackingFilesOut, PieceOut, PlaceOut
 from stimrig.api.store.centre_tables import CentreRig
 from stimrig.api.web.openapi import problem
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 
 BYTES = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 KEY = HTTPBearer(scheme_name="rig", description="a rig's key", auto_error=False)
@@ -45,14 +45,14 @@ def taken(model: Any) -> dict[str, Any]:
     return {"requestBody": {"required": True, "content": {"application/json": {"schema": schema}}}}
 
 
-@router.post("/hello", **answers(HelloOut), openapi_extra=taken(HelloIn))
+@router.post("/hello", **describe_answer(HelloOut), openapi_extra=taken(HelloIn))
 async def hello(request: Request, context: Ctx, rig: Rig) -> dict[str, Any]:
     """How the rig is; the newest item that the centre has of its chain."""
     raw = await request.body()
     return await asyncio.to_thread(lambda: context.ingest.hello(rig, read(HelloIn, raw)))
 
 
-@router.post("/items", **answers(PlaceOut), openapi_extra=taken(BatchIn))
+@router.post("/items", **describe_answer(PlaceOut), openapi_extra=taken(BatchIn))
 async def items(request: Request, context: Ctx, rig: Rig) -> dict[str, Any]:
     """A batch: all of it is taken, or nothing. What is known already is skipped."""
     raw = await request.body()
@@ -60,13 +60,13 @@ async def items(request: Request, context: Ctx, rig: Rig) -> dict[str, Any]:
     return {"seq": place.seq, "hash": place.hash}
 
 
-@router.get("/files", **answers(LackingFilesOut))
+@router.get("/files", **describe_answer(LackingFilesOut))
 def files(context: Ctx, rig: Rig, limit: Annotated[int, Query(ge=1, le=MOST_LISTED)] = 100) -> dict[str, Any]:
     """Files that items of this rig name and the centre lacks, oldest first."""
     return {"files": context.spool.lacking(rig, limit)}
 
 
-@router.get("/heads", **answers(HeadsOut))
+@router.get("/heads", **describe_answer(HeadsOut))
 def heads(
     context: Ctx, rig: Rig, chain: Annotated[str, Query(max_length=32)] = "",
     item: Annotated[int, Query(ge=0, le=2**53)] = 0,
@@ -75,7 +75,7 @@ def heads(
     return {"heads": context.heads.after(rig, chain, item)}
 
 
-@router.put("/files/{sha256}", **answers(PieceOut), openapi_extra={"requestBody": {"content": BYTES}})
+@router.put("/files/{sha256}", **describe_answer(PieceOut), openapi_extra={"requestBody": {"content": BYTES}})
 async def put(
     request: Request, context: Ctx, rig: Rig, sha256: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")],
     offset: Annotated[int, Query(ge=0, le=2**53)] = 0,

@@ -33,7 +33,7 @@ from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.store.centre_tables import CentreModel, CentreRecording, CentreRig
 from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.routes.operation import Figures
 
 operation = APIRouter(tags=["operation"])
@@ -43,7 +43,7 @@ HDF5 = "application/x-hdf5"
 SECRET = ("id", "key_hash", "key_prefix", "audit_hash")
 
 
-@operation.get("/health", **answers(CentreHealthOut))
+@operation.get("/health", **describe_answer(CentreHealthOut))
 def health(context: Ctx) -> dict[str, Any]:
     """`ok` where database and bucket answer; `degraded` where the bucket does not. Holds nothing of any participant."""
     with context.store.read() as session:
@@ -86,7 +86,7 @@ def figures(context: Context) -> Iterator[Metric]:
         yield GaugeMetricFamily(name, words, value)
 
 
-@v1.get("/participants", tags=["participants"], **answers(ParticipantsOut))
+@v1.get("/participants", tags=["participants"], **describe_answer(ParticipantsOut))
 def participants(
     context: Ctx, _who: ModelReader, q: Annotated[str, Query(max_length=32, description="the code begins so")] = "",
     rig: str | None = None, from_: Annotated[str | None, Query(alias="from", description="a day")] = None,
@@ -101,7 +101,7 @@ def participants(
     return {"participants": found, "after": last}
 
 
-@v1.get("/participants/{code}/sessions", tags=["participants"], **answers(SessionsOut))
+@v1.get("/participants/{code}/sessions", tags=["participants"], **describe_answer(SessionsOut))
 def sessions(
     context: Ctx, _who: ModelReader, code: str, before: str | None = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
@@ -124,7 +124,7 @@ async def model_file(context: Ctx, _who: ModelReader, rig: str, model_id: str) -
     return await hand_out(context, row.file, f"{row.participant}-{row.id}.json", "application/json")
 
 
-@v1.get("/recordings", tags=["recordings"], **answers(RecordingsOut))
+@v1.get("/recordings", tags=["recordings"], **describe_answer(RecordingsOut))
 def recordings(
     context: Ctx, _who: ModelReader, participant: str | None = None, rig: str | None = None,
     from_: Annotated[str | None, Query(alias="from", description="day or time (UTC), as 2026-11-23")] = None,
@@ -171,18 +171,18 @@ class RigIn(BaseModel):
     name: Annotated[str, StringConstraints(min_length=1, max_length=60)]
 
 
-def shown(row: CentreRig) -> dict[str, Any]:
+def rig_document(row: CentreRig) -> dict[str, Any]:
     """A rig, without what is nobody's business."""
     return {name: value for name, value in row.as_dict().items() if name not in SECRET}
 
 
-@v1.get("/rigs", tags=["rigs"], **answers(list[RigOut]))
+@v1.get("/rigs", tags=["rigs"], **describe_answer(list[RigOut]))
 def list_rigs(context: Ctx, _who: ModelReader) -> list[dict[str, Any]]:
     """All rigs, by name."""
-    return [shown(row) for row in context.rigs.all()]
+    return [rig_document(row) for row in context.rigs.all()]
 
 
-@v1.post("/rigs", tags=["rigs"], status_code=201, **answers(RigKeyOut, 201, "added"))
+@v1.post("/rigs", tags=["rigs"], status_code=201, **describe_answer(RigKeyOut, 201, "added"))
 def add_rig(context: Ctx, who: Administrator, body: RigIn) -> dict[str, Any]:
     """A new rig, or a new key for one whose key was revoked. The key's text is shown this once."""
     return {"name": body.name, "key": context.rigs.add(body.name, who.name)}
@@ -194,7 +194,7 @@ def revoke_rig(context: Ctx, who: Administrator, name: str) -> None:
     context.rigs.revoke(name, who.name)
 
 
-@v1.get("/warnings", tags=["rigs"], **answers(list[WarningOut]))
+@v1.get("/warnings", tags=["rigs"], **describe_answer(list[WarningOut]))
 def list_warnings(
     context: Ctx, _who: ModelReader, acknowledged: bool = False, before: Annotated[int | None, Query(ge=1)] = None
 ) -> list[dict[str, Any]]:

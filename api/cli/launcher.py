@@ -55,13 +55,13 @@ class Streams:
         if self._given_up or self.child.alive():
             return []
         if self._again_s is None:
-            return [self._told(now_s)]
+            return [self._say_death(now_s)]
         if now_s < self._again_s:
             return []
         self._spawn()
         return []
 
-    def _told(self, now_s: float) -> str:
+    def _say_death(self, now_s: float) -> str:
         if now_s - self.child.started_s > LASTED_S:
             self._deaths = 0
         process = self.child.process

@@ -19,7 +19,7 @@ from stimrig.api.cohort.export_state import FOLDER, State
 from stimrig.api.cohort.parquet import STATUS, record_row, segment_at
 from stimrig.api.cohort.whole_record import WholeRecord
 from stimrig.api.version import software_version
-from stimrig.identify.records.cells import told
+from stimrig.identify.records.cells import cell_text
 
 Words = dict[str, dict[str, Any]]
 
@@ -234,7 +234,7 @@ def cell(value: Any) -> str:
         return "n/a"
     if isinstance(value, float):
         return repr(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)
-    return told(" ".join(str(value).split())) or "n/a"
+    return cell_text(" ".join(str(value).split())) or "n/a"
 
 
 def tsv(columns: Iterable[str], rows: Iterable[dict[str, Any]]) -> Iterator[str]:

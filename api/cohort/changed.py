@@ -62,11 +62,11 @@ class Changes:
         if old is None or new is None:
             for row, names in ((old, self.only_old), (new, self.only_new)):
                 if row is not None:
-                    names.append(_shown(row))
+                    names.append(_in_words(row))
         elif why := list(differences(old, new)):
             day = None if new["day"] is None else new["day"].isoformat()
             kinds = sorted({kind for kind, _ in why}, key=KINDS.index)
-            about = {"record": _shown(new), "participant": new["participant"], "day": day}
+            about = {"record": _in_words(new), "participant": new["participant"], "day": day}
             self.rows.append({**about, "kinds": kinds, "why": [words for _, words in why]})
         else:
             self.same += 1
@@ -143,7 +143,7 @@ def _options(file: Path) -> dict[str, Any]:
     return {name: options.get(name) for name in OPTIONS}
 
 
-def _shown(row: Row) -> str:
+def _in_words(row: Row) -> str:
     return str(row["record_id"] or row["name"] or row["address"])
 
 

@@ -132,7 +132,7 @@ def _fit(record: Any, task: Task) -> Row:
         "verdict": quality["verdict"],
         "reasons": list(quality.get("reasons") or []),
         "effects": [_effect(effect) for effect in document["effects"]],
-        "parameters": _of_model(document),
+        "parameters": _model_parameters(document),
     }
 
 
@@ -166,7 +166,7 @@ def _improve(record: Any, _task: Task) -> Row:
         "verdict": found["verdict"],
         "reasons": [step["reason"] for step in steps[1:]],
         "effects": [_effect(effect) for effect in document["effects"]],
-        "parameters": _of_model(document),
+        "parameters": _model_parameters(document),
         "steps": [{name: step[name] for name in ("added", *OF_STEP)} for step in steps],
         "refused": [{name: row[name] for name in ("effect", "log_evidence_gain")} for row in found["refused"]],
     }  # fmt: skip
@@ -185,7 +185,7 @@ def _effect(found: Mapping[str, Any]) -> Row:
     }
 
 
-def _of_model(document: Mapping[str, Any]) -> list[Row]:
+def _model_parameters(document: Mapping[str, Any]) -> list[Row]:
     """Parameters of a MODEL.json: what a person reads off it, and those of its effects."""
     found = _parameters(MODEL, document.get("figures") or document["uncertainty"].get("figures") or {})
     for effect in document["effects"]:

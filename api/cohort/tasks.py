@@ -70,10 +70,10 @@ OPTIONS = tuple(field.name for field in fields(Task))
 def differing(before: dict[str, Any], now: dict[str, Any]) -> str:
     """Words on how the options of two runs differ; empty if they don't."""
     names = [name for name in OPTIONS if now.get(name) != before.get(name)]
-    return ", ".join(f"{name} {_shown(before.get(name))}, now {_shown(now.get(name))}" for name in names)
+    return ", ".join(f"{name} {_in_words(before.get(name))}, now {_in_words(now.get(name))}" for name in names)
 
 
-def _shown(value: Any) -> str:
+def _in_words(value: Any) -> str:
     return ", ".join(map(str, value)) or "none" if isinstance(value, list) else str(value) if value else "none"
 
 

@@ -46,7 +46,7 @@ NOT_SHOWN = {
     "Field",
     "Query",
     "Header",
-    "answers",
+    "describe_answer",
     "published",
     "problem",
     "compile",

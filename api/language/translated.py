@@ -163,7 +163,7 @@ def _one(language: str, text: str, value: Value) -> str | None:
     tail = text[len(body) :]
     for given, end in ((text, ""), (body, tail)):
         for form, before, after in _forms(given):
-            found = _exact(language, form) or _by_pattern(language, form, value)
+            found = _exact(language, form) or _fit_pattern(language, form, value)
             if found is not None:
                 found = found.removeprefix(before).removesuffix(after)
                 same = given[:1].isupper() and form[:1].islower()
@@ -194,7 +194,7 @@ def _written(language: str) -> frozenset[str]:
     return frozenset(str(entry.string) for entry in catalogue(language) if isinstance(entry.string, str))
 
 
-def _by_pattern(language: str, text: str, value: Value) -> str | None:
+def _fit_pattern(language: str, text: str, value: Value) -> str | None:
     for pattern in _candidates(language, text.strip(_AROUND).lower()):
         if pattern.literal in text and (fit := pattern.fit(text)) is not None:
             values = [

@@ -105,14 +105,14 @@ class Trend:
     async def for_models(self, participant: str, model_ids: Sequence[str]) -> list[Session]:
         """Of each model the session in which its recording was made, with this model for it."""
         sessions, models = await asyncio.to_thread(self._read, participant)
-        found = [_with_model(sessions, models, model_id) for model_id in model_ids]
+        found = [_put_model(sessions, models, model_id) for model_id in model_ids]
         await self._complete(found)
         return found
 
     async def against(self, model: Model) -> tuple[Session, Session] | None:
         """The last approved session before the model's, and the model's with that model; None where there is none."""
         sessions, models = await asyncio.to_thread(self._read, model.participant)
-        own = _with_model(sessions, models, model.id)
+        own = _put_model(sessions, models, model.id)
         before = [
             one for one in sessions if one.at_utc < own.at_utc and one.approval is not None and one.key != own.key
         ]
@@ -148,7 +148,7 @@ class Trend:
         if not old:
             return
         known = await asyncio.to_thread(self._known, [one.model.id for one in old])
-        await asyncio.gather(*(self._found(one) for one in old if one.model.id not in known))
+        await asyncio.gather(*(self._read_document(one) for one in old if one.model.id not in known))
         for one in old:
             one.figures = known.get(one.model.id) or one.figures
 
@@ -156,7 +156,7 @@ class Trend:
         rows = self.store.all(Analysis, Analysis.kind == KEPT_AS, Analysis.model_id.in_(ids))
         return {row.model_id: row.document for row in rows}
 
-    async def _found(self, one: Session) -> None:
+    async def _read_document(self, one: Session) -> None:
         """Read the model's whole document, once: without standard deviations where a worker cannot make them."""
         row = await asyncio.to_thread(self.store.get, Model, one.model.id)
         try:
@@ -194,7 +194,7 @@ def _tests(participant: str) -> Any:
     return select(*columns).where(Test.participant == participant).order_by(Test.requested_utc)
 
 
-def _with_model(sessions: list[Session], models: dict[str, Row[Any]], model_id: str) -> Session:
+def _put_model(sessions: list[Session], models: dict[str, Row[Any]], model_id: str) -> Session:
     """A model's session, with this model for it."""
     row = models[model_id]
     return replace(next(one for one in sessions if one.key == _key(row)), model=row, figures={})

@@ -160,7 +160,7 @@ def telling(row: Table) -> Telling | None:
     if isinstance(row, Recording):
         return _recording(row)
     if isinstance(row, Model | Tracked):
-        return _with_document(row)
+        return _add_document(row)
     if isinstance(row, AuditEntry):
         body = {"seq": row.seq, "hash": row.hash, "previous_hash": row.previous_hash, "at_utc": row.at_utc}
         return Telling("audit", str(row.seq), body)
@@ -197,7 +197,7 @@ def length_of(path: Path) -> int | None:
     return None
 
 
-def _with_document(row: Model | Tracked) -> Telling:
+def _add_document(row: Model | Tracked) -> Telling:
     kind, key = ("model", row.id) if isinstance(row, Model) else ("tracked", row.test_id)
     body = _bounded(_without(row, "document"))
     if row.document is None or row.etag is None or not SHA256.fullmatch(row.etag):

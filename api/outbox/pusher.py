@@ -337,7 +337,7 @@ class Collecting:
         self.asked = True
         try:
             given = self.link.heads(*self._after)
-            kept = self._of_ours(given)
+            kept = self._keep_ours(given)
             if kept:
                 receipts.append(self.path, kept)
         except (RefusedError, OSError) as error:
@@ -348,7 +348,7 @@ class Collecting:
         self.asked = not kept
         return bool(kept)
 
-    def _of_ours(self, given: list[Receipt]) -> list[Receipt]:
+    def _keep_ours(self, given: list[Receipt]) -> list[Receipt]:
         """Those of items that this rig has told, each once: a centre that makes up others fills no disk."""
         place = tuple_(OutboxItem.chain, OutboxItem.seq).in_([(one.chain, one.item) for one in given])
         columns = (OutboxItem.chain, OutboxItem.seq, OutboxItem.id)

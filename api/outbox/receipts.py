@@ -111,7 +111,7 @@ def standing(entries: Sequence[AuditEntry], noted: Sequence[Receipt]) -> Standin
     return Standing(min(broken, default=None), missing and missing.seq, differs, missing)
 
 
-def of_folder(entries: Sequence[AuditEntry], folder: Path) -> Standing:
+def check_folder(entries: Sequence[AuditEntry], folder: Path) -> Standing:
     """`standing` with the receipts in a data folder; their signatures are left to `stimrig audit verify`."""
     return standing(entries, [one for path in files(folder) for _, one in read(path) if one is not None])
 

@@ -26,7 +26,7 @@ ANGLES = ("angle/time_s", "angle/angle_rad")
 """Only of a rig with an angle sensor."""
 
 
-def drawn(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
+def page_curves(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """The curves a page draws: measured, predicted, commanded, and the step response."""
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))

@@ -59,10 +59,10 @@ def read(
     try:
         return join(records, [begun(path) for path in paths])
     except identify.BadRecord as error:
-        raise _by_name(error, len(records), called) from error
+        raise _name_file(error, len(records), called) from error
 
 
-def _by_name(error: Any, count: int, called: Callable[[int], str]) -> Any:
+def _name_file(error: Any, count: int, called: Callable[[int], str]) -> Any:
     """The same error, the file called by its name and not by its number."""
     numbers = {f"recording {number + 1}": number for number in range(count)}
     if error.place not in numbers:

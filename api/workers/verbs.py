@@ -14,7 +14,7 @@ import numpy as np
 from stimrig import identify
 from stimrig.api.structure import held_by
 from stimrig.api.workers import adaptive_verbs, tracking_verbs
-from stimrig.api.workers.curves import comparison, drawn, recorded
+from stimrig.api.workers.curves import comparison, page_curves, recorded
 from stimrig.api.workers.json_values import clean
 from stimrig.api.workers.recordings import export_csv, find_recording, joined, plain_csv
 
@@ -230,7 +230,7 @@ OWN = (
 )  # fmt: skip
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     **{verb.__name__: verb for verb in OWN},
-    "curves": drawn,
+    "curves": page_curves,
     "join": joined,
     **adaptive_verbs.VERBS,
     **tracking_verbs.VERBS,

@@ -70,7 +70,7 @@ def read(text: str) -> Arm:
     raise ArmError(f"--arm {text}: neither a file nor one of {', '.join(MOVERS)}")
 
 
-def with_laws(arm: Arm, texts: Sequence[str]) -> Arm:
+def set_laws(arm: Arm, texts: Sequence[str]) -> Arm:
     """The arm with other laws, each as `PLACE=NAME[,PARAMETER=NUMBER…]`.
 
     Raises

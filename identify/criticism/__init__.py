@@ -192,7 +192,7 @@ def _error_shares(
         "time": _spans(record.time_s - record.time_s[0]),
     }
     tables = {kind: _table(groups, residual_nm, noise_sd_nm, counted) for kind, groups in kinds.items()}
-    return tables | {"frequency": _by_frequency(record.sample_rate_hz, residual_nm, noise_sd_nm, counted)}
+    return tables | {"frequency": _frequency_rows(record.sample_rate_hz, residual_nm, noise_sd_nm, counted)}
 
 
 def _levels(width_us: np.ndarray) -> Groups:
@@ -228,7 +228,7 @@ def _table(groups: Groups, residual_nm: np.ndarray, noise_sd_nm: float, counted:
     ]
 
 
-def _by_frequency(
+def _frequency_rows(
     rate: float, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
 ) -> list[dict[str, Any]]:
     """By octave: root mean square of the residual and of white noise in each."""

@@ -27,13 +27,13 @@ from stimrig.identify.estimation.effect_fit import (
     BAND_COST,
     Candidate,
     add_effect,
+    add_effects,
     detected_effects,
     effect_names,
     fit_form,
     fit_from,
     renewed_curve,
     try_effect,
-    with_effects,
 )
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
 from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
@@ -118,8 +118,8 @@ def search_effects(
     """
     grid, raw = prepare(record)
     plain = fit_plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
-    search = EffectSearch(record, raw, plain, renewed_curve(with_effects(plain, structure, raw)))
-    start = _with_detected(search)
+    search = EffectSearch(record, raw, plain, renewed_curve(add_effects(plain, structure, raw)))
+    start = _add_detected(search)
     search.quiet = quiet_rows(start)
     search.append(start)
     for number in range(most):
@@ -137,7 +137,7 @@ def search_effects(
     return search
 
 
-def _with_detected(search: EffectSearch) -> Fitted:
+def _add_detected(search: EffectSearch) -> Fitted:
     """The base model with the effects that the samples show beyond doubt."""
     base = search.base
     for effect, shown, values in detected_effects(search.raw):
@@ -399,14 +399,14 @@ def still_needed(plain: Fitted, model: Model, raw: Raw, say: Progress) -> tuple[
         Called with the share done and a line of text.
     """
     judged: dict[str, Judged] = {}
-    full = _with_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
+    full = _add_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
     last = _reduced(full, raw, judged, lambda share, text: say(0.6 + 0.4 * share, text))
     if residual_structure(last, quiet_rows(last), raw.noise_sd_nm).left:
         judged = {name: _undecided(verdict) for name, verdict in judged.items()}
     return last, judged
 
 
-def _with_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
+def _add_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
     """The plain model with all effects of the earlier one that this record can hold; the others are judged.
 
     The effect that explains most is added first, then the next: a weak one that is fitted alone takes what belongs to

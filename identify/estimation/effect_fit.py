@@ -192,7 +192,7 @@ def detected_effects(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
     return found
 
 
-def with_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[str], None] | None = None) -> Fitted:
+def add_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[str], None] | None = None) -> Fitted:
     """The model with the named effects, each in its most likely form or in the one given after a colon.
 
     Of several forms, `id:one|another`, the first is fitted; when all effects are there, the likeliest of them is
@@ -234,7 +234,7 @@ def _form(effect: Effect, form: str) -> Form:
 def fitted_with(record: Record, wanted: Sequence[str]) -> Fitted:
     """The plain structure fitted to a record, with the named effects."""
     grid, raw = prepare(record)
-    return with_effects(fit_plain(grid, fitted_rows(grid, None)), wanted, raw)
+    return add_effects(fit_plain(grid, fitted_rows(grid, None)), wanted, raw)
 
 
 TIMES = 2

@@ -300,7 +300,7 @@ def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20) -> Fitted:
 
     The projected solution may be of fewer rows, where the joint moves in the others: see `still_rows`.
     """
-    solution = _with_zeros(solution, rows)
+    solution = _fill_zeros(solution, rows)
     setup = setup_of(solution, rows)
     problem = Problem(setup, [])
     size, linear = solution.projection.basis.size, solution.linear
@@ -322,7 +322,7 @@ def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20) -> Fitted:
     return max(fitted, solve(problem, theta, noise, most=most), key=lambda found: found.log_evidence)
 
 
-def _with_zeros(solution: Solution, rows: np.ndarray) -> Solution:
+def _fill_zeros(solution: Solution, rows: np.ndarray) -> Solution:
     """The solution with a zero for parts of which it has no row: the middle of their torque without pulses."""
     projection, grid = solution.projection, solution.projection.grid
     found = solution.coefficients.copy()

@@ -95,7 +95,7 @@ Columns = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
-class Found:
+class FileContent:
     """What a file of another tool holds.
 
     Parameters
@@ -128,13 +128,13 @@ class Found:
         """How errors call a cell: with the file."""
         return f"{self.name}, {self.cell(row, column)}"
 
-    def noting(self, *notes: str, **changes: object) -> Found:
+    def noting(self, *notes: str, **changes: object) -> FileContent:
         """The same with changes, and with more to say."""
         source = replace(self.source, notes=(*self.source.notes, *(note for note in notes if note)))
         return replace(self, source=source, **changes)  # pyright: ignore[reportArgumentType]
 
 
-def record_of(found: Found) -> Record:
+def record_of(found: FileContent) -> Record:
     """The record, with notes on all that was assumed. Raises BadRecord: with the place and what to do."""
     check_numbers(found.columns, found.at)
     found = _from_zero(without_holes(found))
@@ -180,7 +180,7 @@ def check_numbers(columns: Columns, at: Callable[[int, str], str]) -> None:
             raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=at(int(bad[0]), name), fix=fix)
 
 
-def without_holes(found: Found) -> Found:
+def without_holes(found: FileContent) -> FileContent:
     """Without the rows in which a number is missing: they are gaps like any other.
 
     Raises BadRecord: too many of them.
@@ -207,7 +207,7 @@ def without_holes(found: Found) -> Found:
     )
 
 
-def _from_zero(found: Found) -> Found:
+def _from_zero(found: FileContent) -> FileContent:
     """With times counted from the first sample where they are those of a calendar."""
     time_s = found.columns["time_s"]
     if not np.max(np.abs(time_s), initial=0.0) > bounds.LARGEST["time_s"]:

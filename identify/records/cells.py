@@ -17,13 +17,13 @@ FORMULA = re.compile(rf"(^ *|[;,] *)('*[{SIGNS}])")
 TOLD = re.compile(rf"(^ *|[;,] *)'('*[{SIGNS}])")
 
 
-def told(text: str) -> str:
+def cell_text(text: str) -> str:
     """A text as it stands in a cell."""
     return FORMULA.sub(r"\1'\2", text)
 
 
 def as_written(cell: str) -> str:
-    """The text that `told` made this cell of."""
+    """The text that `cell_text` made this cell of."""
     return TOLD.sub(r"\1\2", cell) if "'" in cell else cell
 
 
@@ -32,7 +32,7 @@ def cell(value: str | float | None) -> str:
     if value is None:
         return ""
     if isinstance(value, str):
-        return told(value)
+        return cell_text(value)
     return f"{value:.8g}" if isinstance(value, float) else str(value)
 
 

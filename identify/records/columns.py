@@ -174,7 +174,7 @@ def columns(header: Sequence[str], given: Given, units_row: Sequence[str], place
         below = units_row[index].strip() if index < len(units_row) else ""
         if plain[index] == target and target not in given and not below:
             columns[target] = Column(index)
-        elif (column := _with_unit(plain[index], target, index, below, given.get(target), place)) is not None:
+        elif (column := _convert_column(plain[index], target, index, below, given.get(target), place)) is not None:
             columns[target] = column
     _refuse_shared(plain, columns, place)
     return columns
@@ -190,7 +190,7 @@ def _refuse_shared(cells: Sequence[str], columns: Mapping[str, Column], place: s
         owner[column.index] = target
 
 
-def _with_unit(name: str, target: str, index: int, below: str, asked: Asked | None, place: str) -> Column | None:
+def _convert_column(name: str, target: str, index: int, below: str, asked: Asked | None, place: str) -> Column | None:
     """A column in its unit; None where nobody asked for it and its unit is not said."""
     if target == "segment":
         return Column(index, note="" if asked else f"segment is column {_short(name)!r}")

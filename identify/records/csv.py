@@ -19,7 +19,7 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns, join
-from stimrig.identify.records.assemble import PULSE_RATE_HZ, Found, check_widths, optional, record_of
+from stimrig.identify.records.assemble import PULSE_RATE_HZ, FileContent, check_widths, optional, record_of
 from stimrig.identify.records.cells import as_written
 from stimrig.identify.records.columns import MAY_LACK, Column, Given
 from stimrig.identify.records.record import Record, Source, joined_source
@@ -338,7 +338,7 @@ class Table:
         missing = np.isnan(values) if column in MAY_LACK else False
         bad = np.flatnonzero(~(np.abs(values) <= bounds.largest(column)) & ~np.asarray(missing))
         if bad.size:
-            shown = _shown(cells[bad[0]].strip())
+            shown = _show_cell(cells[bad[0]].strip())
             fix = "Remove the row's cause, or cut the record before it; values must be finite."
             fix = bounds.fix_of(column, values[bad], fix)
             raise BadRecord(
@@ -356,7 +356,7 @@ class Table:
                 continue
             cell, line = next(pair for pair in zip(cells, lines, strict=True) if sign in pair[0])
             other = f"after numbers with a decimal {'comma' if sign == '.' else 'point'}"
-            message = f"{_shown(cell)!r} {other if self.decimal else 'between separating commas'}"
+            message = f"{_show_cell(cell)!r} {other if self.decimal else 'between separating commas'}"
             fix = "Write all numbers with a decimal point, without signs between thousands."
             raise BadRecord(message, place=self.at(line, column), fix=fix)
 
@@ -366,7 +366,7 @@ class Table:
             return np.nan
         if is_number(cell):
             return float(cell)
-        message, fix = f"{_shown(cell)!r} is no number", "Give a number with a decimal point."
+        message, fix = f"{_show_cell(cell)!r} is no number", "Give a number with a decimal point."
         raise BadRecord(message, place=self.at(line, column), fix=fix)
 
     def _new_name(self, text: str, line: int) -> int:
@@ -384,7 +384,7 @@ class Table:
         return f"{self.name}, line {line}, column {column}"
 
 
-def _shown(cell: str) -> str:
+def _show_cell(cell: str) -> str:
     return cell if len(cell) <= 40 else f"{cell[:40]}…"
 
 
@@ -405,7 +405,7 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
         place = f"{name}, line {layout.line + 1}"
         raise BadRecord("no row under the header", place=place, fix="Give a few seconds of data.")
     source = Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=_notes(encoded, layout, table, known))
-    found = Found(
+    found = FileContent(
         columns={column: np.array(values) for column, values in table.numbers.items()},
         segment=np.array(table.segment) if "segment" in known else None,
         names=list(table.names),
@@ -442,7 +442,7 @@ def _cells_of_parts(header: list[str], known: dict[str, Column], place: str) -> 
     return {column: header.index(column) for column in join.CELLS if column in header}
 
 
-def _joined(found: Found, table: Table, pulse_rate_hz: float | None) -> Record:
+def _joined(found: FileContent, table: Table, pulse_rate_hz: float | None) -> Record:
     """A record that was joined: its times are taken as they are written."""
     for column, values in found.columns.items():
         if (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[column]))).size:

@@ -18,7 +18,7 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns
-from stimrig.identify.records.assemble import PULSE_RATE_HZ, Found, record_of
+from stimrig.identify.records.assemble import PULSE_RATE_HZ, FileContent, record_of
 from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS
 from stimrig.identify.records.columns import Column, Given
 from stimrig.identify.records.record import Record, Source
@@ -290,7 +290,7 @@ def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
         bounds.check_rate(pulse_rate_hz, f"{name}, {RATE}")
     notes = "; ".join(column.note for column in found.values() if column.note)
     source = Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=(notes,) if notes else ())
-    return record_of(Found(numbers, segment, names, name, cell, source, pulse_rate_hz or PULSE_RATE_HZ))
+    return record_of(FileContent(numbers, segment, names, name, cell, source, pulse_rate_hz or PULSE_RATE_HZ))
 
 
 def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, Mapping[str, Variable], Given]:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.summary import Sheet, Shown, quantity
+from stimrig.identify.summary import Sheet, Summarised, quantity
 
 HELD_OUT = "validate"
 """Rows of this segment are never used to fit or to choose an effect; they may only speak against one."""
@@ -92,7 +92,7 @@ class Pulses:
 
 
 @dataclass(frozen=True, repr=False)
-class Record(Shown):
+class Record(Summarised):
     """Pulse widths applied and torque measured, uniformly sampled.
 
     Parameters

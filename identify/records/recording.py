@@ -66,7 +66,7 @@ def read_pulses(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: 
     sound = sent.sound
     # Even slots, late by what the promptest pulses were late together.
     lag = float(np.quantile((sent.written - sent.planned)[sound], PROMPT)) if sound.any() else 0.0
-    late, unsure, extra_s = _felt(sent, time_s, sync)
+    late, unsure, extra_s = _pulse_lateness(sent, time_s, sync)
     may = sent.width > 0
     wild = ~(np.abs(late) <= LONGEST_LATE_S)
     unsure = may & (unsure | wild)
@@ -98,9 +98,9 @@ def _sent(file: StrictFile, name: str, interval_s: float) -> _Sent:
     return _Sent(planned, sent, written, acknowledged, status, interval_s)
 
 
-def _felt(sent: _Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pulse_lateness(sent: _Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lateness of each pulse behind the promptest, s; whether it is unsure; times of pulses that nobody asked for."""
-    late, unsure = _by_host(sent)
+    late, unsure = _host_lateness(sent)
     seen = _edges(time_s, sync)
     found = None if seen is None else _matched(sent, *seen)
     if seen is None or found is None:
@@ -119,7 +119,7 @@ def _felt(sent: _Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray
     return late, np.where(shown, False, unsure | watched), extra_s
 
 
-def _by_host(sent: _Sent) -> tuple[np.ndarray, np.ndarray]:
+def _host_lateness(sent: _Sent) -> tuple[np.ndarray, np.ndarray]:
     """Lateness and doubt by writing and acknowledgement alone."""
     sound = sent.sound & np.isfinite(sent.acknowledged)
     middle = 0.5 * (sent.written + sent.acknowledged)

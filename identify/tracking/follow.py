@@ -157,7 +157,7 @@ def follow(
     before = begin(model, rates) if state is None else state
     rest_s = rest_before(before, record, rest_s)
     begun = rested(model, before.effects, rest_s)
-    seen = look(with_states(model, begun), before, record)
+    seen = look(set_states(model, begun), before, record)
     if seen.came < GONE and seen.wanted_nm > ENOUGH * float(np.ptp(model.recruitment.table()[1])):
         after, distance, outcome = replace(before, trials=before.trials + 1), None, Outcome.NO_TORQUE
     elif not (seen.misfit <= UNEXPLAINED):
@@ -165,7 +165,7 @@ def follow(
         outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
     else:
         after, distance = updated(before, seen.vector, seen.information)
-        outcome = Outcome.ODD if after.odd is not None else _told(seen)
+        outcome = Outcome.ODD if after.odd is not None else _describe(seen)
     after = passed(model, replace(after, effects=begun), record, 0.0)
     next_s = rest_s if before.trials or rest_s is None else min(rest_s, USUAL_REST_S)
     coming = rested(model, after.effects, next_s)
@@ -173,7 +173,7 @@ def follow(
     return Step(outcome, seen, before, after, after.ahead(rates), distance, effects)
 
 
-def _told(seen: Seen) -> Outcome:
+def _describe(seen: Seen) -> Outcome:
     own = seen.information[:LEVELS, :LEVELS] + np.diag(1e-3 / LITTLE**2)
     little = np.all(np.sqrt(np.diag(np.linalg.inv(own))) > LITTLE)
     return Outcome.LITTLE if little else Outcome.FOLLOWED
@@ -220,7 +220,7 @@ def slow_forms(model: Model) -> dict[str, tuple[Form, dict[str, Any]]]:
     return found
 
 
-def with_states(model: Model, states: Mapping[str, float]) -> Model:
+def set_states(model: Model, states: Mapping[str, float]) -> Model:
     """The model with its effects' states at the begin of what is predicted."""
     if not states:
         return model
@@ -262,7 +262,7 @@ def passed(model: Model, state: State, record: Record, rest_s: float | None = No
     if not slow_forms(model):
         return state
     begun = rested(model, state.effects, rest_before(state, record, rest_s))
-    problem, theta = placed(with_states(model, begun), state.mean[state.seen], make_grid(record))
+    problem, theta = placed(set_states(model, begun), state.mean[state.seen], make_grid(record))
     return replace(state, effects=problem.states(theta), ended_s=_end_s(record))
 
 
@@ -323,5 +323,5 @@ def moved_model(
     sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
     own = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
     # What was known of the approved model's own parameters holds for none of the moved ones.
-    begun = with_states(model, effects or {})
+    begun = set_states(model, effects or {})
     return begun.with_(recruitment=moved_curve(own, values), linear=linear, covariance=None, bands={})

@@ -67,7 +67,7 @@ class Server:
         self._loop = asyncio.get_running_loop()
         self.rig, self._ask = rig, ask
         self._previews = Previews(rig.table, rig.speed)
-        if await _answers(path):
+        if await _is_listening(path):
             raise ConfigError(f"socket: {path}: another rig is listening there; stop it or use another path")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -197,7 +197,7 @@ class Server:
         return self.rig.status()
 
 
-async def _answers(path: Path) -> bool:
+async def _is_listening(path: Path) -> bool:
     """Whether a process is listening on that socket."""
     try:
         _, writer = await asyncio.open_unix_connection(path)

@@ -67,7 +67,7 @@ class AngleCalibrating:
             if content is None:
                 return
             if content["sensor"] == self._sensor:
-                self.calibration = _of_its_poses(AngleCalibration.model_validate(content["calibration"]))
+                self.calibration = _check_poses(AngleCalibration.model_validate(content["calibration"]))
             else:
                 log.warning("%s: made with another sensor; take two poses again", self._file.path)
         except (OSError, ValueError, KeyError) as error:
@@ -149,7 +149,7 @@ def _slope(first: AnglePose, second: AnglePose) -> float:
     return (second.angle_rad - first.angle_rad) / apart if apart else float("inf")
 
 
-def _of_its_poses(kept: AngleCalibration) -> AngleCalibration:
+def _check_poses(kept: AngleCalibration) -> AngleCalibration:
     """A calibration out of its file, if it is what its two poses make: a digit that changed is noticed, too.
 
     Raises

@@ -52,12 +52,12 @@ def live_event(
         torque_age_s=max(0.0, receiver.age_s(now_s)),
         lost_samples=receiver.counts.lost_samples,
         samples=_samples(found, origin_s) if samples else None,
-        **({} if angle is None else _of_angle(angle, origin_s, samples)),
-        **(IDLE if run is None else _of_run(run, now_s, samples)),
+        **({} if angle is None else _angle_fields(angle, origin_s, samples)),
+        **(IDLE if run is None else _run_fields(run, now_s, samples)),
     )
 
 
-def _of_run(run: TestRun, now_s: float, samples: bool) -> dict[str, Any]:
+def _run_fields(run: TestRun, now_s: float, samples: bool) -> dict[str, Any]:
     rate_hz, laid = run.plan.pulse_rate_hz, run.score.laid
     reached = 0 if run.t0_s is None else int(np.floor((now_s - run.t0_s) * rate_hz)) + 1
     pulses = range(run.told_pulses, max(run.told_pulses, min(reached, len(laid))))
@@ -93,7 +93,7 @@ def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
     )
 
 
-def _of_angle(angle: AngleReceiver, origin_s: float, samples: bool) -> dict[str, Any]:
+def _angle_fields(angle: AngleReceiver, origin_s: float, samples: bool) -> dict[str, Any]:
     """The newest angle, and all since the last event if they are wanted."""
     rows: list[list[float | None]] = []
     while angle.live:

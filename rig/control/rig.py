@@ -92,7 +92,7 @@ class Rig:
         seen = receiver is not None and receiver.last_s is not None
         return Status(
             state=trial.state,
-            reason=trial.told,
+            reason=trial.reason_stopped,
             latch=self.state.latch,
             test_id=trial.test_id,
             participant=trial.participant,

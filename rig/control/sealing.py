@@ -64,7 +64,9 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
         "pulses": int(felt.sum()) + int(np.sum(unseen_us > 0)),
         "dropped_pulses": int(np.sum(status == PulseStatus.DROPPED)),
         "charge_uc": float(np.sum(widths_us * currents_ma) + np.sum(unseen_us) * highest_ma) * 1e-3,
-        **_of_torque(columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][felt]),
+        **_torque_warnings(
+            columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][felt]
+        ),
         "dose_is_bound": doubtful > 0,
         "doubtful_pulses": doubtful,
     }
@@ -75,7 +77,7 @@ def _most(one: NDArray[Any], other: NDArray[Any], unknown: float) -> float:
     return max((float(value) for value in (*one, *other) if value > 0), default=unknown)
 
 
-def _of_torque(time_s: NDArray[Any], torque_nm: NDArray[Any], pulses_s: NDArray[Any]) -> dict[str, float]:
+def _torque_warnings(time_s: NDArray[Any], torque_nm: NDArray[Any], pulses_s: NDArray[Any]) -> dict[str, float]:
     known = np.isfinite(torque_nm)
     time_s, torque_nm = time_s[known], torque_nm[known]
     peak_nm = float(np.abs(torque_nm).max()) if len(torque_nm) else 0.0
@@ -99,7 +101,7 @@ def summary_of(recording: Recording, counted: dict[str, Any]) -> dict[str, Any]:
             "so the true dose may be lower"
         )
     return {
-        **({"angle": counted.get("angle", {}) | _of_joint(recording)} if recording.angle else {}),
+        **({"angle": counted.get("angle", {}) | _joint_warnings(recording)} if recording.angle else {}),
         "samples": len(recording.columns["torque/time_s"]),
         "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
         "alignment": {**asdict(alignment), "error_ms": finite(alignment.error_ms)},
@@ -107,7 +109,7 @@ def summary_of(recording: Recording, counted: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _of_joint(recording: Recording) -> dict[str, Any]:
+def _joint_warnings(recording: Recording) -> dict[str, Any]:
     angle_rad, error_ms = recording.columns["angle/angle_rad"], recording.angle["error_ms"]
     return {
         "samples": len(angle_rad),
@@ -120,7 +122,7 @@ def _of_joint(recording: Recording) -> dict[str, Any]:
 def warnings(recording: Recording) -> list[str]:
     """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
     alignment, attributes = recording.alignment, recording.attributes
-    found = [*_disturbed_line(recording), *_of_sensor(recording)]
+    found = [*_disturbed_line(recording), *_sensor_warnings(recording)]
     if attributes["journal_note"]:
         found.append(f"journal: {attributes['journal_note']}")
     nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
@@ -145,7 +147,7 @@ def warnings(recording: Recording) -> list[str]:
     return found
 
 
-def _of_sensor(recording: Recording) -> list[str]:
+def _sensor_warnings(recording: Recording) -> list[str]:
     """Warnings about an angle sensor that failed in a test that did not need it, or whose times are uncertain."""
     found = [
         f"{event['reason']}; the angle in this recording may be wrong or missing"

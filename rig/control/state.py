@@ -80,12 +80,14 @@ class State:
         """Raise LatchChangedError if the rig was stopped since `latch` was told: who asks has not seen it."""
         if latch == self.latch:
             return
-        if self.trial.told:
-            raise LatchChangedError(f"now: {self.trial.told}; look at the participant and the rig, then re-arm")
+        if self.trial.reason_stopped:
+            raise LatchChangedError(
+                f"now: {self.trial.reason_stopped}; look at the participant and the rig, then re-arm"
+            )
         raise LatchChangedError("the rig was stopped while this waited; look at the participant, then ask again")
 
     def change(self, trial: Trial) -> None:
-        if trial.told not in ("", self.trial.told):
+        if trial.reason_stopped not in ("", self.trial.reason_stopped):
             self._stops += 1
         changed = trial != self.trial or self._published != self.latch
         self.trial, self._published = trial, self.latch

@@ -66,8 +66,8 @@ def test_every_door_is_known() -> None:
 
 @given(st.text("=+-@\t\r\n'\uff1d;, a"))
 def test_a_text_is_told_as_text_and_read_back(text: str) -> None:
-    assert cells.as_written(cells.told(text)) == text
-    assert not runs(cells.told(text))
+    assert cells.as_written(cells.cell_text(text)) == text
+    assert not runs(cells.cell_text(text))
 
 
 @pytest.mark.parametrize("text", [*HOSTILE[:5], "\t=1", "\r=1"])
@@ -85,7 +85,7 @@ def test_a_number_stays_a_number() -> None:
 def test_a_joined_record(tmp_path: Path) -> None:
     record = named()
     write_joined(record, tmp_path / "joined.csv")
-    assert texts_of(tmp_path / "joined.csv", "segment", "name") >= {cells.told(text) for text in HOSTILE}
+    assert texts_of(tmp_path / "joined.csv", "segment", "name") >= {cells.cell_text(text) for text in HOSTILE}
     back = identify.read(tmp_path / "joined.csv")
     assert back.segment_names == record.segment_names
     assert np.array_equal(back.torque_nm, record.torque_nm), "negative ones, too"
@@ -128,7 +128,7 @@ def test_an_export(tmp_path: Path) -> None:
     for path in tables:
         texts_of(path)
     codes = texts_of(tmp_path / "out" / "participants.tsv", "code")
-    assert codes == {cells.told(f"{text}{number}") for number, text in enumerate(HOSTILE)}
+    assert codes == {cells.cell_text(f"{text}{number}") for number, text in enumerate(HOSTILE)}
     for path in (tmp_path / "out").rglob("*.tsv.gz"):
         assert all(is_number(cell) for cell in re.split(r"[\t\n]", gzip.decompress(path.read_bytes()).decode()[:-1]))
     assert "broken" in " ".join(texts_of(tmp_path / "out" / "errors.csv", "address"))

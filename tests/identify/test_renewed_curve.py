@@ -12,7 +12,7 @@ from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.diagnosis.result import steps
 from stimrig.identify.diagnosis.search import search_effects
-from stimrig.identify.estimation.effect_fit import fitted_with, renewed_curve, with_effects
+from stimrig.identify.estimation.effect_fit import add_effects, fitted_with, renewed_curve
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import fitted_rows, prepare
 from stimrig.identify.fitting import MOVING_JOINT
@@ -92,7 +92,7 @@ def test_a_model_that_does_not_know_of_the_joint_keeps_its_curve():
 @pytest.mark.parametrize("options", [{"recruitment": "power-series"}, {"recruitment": "sigmoid"}])
 def test_a_curve_that_is_no_smoothed_spline_stays_of_its_kind(options: dict[str, str]):
     grid, raw = prepare(whole())
-    base = with_effects(METHOD.start(grid, fitted_rows(grid, None), options)[0], ["passive_torque:linear"], raw)
+    base = add_effects(METHOD.start(grid, fitted_rows(grid, None), options)[0], ["passive_torque:linear"], raw)
     assert renewed_curve(base) is base
 
 

@@ -22,7 +22,7 @@ from stimrig.identify.records.record import Part, Record
 from stimrig.identify.simulation.predict import predict, problem_of
 from stimrig.identify.simulation.pulses import above_rest
 from stimrig.identify.tracking import State, begin, follow, model_for_next, moved_model, passed
-from stimrig.identify.tracking.follow import rested, slow_forms, with_states
+from stimrig.identify.tracking.follow import rested, set_states, slow_forms
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
@@ -76,7 +76,7 @@ def test_a_record_cut_in_two_with_its_state_is_the_uncut_one(plain: Model, effec
     quiet = 435
     before, after = record_of(WIDTHS[:quiet]), record_of(WIDTHS[quiet:])
     wanted = predict(model, record_of(WIDTHS))[quiet * PER :]
-    carried = with_states(model, passed(model, begin(model), before).effects)
+    carried = set_states(model, passed(model, begin(model), before).effects)
     assert predict(carried, after) == pytest.approx(wanted, abs=2e-3)
     if effect != "catch_like":  # that has worn off by then
         assert np.max(np.abs(predict(model, after) - wanted)) > 0.2
@@ -117,7 +117,7 @@ def test_a_state_that_is_none_is_refused_with_place_and_mend(plain: Model, state
 
 def test_on_its_own_record_a_model_begins_rested(plain: Model, tested: Record) -> None:
     model = having(plain, "fatigue", "fitness")
-    tired = with_states(model, {"fatigue": 0.8})
+    tired = set_states(model, {"fatigue": 0.8})
     assert np.array_equal(model.predict(tested), tired.predict(tested))
     trial = record_of(WIDTHS)
     assert not np.array_equal(model.predict(trial), tired.predict(trial))

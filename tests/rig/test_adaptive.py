@@ -181,7 +181,7 @@ def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
     laid_to, seen = 20, []
     for kind, payload in journal.read(rig.path).blocks:
         if kind == Kind.LAID:
-            block = LaidBlock.of_bytes(payload)
+            block = LaidBlock.from_bytes(payload)
             assert len(block.pulse_width_us) == block.segment.end - block.segment.start
             laid_to = block.segment.end
             seen.append(block.segment.by)

@@ -67,7 +67,11 @@ def verify(
     if as_json:
         say_json(found)
     else:
-        say("\n".join([*words(stands, entries), *wrong, *([f"{head}: {NO_HEAD}"] if missing else []), told(found)]))
+        say(
+            "\n".join(
+                [*words(stands, entries), *wrong, *([f"{head}: {NO_HEAD}"] if missing else []), length_words(found)]
+            )
+        )
     if not found["whole"]:
         raise typer.Exit(1)
 
@@ -95,7 +99,7 @@ def how(noted: Receipt) -> str:
     return f"countersigned by the centre on {noted.noted_utc}" if noted.key else f"noted on {noted.noted_utc}"
 
 
-def told(found: dict[str, Any]) -> str:
+def length_words(found: dict[str, Any]) -> str:
     """The trail's length and head, and against what it was held."""
     length = f"{found['entries']} entries; head {found['head']}"
     held = f"compared with {found['receipts']} receipts and noted heads; centre: {found['centre']}"
@@ -111,7 +115,7 @@ def heads(
     ] = None,
 ) -> None:
     """The trail's present end: number and hash of the newest entry, and when it was noted; for `verify --heads`."""
-    with opened(settings_of(data)) as store:
+    with open_store(settings_of(data)) as store:
         head = receipts.head(store, Clock())
     if output is None:
         say(head.model_dump_json(exclude_defaults=True))
@@ -169,7 +173,7 @@ def settings_of(data: Path | None) -> Settings:
     return Settings(**given(data_dir=data))
 
 
-def opened(settings: Settings) -> closing[Store]:
+def open_store(settings: Settings) -> closing[Store]:
     """The database, let go at the end of a `with` statement.
 
     Raises
@@ -188,7 +192,7 @@ def opened(settings: Settings) -> closing[Store]:
 
 def stored(settings: Settings) -> list[AuditEntry]:
     """The trail in the database, read only. Raises InputError."""
-    with opened(settings) as store:
+    with open_store(settings) as store:
         return store.all(AuditEntry, order=AuditEntry.seq)
 
 

@@ -17,7 +17,7 @@ from stimrig.api import owner_only
 from stimrig.api.centre import check as checking
 from stimrig.api.centre import clean
 from stimrig.api.centre.bucket import BucketError
-from stimrig.api.centre.context import CentreSettings, opened, ready_bucket
+from stimrig.api.centre.context import CentreSettings, open_store, ready_bucket
 from stimrig.api.centre.postgres import Cluster
 from stimrig.api.centre.rigs import Rigs
 from stimrig.api.centre.server import prepared, run
@@ -81,20 +81,20 @@ def serve(
     run(app, listener, lambda url: say(f"stimrig centre: {url}/ {head}", *sign_in_lines(url, *how)))
 
 
-def _opened(context: typer.Context, data: Path | None, database: str | None):
+def _open_store(context: typer.Context, data: Path | None, database: str | None):
     """Settings, and the database of the centre."""
     settings = CentreSettings(**{**(context.obj or {}), **given(data_dir=data, database_url=database)})
     if not {"data_dir", "database_url"} & settings.model_fields_set and not (settings.data_dir / "centre.db").exists():
         raise InputError(
             "no centre in ./centre. Give --data or --database as the centre has it, or its settings (docs/centre.md)."
         )
-    return settings, opened(settings)
+    return settings, open_store(settings)
 
 
 @contextmanager
 def _rigs(context: typer.Context, data: Path | None, database: str | None):
     """The rigs of the centre; in the end its database is let go."""
-    with closing(_opened(context, data, database)[1]) as store:
+    with closing(_open_store(context, data, database)[1]) as store:
         yield Rigs(store, Clock(), Guesses(Clock()))
 
 
@@ -136,7 +136,7 @@ def check(
     begun = since or clock.utc()
     if clean.label(begun, "") != begun:
         raise InputError(f"--since {begun}: give a time as 2026-11-23T08:00:00Z")
-    settings, store = _opened(context, data, database)
+    settings, store = _open_store(context, data, database)
     settings = settings.model_copy(update={"files": files}) if files else settings
     count, lost = 0, list[dict[str, str]]()
     try:
@@ -255,7 +255,7 @@ def _centre(folder: Path, port: int, database: str, token: str) -> Child:
 
 def _key(folder: Path, database: str, name: str) -> str:
     """A new key for a rig; one from before is revoked."""
-    with closing(opened(CentreSettings(data_dir=folder / "centre", database_url=database))) as store:
+    with closing(open_store(CentreSettings(data_dir=folder / "centre", database_url=database))) as store:
         rigs = Rigs(store, Clock(), Guesses(Clock()))
         if rigs.named(name) is not None:
             rigs.revoke(name, "demo")

@@ -202,7 +202,7 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "fails", str(error), "restore it from the backup (docs/install.md)")
         return
     entries = store.all(AuditEntry, order=AuditEntry.seq)
-    broken = receipts.of_folder(entries, settings.data_dir).first_broken
+    broken = receipts.check_folder(entries, settings.data_dir).first_broken
     store.close()
     if broken is None:
         yield Finding("database", "ok", f"opens; the chain of the audit trail's {len(entries)} entries is complete")

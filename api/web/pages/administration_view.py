@@ -52,7 +52,7 @@ async def show_page(request: Request, context: Context, key: dict[str, Any] | No
             "tokens": [token for token in people.list_tokens(context, None) if token["origin"] == "issued"],  # pyright: ignore[reportArgumentType]
             "entries": entries[: -NEWEST - 1 : -1],
             "count": len(entries),
-            "stands": receipts.of_folder(entries, context.settings.data_dir),
+            "stands": receipts.check_folder(entries, context.settings.data_dir),
             "centre": status.read(context.settings, context.clock.unix_s()),
         }
 

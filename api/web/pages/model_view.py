@@ -54,7 +54,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
         may_test=who.may(Scope.RUN_TEST),
         may_approve=who.may(Scope.APPROVE_MODEL),
         **{key: value for key, value in shown.items() if key != "figures"},
-        figures={**drawn(document, measured), **shown["figures"]},
+        figures={**draw_figures(document, measured), **shown["figures"]},
     )
 
 
@@ -70,7 +70,7 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
     }
 
 
-def drawn(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
+def draw_figures(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
     """The model's own figures; the first one low enough for the first screen."""
     figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
     first = {"overview": model_charts.overview(figures[model_charts.LARGE])} if model_charts.LARGE in figures else {}

@@ -24,7 +24,7 @@ router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 @router.get("/widths")
 async def show(request: Request, context: Ctx, _who: ModelReader, row: Version) -> Response:
     """The form."""
-    return await shown(request, context, row)
+    return await render_widths(request, context, row)
 
 
 @router.post("/widths")
@@ -38,8 +38,8 @@ async def invert(
     except ApiError as error:
         if error.status != 422:
             raise
-        return await shown(request, context, row, problem=error)
-    return await shown(request, context, row, found, file.filename if file else "")
+        return await render_widths(request, context, row, problem=error)
+    return await render_widths(request, context, row, found, file.filename if file else "")
 
 
 @router.post("/widths.csv")
@@ -58,7 +58,7 @@ def text_of(content: bytes) -> str:
         return content.decode("cp1252", errors="replace")
 
 
-async def shown(
+async def render_widths(
     request: Request, context: Context, row: Model, found: dict[str, Any] | None = None, name: str | None = None,
     problem: ApiError | None = None,
 ) -> Response:  # fmt: skip

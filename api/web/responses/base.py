@@ -71,6 +71,6 @@ def published(name: str, description: str) -> dict[str, Any]:
     return {"description": description, "content": {"application/json": {"schema": schema}}}
 
 
-def answers(model: Any, status: int = 200, description: str = "done", **more: Any) -> dict[str, Any]:
+def describe_answer(model: Any, status: int = 200, description: str = "done", **more: Any) -> dict[str, Any]:
     """Settings of a route whose answer is described, and not checked or changed on its way."""
     return {"response_model": None, "responses": {status: {"model": model, "description": description, **more}}}

@@ -19,7 +19,7 @@ from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepI
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
 from stimrig.api.web.routes import participants
 from stimrig.rig import messages, requests
@@ -186,7 +186,7 @@ def _store(
     return found
 
 
-@router.post("", status_code=201, **answers(CalibrationOut, 201, "open; nothing was sent yet"))
+@router.post("", status_code=201, **describe_answer(CalibrationOut, 201, "open; nothing was sent yet"))
 async def begin_calibration(
     context: Ctx, who: Tester, code: str, response: Response, body: CalibrationIn | None = None
 ) -> dict[str, Any]:  # fmt: skip
@@ -208,7 +208,7 @@ async def begin_calibration(
         return tagged(response, await standing(context, code))
 
 
-@router.get("", **answers(CalibrationOut))
+@router.get("", **describe_answer(CalibrationOut))
 async def calibration(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
     """Where it stands: width, ceiling and whose it is, marks, what is missing, every train."""
     return tagged(response, await standing(context, code))
@@ -220,7 +220,7 @@ def tagged(response: Response, found: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-@router.post("/step", status_code=202, **answers(CalibrationOut, 202, "the train is on its way"))
+@router.post("/step", status_code=202, **describe_answer(CalibrationOut, 202, "the train is on its way"))
 async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, response: Response) -> dict[str, Any]:
     """Play one train: wider (`up`, or `fine` by a fine step), narrower, or the same again.
 
@@ -232,7 +232,7 @@ async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, respons
     return tagged(response, await standing(context, code))
 
 
-@router.post("/mark", **answers(CalibrationOut))
+@router.post("/mark", **describe_answer(CalibrationOut))
 async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response: Response) -> dict[str, Any]:
     """Mark the last train's width as a threshold; marking again replaces."""
     async with context.holds.turn(LIMITS_TURN):  # no train comes between looking and marking
@@ -244,7 +244,7 @@ async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response:
     return tagged(response, await standing(context, code))
 
 
-@router.post("/finish", **answers(CalibratedOut))
+@router.post("/finish", **describe_answer(CalibratedOut))
 async def finish_calibration(context: Ctx, who: Tester, code: str, body: FinishIn | None = None) -> dict[str, Any]:
     """Close it: the profile holds until the end of the day; `discard` leaves the old one."""
     # The rig keeps what was found until it is stored here: where that fails, finishing again stores it.

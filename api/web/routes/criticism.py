@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse
 from stimrig.api.sessions.requests import EffectsIn
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester, Version
-from stimrig.api.web.responses.base import answers, published
+from stimrig.api.web.responses.base import describe_answer, published
 from stimrig.api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
 from stimrig.api.workers.jobs import Job
 
@@ -31,7 +31,7 @@ async def comparison(
     return await context.analyses.comparison(row, recording)
 
 
-@router.get("/models/{model_id}/curves", **answers(CurvesOut))
+@router.get("/models/{model_id}/curves", **describe_answer(CurvesOut))
 async def curves(context: Ctx, _who: ModelReader, row: Version) -> dict[str, Any]:
     """The measured, predicted and commanded curves and the step response, thinned to what a screen shows."""
     return await context.analyses.curves(row)

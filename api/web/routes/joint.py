@@ -18,7 +18,7 @@ from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.seen import Seen
 from stimrig.api.store.tables import Model, Participant
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import VersionOut
 from stimrig.api.web.responses.rig import AngleOut, JointOverviewOut
 from stimrig.api.web.routes import participants
@@ -89,7 +89,7 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
     return context.jobs.start(FIT_TOGETHER, code, by, work)
 
 
-@router.get("/rig/angle", **answers(AngleOut))
+@router.get("/rig/angle", **describe_answer(AngleOut))
 async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
     about = seen.poses()
@@ -97,7 +97,7 @@ async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str,
     return (await context.rig.fresh_status()).angle.model_dump()
 
 
-@router.post("/rig/angle/pose", **answers(AngleOut))
+@router.post("/rig/angle/pose", **describe_answer(AngleOut))
 async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
     """Tell the angle that a goniometer shows, at two poses at least 0.5 rad apart; a third one begins anew."""
     sensor(context)
@@ -128,7 +128,7 @@ async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
     return status.angle.model_dump()
 
 
-@router.get("/participants/{code}/joint", **answers(JointOverviewOut))
+@router.get("/participants/{code}/joint", **describe_answer(JointOverviewOut))
 async def overview(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
     """Today's guided tests: which angles are still to be held, what was done, and the torque-time of all of them."""
     row = await asyncio.to_thread(participants.find, context, code)

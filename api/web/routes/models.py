@@ -18,7 +18,7 @@ from stimrig.api.store import seen
 from stimrig.api.store.tables import Model, Participant
 from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
-from stimrig.api.web.responses.base import answers, published
+from stimrig.api.web.responses.base import describe_answer, published
 from stimrig.api.web.responses.models import InversionOut, PredictionOut, TrackingOut, VersionOut
 from stimrig.api.web.routes import participants
 
@@ -77,7 +77,7 @@ def matches(if_none_match: str, etag: str) -> bool:
     return "*" in tags or etag in tags
 
 
-@router.get("/participants/{code}/tracking", **answers(TrackingOut))
+@router.get("/participants/{code}/tracking", **describe_answer(TrackingOut))
 def tracking(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     """The trials since the approval that holds, oldest first; 404 where no model is approved today."""
     found = context.tracked.document(code)
@@ -167,7 +167,7 @@ class WidthsIn(Body):
         return self
 
 
-@router.post("/models/{model_id}/prediction", **answers(PredictionOut))
+@router.post("/models/{model_id}/prediction", **describe_answer(PredictionOut))
 async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
     """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included.
 
@@ -194,7 +194,7 @@ class ReferenceIn(Body):
     whole_us: StrictBool = Field(True, description="whole µs")
 
 
-@router.post("/models/{model_id}/widths", **answers(InversionOut))
+@router.post("/models/{model_id}/widths", **describe_answer(InversionOut))
 async def widths(context: Ctx, _who: ModelReader, model_id: str, body: ReferenceIn) -> dict[str, Any]:
     """The pulse widths whose predicted torque follows a reference best, and where and why it is out of reach.
 

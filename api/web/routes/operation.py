@@ -21,13 +21,13 @@ from stimrig.api.outbox import status
 from stimrig.api.store.tables import AuditEntry, Model, Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx
 from stimrig.api.web.openapi import problem
-from stimrig.api.web.responses.base import SchemaOut, SchemasOut, answers
+from stimrig.api.web.responses.base import SchemaOut, SchemasOut, describe_answer
 from stimrig.api.web.responses.rig import HealthOut
 
 router = APIRouter(tags=["operation"])
 
 
-@router.get("/health", **answers(HealthOut))
+@router.get("/health", **describe_answer(HealthOut))
 def health(context: Ctx) -> dict[str, Any]:
     """`ok` where database and rig answer; `degraded` says what does not. Holds nothing of any participant."""
     with context.store.read() as session:
@@ -135,7 +135,7 @@ class SchemaResponse(JSONResponse):
     media_type = "application/schema+json"
 
 
-@schemas_router.get("", **answers(SchemasOut))
+@schemas_router.get("", **describe_answer(SchemasOut))
 def published() -> dict[str, Any]:
     """The schemas there are, by name, with their ids; an id ends in the version."""
     return {"schemas": {name: schemas.load(name)["$id"] for name in schemas.NAMES}}

@@ -24,7 +24,7 @@ from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.seen import Seen
 from stimrig.api.store.tables import Approval, Model, Participant, Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester, in_limits_turn
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 from stimrig.api.web.responses.rig import TestOut
 from stimrig.rig.messages import Status
@@ -140,7 +140,7 @@ def meanwhile(context: Context, code: str) -> str:
     return ""
 
 
-@router.post("", status_code=201, **answers(ParticipantOut, 201, "made; see `Location`"))
+@router.post("", status_code=201, **describe_answer(ParticipantOut, 201, "made; see `Location`"))
 def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: Response) -> dict[str, Any]:
     """Make a participant: a code, never a name."""
     row = create(context, body, who.name)
@@ -148,7 +148,7 @@ def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: R
     return row.as_dict()
 
 
-@router.get("", **answers(list[ParticipantOut]))
+@router.get("", **describe_answer(list[ParticipantOut]))
 def list_participants(
     context: Ctx,
     _who: Tester,
@@ -159,7 +159,7 @@ def list_participants(
     return [row.as_dict() for row, _last_utc in matching(context.store, q, archived)]
 
 
-@router.get("/{code}", **answers(ParticipantOut))
+@router.get("/{code}", **describe_answer(ParticipantOut))
 def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
     """One participant with its profile."""
     about = seen.participant(code), seen.decisions(code), seen.poses()  # all that a decision on it may rest on
@@ -168,7 +168,7 @@ def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -
     return find(context, code).as_dict()
 
 
-@router.put("/{code}/profile", **answers(ChangedOut))
+@router.put("/{code}/profile", **describe_answer(ChangedOut))
 async def set_profile(
     context: Ctx,
     who: Tester,
@@ -187,7 +187,7 @@ async def set_profile(
     return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
 
 
-@router.get("/{code}/tests", **answers(list[TestOut]))
+@router.get("/{code}/tests", **describe_answer(list[TestOut]))
 def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
     """A participant's tests, newest first."""
     find(context, code)
@@ -236,7 +236,7 @@ def change_site(context: Context, code: str, body: MuscleIn, by: str, voids: boo
     return row
 
 
-@router.put("/{code}/muscle", **answers(ParticipantOut))
+@router.put("/{code}/muscle", **describe_answer(ParticipantOut))
 async def set_muscle(
     context: Ctx,
     who: Tester,
@@ -279,13 +279,13 @@ def put_archived(context: Context, code: str, archived: bool, by: str) -> Partic
     return row
 
 
-@router.post("/{code}/archive", **answers(ParticipantOut))
+@router.post("/{code}/archive", **describe_answer(ParticipantOut))
 async def archive(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
     """Put it into the archive: it is listed no more by default, and no test of it starts."""
     return (await put_archived(context, code, True, who.name)).as_dict()
 
 
-@router.post("/{code}/unarchive", **answers(ParticipantOut))
+@router.post("/{code}/unarchive", **describe_answer(ParticipantOut))
 async def unarchive(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
     """Take it out of the archive."""
     return (await put_archived(context, code, False, who.name)).as_dict()
@@ -294,7 +294,7 @@ async def unarchive(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
 notes_router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)
 
 
-@notes_router.get("", **answers(list[NoteOut]))
+@notes_router.get("", **describe_answer(list[NoteOut]))
 def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> list[dict[str, Any]]:
     """A participant's notes, newest first, the struck ones among them."""
     response.headers["ETag"] = context.store.etag(context.clock, f"/v1/participants/{code}/notes", notes.about(code))
@@ -302,7 +302,7 @@ def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> lis
     return [note.as_dict() for note in context.notes.participant_notes(code)]
 
 
-@notes_router.post("", status_code=201, **answers(NoteOut, 201, "written"))
+@notes_router.post("", status_code=201, **describe_answer(NoteOut, 201, "written"))
 async def write_note(context: Ctx, who: Tester, code: str, body: NoteIn) -> dict[str, Any]:
     """Write a note on the participant's session, on a test (`test_id`), or at a time in it (`at_s`, or `now`)."""
     position = context.runner.hub.position(body.test_id) if body.test_id else None  # a note that is made now is there
@@ -310,7 +310,7 @@ async def write_note(context: Ctx, who: Tester, code: str, body: NoteIn) -> dict
     return (await asyncio.to_thread(context.notes.add, code, body, who.name, now_s)).as_dict()
 
 
-@notes_router.post("/{note_id}/strike", **answers(NoteOut))
+@notes_router.post("/{note_id}/strike", **describe_answer(NoteOut))
 def strike_note(context: Ctx, who: Tester, code: str, note_id: str) -> dict[str, Any]:
     """Mark a note as wrong: it stays readable, with who struck it."""
     return context.notes.strike(code, note_id, who.name).as_dict()

@@ -20,7 +20,7 @@ from stimrig.api.store.tables import AuditEntry, Token
 from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx, EvenLocked
 from stimrig.api.web.guards import local, same_origin, set_cookie
 from stimrig.api.web.openapi import TOO_MANY
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import AuditOut, KeyOut, ListedToken, ListedUser, SessionOut, TokenOut, UserOut
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
@@ -76,14 +76,14 @@ class KeyIn(_Body):
     days: Annotated[int, Field(strict=True, ge=1, le=366, description="it expires after these")] = 30
 
 
-@router.post("/users", status_code=201, **answers(UserOut, 201, "added"))
+@router.post("/users", status_code=201, **describe_answer(UserOut, 201, "added"))
 async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
     """Add a person; the default scopes are a clinician's."""
     row = await context.people.add(body.name, body.password, body.scopes, who.name)
     return {"name": row.name, "scopes": body.scopes, "created_utc": row.created_utc}
 
 
-@router.get("/users", **answers(list[ListedUser]))
+@router.get("/users", **describe_answer(list[ListedUser]))
 def list_users(context: Ctx, _who: Administrator, response: Response) -> list[dict[str, Any]]:
     """All users."""
     response.headers["ETag"] = context.store.etag(context.clock, "/v1/users", seen.accounts())
@@ -174,7 +174,7 @@ def sign_out(context: Ctx, request: Request, _who: EvenLocked) -> None:
     context.auth.sign_out(cookie)
 
 
-@router.post("/controller-keys", status_code=201, **answers(KeyOut, 201, "issued"))
+@router.post("/controller-keys", status_code=201, **describe_answer(KeyOut, 201, "issued"))
 def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, Any]:
     """A key for an ILC controller: reads models, nothing else, and expires. Its text is shown this once."""
     expires_utc = utc_label(context.clock.unix_s() + 86400.0 * body.days)
@@ -185,7 +185,7 @@ def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, A
 token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)
 
 
-@token_router.post("/tokens", status_code=201, **answers(TokenOut, 201, "issued"))
+@token_router.post("/tokens", status_code=201, **describe_answer(TokenOut, 201, "issued"))
 def issue_token(context: Ctx, who: Administrator, body: TokenIn) -> dict[str, Any]:
     """Issue a token; its text is shown this once."""
     known = {scope.value for scope in Scope}
@@ -198,7 +198,7 @@ def issue_token(context: Ctx, who: Administrator, body: TokenIn) -> dict[str, An
     return {"token": text, "name": body.name, "scopes": body.scopes, "expires_utc": body.expires_utc}
 
 
-@token_router.get("/tokens", **answers(list[ListedToken]))
+@token_router.get("/tokens", **describe_answer(list[ListedToken]))
 def list_tokens(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
     """All tokens, by their prefix; never their text."""
     rows = context.store.all(Token, order=Token.created_utc)
@@ -215,11 +215,11 @@ def revoke_token(context: Ctx, who: Administrator, token_id: str) -> None:
         raise NotFoundError("token", token_id, "GET /v1/tokens lists them.")
 
 
-@token_router.get("/audit", **answers(AuditOut))
+@token_router.get("/audit", **describe_answer(AuditOut))
 def trail(context: Ctx, _who: Administrator) -> dict[str, Any]:
     """The audit trail, and whether its chain holds."""
     entries = context.store.all(AuditEntry, order=AuditEntry.seq)
-    stands = receipts.of_folder(entries, context.settings.data_dir)
+    stands = receipts.check_folder(entries, context.settings.data_dir)
     return {
         "whole": stands.first_broken is None and stands.missing_since is None, "first_broken": stands.first_broken,
         "missing_since": stands.missing_since, "entries": [entry.as_dict() for entry in entries],

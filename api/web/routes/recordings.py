@@ -21,7 +21,7 @@ from stimrig.api.store import audit, seen, uploads
 from stimrig.api.store.tables import Model, Participant, Recording
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
 from stimrig.api.web.openapi import problem
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import UploadOut
 from stimrig.api.web.routes import participants
 
@@ -82,7 +82,10 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
 
 
 @router.post(
-    "/participants/{code}/recordings", status_code=201, openapi_extra=UPLOAD, **answers(UploadOut, 201, "taken in")
+    "/participants/{code}/recordings",
+    status_code=201,
+    openapi_extra=UPLOAD,
+    **describe_answer(UploadOut, 201, "taken in"),
 )
 async def upload(
     context: Ctx,

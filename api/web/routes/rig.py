@@ -15,7 +15,7 @@ from stimrig.api.store import audit, seen
 from stimrig.api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
 from stimrig.api.web.guards import Press
 from stimrig.api.web.middleware import wants_html
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
 from stimrig.rig.messages import StopEvidence
 from stimrig.rig.requests import RearmRequest, SequencesRequest
@@ -43,20 +43,20 @@ def rig_state(context: Context) -> dict[str, Any]:
     }
 
 
-@router.get("/rig", **answers(RigOut))
+@router.get("/rig", **describe_answer(RigOut))
 def rig(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """State, devices, newest torque and its age. `ETag` names the last stop: a re-arm says which one it answers."""
     response.headers["ETag"] = f'"{context.rig.status.latch if context.rig.status else ""}"'
     return rig_state(context)
 
 
-@router.get("/sequences", **answers(SequencesOut))
+@router.get("/sequences", **describe_answer(SequencesOut))
 async def sequences(context: Ctx, _who: Anyone) -> dict[str, Any]:
     """What a test can be made of: this rig's sequences with their settings, units and ranges; and the default test."""
     return await context.rig.ask(SequencesRequest())
 
 
-@router.post("/stop", **answers(StoppedOut, description="stopped, by the rig's evidence"), openapi_extra=STOP)
+@router.post("/stop", **describe_answer(StoppedOut, description="stopped, by the rig's evidence"), openapi_extra=STOP)
 async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
     """Stop stimulation: anyone signed in, and any page that shows the button; JSON, a plain form, or no body at all.
 
@@ -82,7 +82,7 @@ async def stop_on_page(request: Request, context: Context, press: Press) -> Resp
     return RedirectResponse(f"/stopped/{context.stops.keep(told)}", 303)
 
 
-@router.post("/rearm", **answers(RigOut))
+@router.post("/rearm", **describe_answer(RigOut))
 async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
     """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
 
@@ -110,7 +110,7 @@ async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
     return rig_state(context)
 
 
-@router.post("/preview", **answers(PreviewOut))
+@router.post("/preview", **describe_answer(PreviewOut))
 async def preview(context: Ctx, _who: Tester, body: TestIn) -> Response:
     """A test's duration, dose and pulse widths, without playing it. 503 where too many are asked for at once."""
     return JSONResponse(await context.runner.preview(body))

@@ -24,7 +24,7 @@ from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, context_of
 from stimrig.api.web.guards import refuse_outside
 from stimrig.api.web.middleware import chosen_language
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import LeftOut, TestOut
 
 log = logging.getLogger("stimrig.live")
@@ -44,7 +44,7 @@ def find(context: Context, test_id: str) -> Test:
     return row
 
 
-@router.post("", status_code=202, **answers(TestOut, 202, "begun; see `Location`"))
+@router.post("", status_code=202, **describe_answer(TestOut, 202, "begun; see `Location`"))
 async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
     row = await controllers.start(context.runner, context.holds.turn(KEY_TURN), context.store, who, body)
@@ -52,14 +52,14 @@ async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response
     return context.runner.document(row)
 
 
-@router.get("", **answers(list[TestOut]))
+@router.get("", **describe_answer(list[TestOut]))
 def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str, Any]]:
     """The newest tests."""
     rows = context.store.all(Test, order=Test.requested_utc.desc(), limit=max(1, min(limit, 500)))
     return [context.runner.document(row) for row in rows]
 
 
-@router.get("/{test_id}", **answers(TestOut))
+@router.get("/{test_id}", **describe_answer(TestOut))
 def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
     response.headers["ETag"] = context.store.etag(
@@ -68,7 +68,7 @@ def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -
     return context.runner.document(find(context, test_id))
 
 
-@router.put("/{test_id}/ran-by", **answers(TestOut))
+@router.put("/{test_id}/ran-by", **describe_answer(TestOut))
 def set_ran_by(context: Ctx, who: Tester, test_id: str, body: RanByIn) -> dict[str, Any]:
     """Say who ran a test at the rig, where that was not who asked for it."""
     with context.store.write() as session:
@@ -81,7 +81,7 @@ def set_ran_by(context: Ctx, who: Tester, test_id: str, body: RanByIn) -> dict[s
     return context.runner.document(row)
 
 
-@router.post("/{test_id}/keep-plain", **answers(TestOut))
+@router.post("/{test_id}/keep-plain", **describe_answer(TestOut))
 async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]:
     """End the fit of the last approved model's structure after a test: the plain model is offered."""
     row = await asyncio.to_thread(find, context, test_id)
@@ -91,7 +91,7 @@ async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]
     return await asyncio.to_thread(context.runner.document, row)
 
 
-@router.post("/{test_id}/enough", **answers(LeftOut))
+@router.post("/{test_id}/enough", **describe_answer(LeftOut))
 async def enough(context: Ctx, who: Tester, test_id: str) -> dict[str, Any]:
     """End a running adaptive, passive or moving test well, at the next pulse: what was measured is used."""
     row = await asyncio.to_thread(find, context, test_id)

@@ -12,7 +12,7 @@ from stimrig.api import language
 from stimrig.api.models import changes
 from stimrig.api.models.trend import Session
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
-from stimrig.api.web.responses.base import answers
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import TrendOut
 from stimrig.api.web.routes import participants
 from stimrig.identify.records.cells import lines
@@ -36,7 +36,7 @@ async def sessions(context: Context, code: str) -> list[Session]:
     return await context.trend.sessions(code)
 
 
-@router.get("/trend", **answers(TrendOut))
+@router.get("/trend", **describe_answer(TrendOut))
 async def trend(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     """Figures with their uncertainty over the sessions, and what changed since the last approved one."""
     found = await sessions(context, code)

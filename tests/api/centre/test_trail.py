@@ -120,7 +120,7 @@ def test_an_edited_entry_is_named_though_the_chain_was_made_anew(trail: Trail) -
     said = trail.words()
     assert "entry 5 is not the one that was countersigned by the centre on" in said
     assert "Mallory did “look” to P4" in said and was in said
-    assert receipts.of_folder(trail.entries(), trail.rig.folder).first_broken == 5, "the page, REST and the doctor"
+    assert receipts.check_folder(trail.entries(), trail.rig.folder).first_broken == 5, "the page, REST and the doctor"
 
 
 def test_the_centre_sees_it_with_the_next_entry_and_names_the_first_one_after_a_restart(trail: Trail) -> None:
