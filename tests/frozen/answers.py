@@ -26,6 +26,7 @@ VOLATILE = (
     (re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[.\d]*(?:\+00:00|Z)?"), "<time>"),
     (re.compile(r"\bm-[0-9a-f]{6,}\b|\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f-]{22}\b"), "<id>"),
     (re.compile(r"\b[0-9a-f]{64}\b"), "<digest>"),
+    (re.compile(r"stimrig-error-\d+"), "stimrig-error-<id>"),
     (re.compile(r"ses-s[0-9a-f]{10}"), "ses-<hidden>"),
     (re.compile(r"(done before, |in )\d+(?:\.\d+)? m?s\b"), r"\1<duration>"),
     (re.compile(r"(stimrig_rig_|Model )(?:[\w-]{30,}|[0-9a-f]{8}\b)"), r"\1<id>"),
@@ -241,6 +242,8 @@ WEAK = "as_real|as_gap|as_start|arm_moving|sealed_400|rig_stopped|rig_adaptive|r
 """Recordings that say too little, or too much that no model explains: an older processor moves their answers, too."""
 LOOSE: tuple[tuple[str, float, float], ...] = (
     ("", 1e-4, 1e-9),
+    (r"/candidates/.*/(forms|log_evidence_gain|rms_nm)\[\]/", 0.01, 0.05),  # of two log evidences of thousands
+    ("/sd$", 1e-3, 1e-9),  # of second differences
     (f"/({WEAK})/(?!recording/)", 0.05, 0.01),
     ("/(processor_s|worker_memory_mb)/", 1.0, 0.0),  # the machine's
     ("^routes/.*(last_sample_to_model_s|/delay_s)$", 1.0, 0.0),  # the fake rig's clock is the world's, not the day's

@@ -10,7 +10,7 @@ PARTS_HERE = ("fitted/plain_short", "fitted/rig_held", "fitted/broken_word", "fi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", PARTS_HERE)
+@pytest.mark.parametrize("part", [*PARTS_HERE, pytest.param("routes", marks=pytest.mark.service)])
 def test_what_users_hold_is_as_it_was(part: str) -> None:
     assert found(part, HERE / "kept")[0] == []
 
