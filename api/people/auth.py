@@ -45,6 +45,15 @@ class Scope(StrEnum):
     ADMINISTER = "administer"
 
 
+ROLES = {
+    "clinician": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL, Scope.APPROVE_MODEL],
+    "operator": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL],
+    "reader": [Scope.READ_LIVE, Scope.READ_MODEL],
+    "administrator": [Scope.ADMINISTER],
+}
+"""What a person may do, by what people call them."""
+
+
 @dataclass(frozen=True)
 class Principal:
     """Who is asking.

@@ -11,7 +11,7 @@ from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
 from stimrig.api.language import lazy
 from stimrig.api.outbox import receipts, status
-from stimrig.api.people.auth import Scope
+from stimrig.api.people.auth import ROLES
 from stimrig.api.store.tables import AuditEntry
 from stimrig.api.web.dependencies import Administrator, Context, Ctx
 from stimrig.api.web.pages import typed
@@ -22,12 +22,6 @@ from stimrig.api.web.routes import people
 
 router = APIRouter(include_in_schema=False, prefix="/administration")
 NEWEST = 60
-ROLES = {
-    "clinician": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL, Scope.APPROVE_MODEL],
-    "operator": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL],
-    "reader": [Scope.READ_LIVE, Scope.READ_MODEL],
-    "administrator": [Scope.ADMINISTER],
-}
 MAY: dict[str, Any] = {
     "clinician": lazy("runs tests, approves models"),
     "operator": lazy("runs tests; approves nothing"),

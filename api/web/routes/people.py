@@ -13,7 +13,7 @@ from stimrig.api.clock import utc_label
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.outbox import receipts
 from stimrig.api.people import accounts
-from stimrig.api.people.auth import Principal, Scope, unauthorized
+from stimrig.api.people.auth import ROLES, Principal, Scope, unauthorized
 from stimrig.api.sessions.requests import TokenIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import AuditEntry, Token
@@ -45,9 +45,7 @@ class UserIn(_Body):
 
     name: Name
     password: Password
-    scopes: Annotated[list[Scope], Field(min_length=1)] = [
-        Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL, Scope.APPROVE_MODEL,
-    ]  # fmt: skip
+    scopes: Annotated[list[Scope], Field(min_length=1)] = ROLES["clinician"]
 
 
 class SignIn(_Body):
