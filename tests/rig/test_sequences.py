@@ -104,7 +104,7 @@ def test_dose_and_torque_time():
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [
-        ("prsb", {}, "use one of multilevel, prbs"),
+        ("prsb", {}, f"use one of {', '.join(sequences.library())}"),
         ("prbs", {"bit": 7}, "prbs.bit"),
         ("prbs", {"bits": "seven"}, "prbs.bits"),
         ("prbs", {"bits": 40}, "prbs.bits"),
