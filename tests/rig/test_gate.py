@@ -318,6 +318,7 @@ def test_the_journal_says_of_each_pulse_that_was_not_sent_why(tmp_path: Path):
         (3, PulseStatus.DROPPED, now_s),
         (4, PulseStatus.DROPPED, now_s),
     ]
+    assert setup.gate.not_sent == [1, 2, 3, 4], "who follows the test knows them by their index"
 
 
 @pytest.mark.parametrize("number", [0, 5])
@@ -359,6 +360,14 @@ def test_late_acks_are_noted_by_real_time(tmp_path: Path, speed: float):
     assert late == [
         {"event": "late_ack", "index": 0, "delay_s": pytest.approx(0.016 * speed), "time_s": setup.gate.last_pulse_s}
     ]
+
+
+def test_an_ack_after_exactly_the_time_allowed_is_not_late(tmp_path: Path):
+    setup = Setup(tmp_path, start_s=0.0)  # at zero 0.015 s is exactly 15 ms
+    setup.stimulator.ack_delay_s = None
+    setup.fire(100)
+    setup.stimulator.on_ack(Ack(1, 0.015))
+    assert len(setup.events()) == 1, "arm alone"
 
 
 def test_a_pulse_that_becomes_late_while_its_intent_is_written_is_dropped(tmp_path: Path):

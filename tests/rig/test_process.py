@@ -11,6 +11,7 @@ import socket
 import sys
 import tempfile
 import termios
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -59,15 +60,17 @@ def soon(true: Callable[[], bool]) -> None:
 
 def test_one_key_is_one_stop_and_the_terminal_is_given_back(terminal: tuple[int, int]):
     person, ours = terminal
-    before, pressed = termios.tcgetattr(ours), list[int]()
+    before, pressed, earlier = termios.tcgetattr(ours), list[int](), set(threading.enumerate())
     with StopKey(lambda: pressed.append(1), ours, lambda _: True) as key:
         assert key.watched
         assert not termios.tcgetattr(ours)[3] & (termios.ICANON | termios.ECHO)
         assert termios.tcgetattr(ours)[3] & termios.ISIG  # Ctrl-C is a signal as ever
-        for n, keys in enumerate((b" ", b"\x1b[A"), start=1):  # an arrow is one key
+        for n, keys in enumerate((b" ", b"\x1b[A"), start=1):
             os.write(person, keys)
             soon(lambda n=n: len(pressed) == n)
+        assert not select.select([ours], [], [], 0)[0], "an arrow is one key"
     assert termios.tcgetattr(ours) == before and len(pressed) == 2
+    assert "stop key" not in {thread.name for thread in set(threading.enumerate()) - earlier}, "nobody reads any more"
 
 
 def test_without_a_terminal_of_its_own_or_in_the_background_nothing_is_read(terminal: tuple[int, int]):
