@@ -38,7 +38,9 @@ ROUNDED_US = 1.0
 
 
 def recovered_dose(recording: Recording, contents: JournalContents, lost_s: float) -> dict[str, Any]:
-    """Part of a finished test's summary.
+    """The dose of a test whose process died, from its journal's own lines: never less than what was felt.
+
+    Part of a finished test's summary.
 
     Parameters
     ----------
@@ -64,7 +66,7 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
         "pulses": int(felt.sum()) + int(np.sum(unseen_us > 0)),
         "dropped_pulses": int(np.sum(status == PulseStatus.DROPPED)),
         "charge_uc": float(np.sum(widths_us * currents_ma) + np.sum(unseen_us) * highest_ma) * 1e-3,
-        **_torque_warnings(
+        **_torque_dose(
             columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][felt]
         ),
         "dose_is_bound": doubtful > 0,
@@ -77,7 +79,8 @@ def _most(one: NDArray[Any], other: NDArray[Any], unknown: float) -> float:
     return max((float(value) for value in (*one, *other) if value > 0), default=unknown)
 
 
-def _torque_warnings(time_s: NDArray[Any], torque_nm: NDArray[Any], pulses_s: NDArray[Any]) -> dict[str, float]:
+def _torque_dose(time_s: NDArray[Any], torque_nm: NDArray[Any], pulses_s: NDArray[Any]) -> dict[str, float]:
+    """Torque-time since the first pulse, and the peak."""
     known = np.isfinite(torque_nm)
     time_s, torque_nm = time_s[known], torque_nm[known]
     peak_nm = float(np.abs(torque_nm).max()) if len(torque_nm) else 0.0
@@ -101,7 +104,7 @@ def summary_of(recording: Recording, counted: dict[str, Any]) -> dict[str, Any]:
             "so the true dose may be lower"
         )
     return {
-        **({"angle": counted.get("angle", {}) | _joint_warnings(recording)} if recording.angle else {}),
+        **({"angle": counted.get("angle", {}) | _angle_summary(recording)} if recording.angle else {}),
         "samples": len(recording.columns["torque/time_s"]),
         "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
         "alignment": {**asdict(alignment), "error_ms": finite(alignment.error_ms)},
@@ -109,7 +112,7 @@ def summary_of(recording: Recording, counted: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _joint_warnings(recording: Recording) -> dict[str, Any]:
+def _angle_summary(recording: Recording) -> dict[str, Any]:
     angle_rad, error_ms = recording.columns["angle/angle_rad"], recording.angle["error_ms"]
     return {
         "samples": len(angle_rad),
