@@ -99,13 +99,11 @@ class Player:
     def end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
         """End the running test, or latch; True if a test runs."""
         self.state.count_stop()
-        runs = self.state.trial.busy and self._halt is not None
-        if not runs or self._halt is None:
-            if latch_idle:
-                self.state.halted(reason)
-        elif not self._halt.set(cause, reason) and latch_idle:
-            self.state.halted(reason)  # it was ending: both reasons are told
-        return runs
+        halt = self._halt if self.state.trial.busy else None
+        ends_now = halt is not None and halt.set(cause, reason)
+        if latch_idle and not ends_now:  # of a test that was ending both reasons are told
+            self.state.halted(reason)
+        return halt is not None
 
     def trouble(self) -> str | None:
         """That the task of the test has died; None: it has not."""
