@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +87,9 @@ class Block:
         return len(self.samples)
 
 
+Values = TypeVar("Values", float, NDArray[np.float64])
+
+
 @dataclass(frozen=True, slots=True)
 class AngleScale:
     """From a sensor's value to the joint's angle: `direction` × `radians_per_unit` × (raw − `offset`)."""
@@ -95,8 +98,8 @@ class AngleScale:
     direction: int = 1
     radians_per_unit: float = 1.0
 
-    def angle_rad(self, raw: Any) -> Any:
-        """The joint's angle, or angles, rad."""
+    def angle_rad(self, raw: Values) -> Values:
+        """The joint's angle, or angles of the shape of `raw`, rad."""
         return self.direction * self.radians_per_unit * (raw - self.offset)
 
 
