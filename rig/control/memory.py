@@ -1,4 +1,7 @@
-"""What the rig must remember across a crash: that a test was running, or that it is latched and why."""
+"""What the rig must remember when its process ends: its latch, its last pulse, and a calibration's result.
+
+Each is a small file of JSON in the data folder, synced to the disk before what it describes is told.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,9 @@ from stimrig.rig.machine import Machine
 from stimrig.rig.messages import Calibrated
 from stimrig.rig.plan import PlannedTest
 from stimrig.rig.tasks import Turn
+
+log = logging.getLogger("rig")
+rest_log = logging.getLogger("rig.rest")
 
 
 class SmallFile:
@@ -44,6 +50,7 @@ class SmallFile:
         await self._put(json.dumps(content).encode())
 
     async def remove(self) -> None:
+        """Also where there is none. Raises RigError."""
         await self._put(None)
 
     async def _put(self, data: bytes | None) -> None:
@@ -65,7 +72,7 @@ Remembered = Literal["running", "latched"]
 
 
 class Latch:
-    """Stored before the event that it describes."""
+    """That a test was running, or that the rig is latched and why; stored before the event that it describes."""
 
     def __init__(self, folder: Path, machine: Machine) -> None:
         self._file = SmallFile(folder / "latch.json", "latch file", machine)
@@ -87,16 +94,20 @@ class Latch:
         await self._file.write({"state": state, "reason": reason})
 
 
-log = logging.getLogger("rig.rest")
-
-
 class Rest:
-    """Time of the last pulse on the rig's clock; None: there was none with this data folder."""
+    """The rest between tests and trains, counted from the last pulse, and kept when the process ends.
+
+    The machine's monotonic clock continues across processes until the machine is rebooted, so a clean restart of the
+    rig shortens no rest. The wall clock is not used: a wrong time can neither shorten nor lengthen a rest. In case of
+    doubt (another boot, another machine, an unreadable file, a crash during a test) the last pulse is assumed to be
+    now: a rest may be longer than asked for, never shorter.
+    """
 
     def __init__(self, folder: Path, machine: Machine) -> None:
         self._folder, self._machine, self._clock = folder, machine, machine.tasks.clock
         self._file = SmallFile(folder / "last-pulse.json", "the last pulse's time could not be written", machine)
         self.last_pulse_s: float | None = None
+        """On the rig's clock; None: there was none with this data folder."""
         self._ended = True
 
     async def recall(self, in_doubt: bool) -> None:
@@ -122,7 +133,7 @@ class Rest:
         try:
             await self._file.write(content)
         except RigError as error:
-            log.error("%s", error)
+            rest_log.error("%s", error)
             with contextlib.suppress(RigError):  # the disk is read-only now: the latch file still says that a test ran
                 await self._file.remove()
 
@@ -163,11 +174,11 @@ class Rest:
         return (time_s if certain and 0 <= time_s <= self._clock.now_s() else None), True
 
 
-log = logging.getLogger("rig")
-
-
 class Result:
-    """Written before the result is told."""
+    """A calibration's result, kept from its end until a client has stored it: a lost answer loses no thresholds.
+
+    It is written before it is told.
+    """
 
     def __init__(self, folder: Path, machine: Machine) -> None:
         self._file, self._clock = SmallFile(folder / "calibrated.json", "calibration", machine), machine.tasks.clock
