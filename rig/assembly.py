@@ -322,7 +322,10 @@ def laid_blocks(contents: JournalContents) -> list[LaidBlock]:
 
 
 def planned_pulses(contents: JournalContents, header: dict[str, Any], notes: list[str]) -> tuple[Floats, list[Segment]]:
-    """Planned width of each pulse, µs, shape (n,), and the segments; notes say what was inferred."""
+    """Planned width of each pulse, µs, shape (n,), and the segments; notes say what was inferred.
+
+    A lost block is replaced by the intents: they hold the widths that were sent.
+    """
     plan = next((np.frombuffer(p, "<f8") for k, p in contents.blocks if k == Kind.PLAN), None)
     if plan is None:
         notes.append("both copies of the plan are lost: the widths that were sent are used as planned widths")

@@ -19,7 +19,9 @@ class Clock(Protocol):
         """Rig seconds per real second. Time allowances for the operating system are multiplied by it."""
         ...
 
-    def now_s(self) -> float: ...
+    def now_s(self) -> float:
+        """Monotonic rig time, s."""
+        ...
 
     def unix_s(self) -> float:
         """UTC, s since 1970: a label; only the day until which a calibration holds is told by it."""

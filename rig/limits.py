@@ -186,6 +186,7 @@ class Admitted:
 
     @property
     def charge_uc(self) -> float:
+        """Charge of one phase, µC."""
         return self.pulse_width_us * self.current_ma * 1e-3
 
 

@@ -86,6 +86,7 @@ class PlannedTest:
 
     @property
     def charge_uc(self) -> float:
+        """Charge of one phase summed over the pulses, µC."""
         return sequences.dose_uc(self.pulse_width_us, self.plan.profile.current_ma)
 
     @property

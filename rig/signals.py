@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ class Pulse:
 
     @property
     def charge_uc(self) -> float:
+        """Charge of one phase, µC."""
         return self.pulse_width_us * self.current_ma * 1e-3
 
 

@@ -31,7 +31,7 @@ BIN_S = 0.1
 
 
 class RateCheck:
-    """The rate of one test's samples."""
+    """The rate of one test's samples, however irregularly they are read; for cells and angle sensors alike."""
 
     def __init__(self, name: str, rate_hz: float, speed: float) -> None:
         self._name, self._rate_hz = name, rate_hz

@@ -37,7 +37,10 @@ Cause = Literal["stopped", "fault", "withdrawn"]
 
 
 class Halt:
-    """Set once, or once more after a withdrawal; `signal` wakes all who wait."""
+    """The only way to end a test early: the first reason counts, and wakes the sender at once.
+
+    Set once, or once more after a withdrawal; `signal` wakes all who wait.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self.signal = Signal()
@@ -183,6 +186,7 @@ class TestRun:
 
     @property
     def begun(self) -> bool:
+        """Whether a pulse was sent."""
         return self.t0_s is not None and self.sent > 0
 
     @property

@@ -86,7 +86,15 @@ def steps_from(before: float, values: NDArray[Any]) -> NDArray[Any]:
 
 
 class Stream:
-    """Base of the receivers."""
+    """Base of the receivers.
+
+    Parameters
+    ----------
+    source
+        A device that is not open yet.
+    on_lost
+        Called once, with the reason, when the device is gone.
+    """
 
     def __init__(self, name: str, source: Sensor, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
         self._name, self._source, self._on_lost = name, source, on_lost

@@ -24,7 +24,11 @@ from stimrig.rig.machine import Frame, Listener
 
 
 class ReadAhead:
-    """Reads whatever waits at once and hands it out; everything else is the port's own."""
+    """A serial port: reads whatever waits at once and hands it out; everything else is the port's own.
+
+    python-can's slcan asks the operating system for every single byte. That costs most of what a frame costs: with text
+    frames at 1600 Hz it took a third of a processor, and on a busy machine the reader fell behind the cell.
+    """
 
     def __init__(self, port: Any) -> None:
         self._port = port

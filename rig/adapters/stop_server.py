@@ -29,7 +29,12 @@ MOST_AT_ONCE = 600
 
 
 class Connections:
-    """The connections of one socket, silent and active ones."""
+    """The connections of one socket, limited so that idle clients cannot keep out an active one.
+
+    A connection that has not yet sent a complete request is silent; the others are active. A new connection closes the
+    one of its kind that has been idle longest, but none whose request may not have been read yet. So a client that
+    connects is heard, however many come at once.
+    """
 
     def __init__(self, max_silent: int, max_active: int) -> None:
         self._most = {False: max_silent, True: max_active}

@@ -66,9 +66,7 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
         "pulses": int(felt.sum()) + int(np.sum(unseen_us > 0)),
         "dropped_pulses": int(np.sum(status == PulseStatus.DROPPED)),
         "charge_uc": float(np.sum(widths_us * currents_ma) + np.sum(unseen_us) * highest_ma) * 1e-3,
-        **_torque_dose(
-            columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][felt]
-        ),
+        **_torque_dose(columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][felt]),
         "dose_is_bound": doubtful > 0,
         "doubtful_pulses": doubtful,
     }

@@ -56,7 +56,10 @@ def unstuff(stuffed: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """What differs between the protocols.
+    """What differs between the protocols: start byte, header, stuffed body and stop byte they have in common.
+
+    Each header byte stands behind an escape, xor 55. A frame's end is found by its length, since a header byte may
+    itself look like `F0` or `0F`. After damage the reader continues at the next `F0 81`.
 
     Parameters
     ----------

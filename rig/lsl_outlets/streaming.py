@@ -47,7 +47,7 @@ def refuse_locking(folder: Path) -> None:
 
 
 class Tail:
-    """One journal, read from its start on.
+    """One journal, read from its start on. It takes no lock, and writes nothing, not even the time of access.
 
     Raises
     ------
@@ -163,7 +163,18 @@ def clock_offset_s(lsl: Any) -> float:
 
 
 class Outlets:
-    """Torque, pulses and marks."""
+    """Torque, pulses and marks: three streams that exist for as long as the process, whether a test plays or not.
+
+    So a LabRecorder that was started before the first test records them all. What differs from test to test (its ids,
+    the participant's code, begin and end) goes out as marks.
+
+    Parameters
+    ----------
+    sample_rate_hz
+        Nominal rate of the cell in samples per real second; 0: not known.
+    devices
+        Load cell and stimulator, as the rig file names them.
+    """
 
     def __init__(self, lsl: Any, sample_rate_hz: float, devices: dict[str, str], name: str = "stimrig") -> None:
         self._lsl, self._name, self._devices = lsl, name, devices
