@@ -10,7 +10,7 @@ import pytest
 
 from stimrig.identify import fit
 from stimrig.identify.effects import get, library, registry
-from stimrig.identify.effects.base import STAGES
+from stimrig.identify.effects.base import STAGES, Scene
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.plain import fit_plain, prepare
 from stimrig.identify.model import Model
@@ -124,3 +124,21 @@ def test_what_cannot_be_had_is_said(moving):
         fit(moving, effects=["fatigue:nonsense"])
     with pytest.raises(NotIdentifiable, match="angle_rad"):
         fit(hidden_muscles.record(rate_hz=100), effects=["torque_angle"])
+
+
+@pytest.mark.parametrize("name", ["bumps_1", "resisting_1", "spasms_1"])
+@pytest.mark.parametrize("size", [60, 200, 400])
+def test_an_effort_is_proposed_where_it_is(name: str, size: int):
+    """Also in a record that is shorter than the widest shape that is tried."""
+    form = get("voluntary_effort").form(name)
+    scene = Scene(0.025 * np.arange(size), np.zeros(size), 0.025, 8.0, 200.0)
+    at_s = 0.6 * scene.span_s
+    values = {p.name: np.full((1, 1), p.on(scene).start[0]) for p in form.parameters} | {
+        "centre_0_s": np.full((1, 1), at_s),
+        "width_0_s": np.full((1, 1), 0.2),
+        "decay_0_s": np.full((1, 1), 0.3),
+    }
+    residual_nm = form.call(None, values, scene)[0]
+    assert form.propose is not None
+    for proposed in form.propose(residual_nm, scene, {}):
+        assert proposed["centre_0_s"] == pytest.approx(at_s, abs=0.2)
