@@ -43,6 +43,8 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
         Too short, or sampled too slowly.
     BadRequest
         The model's dynamics are not of second order: effects cannot be added to it.
+    NotIdentifiable
+        Less than three seconds may be fitted, or the record does not determine the model.
     """
     search = search_effects(record, progress, structure=structure_of(model))
     result = diagnosis_of(search, judge(search))

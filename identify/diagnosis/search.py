@@ -115,9 +115,18 @@ def search_effects(
         Pulse intervals to fit; by default all that may be fitted.
     structure : sequence of str
         Effects, "id" or "id:form", that the examined model already has.
+
+    Raises
+    ------
+    NotIdentifiable
+        Less than `thresholds.LEAST_S` may be fitted, or as `fit_plain`.
     """
     grid, raw = prepare(record)
-    plain = fit_plain(grid, fitted_rows(grid, None) if fitted is None else fitted)
+    rows = fitted_rows(grid, None) if fitted is None else fitted
+    count = int(rows.sum())
+    if count * grid.step_s < thresholds.LEAST_S:
+        raise NotIdentifiable(f"only {count} pulse intervals may be fitted", fix="Give at least a few seconds of data.")
+    plain = fit_plain(grid, rows)
     search = EffectSearch(record, raw, plain, renewed_curve(add_effects(plain, structure, raw)))
     start = _add_detected(search)
     search.quiet = quiet_rows(start)

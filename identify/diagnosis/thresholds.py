@@ -7,6 +7,9 @@ efforts and tremor do not. The muscle is "at work" in the intervals in which it 
 
 from __future__ import annotations
 
+LEAST_S = 3.0
+"""Fitted time, s, below which no effect is looked for. Not calibrated: a train of a calibration, 2 s and its rests at
+most, is of one width, and its curve and dynamics explain whatever happens in it."""
 FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0

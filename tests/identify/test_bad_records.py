@@ -70,6 +70,18 @@ def test_constant_input_is_not_identifiable():
     assert "never changes" in str(error)
 
 
+def test_a_train_of_a_calibration_is_fitted_and_not_diagnosed():
+    patient = Patient()
+    width_us = np.r_[np.zeros(10), np.full(80, 200.0), np.zeros(10)]  # the longest train that a rig gives
+    torque_nm = patient.torque(width_us, 200.0)
+    torque_nm += 0.05 * np.random.default_rng(2).standard_normal(torque_nm.size)
+    train = Record.from_arrays(np.arange(torque_nm.size) / 200, np.repeat(width_us, 5), torque_nm)
+    assert identify.fit(train).quality["verdict"] == "usable with care"
+    for search in (identify.diagnose, identify.improve, lambda record: identify.fit(record, effects=["auto"])):
+        with pytest.raises(identify.NotIdentifiable, match="only 100 pulse intervals may be fitted"):
+            search(train)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_noise_alone_is_not_usable(method):
     record = base()
