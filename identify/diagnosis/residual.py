@@ -29,7 +29,7 @@ MEDIAN = 0.6745
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """What the residual of one model shows; all but log-likelihoods and `ar1` in N·m."""
+    """What the residual of one model shows; all but log-likelihoods in N·m."""
 
     white_nm: float  # standard deviation that white noise of the samples alone gives an interval's mean
     busy_nm: float  # residual while the muscle works

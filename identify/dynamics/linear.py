@@ -208,11 +208,11 @@ def linear_from_dict(data: dict) -> Linear:
 
 
 NARX_LIMIT = 20.0
-"""Scaled torque at which a diverging free run_narx is stopped."""
+"""Scaled torque at which a diverging free run is stopped."""
 
 
 def run_narx(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
-    """Free run_narx from rest for one pulse width per interval, N·m above the baseline; limited if it diverges."""
+    """Free run from rest for one pulse width per interval, N·m above the baseline; limited if it diverges."""
     variables, terms, weights = recipe["variables"], recipe["terms"], recipe["weights"]
     width = (np.asarray(width_us, float) / recipe["width_scale_us"]).tolist()
     lead = max((lag for _, lag in variables), default=1)
@@ -230,6 +230,6 @@ def run_narx(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
 
 
 def narx_at_samples(recipe: dict[str, Any], grid: Grid, centre: float) -> np.ndarray:
-    """Free run_narx at the record's samples, with its baseline, N·m, shape (N,)."""
+    """Free run at the record's samples, with its baseline, N·m, shape (N,)."""
     means = run_narx(recipe, grid.held(grid.pulse_width_us)) + recipe["baseline_nm"]
     return Discrete((1.0,), (1.0,), 0, grid.step_s, centre).between(grid, means)

@@ -1,4 +1,4 @@
-"""Columns of another tool's file as a record: holes left out, times made even found, all of it said."""
+"""Columns of another tool's file as a record: holes left out, times made even, segments found, all of it said."""
 
 from __future__ import annotations
 

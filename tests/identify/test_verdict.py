@@ -254,12 +254,21 @@ def test_every_rule_at_both_sides(made: Made, rule: str, values: tuple[Any, ...]
 
 
 def test_what_is_left_is_told(made: Made):
-    made.leaves_first(ratio=12.1)
-    assert made.judged().structure == 12.1
-    made.held_share = 0.9
-    assert made.judged().notes == ["90 % of the readings equal the one before: the converter repeats values."]
-    made.held_share = 0.3
-    assert made.judged().notes == []
+    for ratio in (12.0, 12.1):
+        made.leaves_first(ratio=ratio)
+        assert made.judged().structure == ratio
+    for share, notes in ((0.3, []), (0.31, ["31 %"]), (0.9, ["90 %"])):
+        made.held_share = share
+        said = "of the readings equal the one before: the converter repeats values."
+        assert made.judged().notes == [f"{percent} {said}" for percent in notes]
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "ratio", "doubted"), [(67.0, 12.1, True), (68.0, 12.1, False), (67.0, 12.0, False)]
+)
+def test_effects_that_explain_too_little_are_doubted(made: Made, likelihood: float, ratio: float, doubted: bool):
+    found = made.add(FIRST, 50.0, likelihood).leaves(ratio=ratio).judged().found
+    assert (found[FIRST] == 0.45) is doubted
 
 
 def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
