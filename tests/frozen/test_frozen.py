@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.frozen.__main__ import HERE, PARTS, found
+from tests.frozen.parts import HERE, PARTS, compare
 
 PARTS_HERE = ("fitted/plain_short", "fitted/rig_held", "fitted/broken_word", "fitted/other_words")
 
@@ -12,7 +12,7 @@ PARTS_HERE = ("fitted/plain_short", "fitted/rig_held", "fitted/broken_word", "fi
 @pytest.mark.slow
 @pytest.mark.parametrize("part", [*PARTS_HERE, pytest.param("routes", marks=pytest.mark.service)])
 def test_what_users_hold_is_as_it_was(part: str) -> None:
-    assert found(part, HERE / "kept")[0] == []
+    assert compare(part)[0] == []
 
 
 def test_every_part_is_kept() -> None:
