@@ -274,7 +274,10 @@ class Lane:
 
 
 class Passwords:
-    """Hashes and checks: known people at known places in one lane, strangers in another, which may be full."""
+    """argon2id: known people at known places in one lane, strangers in another, which may be full.
+
+    In threads of its own: what guesses cost fills no thread that anything else needs.
+    """
 
     def __init__(self) -> None:
         self.hasher = PasswordHasher()  # argon2id, RFC 9106's parameters for little memory
@@ -323,6 +326,7 @@ class Passwords:
             lane.threads.shutdown(wait=False, cancel_futures=True)
 
 
+# Names: with spaces and umlauts, one way to write each, and no two that look the same.
 LONGEST = 80
 NAME_MARKS = " ._@'’,()-"
 """What a name may hold beside letters, their marks and digits."""

@@ -21,7 +21,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.audit import digest
-from stimrig.api.store.holds import shared_secret as shared
+from stimrig.api.store.holds import shared_secret
 from stimrig.api.store.tables import Confirmation, PageSession, Token
 
 LOCKED = ("locked", "This page is locked")
@@ -112,7 +112,7 @@ class Auth:
     ) -> None:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
         self.idle = idle
-        self.cookie_name = f"stimrig_session_{shared(store, 'session-cookie').hex()[:8]}"
+        self.cookie_name = f"stimrig_session_{shared_secret(store, 'session-cookie').hex()[:8]}"
         """Browsers tell hosts apart, not ports: another service on this host has another name."""
         self._seen: OrderedDict[str, str] = OrderedDict()
         self._remembering = threading.Lock()
@@ -385,7 +385,11 @@ FLUSH_S = 15.0
 
 
 class IdleLock:
-    """Which sessions are locked.
+    """Which sessions are locked: one that nobody touches is, and asks for the password again, and for nothing else.
+
+    Only a person's actions count, as `stimrig.api.web.guards` tells them from what scripts ask for by themselves. Times
+    of actions are kept in memory and written down now and then, so that no page waits for the disk; a lock holds over a
+    restart.
 
     Parameters
     ----------

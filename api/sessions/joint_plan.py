@@ -271,7 +271,10 @@ ENOUGH = 0.9
 
 @dataclass(frozen=True)
 class Grid:
-    """The cells.
+    """Cells of angle and velocity: fast and slow in both directions, and nearly still.
+
+    A cell is seen once the joint was in it for long enough. Nearly still is not asked for, nor fast at the ends of the
+    range, where a movement turns round.
 
     Parameters
     ----------

@@ -237,6 +237,8 @@ LOOK_S = 3.0
 class Follower:
     """This service as a follower of tests.
 
+    Who began a test follows it to its end; when that service is dead, another one of the same rig does.
+
     Parameters
     ----------
     holds : Holds

@@ -144,6 +144,8 @@ def outside(asked: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bou
     return found
 
 
+# The range of joint angles: a straight elbow has the angle 0; flexion is positive. Programs send radians, pages show
+# degrees.
 RANGE = "angle_range_rad"
 """In a profile: lowest and highest angle that is comfortable today."""
 SET_AT = "angle_set_at_utc"

@@ -276,6 +276,8 @@ def no_rig(detail: str) -> ApiError:
 async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[messages.LiveEvent, None]:
     """The live events of a test with all samples, until it has ended.
 
+    On a connection of its own: the lasting one carries what pages draw.
+
     Raises
     ------
     ApiError

@@ -42,7 +42,10 @@ class StopResult:
 
 
 class StopLog:
-    """The newest answers, each under a key that nobody guesses: who pressed may have no session any more."""
+    """The newest answers, each under a key that nobody guesses: who pressed may have no session any more.
+
+    The page that tells an answer is loaded by its key: loading it again stops nothing.
+    """
 
     def __init__(self) -> None:
         self._told: dict[str, StopResult] = {}

@@ -265,7 +265,7 @@ SECRET_BYTES = 32
 
 
 def shared_secret(store: Store, name: str, before: Path | None = None) -> bytes:
-    """A secret of `LENGTH` bytes: read, or drawn at the first start.
+    """A secret that all services share, so that a page of one is good at another: read, or drawn once.
 
     Parameters
     ----------

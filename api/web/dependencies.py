@@ -127,8 +127,9 @@ class Context(Parts):
         self.analyses = Analyses(store, clock, pool, self.versions, settings)
         self.tracked = TrackedVersions(store, clock, self.versions)
         self.holds = holds.open_holds(store)
-        adviser, tracker = (Adviser(worker, places(settings, store)) for _ in range(2))  # a folder that the pool learns
-        trials = Trials(rig, store, clock, self.tracked, tracker)  # ends no test
+        # workers of their own: a folder that the pool learns ends no test
+        adviser, tracker = (Adviser(worker, places(settings, store)) for _ in range(2))
+        trials = Trials(rig, store, clock, self.tracked, tracker)
         self.runner = Runner(
             store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
             Follower(store, self.holds, settings.rig),

@@ -73,7 +73,7 @@ PAGE = {
     "Content-Security-Policy": PAGE_POLICY,
     "Referrer-Policy": "same-origin",  # with no-referrer a form's Origin is "null", and the door asks for it
 }
-DATA = {
+DATA = {  # should a browser be led to show it
     **ALWAYS,
     "Content-Security-Policy": policy(NOTHING, "form-action 'none'", NOWHERE),
     "Referrer-Policy": "no-referrer",
