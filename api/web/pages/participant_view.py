@@ -320,10 +320,7 @@ async def set_muscle(
     return RedirectResponse(await context.questions.ask_if_doubtful(question, who), 303)
 
 
-trials_router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
-
-
-@trials_router.get("/trials")
+@router.get("/trials")
 async def trials(context: Ctx, who: Tester, code: str) -> Response:
     """The card by itself, for the script that renews it; empty where there is nothing to tell."""
 
