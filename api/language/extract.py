@@ -142,7 +142,8 @@ class _Sentences(ast.NodeVisitor):
 
     def visit_Call(self, node: ast.Call) -> None:
         name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        owner = getattr(getattr(node.func, "value", None), "id", "")
+        of = getattr(node.func, "value", None)
+        owner = getattr(of, "id", getattr(of, "attr", "")).lstrip("_")  # `log`, `self.log` and `self._log` are one
         if name not in NOT_SHOWN and owner not in ("log", "re", "audit"):
             self.generic_visit(node)
         given = {part.arg: text for part in node.keywords if (text := _text(part.value))}

@@ -42,8 +42,7 @@ class Tasks:
     def _ended(self, task: asyncio.Task[None]) -> None:
         self._running.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
-            log = self._log
-            log.error("what went on in the background has failed", exc_info=error)
+            self._log.error("what went on in the background has failed", exc_info=error)
 
     async def close(self) -> None:
         """End all of it."""
@@ -201,8 +200,7 @@ class Watcher:
         except ApiError as error:
             self.give_up(f"{error.title}. {error.detail}")
         except Exception as error:
-            log = self.log
-            log.exception("a test is not watched any more")
+            self.log.exception("a test is not watched any more")
             self.give_up(f"{type(error).__name__}.")
 
     def give_up(self, why: str) -> None:

@@ -132,6 +132,7 @@ def test_sentences_of_the_source_become_patterns() -> None:
         '"""A docstring of words."""\n'
         'x = f"the plateau is {share:.1%} of {a.b} and {f(1)}, 5 %"\n'
         'log.info("not for people at all")\n'
+        'self._log.info("nor is what an object logs")\n'
     )
     assert list(extract.sentences(source)) == ["the plateau is %(share)s of %(b)s and %(value)s, 5 %%"]
 
