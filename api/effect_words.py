@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import ast
 from collections.abc import Iterable
 from functools import cache
 from importlib.util import find_spec
@@ -48,13 +48,20 @@ UNITS = (
 
 @cache
 def titles() -> dict[str, str]:
-    """Titles by id, as the effects' files say them; read as text, since the web process does not load their physics."""
+    """Titles by id, as `EFFECT = Effect(…)` in the library's files says them.
+
+    The files are read and not loaded: the web process does without their physics, and the centre has no worker to ask.
+    """
     spec = find_spec("stimrig.identify.effects")
     assert spec is not None and spec.origin is not None
-    texts = (path.read_text(encoding="utf-8") for path in sorted(Path(spec.origin).parent.glob("*.py")))
-    return dict(
-        pair for text in texts for pair in re.findall(r'^    id="(\w+)",\n    name="(.+)",$', text, re.MULTILINE)
-    )
+    found: dict[str, str] = {}
+    for path in sorted(Path(spec.origin).parent.glob("*.py")):
+        for line in ast.parse(path.read_text(encoding="utf-8")).body:
+            match line:
+                case ast.Assign(targets=[ast.Name("EFFECT")], value=ast.Call(keywords=given)):
+                    said = {part.arg: str(part.value.value) for part in given if isinstance(part.value, ast.Constant)}
+                    found[said["id"]] = said["name"]
+    return found
 
 
 def effect_words(effect: str) -> str:

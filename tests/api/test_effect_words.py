@@ -39,6 +39,7 @@ def test_titles_and_main_parameters_are_those_of_the_library() -> None:
 def test_words_in_german() -> None:
     with language.using("de"):
         assert effects_words(["fatigue:by_pulses", "mains_hum"]) == "Ermüdung (by pulses), Netzbrummen"
+        assert effects_words(["fatigue", "my_swing"]) == "Ermüdung, My swing", "a person's own effect: its id in words"
         assert changes.name_of("fatigue.depth", "1").words == "Ermüdung, Tiefe"
         assert translated("recruitment_hysteresis: the evidence is too weak (log evidence +0.3): what it explains "
                           "looks like noise.").startswith("Hysterese der Rekrutierung: ")  # fmt: skip
