@@ -179,10 +179,11 @@ NAMES = {
     "charge_uc": Name(lazy("Dose (charge)"), "mC", 1e-3, digits=2),
     "current_ma": Name(lazy("Current"), "mA", digits=1),
 }
-"""In the order in which they are shown; those from the fourth last on after the effects' parameters."""
+"""In the order in which they are shown."""
 UNBROKEN = "\u00a0"
 """Between a number and its unit no line ends."""
 LAST = ("follows_percent", "noise_sd_nm", "charge_uc", "current_ma")
+"""Shown after the effects' parameters."""
 KINDS = {"electrodes": lazy("electrodes"), "side": lazy("the side"), "posture": lazy("posture")}
 
 

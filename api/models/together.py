@@ -42,7 +42,7 @@ async def fit(
         404: no such recording; 422: of another participant, named twice, without the joint's angle although an effect
         needs it, or the data do not allow the fit.
     """
-    rows = await asyncio.to_thread(_find_analysis, analyses, participant, recordings)
+    rows = await asyncio.to_thread(_find_recordings, analyses, participant, recordings)
     ids = _ids(effects)
     await analyses.check_known(ids)
     needs = [ANGLE] if {*ids} & {*_ids(JOINT_EFFECTS)} else []
@@ -56,7 +56,7 @@ def _ids(effects: Sequence[str]) -> list[str]:
     return [name.partition(":")[0] for name in effects]
 
 
-def _find_analysis(analyses: Analyses, participant: str, recordings: Sequence[str]) -> list[Recording]:
+def _find_recordings(analyses: Analyses, participant: str, recordings: Sequence[str]) -> list[Recording]:
     rows = []
     for identity in recordings:
         row: Recording | None = analyses.store.get(Recording, identity)

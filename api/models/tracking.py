@@ -95,7 +95,7 @@ def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
     bounds : Bounds
         Beyond these a person is asked (`Limits.alarms`).
     """
-    words = _outcome_row(number, step) or _beyond(number, step["coming"], bounds)
+    words = _outcome_sentence(number, step) or _beyond(number, step["coming"], bounds)
     return f"{words} {NEW_TEST}" if words else None
 
 
@@ -109,7 +109,7 @@ def not_followed(number: int) -> str:
     return f"{words} {NEW_TEST}"
 
 
-def _outcome_row(number: int, step: Mapping[str, Any]) -> str | None:
+def _outcome_sentence(number: int, step: Mapping[str, Any]) -> str | None:
     if step["outcome"] == NO_TORQUE:
         return (
             f"In trial {number} the pulses gave next to no torque. Look at the electrodes and cables; if they are in "

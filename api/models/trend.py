@@ -105,14 +105,14 @@ class Trend:
     async def for_models(self, participant: str, model_ids: Sequence[str]) -> list[Session]:
         """Of each model the session in which its recording was made, with this model for it."""
         sessions, models = await asyncio.to_thread(self._read, participant)
-        found = [_put_model(sessions, models, model_id) for model_id in model_ids]
+        found = [_session_of(sessions, models, model_id) for model_id in model_ids]
         await self._complete(found)
         return found
 
     async def against(self, model: Model) -> tuple[Session, Session] | None:
         """The last approved session before the model's, and the model's with that model; None where there is none."""
         sessions, models = await asyncio.to_thread(self._read, model.participant)
-        own = _put_model(sessions, models, model.id)
+        own = _session_of(sessions, models, model.id)
         before = [
             one for one in sessions if one.at_utc < own.at_utc and one.approval is not None and one.key != own.key
         ]
@@ -194,7 +194,7 @@ def _tests(participant: str) -> Any:
     return select(*columns).where(Test.participant == participant).order_by(Test.requested_utc)
 
 
-def _put_model(sessions: list[Session], models: dict[str, Row[Any]], model_id: str) -> Session:
+def _session_of(sessions: list[Session], models: dict[str, Row[Any]], model_id: str) -> Session:
     """A model's session, with this model for it."""
     row = models[model_id]
     return replace(next(one for one in sessions if one.key == _key(row)), model=row, figures={})
