@@ -234,7 +234,8 @@ class Analyses:
         path = await asyncio.to_thread(self.path, model.recording_id)
         place, _kind, given = await asyncio.to_thread(self._criticised, model)
         found = await self.asked("improve", on_call, data=path, **given)
-        rows = await asyncio.to_thread(self._store_steps, found, place if is_plain(place) else model, by)
+        first = place if await asyncio.to_thread(is_plain, place) else model
+        rows = await asyncio.to_thread(self._store_steps, found, first, by)
         return {key: value for key, value in found.items() if key != "models"}, rows
 
     def _store_steps(self, found: dict[str, Any], first: Model, by: str) -> list[Model]:
