@@ -131,7 +131,7 @@ def detail_words(detail: dict[str, Any]) -> str:
     return " · ".join(parts)
 
 
-environment.filters["told"] = detail_words
+environment.filters["detail_words"] = detail_words
 
 
 def back() -> Response:
