@@ -143,12 +143,13 @@ class Versions:
             raise NotFoundError("model", model_id, "GET /v1/participants/{code}/models lists a participant's.")
         return row
 
-    def of(self, participant: str) -> list[dict[str, Any]]:
-        """A participant's versions as clients see them, newest first.
+    def of(self, participant: str, since_utc: str = "") -> list[dict[str, Any]]:
+        """A participant's versions as clients see them, newest first; with `since_utc` those made since then.
 
         Three queries, and no model is read whole but those from before a verdict was kept beside them.
         """
-        query = select(Model).options(defer(Model.document)).where(Model.participant == participant)
+        wanted = (Model.participant == participant, Model.created_utc >= since_utc)
+        query = select(Model).options(defer(Model.document)).where(*wanted)
         decided = select(Approval).where(Approval.participant == participant).order_by(Approval.id)
         with self.store.read() as session:
             rows = list(session.scalars(query.order_by(Model.created_utc.desc())))

@@ -191,7 +191,7 @@ def step(context: Context, row: Participant) -> Step:
     test = _last_test(context, row.code)
     open_test = test is not None and test.state in OPEN_STATES
     mine = current is not None and test is not None and current.test_id == test.id
-    models = [one for one in context.versions.of(row.code) if one["created_utc"] >= context.clock.start_of_day_utc()]
+    models = context.versions.of(row.code, since_utc=context.clock.start_of_day_utc())
     kept = next(filter(_counts, models), None)
     served = context.versions.approved(row.code)
     now = Situation(
