@@ -210,7 +210,9 @@ class Computing:
 
     def _running(self) -> subprocess.Popen[bytes]:
         """The process, fresh where there is none or where it has done enough."""
-        if self.process is not None and (self.done >= self.records or self.process.poll() is not None):
+        if self.process is not None and (
+            self.done >= self.records or self.process.poll() is not None or self._spoke(self.process)
+        ):
             self.close_process()
         if self.process is None:
             self.process = subprocess.Popen(
@@ -228,6 +230,13 @@ class Computing:
                 raise RuntimeError(f"the process that computes does not start ({_how(code)})")
             self.left_open = json.loads(ready)["left_open"]
         return self.process
+
+    def _spoke(self, process: subprocess.Popen[bytes]) -> bool:
+        """Whether it says something that nobody asked: it would spoil the row of the next record."""
+        assert process.stdout is not None
+        with selectors.DefaultSelector() as ready:
+            ready.register(process.stdout, selectors.EVENT_READ)
+            return bool(self._rest or ready.select(0))
 
     def _line(self, process: subprocess.Popen[bytes], until_s: float) -> bytes | None:
         """The next line; None where the process ended, or none came in time."""

@@ -66,7 +66,7 @@ def compute(progress: Callable[..., None], file: str, name: str, known: Row, tas
             return {"left_out": True}
     except IdentifyError as error:
         kind = next((word for type_, word in KINDS if isinstance(error, type_)), "bad record")
-        row |= failed(kind, str(error).replace(file, name).replace(path.name, name))
+        row |= failed(kind, str(error).replace(file, path.name).replace(path.name, name))
     except MemoryError:
         row |= failed("out of memory", "it takes more memory than a worker may have. Give more with --memory.")
     except RecursionError:

@@ -47,7 +47,7 @@ def own_output() -> TextIO:
 
 
 def parsed() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="api.workers.child")
+    parser = argparse.ArgumentParser(prog="stimrig.api.workers.child")
     parser.add_argument("--reads", type=Path, action="append", default=[])
     parser.add_argument("--writes", type=Path, action="append", default=[])
     parser.add_argument("--verbs", default=VERBS, help="module with a table of what can be called")

@@ -155,6 +155,12 @@ def test_hostile_files_are_rows_and_give_nothing_away(computing: Computing, tmp_
         assert "record.h5" not in found["error"], "the name that the person knows"
 
 
+@pytest.mark.parametrize("name", ["x.csv", "my-record.csv", "old/record.csv"])
+def test_a_mistake_names_the_record_as_the_person_does(computing: Computing, name: str) -> None:
+    found = row(computing, b"no table", name=name)
+    assert found["error"].startswith(f"{name}, line 1: ")
+
+
 def test_no_file_of_the_machine_can_be_read(computing: Computing, good: bytes, tmp_path: Path) -> None:
     """The child is shut in before it reads: what the harness of hostile files tries, tried directly."""
     row(computing, good)
@@ -214,9 +220,9 @@ def taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[...,
         script = tmp_path / "evil.py"
         script.write_text(
             'import json, sys\nprint(\'{"ready": true, "left_open": {}}\', flush=True)\n'
-            f"for number, line in enumerate(sys.stdin):\n    for answer in {answers!r}:\n"
-            "        answer = answer.replace('CALL', json.loads(line)['call']).replace('NUMBER', str(number))\n"
-            "        print(answer, flush=True)\n"
+            f"for number, line in enumerate(sys.stdin):\n    said = {chr(10).join(answers)!r}\n"
+            "    said = said.replace('CALL', json.loads(line)['call']).replace('NUMBER', str(number))\n"
+            "    print(said, flush=True)\n"
         )
         monkeypatch.setattr(own, "CHILD", (sys.executable, str(script)))
 
@@ -242,10 +248,18 @@ def test_a_process_that_was_taken_over_cannot_end_a_run(taken_over: Callable[...
     assert (found["status"], found["error_kind"]) == ("error", "unexpected")
 
 
-def test_a_second_answer_is_nobody_elses(taken_over: Callable[..., None]) -> None:
-    taken_over(*[told('{"status": "ok", "participant": "PNUMBER"}')] * 2)
+@pytest.mark.parametrize("more", [told('{"status": "ok", "participant": "PNUMBER"}'), "no JSON", '{"call": '])
+def test_what_was_said_behind_an_answer_is_nobody_elses(taken_over: Callable[..., None], more: str) -> None:
+    taken_over(told('{"status": "ok", "participant": "PNUMBER"}'), more)
     with closing(Computing(MEMORY)) as computing:
-        assert [row(computing, b"")["participant"] for _ in range(3)] == ["P0", "P1", "P2"]
+        found = [row(computing, b"")["participant"] for _ in range(3)]
+        assert found == ["P0"] * 3, "a fresh process each time, for the one before said what nobody asked"
+
+
+def test_an_answer_on_another_record_is_passed_over(taken_over: Callable[..., None]) -> None:
+    taken_over(told('{"status": "ok", "participant": "other"}').replace("CALL", "1"), told('{"status": "ok"}'))
+    with closing(Computing(MEMORY)) as computing:
+        assert "participant" not in row(computing, b"")
 
 
 def test_a_process_has_no_say_in_which_record_it_was(taken_over: Callable[..., None]) -> None:
