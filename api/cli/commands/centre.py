@@ -8,27 +8,21 @@ import sys
 import threading
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from tqdm import tqdm
 
 from stimrig.api import owner_only
-from stimrig.api.centre import check as checking
-from stimrig.api.centre import clean
-from stimrig.api.centre.bucket import BucketError
-from stimrig.api.centre.context import CentreSettings, open_store, ready_bucket
-from stimrig.api.centre.postgres import Cluster
-from stimrig.api.centre.rigs import Rigs
-from stimrig.api.centre.server import prepared, run
 from stimrig.api.cli.child import Child
 from stimrig.api.cli.errors import CommandError, InputError, LaunchError
 from stimrig.api.cli.launcher import Ended, Endings
 from stimrig.api.cli.terminal import given, say, say_json, sign_in_lines
 from stimrig.api.client.errors import ServiceError
 from stimrig.api.client.rest import Client
-from stimrig.api.clock import Clock
-from stimrig.api.people.pace import Guesses
+
+if TYPE_CHECKING:
+    from stimrig.api.centre.context import CentreSettings
 
 DataOption = Annotated[Path | None, typer.Option(help="data folder; default ./centre, or STIMRIG_CENTRE_DATA_DIR")]
 DatabaseOption = Annotated[
@@ -71,6 +65,9 @@ def serve(
             raise InputError("--demo makes its own database and bucket: leave --database and --files out.")
         play(data or Path("centre-demo"), 8100 if port is None else port)
         return
+    from stimrig.api.centre.context import CentreSettings
+    from stimrig.api.centre.server import prepared, run
+
     settings = CentreSettings(**named)
     try:
         app, listener = prepared(settings)
@@ -81,20 +78,27 @@ def serve(
     run(app, listener, lambda url: say(f"stimrig centre: {url}/ {head}", *sign_in_lines(url, *how)))
 
 
-def _open_store(context: typer.Context, data: Path | None, database: str | None):
-    """Settings, and the database of the centre."""
+def _settings(context: typer.Context, data: Path | None, database: str | None) -> CentreSettings:
+    """Those of a centre that is there."""
+    from stimrig.api.centre.context import CentreSettings
+
     settings = CentreSettings(**{**(context.obj or {}), **given(data_dir=data, database_url=database)})
     if not {"data_dir", "database_url"} & settings.model_fields_set and not (settings.data_dir / "centre.db").exists():
         raise InputError(
             "no centre in ./centre. Give --data or --database as the centre has it, or its settings (docs/centre.md)."
         )
-    return settings, open_store(settings)
+    return settings
 
 
 @contextmanager
-def _rigs(context: typer.Context, data: Path | None, database: str | None):
+def _rigs(settings: CentreSettings):
     """The rigs of the centre; in the end its database is let go."""
-    with closing(_open_store(context, data, database)[1]) as store:
+    from stimrig.api.centre.context import open_store
+    from stimrig.api.centre.rigs import Rigs
+    from stimrig.api.clock import Clock
+    from stimrig.api.people.pace import Guesses
+
+    with closing(open_store(settings)) as store:
         yield Rigs(store, Clock(), Guesses(Clock()))
 
 
@@ -106,7 +110,7 @@ def add_rig(
     database: DatabaseOption = None,
 ) -> None:
     """A new rig, or a new key for a revoked one; prints the key this once."""
-    with _rigs(context, data, database) as rigs:
+    with _rigs(_settings(context, data, database)) as rigs:
         key = rigs.add(name, WHO)
     say("settings for the rig's service, shown this once:", f"STIMRIG_CENTRE_URL={url}", f"STIMRIG_CENTRE_KEY={key}")
 
@@ -116,7 +120,7 @@ def revoke_rig(
     database: DatabaseOption = None,
 ) -> None:  # fmt: skip
     """The rig's key opens nothing any more; what it pushed stays."""
-    with _rigs(context, data, database) as rigs:
+    with _rigs(_settings(context, data, database)) as rigs:
         rigs.revoke(name, WHO)
     say(f"the key of {name} is revoked; what it pushed stays")
 
@@ -132,11 +136,18 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="print what was found as JSON")] = False,
 ) -> None:
     """Read the bucket's files again and compare them with their hashes; exit 1 where one differs."""
+    from stimrig.api.centre import check as checking
+    from stimrig.api.centre import clean
+    from stimrig.api.centre.bucket import BucketError
+    from stimrig.api.centre.context import open_store, ready_bucket
+    from stimrig.api.clock import Clock
+
     clock = Clock()
     begun = since or clock.utc()
     if clean.label(begun, "") != begun:
         raise InputError(f"--since {begun}: give a time as 2026-11-23T08:00:00Z")
-    settings, store = _open_store(context, data, database)
+    settings = _settings(context, data, database)
+    store = open_store(settings)
     settings = settings.model_copy(update={"files": files}) if files else settings
     count, lost = 0, list[dict[str, str]]()
     try:
@@ -208,7 +219,7 @@ class EmulatedRig:
 
 
 def play(folder: Path, port: int) -> None:
-    """All of it, until Ctrl-C or SIGTERM.
+    """A whole centre on one machine, until Ctrl-C or SIGTERM: PostgreSQL, a folder as the bucket, two emulated rigs.
 
     Raises
     ------
@@ -217,6 +228,8 @@ def play(folder: Path, port: int) -> None:
     SettingsError
         PostgreSQL is not installed, or cannot be set up.
     """
+    from stimrig.api.centre.postgres import Cluster
+
     folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True, mode=0o711)  # PostgreSQL's user passes through it
     with suppress(Ended), Endings(), ExitStack() as stack:
@@ -255,8 +268,9 @@ def _centre(folder: Path, port: int, database: str, token: str) -> Child:
 
 def _key(folder: Path, database: str, name: str) -> str:
     """A new key for a rig; one from before is revoked."""
-    with closing(open_store(CentreSettings(data_dir=folder / "centre", database_url=database))) as store:
-        rigs = Rigs(store, Clock(), Guesses(Clock()))
+    from stimrig.api.centre.context import CentreSettings
+
+    with _rigs(CentreSettings(data_dir=folder / "centre", database_url=database)) as rigs:
         if rigs.named(name) is not None:
             rigs.revoke(name, "demo")
         return rigs.add(name, "demo")
