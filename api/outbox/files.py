@@ -113,15 +113,15 @@ class Files:
             return Source(sha256, None, body, len(body)) if hashlib.sha256(body).hexdigest() == sha256 else None
         path = Path(row.path)
         seen = _signature(path)
+        if seen is None:
+            return None
         if self._whole != (sha256, path, seen):
             try:
                 if sha256_of(path) != sha256 or _signature(path) != seen:
                     return None
             except OSError:
                 return None
-        if seen is None:
-            return None
-        self._whole = (sha256, path, seen)
+            self._whole = (sha256, path, seen)
         return Source(sha256, path, None, seen[1])
 
 
