@@ -85,7 +85,7 @@ def load_model(path: Path) -> Any:
         raise InputError(f"{path}: {error}") from error
 
 
-def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects: Sequence[str] = ()) -> Any:
+def load_record(data: Sequence[Path], columns: list[str] | None = None, effects: Sequence[str] = ()) -> Any:
     """A record from its file, or from several as one; what was assumed goes to standard error.
 
     Raises
@@ -95,13 +95,13 @@ def load_joined(data: Sequence[Path], columns: list[str] | None = None, effects:
     IdentifyError
         One cannot be read, they do not go together, or one lacks what one of the `effects` needs.
     """
-    from stimrig.api.workers import recordings
+    from stimrig.api import record_files
 
     twice = [path for number, path in enumerate(data) if path in data[:number]]
     if twice:
         raise InputError(f"{twice[0]}: named twice. Name each recording once.")
     needs = _needed(effects) if len(data) > 1 else []
-    return recordings.read(data, columns, needs, note=lambda words: print(words, file=sys.stderr))
+    return record_files.read(data, columns, needs, note=lambda words: print(words, file=sys.stderr))
 
 
 def _needed(effects: Sequence[str]) -> list[str]:
@@ -137,7 +137,7 @@ def load_held(path: Path | None, data: Sequence[Path], columns: list[str] | None
     from stimrig.api.structure import held_by
 
     model = None if path is None else load_model(path)
-    record = load_joined(data, columns)
+    record = load_record(data, columns)
     try:
         return record, model, held_by(model, record)
     except identify.IdentifyError as error:

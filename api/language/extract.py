@@ -30,9 +30,9 @@ SENTENCES = (
     "identify/simulation/joint_surface.py", "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/adapters/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py",
     "rig/journal.py", "rig/limits.py", "rig/plan.py", "rig/protocols.py", "rig/score.py", "rig/sequences/*.py",
-    "rig/trial.py", "api/models/*.py", "api/people/*.py", "api/sessions/*.py", "api/store/seen.py",
+    "rig/phase.py", "api/models/*.py", "api/people/*.py", "api/sessions/*.py", "api/store/seen.py",
     "api/web/*.py", "api/web/routes/*.py", "api/web/pages/*.py", "api/workers/*.py", "api/errors.py",
-    "api/centre/directory.py", "api/centre/downloads.py", "api/centre/rigs.py",
+    "api/centre/directory.py", "api/centre/downloads.py", "api/centre/rigs.py", "api/record_files.py",
 )  # fmt: skip
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.api.record_files import begun
 from stimrig.api.workers.json_values import clean
-from stimrig.api.workers.recordings import begun
 
 Progress = Callable[[float, str], None]
 MOST_MISSED = 50

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.api.record_files import export_csv, find_recording, joined, plain_csv
 from stimrig.api.structure import held_by
 from stimrig.api.workers import adaptive_verbs, tracking_verbs
 from stimrig.api.workers.curves import comparison, page_curves, recorded
 from stimrig.api.workers.json_values import clean
-from stimrig.api.workers.recordings import export_csv, find_recording, joined, plain_csv
 
 Progress = Callable[[float, str], None]
 SIGNATURE_POINTS = 900

@@ -25,9 +25,9 @@ from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError
 from stimrig.rig.limits import Limit, refuse
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import AngleCalibration, AnglePose, AngleStatus, TestPlan
+from stimrig.rig.phase import Phase
 from stimrig.rig.requests import AnglePoseRequest
 from stimrig.rig.signals import TRUSTED, AngleScale
-from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
 
@@ -270,7 +270,7 @@ class Joint:
             )
         check_start(self._receiver(), plan, table, self._tasks.clock)
 
-    async def pose(self, request: AnglePoseRequest, trial: Trial) -> None:
+    async def pose(self, request: AnglePoseRequest, phase: Phase) -> None:
         """The goniometer's angle of a joint that is held still; the second one completes a calibration.
 
         Raises
@@ -283,8 +283,8 @@ class Joint:
             See `AngleCalibrating.pose`.
         """
         self._refuse_absent("angle_pose")
-        if trial.busy:
-            raise BusyError(f"test {trial.test_id} is {trial.state}; take the pose afterwards")
+        if phase.busy:
+            raise BusyError(f"test {phase.test_id} is {phase.state}; take the pose afterwards")
         await self.poses.pose(request.angle_rad, request.by, self._receiver(), self._bound, request.first)
         self._pair.rescale(self.poses.scale)
 

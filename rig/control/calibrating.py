@@ -45,13 +45,13 @@ class Calibrations:
         """
         state, latch = self._state, self._state.latch
         async with state.in_turn():
-            following = state.trial.calibrate(request.participant)
+            following = state.phase.calibrate(request.participant)
             state.refuse_unseen(latch)
             self._result.refuse_waiting()
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
             calibration = Calibration(request, self._table, self._tasks.clock.unix_s(), self._pair.steps)
             await self._tasks.work(self._store.check_room, f"{request.calibration_id}.001")
-            state.trial.may_start()  # a stop may have come meanwhile
+            state.phase.may_start()  # a stop may have come meanwhile
             state.calibration = calibration
             state.change(following)
 
@@ -73,7 +73,7 @@ class Calibrations:
             self._rest.check(test, calibration.rest)
             await self._tasks.work(self._store.check_room, train.test_id)
             self._open()  # a stop may have come meanwhile
-            following = self._state.trial.train(train.test_id)
+            following = self._state.phase.train(train.test_id)
             await self._player.launch(test, calibration.table, following, self._joint.described())
 
     async def mark(self, request: CalibrateMarkRequest) -> None:
@@ -113,20 +113,20 @@ class Calibrations:
         if not discard:
             found = {"calibration_id": of.calibration_id, "participant": of.participant, "by": of.by, "result": result}
             await self._result.keep(Calibrated.model_validate(found))
-        if self._state.trial.state == "calibrating":  # a stop may have come meanwhile: it takes no result back
-            self._state.change(self._state.trial.calibrated())
+        if self._state.phase.state == "calibrating":  # a stop may have come meanwhile: it takes no result back
+            self._state.change(self._state.phase.calibrated())
         return result
 
     def _open(self, calibration_id: str = "", today: bool = False) -> Calibration:
         """The open calibration between two trains; `today`: if its day is not over."""
-        calibration, trial = self._state.calibration, self._state.trial
+        calibration, phase = self._state.calibration, self._state.phase
         if calibration is None:
             raise PlanError("calibration: none is open (a stop or a fault closes it); start a new one")
         open_id = calibration.request.calibration_id
         if calibration_id not in ("", open_id):
             raise PlanError(f"calibration: {calibration_id!r} is not open; {open_id} is")
-        if trial.state != "calibrating":
-            raise BusyError(f"calibration: train {trial.test_id} is {trial.state}; wait or stop it")
+        if phase.state != "calibrating":
+            raise BusyError(f"calibration: train {phase.test_id} is {phase.state}; wait or stop it")
         if today:
             calibration.check_day(self._tasks.clock.unix_s())
         return calibration

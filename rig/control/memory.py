@@ -71,7 +71,7 @@ class SmallFile:
 Remembered = Literal["running", "latched"]
 
 
-class Latch:
+class LatchFile:
     """That a test was running, or that the rig is latched and why; stored before the event that it describes."""
 
     def __init__(self, folder: Path, machine: Machine) -> None:

@@ -23,9 +23,9 @@ from stimrig.rig.control.state import State
 from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError, WithdrawnError
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import Event, Extended, FinishedEvent, StopEvidence, Withdrawn
+from stimrig.rig.phase import Phase
 from stimrig.rig.requests import EnoughRequest, ExtendRequest, WithdrawRequest
 from stimrig.rig.tasks import Signal, Task
-from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
 
@@ -62,7 +62,7 @@ class Player:
             raise WithdrawnError(f"test {test_id}: {withdrawn}; ask for a new test")
 
     async def launch(
-        self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Trial, angle: dict[str, Any] | None,
+        self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Phase, angle: dict[str, Any] | None,
         key: str = "",
     ) -> None:  # fmt: skip
         """Create latch file and journal, then play: for every test and every train of a calibration.
@@ -78,7 +78,7 @@ class Player:
         key
             What extensions of an adaptive test must know.
         """
-        state, before, halt = self.state, self.state.trial, Halt(self._clock)
+        state, before, halt = self.state, self.state.phase, Halt(self._clock)
         halt.on_set(lambda: self._ending(halt))
         self._halt, self.evidence, self._key = halt, None, key
         self.evidence_ready.clear()
@@ -99,7 +99,7 @@ class Player:
     def end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
         """End the running test, or latch; True if a test runs."""
         self.state.count_stop()
-        halt = self._halt if self.state.trial.busy else None
+        halt = self._halt if self.state.phase.busy else None
         ends_now = halt is not None and halt.set(cause, reason)
         if latch_idle and not ends_now:  # of a test that was ending both reasons are told
             self.state.halted(reason)
@@ -107,17 +107,17 @@ class Player:
 
     def trouble(self) -> str | None:
         """That the task of the test has died; None: it has not."""
-        trial = self.state.trial
-        if trial.busy and self.run is not None and (self.playing is None or self.playing.done.is_set()):
-            return f"the task of test {trial.test_id} ended, but its test did not"
+        phase = self.state.phase
+        if phase.busy and self.run is not None and (self.playing is None or self.playing.done.is_set()):
+            return f"the task of test {phase.test_id} ended, but its test did not"
         return None
 
     async def withdraw(self, request: WithdrawRequest) -> Withdrawn:
         """See `WithdrawRequest`. Like a stop it waits for no turn, and for nothing else. Raises PlanError (its id)."""
         test_id, reason = request.test_id, f"withdrawn: {request.reason:.{LONGEST_WORDS}}"
         check_names("withdraw", test_id=test_id)
-        present, run = self.state.trial.test_id == test_id, self.run
-        ending = present and self.state.trial.state not in ("arming", "running")
+        present, run = self.state.phase.test_id == test_id, self.run
+        ending = present and self.state.phase.state not in ("arming", "running")
         begun = present and run is not None and run.begun
         over = self.finished is not None and self.finished.test_id == test_id
         if ending or over or (begun and not request.begun):
@@ -169,13 +169,13 @@ class Player:
 
     def _ending(self, halt: Halt) -> None:
         if halt.cause == "withdrawn":
-            self.state.change(self.state.trial.withdrawn())
+            self.state.change(self.state.phase.withdrawn())
         else:
             self.state.halted(halt.reason)
 
-    async def _not_begun(self, before: Trial) -> None:
+    async def _not_begun(self, before: Phase) -> None:
         """No pulse was sent. A stop that came meanwhile counts as one of an idle rig."""
-        state, halted = self.state, self.state.trial
+        state, halted = self.state, self.state.phase
         state.change(before)
         if halted.lost:
             state.change(before.disconnected(halted.lost))
@@ -197,7 +197,7 @@ class Player:
             if result.last_pulse_s is not None:  # stored before another test may start; an unconfirmed end is one now
                 confirmed = result.evidence.confirmed
                 await self.rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
-            self.state.change(self.state.trial.ended())
+            self.state.change(self.state.phase.ended())
             finished = await self.tasks.work(self.store.finish, run.journal.path, run.plan.test_id, result)
             await self._finish(run, result, finished)
         except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
@@ -206,28 +206,28 @@ class Player:
 
     async def _announce(self, run: TestRun) -> None:
         await self.tasks.wait(math.inf, run.started, run.halt.signal)
-        if run.started.is_set() and self.state.trial.state == "arming":
-            self.state.change(self.state.trial.armed())
+        if run.started.is_set() and self.state.phase.state == "arming":
+            self.state.change(self.state.phase.armed())
 
     async def _finish(self, run: TestRun, result: RunResult, finished: FinishedEvent) -> None:
-        state, train = self.state, self.state.trial.calibrating
+        state, train = self.state, self.state.phase.calibrating
         if finished.recording_path is None and run.t0_s is not None:  # only a journal: needs a person
-            state.change(state.trial.halted(finished.reason))
+            state.change(state.phase.halted(finished.reason))
         await state.settle()
         self.run = None
         if train and state.calibration is not None:
             state.calibration.played(run.plan.profile.max_pulse_width_us, result.rise_nm, finished)
         if not train:
             self.finished = finished
-        state.change(state.trial.sealed())
+        state.change(state.phase.sealed())
         if not train:
             self._publish(finished)
 
     async def _broken(self, reason: str) -> None:
         self.evidence_ready.set()
         self.run = None
-        self.state.change(Trial("latched", reason, lost=reason))
-        await self.state.remember(Trial("uncertain", reason))
+        self.state.change(Phase("latched", reason, lost=reason))
+        await self.state.remember(Phase("uncertain", reason))
         await self.rest.pulse_at(self._clock.now_s(), ended=False)
 
 

@@ -15,7 +15,7 @@ from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibrating import Calibrations
 from stimrig.rig.control.calibration import check_profile, check_range
 from stimrig.rig.control.live import finite, live_event
-from stimrig.rig.control.memory import Latch, Rest, Result
+from stimrig.rig.control.memory import LatchFile, Rest, Result
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
 from stimrig.rig.control.replies import internal_error, refusal
@@ -35,8 +35,8 @@ from stimrig.rig.messages import (
     StopEvidence,
     TestPlan,
 )
+from stimrig.rig.phase import Phase
 from stimrig.rig.requests import AnglePoseRequest, Request
-from stimrig.rig.trial import Trial
 
 log = logging.getLogger("rig")
 
@@ -65,7 +65,7 @@ class Rig:
         self.table = config.limits.table()
         """Hard limits, narrowed by the rig file."""
         self._born_s = self._clock.now_s()
-        self.state = State(Latch(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._tell)
+        self.state = State(LatchFile(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._tell)
         self.pair = Pair(config, machine, self.fault, self._lost)
         self.joint = Joint(config, machine, self.pair, self.table["angle_rad"])
         self.rest = Rest(config.data_dir, machine)
@@ -84,18 +84,18 @@ class Rig:
         return self.player.finished
 
     def status(self) -> Status:
-        trial, run, receiver = self.state.trial, self.player.run, self.pair.receiver
+        phase, run, receiver = self.state.phase, self.player.run, self.pair.receiver
         calibration = self.state.calibration
         cell = dict(self.pair.identity["load_cell"])
         if receiver and (measured_hz := receiver.measured_rate_hz()) is not None:
             cell["measured_rate_hz"] = round(measured_hz, 2)
         seen = receiver is not None and receiver.last_s is not None
         return Status(
-            state=trial.state,
-            reason=trial.reason_stopped,
+            state=phase.state,
+            reason=phase.reason_stopped,
             latch=self.state.latch,
-            test_id=trial.test_id,
-            participant=trial.participant,
+            test_id=phase.test_id,
+            participant=phase.participant,
             segment=run.segment() if run else None,
             elapsed_s=run.elapsed_s() if run else 0.0,
             duration_s=run.score.longest_s if run else 0.0,
@@ -113,10 +113,10 @@ class Rig:
 
     def trouble(self) -> str | None:
         """Which task or request of this process hangs or has died; None: none. For the process's watchdog."""
-        trial, receiver = self.state.trial, self.pair.receiver
+        phase, receiver = self.state.phase, self.pair.receiver
         if (found := self.state.trouble() or self.player.trouble()) is not None:
             return found
-        if receiver is not None and not receiver.living and trial.state != "disconnected" and not trial.lost:
+        if receiver is not None and not receiver.living and phase.state != "disconnected" and not phase.lost:
             return "the torque receiver has ended"
         return None
 
@@ -159,21 +159,21 @@ class Rig:
             before, reason = "uncertain", f"the rig died during a test ({reason or 'its journal was left'})"
         elif remembered == "latched":
             before = "latched"
-        trial = Trial().connected(before, reason)
+        phase = Phase().connected(before, reason)
         try:
             await self.pair.connect()
         except DeviceError as error:
             log.error("%s", error)
-            trial = trial.disconnected(str(error))  # a latch stays although a device is missing
+            phase = phase.disconnected(str(error))  # a latch stays although a device is missing
         else:
             if before == "uncertain":
-                trial = replace(trial, reason=f"{reason}; the stimulator, asked now: {self.pair.found_state}")
-        self.state.change(trial)
+                phase = replace(phase, reason=f"{reason}; the stimulator, asked now: {self.pair.found_state}")
+        self.state.change(phase)
 
     async def close(self) -> None:
         """Stop a running test, wait until it is sealed, disconnect. A start that is under way does not begin."""
         self.state.closing = True
-        self.state.change(self.state.trial.disconnected("the rig is shutting down"))
+        self.state.change(self.state.phase.disconnected("the rig is shutting down"))
         await self.stop("the rig is shutting down", "rig", latch_idle=False)
         if self.player.playing is not None:
             await self._tasks.sleep(SEALED_WITHIN_S, self.player.playing.done)
@@ -187,7 +187,7 @@ class Rig:
         Raises
         ------
         BusyError, LatchedError, UncertainError, DeviceError
-            See `Trial.start`.
+            See `Phase.start`.
         PlanError, RefusedError
             The plan is wrong, or outside a limit.
         LatchChangedError, WithdrawnError
@@ -196,11 +196,11 @@ class Rig:
             The journal or the latch file cannot be written.
         """
         state = self.state
-        state.trial.may_start()  # before its turn: a start that was asked for while stopped must not run later
+        state.phase.may_start()  # before its turn: a start that was asked for while stopped must not run later
         latch = state.latch
         await self.joint.await_angle(request)
         async with state.in_turn():
-            state.trial.may_start()
+            state.phase.may_start()
             state.refuse_unseen(latch)
             check_names("plan", test_id=request.test_id, participant=request.participant)
             if request.adaptive is not None and len(key) < MIN_KEY:  # only who started it extends it
@@ -210,7 +210,7 @@ class Rig:
             table = limits.for_plan(self.table, request)
             test = await self._tasks.work(plan.build, request, table)
             await self._tasks.work(self.store.check_room, request.test_id)
-            following = state.trial.start(request.test_id, request.participant)  # a stop may have come meanwhile
+            following = state.phase.start(request.test_id, request.participant)  # a stop may have come meanwhile
             now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
             needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
             check_profile(request.profile, now_s, needs_widths, longest_s)
@@ -226,7 +226,7 @@ class Rig:
     async def angle_pose(self, request: AnglePoseRequest) -> Status:
         """A pose of the angle sensor's calibration; raises as `Joint.pose`."""
         async with self.state.in_turn():
-            await self.joint.pose(request, self.state.trial)
+            await self.joint.pose(request, self.state.phase)
             self._tell()
         return self.status()
 
@@ -240,9 +240,9 @@ class Rig:
         player, state = self.player, self.state
         if player.end("stopped", words, latch_idle):
             await self._tasks.sleep(STOP_TIMEOUT_S, player.evidence_ready)
-            if state.trial.state == "sealing":
+            if state.phase.state == "sealing":
                 await state.written(until_s)
-            if player.evidence is not None or state.trial.busy:
+            if player.evidence is not None or state.phase.busy:
                 return player.evidence or self._unconfirmed(
                     "no more pulses are sent; the device did not answer in time"
                 )
@@ -284,13 +284,13 @@ class Rig:
         state = self.state
         async with state.in_turn():
             state.refuse_unseen(latch)
-            stopped = state.trial
+            stopped = state.phase
             following = stopped.rearm()
             if stopped.lost or not await self.pair.both_answer():
                 try:
                     await self.pair.reconnect()
                 except DeviceError as error:
-                    state.change(state.trial.disconnected(str(error)))
+                    state.change(state.phase.disconnected(str(error)))
                     raise
             await self._recover("its recording could not be sealed at its end")
             await self.rest.settle()
@@ -299,7 +299,7 @@ class Rig:
             try:
                 state.refuse_unseen(latch)
             except LatchChangedError:
-                await state.remember(state.trial)
+                await state.remember(state.phase)
                 raise
             log.info("re-armed by %s after: %s", by, stopped.reason)
             state.change(following)
@@ -320,7 +320,7 @@ class Rig:
     def _lost(self, reason: str) -> None:
         log.error("%s", reason)
         self.player.end("fault", reason, latch_idle=False)
-        self.state.change(self.state.trial.disconnected(reason))
+        self.state.change(self.state.phase.disconnected(reason))
 
     def _tell(self) -> None:
         self._publish(StateEvent(status=self.status()))

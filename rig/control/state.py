@@ -8,10 +8,10 @@ import math
 from collections.abc import AsyncIterator, Callable
 
 from stimrig.rig.control.calibration import Calibration
-from stimrig.rig.control.memory import Latch
+from stimrig.rig.control.memory import LatchFile
 from stimrig.rig.errors import BusyError, LatchChangedError, RigError
+from stimrig.rig.phase import STOPPED, Phase
 from stimrig.rig.tasks import Task, Tasks, Turn
-from stimrig.rig.trial import STOPPED, Trial
 
 log = logging.getLogger("rig")
 
@@ -22,7 +22,7 @@ RETRY_S = 1.0
 
 
 class State:
-    """The trial, its latch and the turn of requests.
+    """The phase, its latch and the turn of requests.
 
     Requests that begin something take their turn, one after the other. A stop never waits for it: it changes the state
     at once, and what was begun finds that out before it goes on.
@@ -35,8 +35,8 @@ class State:
         Called after each change.
     """
 
-    def __init__(self, file: Latch, tasks: Tasks, instance: str, publish: Callable[[], None]) -> None:
-        self.trial = Trial()
+    def __init__(self, file: LatchFile, tasks: Tasks, instance: str, publish: Callable[[], None]) -> None:
+        self.phase = Phase()
         self.file = file
         self.calibration: Calibration | None = None
         """The one that is open: a stop, a fault or a lost device closes it."""
@@ -80,21 +80,21 @@ class State:
         """Raise LatchChangedError if the rig was stopped since `latch` was told: who asks has not seen it."""
         if latch == self.latch:
             return
-        if self.trial.reason_stopped:
+        if self.phase.reason_stopped:
             raise LatchChangedError(
-                f"now: {self.trial.reason_stopped}; look at the participant and the rig, then re-arm"
+                f"now: {self.phase.reason_stopped}; look at the participant and the rig, then re-arm"
             )
         raise LatchChangedError("the rig was stopped while this waited; look at the participant, then ask again")
 
-    def change(self, trial: Trial) -> None:
-        if trial.reason_stopped not in ("", self.trial.reason_stopped):
+    def change(self, phase: Phase) -> None:
+        if phase.reason_stopped not in ("", self.phase.reason_stopped):
             self._stops += 1
-        changed = trial != self.trial or self._published != self.latch
-        self.trial, self._published = trial, self.latch
-        if not trial.calibrating:
+        changed = phase != self.phase or self._published != self.latch
+        self.phase, self._published = phase, self.latch
+        if not phase.calibrating:
             self.calibration = None
         if changed:
-            log.info("state %s %s", trial.state, trial.reason, extra={"test_id": trial.test_id})
+            log.info("state %s %s", phase.state, phase.reason, extra={"test_id": phase.test_id})
             self._publish()
 
     def count_stop(self) -> None:
@@ -103,19 +103,19 @@ class State:
 
     def halted(self, reason: str) -> None:
         """A stop or a fault: the state that follows, and its latch for the next process."""
-        following = self.trial.halted(reason)
+        following = self.phase.halted(reason)
         if following.state in STOPPED or following.state == "sealing":
             # behind whatever is being written: a clear that was under way does not come last
             self._latching = self._tasks.spawn(self.remember(following), "latch file")
         self.change(following)
 
-    async def remember(self, trial: Trial) -> None:
+    async def remember(self, phase: Phase) -> None:
         """Write the latch file. If the disk fails, the rig stays stopped; a latch is written once the disk takes it.
 
         Until then the file holds "running" if a test had begun, so that the next process starts as uncertain.
         """
         try:
-            await self.file.write("running" if trial.state == "uncertain" else "latched", trial.reason)
+            await self.file.write("running" if phase.state == "uncertain" else "latched", phase.reason)
         except RigError as error:
             log.error("%s", error)
             self._tasks.spawn(self._remember_later(), "latch file")
@@ -123,14 +123,14 @@ class State:
     async def _remember_later(self) -> None:
         await self._tasks.sleep(RETRY_S)
         async with self._turn:  # not while somebody re-arms
-            if self.trial.state in STOPPED:
-                await self.remember(self.trial)
+            if self.phase.state in STOPPED:
+                await self.remember(self.phase)
 
     async def settle(self) -> None:
         """Store what the rig will be after this test; once more if it is stopped meanwhile."""
         stored = None
-        while stored is not self.trial:
-            stored = self.trial
+        while stored is not self.phase:
+            stored = self.phase
             following = stored.sealed()
             if following.state == "latched":
                 await self.remember(following)

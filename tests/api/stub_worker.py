@@ -299,7 +299,7 @@ class Stub:
             Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
             return {"result": {"rows": 1}}
         if verb == "plain_csv":
-            from stimrig.api.workers.recordings import plain_csv
+            from stimrig.api.record_files import plain_csv
             from stimrig.identify.errors import IdentifyError
 
             try:
@@ -307,7 +307,7 @@ class Stub:
             except IdentifyError as error:
                 return {"error": {"expected": True, "detail": str(error), "place": error.place}}
         if verb == "find_recording":
-            from stimrig.api.workers.recordings import find_recording
+            from stimrig.api.record_files import find_recording
 
             return {"result": find_recording(lambda *_: None, **arguments)}
         if verb == "recorded":

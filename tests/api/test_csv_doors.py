@@ -17,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig import identify
+from stimrig.api import record_files
 from stimrig.api.cli import main
 from stimrig.api.cohort import bids, parquet
 from stimrig.api.models import inverted
 from stimrig.api.web.routes import trend
-from stimrig.api.workers import recordings
 from stimrig.identify.records import cells
 from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.record import Record, Source
@@ -33,7 +33,7 @@ ONLY_NUMBERS = "numbers under a header of ours"
 DOORS: dict[str, tuple[int, str]] = {
     "identify/records/cells.py": (1, "the writer itself"),
     "identify/records/join.py": (3, "test_a_joined_record"),
-    "api/workers/recordings.py": (2, "test_a_recording"),
+    "api/record_files.py": (2, "test_a_recording"),
     "api/web/routes/trend.py": (2, "test_a_trend"),
     "api/web/routes/recordings.py": (
         4,
@@ -95,7 +95,7 @@ def test_a_recording(tmp_path: Path) -> None:
     """Somebody's own file goes in with formulas; what is handed out has none, and is read as the same segments."""
     rows = (f"{k / 100:.2f},{k % 7},{-k / 1000},{HOSTILE[k // 40]}\n" for k in range(40 * len(HOSTILE)))
     (tmp_path / "in.csv").write_text("time_s,pulse_width_us,torque_nm,segment\n" + "".join(rows))
-    recordings.export_csv(str(tmp_path / "in.csv"), lambda *_: None, str(tmp_path / "out.csv"))
+    record_files.export_csv(str(tmp_path / "in.csv"), lambda *_: None, str(tmp_path / "out.csv"))
     texts_of(tmp_path / "out.csv", "segment")
     given, back = identify.read(tmp_path / "in.csv"), identify.read(tmp_path / "out.csv")
     assert back.segment_names == given.segment_names

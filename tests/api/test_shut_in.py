@@ -19,10 +19,10 @@ import httpx
 import pytest
 
 from stimrig.api.errors import ApiError
+from stimrig.api.record_files import find_recording
 from stimrig.api.workers import confinement
 from stimrig.api.workers.pool import WORKER, Pool
 from stimrig.api.workers.process import Places
-from stimrig.api.workers.recordings import find_recording
 from tests.api.conftest import STUB, Service, run_service, soon
 from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool

@@ -202,7 +202,7 @@ def test_experiment_joins_only_the_participants_own_model(client: httpx.Client, 
 
 def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) -> None:
     from stimrig import identify
-    from stimrig.api.workers import recordings
+    from stimrig.api import record_files
     from tests.api.fake_rig import write_recording
 
     widths = [200.0 if index >= 40 and index // 20 % 2 else 0.0 for index in range(240)]
@@ -216,7 +216,7 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
             file.attrs["created_utc"] = f"2026-01-01T00:{minute:02d}:00.250Z"
         paths.append(str(path))
     out, exported = tmp_path / "joined.csv", tmp_path / "exported.csv"
-    found = recordings.joined(paths, str(out), lambda *_: None)
+    found = record_files.joined(paths, str(out), lambda *_: None)
     assert found["file_sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
     joined = identify.read(out)
     assert [source.recording_id for source in joined.source.parts] == ["R-early", "R-late"]
@@ -225,9 +225,9 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
     assert joined.parts[0].begun_s == pytest.approx(1767225600.25)
     # Torque that follows at once is no second order: its zero is found to a fiftieth of its 5 N·m.
     assert identify.fit(joined).baseline_nm == pytest.approx(0.0, abs=0.1)
-    recordings.joined(paths[::-1], str(exported), lambda *_: None)
+    record_files.joined(paths[::-1], str(exported), lambda *_: None)
     assert exported.read_bytes() == out.read_bytes()
-    recordings.export_csv(str(out), lambda *_: None, str(exported))
+    record_files.export_csv(str(out), lambda *_: None, str(exported))
     assert identify.read(exported).parts == joined.parts
 
 

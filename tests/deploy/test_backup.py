@@ -90,12 +90,12 @@ def test_there_and_back(machine: Machine, tmp_path: Path) -> None:
 
 
 def test_the_rig_reads_the_latch_of_restored_data(machine: Machine, tmp_path: Path) -> None:
-    from stimrig.rig.control.memory import Latch
+    from stimrig.rig.control.memory import LatchFile
     from tests.simulator.virtual_time import VirtualMachine
 
     def read(folder: Path) -> tuple[str | None, str]:
         there = VirtualMachine()
-        return there.run(Latch(folder, there).read())
+        return there.run(LatchFile(folder, there).read())
 
     (machine.rig / "latch.json").write_text('{"state": "running", "reason": "test t3"}')
     kept = backup.make(machine.rig, machine.api, tmp_path / "backups")

@@ -300,7 +300,7 @@ def test_bad_csv_columns_are_one_line(tmp_path, cells, says):
 
 
 def test_exported_records_keep_both(tmp_path):
-    from stimrig.api.workers.recordings import export_csv
+    from stimrig.api.record_files import export_csv
 
     seal(tmp_path / "r.h5", sync=True)
     sealed = read(tmp_path / "r.h5")

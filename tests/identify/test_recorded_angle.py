@@ -91,7 +91,7 @@ def test_impossible_angles_are_one_line(tmp_path: Path, spoil: str, says: str):
 
 
 def test_csv_keeps_both_columns(tmp_path: Path):
-    from stimrig.api.workers.recordings import export_csv
+    from stimrig.api.record_files import export_csv
 
     record = sealed(tmp_path / "a.h5")
     export_csv(str(tmp_path / "a.h5"), lambda *_: None, str(tmp_path / "a.csv"))

@@ -12,7 +12,7 @@ import pytest
 
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.clock import MonotonicClock, utc_text
-from stimrig.rig.control.memory import Latch, Rest
+from stimrig.rig.control.memory import LatchFile, Rest
 from stimrig.rig.errors import BusyError, PlanError, RigError
 from stimrig.rig.messages import CalibrationResult, Threshold
 from stimrig.rig.requests import CalibrateFinishRequest, CalibrateStartRequest
@@ -25,12 +25,12 @@ from tests.simulator.world import World
 
 def test_the_latch_is_remembered(tmp_path: Path):
     machine = VirtualMachine()
-    latch = Latch(tmp_path, machine)
+    latch = LatchFile(tmp_path, machine)
     assert machine.run(latch.read()) == (None, "")
     machine.run(latch.write("running", "test 7"))
-    assert machine.run(Latch(tmp_path, machine).read()) == ("running", "test 7")
+    assert machine.run(LatchFile(tmp_path, machine).read()) == ("running", "test 7")
     machine.run(latch.write("latched", "electrode"))
-    assert machine.run(Latch(tmp_path, machine).read()) == ("latched", "electrode")
+    assert machine.run(LatchFile(tmp_path, machine).read()) == ("latched", "electrode")
     machine.run(latch.clear())
     machine.run(latch.clear())
     assert machine.run(latch.read()) == (None, "")
@@ -40,13 +40,13 @@ def test_the_latch_is_remembered(tmp_path: Path):
 def test_a_latch_that_cannot_be_read_counts_as_a_test_that_ran(tmp_path: Path, content: str):
     (tmp_path / "latch.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     machine = VirtualMachine()
-    assert machine.run(Latch(tmp_path, machine).read())[0] == "running"
+    assert machine.run(LatchFile(tmp_path, machine).read())[0] == "running"
 
 
 def test_what_is_asked_for_first_is_written_first_however_slow_the_disk_is(tmp_path: Path):
     machine = VirtualMachine()
     slow_work(machine, 0.5, 0.1, 0.3)
-    latch = Latch(tmp_path, machine)
+    latch = LatchFile(tmp_path, machine)
     asked = latch.write("running", "test 7"), latch.clear(), latch.write("latched", "electrode")
     tasks = [machine.tasks.begin(one, str(number)) for number, one in enumerate(asked)]
     machine.run(machine.tasks.join(tasks[-1]))

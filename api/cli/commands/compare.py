@@ -14,8 +14,8 @@ from stimrig.api.cli.terminal import (
     ModelFile,
     SeveralData,
     called,
-    load_joined,
     load_model,
+    load_record,
     model_report,
     say,
     say_json,
@@ -40,7 +40,7 @@ def compare(
     from stimrig.api.workers.json_values import clean
 
     model = load_model(model_json)
-    record = load_joined(data, columns)
+    record = load_record(data, columns)
     found = identify.compare(model, record).to_dict()
     if html is not None:
         drawn = clean(curves(model, record))

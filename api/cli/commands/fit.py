@@ -14,8 +14,8 @@ from stimrig.api.cli.terminal import (
     Json,
     SeveralData,
     carried_lines,
-    load_joined,
     load_model,
+    load_record,
     model_report,
     names,
     say,
@@ -63,7 +63,7 @@ def fit(
     if carry is not None and (method != METHOD or effects or fit_on):
         raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
     earlier = None if carry is None else load_model(carry)
-    record = load_joined(data, columns, names(effects))
+    record = load_record(data, columns, names(effects))
     found: dict[str, Any] | None = None
     with progress_bar() as progress:
         if earlier is None:

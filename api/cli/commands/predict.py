@@ -13,8 +13,8 @@ from stimrig.api.cli.terminal import (
     Data,
     Json,
     ModelFile,
-    load_joined,
     load_model,
+    load_record,
     number,
     percent,
     say,
@@ -37,7 +37,7 @@ def predict(
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
 
     model = load_model(model_json)
-    record = load_joined([data], columns)
+    record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))
     found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
     if output.suffix.lower() == ".mat":

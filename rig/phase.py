@@ -5,7 +5,7 @@
                               +-> stopping -> sealing -> latched -> (a person) -> ready
     ready -> calibrating -> arming … sealing -> calibrating -> … -> ready
 
-Every method returns a new `Trial` or raises the reason why it cannot. Only `rearm`, called by a person, leads out of
+Every method returns a new `Phase` or raises the reason why it cannot. Only `rearm`, called by a person, leads out of
 `latched` and `uncertain`.
 """
 
@@ -29,7 +29,7 @@ class TransitionError(RigError):
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class Phase:
     """State, its reason, and the test. `latch` and `lost` say which state follows the test."""
 
     state: RigState = "disconnected"
@@ -50,22 +50,22 @@ class Trial:
         """Whether a test is in progress: its devices and files are in use."""
         return self.state in BUSY
 
-    def connected(self, before: RigState | None = None, reason: str = "") -> Trial:
+    def connected(self, before: RigState | None = None, reason: str = "") -> Phase:
         """Both devices answer. `before`: the rig's state when its last process ended, from the latch file."""
         self._only("disconnected")
         if before == "latched":
-            return Trial("latched", reason)
+            return Phase("latched", reason)
         if before is not None:
-            return Trial("uncertain", reason)
-        return Trial("ready", "")
+            return Phase("uncertain", reason)
+        return Phase("ready", "")
 
-    def disconnected(self, reason: str) -> Trial:
+    def disconnected(self, reason: str) -> Phase:
         """A device is gone: takes effect at once when idle, else after the test; a latch stays."""
         if self.busy or self.state in STOPPED:
             return replace(self, lost=reason)
-        return Trial("disconnected", reason)
+        return Phase("disconnected", reason)
 
-    def start(self, test_id: str, participant: str) -> Trial:
+    def start(self, test_id: str, participant: str) -> Phase:
         """A person asks for a test.
 
         Raises
@@ -74,14 +74,14 @@ class Trial:
             Naming the holder or the reason.
         """
         self.may_start()
-        return Trial("arming", "", test_id, participant)
+        return Phase("arming", "", test_id, participant)
 
-    def calibrate(self, participant: str) -> Trial:
+    def calibrate(self, participant: str) -> Phase:
         """A person opens a guided calibration. Raises as `start` does."""
         self.may_start()
-        return Trial("calibrating", "", None, participant, calibrating=True)
+        return Phase("calibrating", "", None, participant, calibrating=True)
 
-    def train(self, test_id: str) -> Trial:
+    def train(self, test_id: str) -> Phase:
         """One train of the open calibration."""
         self._only("calibrating")
         return replace(self, state="arming", test_id=test_id)
@@ -99,51 +99,51 @@ class Trial:
         if self.state == "disconnected":
             raise DeviceError(f"{self.reason}; correct that, then re-arm")
 
-    def armed(self) -> Trial:
+    def armed(self) -> Phase:
         """The device is ready for the first pulse."""
         self._only("arming")
         return replace(self, state="running")
 
-    def halted(self, reason: str) -> Trial:
+    def halted(self, reason: str) -> Phase:
         """A stop or a fault, at any time: an idle rig latches at once, also without devices; a test is ended first.
 
         Where it is stopped already, both reasons are told: the later one may be the one that matters.
         """
         if self.state in ("ready", "calibrating"):
-            return Trial("latched", reason)
+            return Phase("latched", reason)
         if self.state == "disconnected":
-            return Trial("latched", reason, lost=self.reason)
+            return Phase("latched", reason, lost=self.reason)
         earlier = (one for one in self.reason.split(BEFORE) if one not in ("", reason))
         all_reasons = BEFORE.join((reason, *earlier))[:LONGEST_REASON]
         state = "stopping" if self.state in ("arming", "running") else self.state
         return replace(self, state=state, reason=all_reasons, latch=self.busy)
 
-    def withdrawn(self) -> Trial:
+    def withdrawn(self) -> Phase:
         """The test is ended without a latch: nothing is wrong."""
         self._only("arming", "running")
         return replace(self, state="stopping")
 
-    def ended(self) -> Trial:
+    def ended(self) -> Phase:
         """Stimulation is over; the recording is being sealed."""
         self._only("running", "stopping", "arming")
         return replace(self, state="sealing")
 
-    def sealed(self) -> Trial:
+    def sealed(self) -> Phase:
         """The recording is sealed (or its journal is kept)."""
         self._only("sealing")
         if self.latch:
-            return Trial("latched", self.reason, lost=self.lost)
+            return Phase("latched", self.reason, lost=self.lost)
         if self.lost:
-            return Trial("disconnected", self.lost)
+            return Phase("disconnected", self.lost)
         if self.calibrating:
             return replace(self, state="calibrating", test_id=None)
-        return Trial("ready", "")
+        return Phase("ready", "")
 
-    def calibrated(self) -> Trial:
+    def calibrated(self) -> Phase:
         self._only("calibrating")
-        return Trial("ready", "")
+        return Phase("ready", "")
 
-    def rearm(self) -> Trial:
+    def rearm(self) -> Phase:
         """A person has checked participant and rig, and both devices have just answered.
 
         Raises
@@ -155,7 +155,7 @@ class Trial:
             raise BusyError(f"test {self.test_id} is {self.state}; nothing to re-arm")
         if self.state == "calibrating":
             raise BusyError(f"a calibration of participant {self.participant} is open; nothing to re-arm")
-        return Trial("ready", "")
+        return Phase("ready", "")
 
     def _only(self, *states: RigState) -> None:
         if self.state not in states:

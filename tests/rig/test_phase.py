@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig.rig.errors import BusyError, DeviceError, LatchedError, RigError, UncertainError
-from stimrig.rig.trial import LONGEST_REASON, TransitionError, Trial
+from stimrig.rig.phase import LONGEST_REASON, Phase, TransitionError
 
 STEPS = {
     "start": lambda t: t.start("id", "P"),
@@ -24,47 +24,47 @@ STEPS = {
 
 @given(st.lists(st.sampled_from(sorted(STEPS)), max_size=30))
 def test_after_a_fault_nothing_starts_without_a_person(steps: list[str]):
-    trial = Trial().connected().start("a", "P").armed().halted("the fault")
+    phase = Phase().connected().start("a", "P").armed().halted("the fault")
     for step in steps:
         try:
-            trial = STEPS[step](trial)
+            phase = STEPS[step](phase)
         except RigError:
             continue
-        assert trial.state in ("stopping", "sealing", "latched")
+        assert phase.state in ("stopping", "sealing", "latched")
     with pytest.raises(RigError):
-        trial.start("b", "P")
+        phase.start("b", "P")
 
 
 @given(st.lists(st.sampled_from(sorted(STEPS)), max_size=30))
 def test_uncertain_stays_uncertain(steps: list[str]):
-    trial = Trial().connected("uncertain", "died")
+    phase = Phase().connected("uncertain", "died")
     for step in steps:
         try:
-            trial = STEPS[step](trial)
+            phase = STEPS[step](phase)
         except RigError:
             continue
-        assert trial.state == "uncertain"
-    assert trial.rearm().state == "ready"
+        assert phase.state == "uncertain"
+    assert phase.rearm().state == "ready"
 
 
-ARMING = Trial("arming", "", "a", "P")
-STOPPING = Trial("stopping", "why", "a", "P", latch=True)
+ARMING = Phase("arming", "", "a", "P")
+STOPPING = Phase("stopping", "why", "a", "P", latch=True)
 SEALING = replace(STOPPING, state="sealing")
-CALIBRATING = Trial("calibrating", "", None, "P", calibrating=True)
+CALIBRATING = Phase("calibrating", "", None, "P", calibrating=True)
 TRAIN = replace(CALIBRATING, state="arming", test_id="c.001")
-READY = Trial("ready", "")
-LATCHED = Trial("latched", "why")
-UNCERTAIN = Trial("uncertain", "died")
+READY = Phase("ready", "")
+LATCHED = Phase("latched", "why")
+UNCERTAIN = Phase("uncertain", "died")
 
 EVERY_STATE = (
-    Trial("disconnected", "gone"), READY, CALIBRATING, ARMING, TRAIN, replace(ARMING, state="running"),
+    Phase("disconnected", "gone"), READY, CALIBRATING, ARMING, TRAIN, replace(ARMING, state="running"),
     replace(TRAIN, state="running"), STOPPING, replace(ARMING, state="sealing"), replace(TRAIN, state="sealing"),
     SEALING, LATCHED, UNCERTAIN,
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("trial", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
-def test_each_step_is_taken_from_its_own_states_alone(trial: Trial):
+@pytest.mark.parametrize("phase", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
+def test_each_step_is_taken_from_its_own_states_alone(phase: Phase):
     """A step from any other state is a fault in the program: it raises, and names both."""
     for step, states in {
         "connected": ("disconnected",),
@@ -73,23 +73,23 @@ def test_each_step_is_taken_from_its_own_states_alone(trial: Trial):
         "sealed": ("sealing",),
         "calibrated": ("calibrating",),
     }.items():
-        if trial.state in states:
-            getattr(trial, step)()
+        if phase.state in states:
+            getattr(phase, step)()
             continue
         with pytest.raises(TransitionError) as raised:
-            getattr(trial, step)()
-        assert str(raised.value) == f"the rig is {trial.state}, this step needs {' or '.join(states)}"
-    if trial.state != "calibrating":
+            getattr(phase, step)()
+        assert str(raised.value) == f"the rig is {phase.state}, this step needs {' or '.join(states)}"
+    if phase.state != "calibrating":
         with pytest.raises(TransitionError, match="needs calibrating"):
-            trial.train("c.001")
+            phase.train("c.001")
 
 
 def test_what_each_step_gives():
-    assert Trial().connected() == READY
-    assert Trial().connected("latched", "why") == LATCHED
-    assert Trial().connected("latched") == Trial("latched", "")
-    assert Trial() == Trial("disconnected", "not connected yet", None, None, latch=False, lost="", calibrating=False)
-    assert Trial().connected("running", "died") == UNCERTAIN
+    assert Phase().connected() == READY
+    assert Phase().connected("latched", "why") == LATCHED
+    assert Phase().connected("latched") == Phase("latched", "")
+    assert Phase() == Phase("disconnected", "not connected yet", None, None, latch=False, lost="", calibrating=False)
+    assert Phase().connected("running", "died") == UNCERTAIN
     assert READY.start("a", "P") == ARMING
     assert READY.calibrate("P") == CALIBRATING
     assert CALIBRATING.train("c.001") == TRAIN
@@ -105,7 +105,7 @@ def test_where_the_sealing_leads():
     assert replace(TRAIN, state="sealing").sealed() == CALIBRATING
     assert SEALING.sealed() == LATCHED
     assert replace(SEALING, lost="gone").sealed() == replace(LATCHED, lost="gone")
-    assert replace(TRAIN, state="sealing", lost="gone").sealed() == Trial("disconnected", "gone")
+    assert replace(TRAIN, state="sealing", lost="gone").sealed() == Phase("disconnected", "gone")
 
 
 def test_a_stop_leads_to_the_latch_from_everywhere_and_every_reason_is_told_the_newest_first():
@@ -120,49 +120,49 @@ def test_a_stop_leads_to_the_latch_from_everywhere_and_every_reason_is_told_the_
         more = stopped.halted("another")
         assert more == replace(stopped, reason=f"another; before: {stopped.reason}")
         assert more.halted(stopped.reason).reason == f"{stopped.reason}; before: another"
-    assert Trial("disconnected", "gone").halted("why") == replace(LATCHED, lost="gone")
+    assert Phase("disconnected", "gone").halted("why") == replace(LATCHED, lost="gone")
 
 
 def test_reasons_are_told_up_to_a_length_and_the_newest_is_never_cut():
-    trial = LATCHED
+    phase = LATCHED
     for number in range(100):
-        trial = trial.halted(f"{number} {'x' * 600}")
-    assert len(trial.reason) == LONGEST_REASON
-    assert trial.reason.startswith(f"99 {'x' * 600}; before: 98 x")
+        phase = phase.halted(f"{number} {'x' * 600}")
+    assert len(phase.reason) == LONGEST_REASON
+    assert phase.reason.startswith(f"99 {'x' * 600}; before: 98 x")
 
 
 def test_a_lost_device_is_remembered_until_the_end_of_a_test_and_while_a_person_is_awaited():
-    for trial in EVERY_STATE:
-        waits = trial.busy or trial.state in ("latched", "uncertain")
-        assert trial.disconnected("unplugged") == (
-            replace(trial, lost="unplugged") if waits else Trial("disconnected", "unplugged")
+    for phase in EVERY_STATE:
+        waits = phase.busy or phase.state in ("latched", "uncertain")
+        assert phase.disconnected("unplugged") == (
+            replace(phase, lost="unplugged") if waits else Phase("disconnected", "unplugged")
         )
 
 
-@pytest.mark.parametrize("trial", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
-def test_a_start_is_refused_in_every_state_but_ready(trial: Trial):
+@pytest.mark.parametrize("phase", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
+def test_a_start_is_refused_in_every_state_but_ready(phase: Phase):
     look = "look at the participant and the rig, then re-arm"
     expected = {
         "calibrating": (BusyError, "a calibration of participant P is open; finish or discard it"),
         "latched": (LatchedError, f"why; {look}"),
         "uncertain": (UncertainError, f"died; {look}"),
         "disconnected": (DeviceError, "gone; correct that, then re-arm"),
-    }.get(trial.state, (BusyError, f"test {trial.test_id} of participant P is {trial.state}; wait or stop it"))
-    if trial.state == "ready":
-        trial.may_start()
+    }.get(phase.state, (BusyError, f"test {phase.test_id} of participant P is {phase.state}; wait or stop it"))
+    if phase.state == "ready":
+        phase.may_start()
         return
-    for begin in (trial.may_start, lambda: trial.start("b", "Q"), lambda: trial.calibrate("Q")):
+    for begin in (phase.may_start, lambda: phase.start("b", "Q"), lambda: phase.calibrate("Q")):
         with pytest.raises(RigError) as raised:
             begin()
         assert (type(raised.value), str(raised.value)) == expected
 
 
-@pytest.mark.parametrize("trial", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
-def test_rearming_ends_no_test_and_no_calibration(trial: Trial):
-    if not trial.busy and trial.state != "calibrating":
-        assert trial.rearm() == READY
+@pytest.mark.parametrize("phase", EVERY_STATE, ids=lambda t: f"{t.state}-{t.test_id}")
+def test_rearming_ends_no_test_and_no_calibration(phase: Phase):
+    if not phase.busy and phase.state != "calibrating":
+        assert phase.rearm() == READY
         return
-    what = f"test {trial.test_id} is {trial.state}" if trial.busy else "a calibration of participant P is open"
+    what = f"test {phase.test_id} is {phase.state}" if phase.busy else "a calibration of participant P is open"
     with pytest.raises(BusyError) as raised:
-        trial.rearm()
+        phase.rearm()
     assert str(raised.value) == f"{what}; nothing to re-arm"
