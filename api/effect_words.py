@@ -1,4 +1,4 @@
-"""Titles of the library's effects and names of their parameters, in the page's language; ids are for programs."""
+"""What the library's effects say of themselves to people, in the page's language; ids are for programs."""
 
 from __future__ import annotations
 
@@ -10,36 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stimrig.api import language
-from stimrig.api.language import lazy
 
-PARAMETERS: dict[str, Any] = {
-    "bend_1": lazy("slope over the angle"),
-    "ceiling": lazy("ceiling"),
-    "delay": lazy("delay"),
-    "depth": lazy("depth"),
-    "elastic_1": lazy("elastic torque over the angle"),
-    "fall": lazy("time constant of relaxation"),
-    "floor": lazy("floor"),
-    "frequency": lazy("frequency"),
-    "gain": lazy("gain"),
-    "gain_0": lazy("gain at the first knot"),
-    "gap_0": lazy("gap at small widths"),
-    "half_width": lazy("half width"),
-    "height_0": lazy("peak torque"),
-    "knee": lazy("knee"),
-    "knot_1": lazy("first shift"),
-    "lag": lazy("spread of the delays"),
-    "period": lazy("period"),
-    "ratio": lazy("ratio"),
-    "resonance": lazy("resonance"),
-    "share": lazy("share"),
-    "sharpness": lazy("sharpness"),
-    "shift": lazy("shift"),
-    "slope": lazy("slope"),
-    "slow_share": lazy("share of slow fibres"),
-    "stiffness": lazy("stiffness"),
-}
-"""The parameters that stand for an effect in the trend, without their units."""
 UNITS = (
     "_nm_s_per_rad2", "_s_per_rad", "_per_rad2", "_nm_per_s", "_us_per_s", "_nm_per_rad", "_per_rad", "_per_s", "_nm",
     "_us", "_s", "_hz", "_rad", "_ms",
@@ -47,27 +18,39 @@ UNITS = (
 
 
 @cache
-def titles() -> dict[str, str]:
-    """Titles by id, as `EFFECT = Effect(…)` in the library's files says them.
+def library() -> dict[str, dict[str, Any]]:
+    """What the library's effects say of themselves in `EFFECT = Effect(…)`, by id; no forms.
 
     The files are read and not loaded: the web process does without their physics, and the centre has no worker to ask.
     """
     spec = find_spec("stimrig.identify.effects")
     assert spec is not None and spec.origin is not None
-    found: dict[str, str] = {}
+    found: dict[str, dict[str, Any]] = {}
     for path in sorted(Path(spec.origin).parent.glob("*.py")):
         for line in ast.parse(path.read_text(encoding="utf-8")).body:
             match line:
                 case ast.Assign(targets=[ast.Name("EFFECT")], value=ast.Call(keywords=given)):
-                    said = {part.arg: str(part.value.value) for part in given if isinstance(part.value, ast.Constant)}
-                    found[said["id"]] = said["name"]
+                    plain = [part for part in given if isinstance(part.value, ast.Constant | ast.Dict)]
+                    said = {str(part.arg): ast.literal_eval(part.value) for part in plain}
+                    found[said["id"]] = said
     return found
+
+
+def fact_of(effect: str, key: str, otherwise: Any) -> Any:
+    """What an effect says of itself in its file; `otherwise` where it says nothing, or is a person's own."""
+    return library().get(effect, {}).get(key, otherwise)
+
+
+@cache
+def _short_names() -> dict[str, str]:
+    """The parameters that stand for their effects, without their units."""
+    return {without_unit(key): words for effect in library().values() for key, words in effect.get("main", {}).items()}
 
 
 def effect_words(effect: str) -> str:
     """An effect's title; the id of a person's own effect as words."""
-    known = titles().get(effect)
-    return effect.replace("_", " ").capitalize() if known is None else language._(known)
+    title = fact_of(effect, "name", "")
+    return language._(title) if title else effect.replace("_", " ").capitalize()
 
 
 def within(effect: str) -> str:
@@ -94,4 +77,5 @@ def without_unit(parameter: str) -> str:
 def parameter_words(parameter: str) -> str:
     """A parameter's name without its unit, in the page's language where it stands for its effect."""
     name = without_unit(parameter)
-    return str(PARAMETERS.get(name) or name.replace("_", " "))
+    known = _short_names().get(name)
+    return name.replace("_", " ") if known is None else language._(known)

@@ -40,8 +40,8 @@ FOR_PROGRAMMERS = {
     "confinement.py", "child.py", "_can.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
-NAMED = {"Effect": ("name",), "Parameter": ("about",)}
-"""Calls with arguments that pages show although they may be a single word."""
+NAMED = {"Effect": ("name", "main"), "Parameter": ("about",)}
+"""Calls with arguments (of a dictionary its values) that pages show although they may be a single word."""
 NOT_SHOWN = {
     "Field",
     "Query",
@@ -147,7 +147,8 @@ class _Sentences(ast.NodeVisitor):
         if name not in NOT_SHOWN and owner not in ("log", "re", "audit"):
             self.generic_visit(node)
         given = {part.arg: text for part in node.keywords if (text := _text(part.value))}
-        self.found += [given[part] for part in NAMED.get(name, ()) if part in given]
+        named = [part.value for part in node.keywords if part.arg in NAMED.get(name, ())]
+        self.found += [_text(one) for part in named for one in (part.values if isinstance(part, ast.Dict) else [part])]
         if name == "Effect" and "_" in given.get("id", ""):  # a page may find an effect by its id, or by that as words
             self.found += [given["id"], given["id"].replace("_", " ")]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from stimrig.api import language
-from stimrig.api.effect_words import effect_words, effects_words, parameter_words
+from stimrig.api.effect_words import effect_words, effects_words, fact_of, parameter_words
 from stimrig.api.language import _, lazy
 from stimrig.api.models.stored_model import Figure
 
@@ -23,8 +23,6 @@ SAME_CURRENT = 0.01
 """Currents that differ by at most this share are the same."""
 OF_THE_CURVE = ("threshold_us", "plateau_nm")
 """What changes with the current alone: not compared across two currents."""
-OF_THE_RECORD = ("baseline_drift", "mains_hum", "sensor_clipping", "tremor", "voluntary_effort")
-"""Effects that are of one record, its sensor or its person's mood: their parameters change, and no muscle did."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ def comparable(before: State, now: State) -> list[str]:
     ]  # fmt: skip
     if not same_current(before, now):
         names = [name for name in names if name not in OF_THE_CURVE]
-    return [name for name in names if name.partition(".")[0] not in OF_THE_RECORD]
+    return [name for name in names if fact_of(name.partition(".")[0], "muscle", True)]
 
 
 def same_current(before: State, now: State) -> bool:

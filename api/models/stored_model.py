@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from stimrig.api.effect_words import fact_of
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _
 
@@ -201,14 +202,6 @@ def validity(document: dict[str, Any]) -> str | None:
 Figure = dict[str, Any]
 """`value`, `sd` (None where it is not known) and `unit`; of an effect's parameter, the effect's `form` besides."""
 UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "damping": "1", "delay_s": "s"}
-MAIN = {
-    "asymmetric_relaxation": ("ratio", "fall_s"),
-    "passive_torque": ("stiffness_nm_per_rad",),
-    "recruitment_hysteresis": ("half_width_us", "share"),
-    "tremor": ("frequency_hz",),
-    "voluntary_effort": ("height_0_nm", "height_1_nm"),
-}
-"""The parameters that stand for an effect, first choice first; of others the first one that they name."""
 
 
 def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
@@ -223,7 +216,7 @@ def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
     }
     for effect in document.get("effects") or []:
         known = effect.get("parameters") or {}
-        wanted = [name for name in MAIN.get(effect["id"], ()) if name in known] or list(known)[:1]
+        wanted = [name for name in fact_of(effect["id"], "main", ()) if name in known] or list(known)[:1]
         for name in wanted[:1]:
             given = known[name] if isinstance(known[name], dict) else {"value": known[name]}
             figure = {"value": given.get("value"), "sd": given.get("sd"), "unit": given.get("unit") or "1"}

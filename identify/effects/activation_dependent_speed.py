@@ -88,4 +88,5 @@ EFFECT = Effect(
     plain="The muscle is faster or slower when it works hard. One linear model is right at one level only; the "
     "controller should know the speed at each level.",
     source="Hunt, Munih, Donaldson, Barr 1998: speed varied fivefold with level, small-signal gain up to threefold",
+    main={"slope": "slope"},
 )

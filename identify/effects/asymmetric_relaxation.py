@@ -107,4 +107,5 @@ EFFECT = Effect(
     plain="The muscle does not relax at the same speed as it contracts. A stroke can change either of the two. A "
     "controller that uses one speed reacts too late in one direction.",
     source="McCrea, Eng, Hodgson 2003 (development and decay impaired independently); Thelen 2003",
+    main={"ratio": "ratio", "fall_s": "time constant of relaxation"},
 )

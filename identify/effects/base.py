@@ -330,6 +330,12 @@ class Effect:
         an effect is added before any fit. `raw` is what `stimrig.identify.estimation.samples.inspect` gives.
     prior : float
         Logarithm of its prior odds, relative to other effects.
+    muscle : bool
+        Whether it is of the muscle. Else it is of one record, its sensor or its person's mood: that its parameters
+        differ between two sessions says nothing of the muscle.
+    main : dict of str
+        The parameters that stand for it in the trend, first choice first, and their names for people, without units;
+        the form's first one where none of them is its own.
     """
 
     id: str
@@ -346,6 +352,8 @@ class Effect:
     band: bool = False
     detect: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
     prior: float = 0.0
+    muscle: bool = True
+    main: dict[str, str] = field(default_factory=dict)
 
     @property
     def stage(self) -> str:

@@ -190,4 +190,5 @@ EFFECT = Effect(
     plain="The first pulses after a rest give more torque than those that follow. Without it in the model, a "
     "controller overshoots at every start.",
     source="Bickel, Slade, Dudley 2004; Binder-Macleod, Kesar 2005",
+    main={"gain": "gain"},
 )

@@ -67,4 +67,5 @@ EFFECT = Effect(
     plain="Some hundredths of a second pass between a pulse and its first torque. With a longer delay the controller "
     "must react more gently.",
     source="Sinclair et al.: quadriceps onset 31 ± 3 ms at 90°, 67 ± 24 ms at 15°; offset 58 ± 5 ms",
+    main={"delay_s": "delay", "lag_s": "spread of the delays"},
 )

@@ -45,4 +45,6 @@ EFFECT = Effect(
     source="Electrical interference",
     raw=True,
     detect=lambda raw: None if raw.hum is None else ("line", raw.hum),
+    muscle=False,
+    main={"frequency_hz": "frequency"},
 )

@@ -39,4 +39,5 @@ EFFECT = Effect(
     plain="The muscle has fast and slow fibres: after a step the torque first rises fast, then slowly for a while.",
     source="Parallel fast and slow branches; cf. Ding et al. 2003 for the two fibre types' time constants",
     prior=-1.5,
+    main={"slow_share": "share of slow fibres"},
 )

@@ -48,4 +48,5 @@ EFFECT = Effect(
     plain="Above some torque the limb or the fixture gives way: the muscle pulls harder, but the load cell does not "
     "show it.",
     source="Soft knee of tendon and compliance after the dynamics (Wiener structure)",
+    main={"ceiling_nm": "ceiling", "knee_nm": "knee"},
 )

@@ -156,4 +156,5 @@ EFFECT = Effect(
     plain="The joint resists movement also without stimulation: stiffness and, after a stroke, spasticity.",
     source="De Groote et al. 2016; Riener et al. 1996",
     needs=("angle_rad",),
+    main={"stiffness_nm_per_rad": "stiffness", "elastic_1_nm": "elastic torque over the angle"},
 )

@@ -30,4 +30,5 @@ EFFECT = Effect(
     plain="The muscle warms up: after some seconds of work the same pulse gives more torque. Within about a minute of "
     "rest this gain is lost. A short conditioning train before the session makes the response repeatable.",
     source="O'Leary, Hope, Sale 1997: twitch +45 % at 5 s and +28 % at 1 min after 7 s at 100 Hz",
+    main={"gain": "gain"},
 )

@@ -158,4 +158,5 @@ EFFECT = Effect(
     "the controller's error is the distance between the two curves.",
     source="Durfee, MacLean 1989: deconvolution of a ramp gives one curve for each direction",
     prior=-2.5,
+    main={"half_width_us": "half width", "share": "share", "gap_0_nm": "gap at small widths"},
 )

@@ -63,4 +63,6 @@ EFFECT = Effect(
     source="Range of the analogue-to-digital converter",
     raw=True,
     detect=_detect,
+    muscle=False,
+    main={"ceiling_nm": "ceiling", "floor_nm": "floor"},
 )

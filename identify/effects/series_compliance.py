@@ -226,4 +226,5 @@ EFFECT = Effect(
     plain="Strap, tendon or fixture act as a spring: the torque oscillates after every step. Fasten the limb and the "
     "load cell more firmly.",
     source="A resonance in series with the muscle",
+    main={"resonance_hz": "resonance"},
 )

@@ -74,4 +74,5 @@ EFFECT = Effect(
     "warms, or an electrode moves. Weak pulses change most, strong ones hardly. Check the electrodes.",
     source="Electrode and skin impedance; no single source, see docs/diagnosis.md",
     prior=-2.5,
+    main={"slope_us_per_s": "slope", "shift_us": "shift", "slope_per_s": "slope", "share": "share"},
 )

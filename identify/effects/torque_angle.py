@@ -106,4 +106,10 @@ EFFECT = Effect(
     "for it. A test at a single angle cannot show it.",
     source="Marion et al. 2010; Thelen 2003",
     needs=("angle_rad",),
+    main={
+        "slope_per_rad": "slope",
+        "sharpness_per_rad2": "sharpness",
+        "gain_0": "gain at the first knot",
+        "bend_1": "slope over the angle",
+    },
 )

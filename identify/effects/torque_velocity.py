@@ -97,4 +97,5 @@ EFFECT = Effect(
     "while the limb is held still.",
     source="Hill 1938; Marion et al. 2010; De Groote et al. 2016",
     needs=("velocity_rad_s",),
+    main={"slope_s_per_rad": "slope", "gain_nm_s_per_rad2": "gain"},
 )

@@ -49,4 +49,6 @@ EFFECT = Effect(
     source="Narrow band near 5 Hz (pathological) or from 8 to 12 Hz (physiological)",
     predictable=False,
     band=True,
+    muscle=False,
+    main={"frequency_hz": "frequency"},
 )

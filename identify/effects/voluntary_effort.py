@@ -197,4 +197,6 @@ EFFECT = Effect(
     source="Additive torque that does not depend on the stimulation",
     predictable=False,
     prior=-5.0,
+    muscle=False,
+    main={"height_0_nm": "peak torque"},
 )

@@ -9,7 +9,7 @@ import time
 from websockets.sync.client import connect
 
 from stimrig.api import language
-from stimrig.api.effect_words import PARAMETERS, effects_words, titles, without_unit
+from stimrig.api.effect_words import effects_words, library, parameter_words
 from stimrig.api.language import translated
 from stimrig.api.models import changes, explanation, stored_model
 from stimrig.identify import effects
@@ -26,14 +26,17 @@ PLAIN = {
 service = shared_service()
 
 
-def test_titles_and_main_parameters_are_those_of_the_library() -> None:
-    """An effect says its title in its own file alone."""
-    assert titles() == {entry["id"]: entry["name"] for entry in effects.library()}
-    for entry in effects.library():
-        for form in entry["forms"]:
-            held = {"id": entry["id"], "parameters": {one["name"]: 1.0 for one in form["parameters"]}}
+def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -> None:
+    """Its title, whether it is of the muscle, and each form's main parameter with a name: in its own file alone."""
+    for effect, known in effects.registry().items():
+        said = {"muscle": True, "main": {}} | library()[effect]
+        assert (said["name"], said["muscle"], said["main"]) == (known.name, known.muscle, known.main)
+        assert all(parameter_words(parameter) == words for parameter, words in known.main.items()), effect
+        for form in known.forms:
+            held = {"id": effect, "parameters": {one.name: 1.0 for one in form.parameters}}
             (figure,) = [name for name in stored_model.muscle_figures(PLAIN | {"effects": [held]}) if "." in name]
-            assert without_unit(figure.partition(".")[2]) in PARAMETERS, figure
+            assert figure.partition(".")[2] in known.main, figure
+    assert set(library()) == set(effects.registry())
 
 
 def test_words_in_german() -> None:
@@ -43,7 +46,7 @@ def test_words_in_german() -> None:
         assert changes.name_of("fatigue.depth", "1").words == "Ermüdung, Tiefe"
         assert translated("recruitment_hysteresis: the evidence is too weak (log evidence +0.3): what it explains "
                           "looks like noise.").startswith("Hysterese der Rekrutierung: ")  # fmt: skip
-        for effect in titles():
+        for effect in library():
             assert translated(effect) not in (effect, f'<span lang="en">{effect}</span>') or effect == "tremor"
 
 

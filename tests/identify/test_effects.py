@@ -8,6 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
+from stimrig.hardware_sim.hidden.library import EFFECTS
 from stimrig.identify import fit
 from stimrig.identify.effects import get, library, registry
 from stimrig.identify.effects.base import STAGES, Scene
@@ -52,8 +53,8 @@ def _theta(problem: Problem) -> np.ndarray:
     return problem.from_physical(np.array(values + [p.neutral for c in problem.chosen for p in c.parameters]))
 
 
-def test_every_id_of_the_contract_is_there():
-    assert set(registry()) >= CONTRACT
+def test_every_id_of_the_contract_is_there_and_every_effect_has_its_hidden_twin():
+    assert set(EFFECTS) == set(registry()) >= CONTRACT
 
 
 def test_the_library_is_plain_data_with_everything_a_page_shows():
