@@ -56,6 +56,7 @@ class Emulator:
             "stimulator_device": settings.stimulator,
             "load_cell_transport": settings.transport,
             "cell": settings.cell,
+            "load_cell": cell.rig_keys,
             "samples_per_frame": cell.samples_per_frame,
             "has_counter": cell.has_counter,
             "sample_rate_hz": settings.rate_hz,

@@ -14,12 +14,12 @@ from stimrig.hardware_sim.arm.movers import MOVERS
 from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS
 from stimrig.hardware_sim.errors import SettingsError
 from stimrig.hardware_sim.load_cells import CELLS, TRANSPORTS
+from stimrig.hardware_sim.load_cells.cells import WithAngle
 from stimrig.hardware_sim.patients import PATIENTS
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators import STIMULATORS
 
 DEFAULTS = Settings()
-WITH_ANGLE = "with_angle"
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -65,9 +65,9 @@ def settings(options: argparse.Namespace, patient: str) -> Settings:
 def _cell_kind(options: argparse.Namespace) -> str:
     """The cell as asked for; the one with an angle is there where, and only where, the angle is in its frame."""
     in_cell = options.arm is not None and options.angle == "in-cell"
-    kind = options.cell or (WITH_ANGLE if in_cell else DEFAULTS.cell)
-    if in_cell != (kind == WITH_ANGLE):
-        raise SettingsError(f"--cell {WITH_ANGLE} goes with --arm and --angle in-cell, and no other cell does")
+    kind = options.cell or (WithAngle.name if in_cell else DEFAULTS.cell)
+    if in_cell != (kind == WithAngle.name):
+        raise SettingsError(f"--cell {WithAngle.name} goes with --arm and --angle in-cell, and no other cell does")
     return kind
 
 

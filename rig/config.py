@@ -9,7 +9,6 @@ import argparse
 import json
 import math
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -124,17 +123,6 @@ def load(path: Path, **overrides: Any) -> RigConfig:
     return check(content, str(path), **overrides)
 
 
-def _packed(dbc: str, samples: int, counter: str) -> dict[str, Any]:
-    return {"dbc": dbc, "signal": [f"Torque{i + 1}_Nm" for i in range(samples)], "counter": counter, "sync": ""}
-
-
-EMULATED_CELLS: dict[str, Callable[[int], dict[str, Any]]] = {
-    "plain": lambda samples: _packed("torque_packed3", samples, "Counter") if samples > 1 else {},
-    "counts": lambda samples: _packed("counts_be16", samples, ""),
-    "canopen": lambda _: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]},
-    "with_angle": lambda _: {"dbc": "torque_with_angle"},
-}
-"""Rig-file settings for each of the emulator's cells, by name and samples per frame."""
 EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5, "clipped_torque_s": 10.0, "stale_angle_s": 0.5}
 """No person is connected to an emulator, and it shares its processors with other programs. A pause of 0.1 s would stop
 a real rig, but must not end a demo. A hidden saturated amplifier is there to be diagnosed, and stays saturated for up
@@ -157,7 +145,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         line = json.loads(text)
         # the link stays valid after replugging, like udev's names by id
         stimulator, can = line.get("stimulator_link", line["stimulator"]), line["can"]
-        cell = EMULATED_CELLS[line.get("cell", "plain")](int(line.get("samples_per_frame", 1)))
+        cell = dict(line["load_cell"] if "cell" in line else {})
         sensor = _emulated_sensor(line["angle_sensor"]) if line.get("angle_sensor") else None
         # the link is missing while the emulated stimulator is unplugged: then use the port itself
         linked = Path(str(stimulator)).is_symlink() or Path(str(stimulator)).exists()

@@ -1,7 +1,7 @@
 """The electronics of load cells: how samples become CAN frames, and what starts and stops them.
 
-A cell's constructor takes the number of samples per frame, one of its `layouts`. A frame's time is that of its last
-sample.
+A cell's constructor takes the number of samples per frame, one of its `layouts`; each of those has the keys by which a
+rig file describes the cell then. A frame's time is that of its last sample.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
+from typing import Any, ClassVar
 
 from stimrig.hardware_sim.load_cells.frames import Frame, Sample
 
@@ -17,15 +18,21 @@ TORQUE = struct.Struct("<fHBB")
 """Little endian: torque in N·m, counter, status, spare."""
 
 
+def _packed(dbc: str, samples: int, counter: str) -> dict[str, Any]:
+    return {"dbc": dbc, "signal": [f"Torque{i + 1}_Nm" for i in range(samples)], "counter": counter, "sync": ""}
+
+
 class Cell:
     """A cell that sends from power-on and takes no commands."""
 
-    can_id: int
-    layouts: tuple[int, ...] = (1,)
-    has_counter = has_sync = True
+    name: ClassVar[str]
+    can_id: ClassVar[int]
+    layouts: ClassVar[dict[int, dict[str, Any]]] = {1: {}}
 
     def __init__(self, samples_per_frame: int = 1) -> None:
         self.samples_per_frame = samples_per_frame
+        self.rig_keys = self.layouts[samples_per_frame]
+        self.has_counter, self.has_sync = (self.rig_keys.get(key) != "" for key in ("counter", "sync"))
         self.running = True
         """Whether it is sending."""
 
@@ -48,15 +55,9 @@ class Plain(Cell):
     """
 
     PACKED = struct.Struct("<hhhH")
-    PACKED_SAMPLES = 3
     COUNTS_PER_NM = 500
 
-    can_id = 0x181
-    layouts = (1, PACKED_SAMPLES)
-
-    def __init__(self, samples_per_frame: int = 1) -> None:
-        super().__init__(samples_per_frame)
-        self.has_sync = samples_per_frame == 1
+    name, can_id, layouts = "plain", 0x181, {1: {}, 3: _packed("torque_packed3", 3, "Counter")}
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
         """Values are limited to full scale; NaN is the lowest count."""
@@ -64,7 +65,7 @@ class Plain(Cell):
         if len(samples) == 1:
             return TORQUE.pack(last.torque_nm, last.counter & 0xFFFF, SYNC_BIT if last.sync else 0, 0)
         counts = (_counts(one.torque_nm, self.COUNTS_PER_NM, nothing=-32767) for one in samples)
-        return self.PACKED.pack(*counts, last.counter // self.PACKED_SAMPLES & 0xFFFF)
+        return self.PACKED.pack(*counts, last.counter // self.samples_per_frame & 0xFFFF)
 
 
 class Counts(Cell):
@@ -76,9 +77,7 @@ class Counts(Cell):
     ZERO_COUNTS = 32768
     COUNTS_PER_NM = 32767 / 50.0
 
-    can_id = 610
-    layouts = (1, 2, 3, 4)
-    has_counter = has_sync = False
+    name, can_id, layouts = "counts", 610, {count: _packed("counts_be16", count, "") for count in (1, 2, 3, 4)}
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
         """Values are limited to full scale; NaN is the lowest count."""
@@ -98,7 +97,7 @@ class CanOpen(Cell):
     NMT_ID, NODE = 0x000, 1
     START, LEAVE = 0x01, (0x02, 0x80, 0x81, 0x82)
 
-    can_id = 0x180 + NODE
+    name, can_id, layouts = "canopen", 0x180 + NODE, {1: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]}}
 
     def __init__(self, samples_per_frame: int = 1) -> None:
         super().__init__(samples_per_frame)
@@ -129,7 +128,7 @@ class WithAngle(Cell):
     COUNTS_PER_DEG = 100
     NO_ANGLE = -32768
 
-    can_id = 0x181
+    name, can_id, layouts = "with_angle", 0x181, {1: {"dbc": "torque_with_angle"}}
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
         """Of one sample; an angle that is no number is the lowest count."""
@@ -145,5 +144,5 @@ def _counts(value: float, per_unit: float, nothing: int) -> int:
     return min(max(round(value * per_unit), -32767), 32767) if math.isfinite(value) else nothing
 
 
-CELLS: dict[str, type[Cell]] = {"canopen": CanOpen, "counts": Counts, "plain": Plain, "with_angle": WithAngle}
+CELLS: dict[str, type[Cell]] = {cell.name: cell for cell in sorted(Cell.__subclasses__(), key=lambda cell: cell.name)}
 """By name, in alphabetical order."""

@@ -1,12 +1,15 @@
-"""Stimulators: a board and the firmware that runs on it, with the codec of its maker."""
+"""Stimulators: a board and the firmware that runs on it, with the codec of its maker. A firmware is a file here."""
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+
 from stimrig.hardware_sim.stimulators.board import Firmware
-from stimrig.hardware_sim.stimulators.p24 import P24
-from stimrig.hardware_sim.stimulators.rehastim2 import RehaStim2
 
 __all__ = ["STIMULATORS"]
 
-STIMULATORS: dict[str, type[Firmware]] = {"p24": P24, "rehastim2": RehaStim2}
-"""Firmwares by name, in alphabetical order."""
+for entry in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{entry.name}")
+STIMULATORS = {firmware.__module__.rpartition(".")[2]: firmware for firmware in Firmware.__subclasses__()}
+"""Firmwares by the name of their file, in alphabetical order."""

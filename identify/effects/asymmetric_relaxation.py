@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stimrig.identify.dynamics.variable_speed import SpeedLaw
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, activate, form
+from stimrig.identify.dynamics.variable_speed import SpeedLaw, activate
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
 
 _LAGS = (
     Parameter("rise_s", "s", 0.0, 0.35, 0.0, (0.02, 0.1), about="activation"),

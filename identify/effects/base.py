@@ -481,28 +481,3 @@ def adapt(
             x = end
         last[m] = x
     return out, last
-
-
-@njit(cache=True, nogil=True)
-def activate(
-    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float
-) -> np.ndarray:  # pragma: no cover
-    """Mean over each interval of a, from 0; a' = (w - a)/τ, τ = rise if w > a, else fall; shapes (M, K), (M,).
-
-    With τ = 0, a follows w at once.
-    """
-    rows, size = drive.shape
-    out = np.empty((rows, size))
-    for m in range(rows):
-        a = 0.0
-        for k in range(size):
-            w = drive[m, k]
-            tau = rise_s[m] if w > a else fall_s[m]
-            if tau <= 0.0:
-                a = w
-                out[m, k] = w
-            else:
-                decay = np.exp(-step_s / tau)
-                out[m, k] = w + (a - w) * (1.0 - decay) * tau / step_s
-                a = w + (a - w) * decay
-    return out

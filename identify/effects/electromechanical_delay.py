@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, activate, form
+from stimrig.identify.dynamics.variable_speed import activate
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 
 @form(

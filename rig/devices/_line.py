@@ -1,8 +1,13 @@
-"""What drivers of stimulators on a serial line share: numbered packets, and commands that wait for their acks."""
+"""What drivers of stimulators on a serial line share: the frames of ScienceMode 2 and 4, and commands with their acks.
+
+An ack has its command's number, and the command + 1.
+"""
 
 from __future__ import annotations
 
+import binascii
 import logging
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
@@ -71,16 +76,20 @@ class Framing:
         Header -> length of the whole frame, bytes.
     max_frame_bytes
         Longest frame that a reader waits for.
-    pack, unpack
-        Packet -> payload and back; `unpack` gets at least two bytes.
+    command_bits
+        Of the payload's first two bytes, which are packet number and command; data follow.
     """
 
     header_fields: int
     header: Callable[[bytes], bytes]
     frame_length: Callable[[bytes], int]
     max_frame_bytes: int
-    pack: Callable[[Packet], bytes]
-    unpack: Callable[[bytes], Packet]
+    command_bits: int
+
+    @property
+    def numbers(self) -> int:
+        """Packet numbers before they repeat."""
+        return 1 << 16 - self.command_bits
 
     @property
     def header_bytes(self) -> int:
@@ -93,7 +102,7 @@ class Framing:
 
     def encode(self, packet: Packet) -> bytes:
         """The frame of a packet, as written to the line."""
-        body = stuff(self.pack(packet))
+        body = stuff(struct.pack(">H", packet.number << self.command_bits | packet.command) + packet.data)
         escaped = b"".join(bytes((ESCAPE, byte ^ KEY)) for byte in self.header(body))
         return bytes((START,)) + escaped + body + bytes((STOP,))
 
@@ -113,7 +122,8 @@ class Framing:
         payload = unstuff(body)
         if len(payload) < SHORTEST_BODY_BYTES:
             raise WireError(f"no command in frame: {frame.hex(' ')}")
-        return self.unpack(payload)
+        head = int.from_bytes(payload[:2], "big")
+        return Packet(head >> self.command_bits, head & (1 << self.command_bits) - 1, payload[2:])
 
     def header_of(self, frame: bytes | bytearray) -> bytes:
         """Header of a frame, or of its beginning. Raises WireError if an escape is missing."""
@@ -121,9 +131,6 @@ class Framing:
         if any(byte != ESCAPE for byte in head[::2]):
             raise WireError(f"escapes missing in header: {head.hex(' ')}")
         return bytes(byte ^ KEY for byte in head[1::2])
-
-    def reader(self) -> FrameReader:
-        return FrameReader(self)
 
 
 class FrameReader:
@@ -164,6 +171,53 @@ class FrameReader:
         return bool(self._buffer)
 
 
+def _crc_table() -> bytes:
+    table = bytearray()
+    for byte in range(256):
+        for _ in range(8):
+            byte = (byte << 1 ^ 0x07 if byte & 0x80 else byte << 1) & 0xFF
+        table.append(byte)
+    return bytes(table)
+
+
+_CRC = _crc_table()
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8, polynomial 07, from 0, not reflected."""
+    crc = 0
+    for byte in data:
+        crc = _CRC[crc ^ byte]
+    return crc
+
+
+def _header_2(body: bytes) -> bytes:
+    if len(body) > 0xFF:
+        raise WireError(f"body of {len(body)} bytes, at most {0xFF}")
+    return bytes((crc8(body), len(body)))
+
+
+SCIENCEMODE_2 = Framing(
+    header_fields=2,
+    header=_header_2,
+    frame_length=lambda header: header[1] + 6,
+    max_frame_bytes=0xFF + 6,
+    command_bits=8,
+)
+"""The header is a CRC-8 and the length of the stuffed body, a byte each."""
+SCIENCEMODE_4 = Framing(
+    header_fields=4,
+    header=lambda body: struct.pack(">HH", len(body) + 10, binascii.crc_hqx(body, 0)),
+    frame_length=lambda header: int.from_bytes(header[:2], "big"),
+    max_frame_bytes=128,
+    command_bits=10,
+)
+"""The header is the frame's length and a CRC of the stuffed body, two bytes each.
+
+The longest frame is longer than any answer of the low level. Part of a damaged frame may look like the start of a
+longer one, and the reader would then wait for that length and lose the frames in between.
+"""
+
 log = logging.getLogger("rig.line")
 
 
@@ -176,10 +230,6 @@ class PacketLine:
         Not opened yet.
     name
         Its path.
-    numbers
-        Number of packet numbers before they repeat.
-    reader
-        Makes a new reader of frames each time the port is opened.
     on_packet
         Called with each packet and the time at which it was read (rig clock).
     """
@@ -189,15 +239,14 @@ class PacketLine:
         machine: Machine,
         port: Port,
         name: str,
-        numbers: int,
-        reader: Callable[[], FrameReader],
+        framing: Framing,
         on_packet: Callable[[Packet, float], None],
     ) -> None:
         self.port = name
         self.last_written_s = -1e9
         self._tasks, self._clock, self._serial = machine.tasks, machine.tasks.clock, port
-        self._numbers, self._number = numbers, 0
-        self._reader, self._frames = reader, reader()
+        self._framing, self._number = framing, 0
+        self._frames = FrameReader(framing)
         self._on_packet = on_packet
         self._waiting: dict[int, tuple[Signal, list[Packet]]] = {}
         self._open, self._lost = False, "not opened"
@@ -210,7 +259,7 @@ class PacketLine:
 
     async def open(self) -> None:
         """Open the port and start reading. Raises DeviceError, which names the port and says how to correct it."""
-        self._frames = self._reader()
+        self._frames = FrameReader(self._framing)
         await self._tasks.work(self._serial.open, self._read, self._lose)
         self._open, self._lost = True, ""
 
@@ -237,7 +286,7 @@ class PacketLine:
         DeviceError
             The line accepts no bytes, or the frame cannot be encoded.
         """
-        self._number = (self._number + 1) % self._numbers
+        self._number = (self._number + 1) % self._framing.numbers
         try:
             frame = make(self._number)
         except WireError as error:
@@ -317,15 +366,13 @@ class LineStimulator(Generic[S]):
     """Base of the drivers; see `rig.devices.Stimulator` for what the methods promise."""
 
     framing: ClassVar[Framing]
-    numbers: ClassVar[int]
-    """Packet numbers before they repeat."""
     serial: ClassVar[dict[str, Any]]
     """Arguments of `serial.Serial`."""
 
     def __init__(self, settings: S, machine: Machine) -> None:
         self._settings = settings
         port = machine.port(settings.port, **self.serial)
-        self._line = PacketLine(machine, port, settings.port, self.numbers, self.framing.reader, self._take)
+        self._line = PacketLine(machine, port, settings.port, self.framing, self._take)
         self.listen = self._line.listen
 
     async def open(self) -> dict[str, Any]:

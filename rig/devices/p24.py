@@ -1,30 +1,22 @@
 """Hasomed RehaMove P24 in ScienceMode 4's low level: one command per pulse, so without commands nothing is sent.
 
 The driver takes only width and current and makes the symmetric biphasic pulse itself, so a pulse is always balanced.
-
-Frame: `F0`, length and CRC each as two bytes behind an escape, the stuffed payload, `0F`. The payload starts with
-packet number (6 bits) and command (10 bits). An ack is the command + 1.
 """
 
 from __future__ import annotations
 
-import binascii
 import struct
 from enum import IntEnum
 
 from pydantic import Field
 
-from stimrig.rig.devices._line import Framing, LineSettings, LineStimulator, Packet, in_words
+from stimrig.rig.devices._line import SCIENCEMODE_4, LineSettings, LineStimulator, Packet, in_words
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
 from stimrig.rig.signals import Ack
 
 KIND = "stimulator"
 
-OVERHEAD_BYTES = 10
-MAX_FRAME_BYTES = 128
-"""Longer than any answer of the low level. Part of a damaged frame may look like the start of a longer frame, and the
-reader would then wait for that length and lose the frames in between."""
 INTERPHASE_US = 100
 
 
@@ -62,21 +54,6 @@ def result_text(result: int) -> str:
     return RESULTS.get(result, f"error {result}")
 
 
-def _unpack(payload: bytes) -> Packet:
-    head = int.from_bytes(payload[:2], "big")
-    return Packet(head >> 10, head & 0x3FF, payload[2:])
-
-
-FRAMING = Framing(
-    header_fields=4,
-    header=lambda body: struct.pack(">HH", len(body) + OVERHEAD_BYTES, binascii.crc_hqx(body, 0)),
-    frame_length=lambda header: int.from_bytes(header[:2], "big"),
-    max_frame_bytes=MAX_FRAME_BYTES,
-    pack=lambda packet: struct.pack(">H", packet.number << 10 | packet.command) + packet.data,
-    unpack=_unpack,
-)
-
-
 def ll_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float, connector: int = 0) -> bytes:
     """Frame of one symmetric biphasic pulse: (w, +I), (100 µs, 0), (w, −I).
 
@@ -106,7 +83,7 @@ def ll_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float, 
     points = ((pulse_width_us, int(half_ma)), (INTERPHASE_US, 0), (pulse_width_us, -int(half_ma)))
     head = 0x80 | channel << 5 | connector << 4 | len(points) - 1
     body = b"".join(struct.pack(">I", width << 20 | half + 300 << 10) for width, half in points)
-    return FRAMING.encode(Packet(number, Command.LL_CHANNEL_CONFIG, bytes((head,)) + body))
+    return SCIENCEMODE_4.encode(Packet(number, Command.LL_CHANNEL_CONFIG, bytes((head,)) + body))
 
 
 def parse_status(data: bytes) -> tuple[int, int, int]:
@@ -139,7 +116,7 @@ class P24(LineStimulator[Settings]):
     """Driver of one P24 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
 
     steps = Steps(pulse_width_us=1.0, current_ma=0.5, shortest_us=1.0)
-    framing, numbers = FRAMING, 64
+    framing = SCIENCEMODE_4
     serial = {"baudrate": 3_000_000, "stopbits": 2, "rtscts": True}  # noqa: RUF012
 
     async def _identity(self) -> tuple[str, str]:

@@ -4,9 +4,7 @@ The channel list is never used, since the device would continue to play it for u
 command. The device's own watchdog is still active: after 1200 ms without a command it closes the connection and offers
 a new one. Only `feed` keeps it alive, which the rig calls after a health check: there is no keep-alive thread.
 
-Frame: `F0`, CRC-8 and length each as one byte behind an escape, the stuffed body, `0F`. The body is packet number,
-command, data; numbers of several bytes come most significant first. CRC and length are those of the stuffed body.
-An ack is the command + 1 with the same number; its first byte is a signed result.
+Numbers of several bytes come most significant first. The first byte of an ack is a signed result.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from typing import Any
 
 from pydantic import Field
 
-from stimrig.rig.devices._line import Framing, LineSettings, LineStimulator, Packet
+from stimrig.rig.devices._line import SCIENCEMODE_2, LineSettings, LineStimulator, Packet
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
 from stimrig.rig.machine import Machine
@@ -29,8 +27,6 @@ FEED_S = 0.3
 """Rig seconds after the last command at which a keep-alive goes out, a quarter of the device's watchdog."""
 OFFER_S = 1.5
 """Real seconds to wait for the device to offer a connection; it does so every 500 ms."""
-OVERHEAD_BYTES = 6
-MAX_BODY_BYTES = 0xFF
 VERSION = 1
 
 
@@ -73,42 +69,6 @@ def result_text(result: int) -> str:
     return RESULTS.get(result, f"error {result}")
 
 
-def _crc_table() -> bytes:
-    table = bytearray()
-    for byte in range(256):
-        for _ in range(8):
-            byte = (byte << 1 ^ 0x07 if byte & 0x80 else byte << 1) & 0xFF
-        table.append(byte)
-    return bytes(table)
-
-
-_CRC = _crc_table()
-
-
-def crc8(data: bytes) -> int:
-    """CRC-8, polynomial 07, from 0, not reflected."""
-    crc = 0
-    for byte in data:
-        crc = _CRC[crc ^ byte]
-    return crc
-
-
-def _header(body: bytes) -> bytes:
-    if len(body) > MAX_BODY_BYTES:
-        raise WireError(f"body of {len(body)} bytes, at most {MAX_BODY_BYTES}")
-    return bytes((crc8(body), len(body)))
-
-
-FRAMING = Framing(
-    header_fields=2,
-    header=_header,
-    frame_length=lambda header: header[1] + OVERHEAD_BYTES,
-    max_frame_bytes=MAX_BODY_BYTES + OVERHEAD_BYTES,
-    pack=lambda packet: bytes((packet.number, packet.command)) + packet.data,
-    unpack=lambda payload: Packet(payload[0], payload[1], payload[2:]),
-)
-
-
 def single_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float) -> bytes:
     """Frame of one symmetric biphasic pulse, drawn by the device.
 
@@ -135,7 +95,7 @@ def single_pulse(number: int, channel: int, pulse_width_us: int, current_ma: flo
     if not (0 <= channel <= 7):
         raise WireError(f"channel {channel}: 0 to 7")
     data = bytes((channel,)) + pulse_width_us.to_bytes(2, "big") + bytes((int(current_ma),))
-    return FRAMING.encode(Packet(number, Command.SINGLE_PULSE, data))
+    return SCIENCEMODE_2.encode(Packet(number, Command.SINGLE_PULSE, data))
 
 
 class Settings(LineSettings):
@@ -148,7 +108,7 @@ class RehaStim2(LineStimulator[Settings]):
     """Driver of one RehaStim 2 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
 
     steps = Steps(pulse_width_us=1.0, current_ma=2.0, shortest_us=20.0)
-    framing, numbers = FRAMING, 256
+    framing = SCIENCEMODE_2
     serial = {"baudrate": 460_800, "parity": "E"}  # noqa: RUF012
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
@@ -219,7 +179,7 @@ class RehaStim2(LineStimulator[Settings]):
             return False
         accepted = offer.data[:1] == bytes((VERSION,))
         result = 0 if accepted else -5
-        self._line.tell(lambda _: FRAMING.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
+        self._line.tell(lambda _: SCIENCEMODE_2.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
         if not accepted:
             raise DeviceError(f"stimulator {self._settings.port}: it uses protocol {offer.data.hex()}, this driver 1")
         return True

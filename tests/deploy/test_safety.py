@@ -11,11 +11,12 @@ import sys
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import pytest
 
 from deploy import soup
+from stimrig.rig import devices
 from tests.simulator.invariants import INVARIANTS
 
 ROOT = Path(__file__).parents[2]
@@ -57,12 +58,18 @@ def faults(hazards: list[dict[str, Any]]) -> list[str]:
 def control_faults(control: dict[str, Any]) -> list[str]:
     what = control.get("what") or "a control without words"
     found = [f"{what}: no {key}" for key in ("what", "where", "tests") if not control.get(key)]
-    found += [f"{what}: {place} is not there" for place in control.get("where", []) if not (ROOT / place).exists()]
+    found += [f"{what}: {place} is not there" for place in control.get("where", []) if not files(place)]
     for test in control.get("tests", []):
         path, _, name = test.partition("::")
         if not (path.startswith("tests/") and (ROOT / path).is_file() and name in names_in(ROOT / path)):
             found.append(f"{what}: no such test: {test}")
     return found
+
+
+def files(place: str) -> set[Path]:
+    """A path or a pattern of paths; with a kind of devices in brackets, the drivers of that kind among them."""
+    pattern, _, kind = place.removesuffix(")").partition(" (")
+    return {path for path in ROOT.glob(pattern) if not kind or path.stem in devices.library(cast("Any", kind))}
 
 
 def hazards() -> list[dict[str, Any]]:
@@ -88,6 +95,7 @@ def test_every_invariant_of_the_simulator_guards_against_a_hazard() -> None:
         (lambda h: h["control"][0]["tests"].append("tests/rig/test_nothing.py::test_x"), "no such test"),
         (lambda h: h["control"][0]["tests"].append("tests/rig/test_limits.py"), "no such test"),
         (lambda h: h["control"][0]["where"].append("rig/nowhere.py"), "is not there"),
+        (lambda h: h["control"][0]["where"].append("rig/devices/*.py (pump)"), "is not there"),
         (lambda h: h["invariants"].append("nothing_ever_happens"), "no such invariant"),
         (lambda h: h.update(severity="harmless"), "severity"),
         (lambda h: h.update(causes=[]), "no causes"),
@@ -98,6 +106,16 @@ def test_what_does_not_hold_is_found(spoil: Any, told: str) -> None:
     spoiled = hazards()
     spoil(spoiled[0])
     assert any(told in fault for fault in faults(spoiled))
+
+
+def test_every_driver_is_named_by_a_control_that_is_tested() -> None:
+    named = {
+        path for hazard in hazards() for one in hazard["control"] for place in one["where"] for path in files(place)
+    }
+    drivers = {
+        ROOT / "rig" / "devices" / f"{name}.py" for kind in get_args(devices.Kind) for name in devices.library(kind)
+    }
+    assert drivers <= named
 
 
 def test_it_says_plainly_that_it_is_no_certified_device() -> None:

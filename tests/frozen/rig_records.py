@@ -40,7 +40,7 @@ class QuietRig:
         content = {
             "require_calibration": False,
             "stimulator": {"device": settings.stimulator, "port": "/dev/simulated"},
-            "load_cell": cell | config.EMULATED_CELLS[settings.cell](1),
+            "load_cell": cell | devices.load_cell.cell.rig_keys,
             "angle_sensor": {"device": "can_angle_sensor", "offset": 30.0, "direction": -1} if arm else None,
         }  # fmt: skip
         checked = config.check(content, "simulated", data_dir=FOLDER, socket=FOLDER / "socket")

@@ -21,7 +21,7 @@ TRANSPORTS = tuple(load_cells.TRANSPORTS)
 CELLS = {
     f"{name} x{count}" if count > 1 else name: ("--cell", name, "--samples-per-frame", str(count))
     for name, cell in load_cells.CELLS.items()
-    for count in {cell.layouts[0], cell.layouts[-1]}
+    for count in {min(cell.layouts), max(cell.layouts)}
 }
 """Every emulated cell with its fewest and its most samples per frame, as options of the emulator."""
 HOLD = [

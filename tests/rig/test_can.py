@@ -197,6 +197,7 @@ def test_the_emulators_line_says_what_a_calibration_would_find(kind: str):
         "stimulator": "/dev/pts/gone",
         "can": {"interface": "virtual", "channel": "e"},
         "cell": "with_angle" if kind == "in_cell" else "plain",
+        "load_cell": {"dbc": "torque_with_angle"} if kind == "in_cell" else {},
         "angle_sensor": {
             "kind": kind, "frame_id": 386, "rate_hz": 100.0, "offset_deg": 12.5, "direction": -1, "scale": 1.25
         },

@@ -7,9 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from stimrig.hardware_sim.load_cells import CELLS
+from stimrig.hardware_sim.load_cells.frames import Sample
+from stimrig.hardware_sim.stimulators import STIMULATORS
 from stimrig.rig import config
-from stimrig.rig.devices import find
+from stimrig.rig.devices import find, library
 from stimrig.rig.errors import ConfigError
+from stimrig.rig.machine import Frame
 from tests.harness.processes import CLINIC_WATCH
 
 GOOD = """
@@ -155,7 +159,7 @@ def test_the_command_line_makes_no_rig_file_faster(tmp_path: Path):
         config.load(tmp_path / "rig.toml", clock_speed=2.0)
 
 
-CELLS = {
+DESCRIBED = {
     ("plain", 1): ("torque_default", ["Torque_Nm"], "Counter", "Sync"),
     ("plain", 3): ("torque_packed3", ["Torque1_Nm", "Torque2_Nm", "Torque3_Nm"], "Counter", ""),
     ("counts", 1): ("counts_be16", ["Torque1_Nm"], "", ""),
@@ -164,18 +168,28 @@ CELLS = {
 }
 
 
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.parametrize("stimulator", ["p24", "rehastim2"])
+@pytest.mark.parametrize("cell", [(name, count) for name, kind in CELLS.items() for count in kind.layouts])
+@pytest.mark.parametrize("stimulator", library("stimulator"))
 def test_every_emulated_device_has_its_description(tmp_path: Path, stimulator: str, cell: tuple[str, int]):
+    """The rig reads from an emulated cell's frame what that put into it, and every driver has an emulated device."""
+    assert set(library("stimulator")) == set(STIMULATORS)
+    name, count = cell
+    emulated = CELLS[name](count)
     line = {
         "stimulator": "/dev/pts/3", "stimulator_device": stimulator, "can": {"interface": "slcan", "channel": "x"},
-        "cell": cell[0], "samples_per_frame": cell[1],
+        "cell": name, "load_cell": emulated.rig_keys,
     }  # fmt: skip
     loaded = config.for_emulator(json.dumps(line), data_dir=tmp_path, socket=tmp_path / "s")
     assert loaded.stimulator.device == stimulator
     found = loaded.load_cell.model_dump()
     signals = found["signal"] if isinstance(found["signal"], list) else [found["signal"]]
-    assert (found["dbc"], signals, found["counter"], found["sync"]) == CELLS[cell]
-    assert bool(found["start_frames"]) == (cell[0] == "canopen")
+    described = (found["dbc"], signals, found["counter"], found["sync"])
+    assert described == DESCRIBED.get(cell, described)
+    assert bool(found["start_frames"]) == (not emulated.running)
     device = find("load_cell", "can_load_cell").create(loaded.load_cell, None)
-    assert (device.counter_modulus > 0) == (cell[0] != "counts")
+    assert (device.counter_modulus > 0) == emulated.has_counter == (name != "counts")
+    samples = [Sample(torque_nm, 40 * count + i, False, 0) for i, torque_nm in enumerate((1.5, -2.5, 0.5, 7.0)[:count])]
+    frame = emulated.encode(samples)
+    assert frame.can_id == device._frame.message.frame_id
+    read = device.decode([Frame(frame.can_id, frame.data, 1.0, 1.0)])
+    assert read.samples["torque_nm"] == pytest.approx([sample.torque_nm for sample in samples], abs=2e-3)

@@ -19,7 +19,7 @@ from stimrig.rig.acquire.evidence import DECAY_S, NO_SIGNAL, SILENT_S, watch_dec
 from stimrig.rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.control.sealing import warnings
-from stimrig.rig.devices import p24, rehastim2
+from stimrig.rig.devices import find, library
 from stimrig.rig.errors import WireError
 from stimrig.rig.limits import Steps
 from stimrig.rig.messages import SegmentPlan
@@ -87,7 +87,7 @@ class Line:
         self.devices = make_devices(Settings(stimulator=name))
         computer = Computer(self.world, 0.0, 0.0)
         self.process = Process(computer, SimulatedDisk(self.world), Wires(self.world, self.devices, 0.02, void))
-        module = {"p24": p24, "rehastim2": rehastim2}[name]
+        module = find("stimulator", name)
         self.driver = module.create(module.Settings(device=name, port="none"), self.process)
         self.told: list[Ack] = []
         self.driver.listen(self.told.append, void)
@@ -101,7 +101,7 @@ class Line:
         assert asked[0].result is None or asked[0].result
 
 
-@pytest.mark.parametrize("name", ["p24", "rehastim2"])
+@pytest.mark.parametrize("name", library("stimulator"))
 def test_a_stop_takes_back_what_waits_in_the_computer_before_it_asks(name: str, monkeypatch: pytest.MonkeyPatch):
     line, did = Line(name), list[str]()
     write = SimulatedPort.write

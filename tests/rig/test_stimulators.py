@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from stimrig.hardware_sim.stimulators import sciencemode
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2, ScienceMode4
-from stimrig.rig.devices import p24, rehastim2
+from stimrig.rig.devices import library, p24, rehastim2
+from stimrig.rig.devices._line import SCIENCEMODE_2, SCIENCEMODE_4, FrameReader, Framing
 from stimrig.rig.devices._line import Packet as RigsPacket
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.machine import Told
@@ -36,7 +37,7 @@ def test_a_pulse_that_the_frame_cannot_carry_is_refused(width_us: int, current_m
 
 @given(st.integers(1, 4095), st.integers(0, 260), st.integers(0, 3))
 def test_every_pulse_is_balanced(width_us: int, half_ma: int, channel: int):
-    data = p24.FRAMING.decode(p24.ll_pulse(1, channel, width_us, half_ma / 2)).data
+    data = SCIENCEMODE_4.decode(p24.ll_pulse(1, channel, width_us, half_ma / 2)).data
     points = [(p >> 20, (p >> 10 & 0x3FF) - 300) for p in struct.unpack(">3I", data[1:])]
     assert sum(width * half for width, half in points) == 0
     assert points[0] == (width_us, half_ma)
@@ -77,7 +78,7 @@ def test_results_are_signed():
 
 
 def test_a_single_pulse_and_what_cannot_be_one():
-    assert rehastim2.single_pulse(9, 0, 300, 24.0) == rehastim2.FRAMING.encode(RigsPacket(9, 36, bytes((0, 1, 44, 24))))
+    assert rehastim2.single_pulse(9, 0, 300, 24.0) == SCIENCEMODE_2.encode(RigsPacket(9, 36, bytes((0, 1, 44, 24))))
     for wrong in ((0, 19, 20), (0, 501, 20), (0, 300, 25), (0, 300, 128), (0, 300, -2), (8, 300, 20), (-1, 300, 20)):
         with pytest.raises(WireError):
             rehastim2.single_pulse(1, *wrong)
@@ -123,29 +124,31 @@ class Other(VirtualMachine):
 
 ANSWERS: dict[str, tuple[Callable[[bytes], bytes], bytes]] = {
     "silent": (lambda _: b"", b""),
-    "a RehaStim 2": (lambda _: REHASTIM_OFFER, REHASTIM_OFFER),
-    "a P24": (lambda _: bytes.fromhex("f0815581588125810710 0100 0f".replace(" ", "")), b""),
+    "rehastim2": (lambda _: REHASTIM_OFFER, REHASTIM_OFFER),
+    "p24": (lambda _: bytes.fromhex("f0815581588125810710 0100 0f".replace(" ", "")), b""),
     "an echo": (lambda data: data, b""),
     "a modem": (lambda _: b"\r\nERROR\r\n", b"RING\r\n"),
 }
 
 
-DRIVERS: dict[str, tuple[Any, set[Any]]] = {
-    "a P24": (p24, {p24.Command.DEVICE_ID, p24.Command.EXTENDED_VERSION, p24.Command.STIM_STATUS}),
-    "a RehaStim 2": (rehastim2, {rehastim2.Command.GET_MODE}),
+DRIVERS = library("stimulator")
+ASKING: dict[str, set[Any]] = {
+    "p24": {p24.Command.DEVICE_ID, p24.Command.EXTENDED_VERSION, p24.Command.STIM_STATUS},
+    "rehastim2": {rehastim2.Command.GET_MODE},
 }
+"""Each driver's commands that change nothing at the device."""
 
 
 @pytest.mark.parametrize(("of", "what"), [(of, what) for of in DRIVERS for what in ANSWERS if what != of])
 def test_a_stimulator_that_is_another_is_only_asked_who_it_is(of: str, what: str):
-    line, (driver, asking) = Other(*ANSWERS[what]), DRIVERS[of]
-    device = driver.create(driver.Settings(device=driver.__name__.rpartition(".")[2], port=PORT), line)
+    line, driver = Other(*ANSWERS[what]), DRIVERS[of]
+    device = driver.create(driver.Settings(device=of, port=PORT), line)
     device.listen(lambda _: None, lambda _: None)
     with pytest.raises(DeviceError, match=PORT):
         line.run(device.open())
-    commands = {packet.command for packet in driver.FRAMING.reader().feed(line.heard)}
+    commands = {packet.command for packet in FrameReader(driver.create.framing).feed(line.heard)}
     assert commands
-    assert commands <= asking
+    assert commands <= ASKING[of]
 
 
 def test_a_mistake_in_a_driver_is_told_at_once():
@@ -221,15 +224,15 @@ class Codec(NamedTuple):
     """Name of the decoder's count."""
 
 
-def of_rig(version: int, module: Any) -> Codec:
+def of_rig(version: int, framing: Framing) -> Codec:
     return Codec(
-        version, lambda packet: module.FRAMING.encode(RigsPacket(*packet)), module.FRAMING.reader, 1, "damaged"
+        version, lambda packet: framing.encode(RigsPacket(*packet)), lambda: FrameReader(framing), 1, "damaged"
     )
 
 
 CODECS = {
-    "rig 2": of_rig(2, rehastim2),
-    "rig 4": of_rig(4, p24),
+    "rig 2": of_rig(2, SCIENCEMODE_2),
+    "rig 4": of_rig(4, SCIENCEMODE_4),
     "emulator 2": Codec(2, ScienceMode2.encode, ScienceMode2, 0, "corrupt_frames"),
     "emulator 4": Codec(4, ScienceMode4.encode, ScienceMode4, 0, "corrupt_frames"),
 }
@@ -336,7 +339,7 @@ def test_stuffing_is_reversible_and_hides_borders(data: bytes):
 )
 def test_what_is_no_frame_is_told(text: str):
     with pytest.raises(WireError):
-        rehastim2.FRAMING.decode(bytes.fromhex(text))
+        SCIENCEMODE_2.decode(bytes.fromhex(text))
 
 
 def test_a_body_longer_than_its_length_field_is_refused():

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stimrig.hardware_sim.factory import make_devices
+from stimrig.hardware_sim.load_cells.cells import CELLS, WithAngle
 from stimrig.hardware_sim.settings import Settings
+from stimrig.hardware_sim.stimulators import STIMULATORS
 from stimrig.rig import config
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import RigError
@@ -62,8 +64,9 @@ class Life:
         )  # fmt: skip
         self.rate_hz = chance.choice((20.0, 40.0, 50.0))
         self.adaptive = chance.random() < 0.3
+        cells = set(CELLS) - {WithAngle.name}  # whose angle would be one more
         settings = Settings(
-            stimulator=chance.choice(("p24", "rehastim2")), cell=chance.choice(("plain", "plain", "counts", "canopen")),
+            stimulator=chance.choice(tuple(STIMULATORS)), cell=chance.choice(("plain", *sorted(cells, reverse=True))),
             rate_hz=chance.choice((200.0, 200.0, 400.0, 1600.0)), noise_seed=seed & 0xFFFF,
             clock_ppm=chance.uniform(-200, 200), angle_offset_deg=30.0, angle_direction=-1,
             angle_clock_ppm=chance.uniform(-200, 200),
@@ -203,13 +206,12 @@ class Life:
         self.world.tell("accident", f"{number} {self.befallen[-1]}")
 
     def _rig_file(self, settings: Settings) -> config.RigConfig:
-        cell = config.EMULATED_CELLS[settings.cell](settings.samples_per_frame)
         content = {
             "require_calibration": False,
             "stimulator": {"device": settings.stimulator, "port": "/dev/simulated"},
             "load_cell": {
                 "device": "can_load_cell", "bus": {"interface": "simulated"}, "sample_rate_hz": settings.rate_hz,
-                **({"sync": ""} if settings.cell == "counts" else {}), **cell,
+                **self.devices.load_cell.cell.rig_keys,
             },
             "angle_sensor": {"device": "can_angle_sensor", "offset": 30.0, "direction": -1} if self.arm else None,
         }  # fmt: skip
