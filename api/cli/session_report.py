@@ -11,7 +11,7 @@ from stimrig.api.cli.terminal import carried_lines, model_report, number
 from stimrig.api.client.documents import SessionTest
 from stimrig.api.client.errors import Unreachable
 from stimrig.api.client.rest import Client
-from stimrig.api.clinical_words import adaptive_end_words
+from stimrig.api.clinical_words import words
 
 
 def run_test(
@@ -97,7 +97,7 @@ def adaptive_lines(told: Mapping[str, Any] | None) -> list[str]:
         for name, words in (("curve_percent", "curve"), ("step_percent", "step response"))
     )
     used = f"{number(told['torque_time_nm_s'], 1)} of at most {number(told['max_torque_time_nm_s'], 1)} N·m·s"
-    lines = [f"ended          {adaptive_end_words(told['ended'])}; {used}", f"known          {reached}"]
+    lines = [f"ended          {words(told['ended'], 'end')}; {used}", f"known          {reached}"]
     return [*lines, *([f"in doubt       {told['problem']}"] if told["problem"] else [])]
 
 

@@ -45,21 +45,16 @@ NAMED = {"Effect": ("name", "main"), "Parameter": ("about",)}
 NOT_SHOWN = {
     "Field",
     "Query",
-    "Header",
     "describe_answer",
     "published",
     "problem",
-    "compile",
-    "getLogger",
     "spawn",
-    "_",
-    "lazy",
     "BadChunk",
     "ngettext",
     "policy",
     "WireError",
 }
-"""Calls whose texts no page shows: descriptions of the API, patterns, logs, and what is extracted already."""
+"""Calls whose texts no page shows: descriptions of the API, names of threads, what only a log says, plural forms."""
 
 VOCABULARY = (
     # roles of people
@@ -123,7 +118,9 @@ def _marked(method: str, path: Path, options: dict[str, str]) -> Iterator[str | 
 
 def sentences(source: str) -> Iterator[str]:
     """The sentences of a module: texts of more than a word that are no docstring and go to no log."""
-    yield from _Sentences().of(ast.parse(source))
+    found = _Sentences()
+    found.visit(ast.parse(source))
+    yield from found.found
 
 
 class _Sentences(ast.NodeVisitor):
@@ -131,10 +128,6 @@ class _Sentences(ast.NodeVisitor):
 
     def __init__(self) -> None:
         self.found: list[str] = []
-
-    def of(self, tree: ast.AST) -> list[str]:
-        self.visit(tree)
-        return self.found
 
     def visit_Expr(self, node: ast.Expr) -> None:
         if not isinstance(node.value, ast.Constant):  # a docstring

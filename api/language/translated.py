@@ -15,7 +15,7 @@ from itertools import islice
 
 from markupsafe import Markup
 
-from stimrig.api.language.words import DEFAULT, catalogue, code, localised, translations
+from stimrig.api.language.words import DEFAULT, catalogue, code, localised
 
 _PLACE = re.compile(r"%\((\w+)\)s")
 _END = re.compile(r"(?<=[.!?;:,]) ")
@@ -47,9 +47,8 @@ class Pattern:
     places: tuple[Names, ...]
     ends_in_place: bool
     """Its end is a place, and that of its translation another: a sign there is the sentence's."""
-    literal: str
     key: str
-    """`literal` in small letters, without spaces and signs around it."""
+    """The longest of `literals` in small letters, without spaces and signs around it."""
     becomes: str
     weight: int
     """Its letters."""
@@ -106,9 +105,13 @@ def of(language: str, text: str) -> str | None:
         return None
     _tries.set(iter(range(MOST_TRIES)))
     try:
-        return _sentences(language, text)
+        if (found := _certain(language, text)) is not None:
+            return found
+        parts = re.split(r"(?<=[.!?]) ", text)
+        likely = [_certain(language, part) or _message(language, part, _likely) for part in parts]
     except (_TooManyTries, RecursionError):
         return None
+    return None if None in likely else " ".join(map(str, likely))
 
 
 class _TooManyTries(Exception):
@@ -118,25 +121,18 @@ class _TooManyTries(Exception):
 _tries: ContextVar[Iterator[int]] = ContextVar("tries")
 
 
-def _sentences(language: str, text: str) -> str | None:
-    found = _certain(language, text)
-    if found is not None:
-        return found
-    parts = re.split(r"(?<=[.!?]) ", text)
-    likely = [_certain(language, part) or _one(language, part, _likely) for part in parts]
-    return None if None in likely else " ".join(part for part in likely if part is not None)
-
-
 @lru_cache(maxsize=8192)
 def _certain(language: str, text: str) -> str | None:
     """The translation of a message, or of messages one after the other; None where English would stay."""
     if not text:
         return ""
-    whole = _message(language, text)
+    whole = _message(language, text, _known)
     if whole is not None:
         return whole
     for sign in reversed(list(islice(_END.finditer(text), MOST_ENDS))):
-        first = _part(language, text[: sign.start()])
+        first = _message(language, text[: sign.start()], _known)
+        if first is None and text[sign.start() - 1] == ":" and not _PROSE.search(text[: sign.start()]):
+            first = text[: sign.start()]  # a name
         rest = _certain(language, text[sign.end() :]) if first is not None else None
         if rest is not None:
             return f"{first} {rest}"
@@ -144,18 +140,7 @@ def _certain(language: str, text: str) -> str | None:
 
 
 @lru_cache(maxsize=8192)
-def _message(language: str, text: str) -> str | None:
-    """One message with nothing left in English."""
-    return _one(language, text, _known)
-
-
-def _part(language: str, text: str) -> str | None:
-    """One message; or a name before a colon, as it is."""
-    found = _message(language, text)
-    return text if found is None and text[-1:] == ":" and not _PROSE.search(text) else found
-
-
-def _one(language: str, text: str, value: Value) -> str | None:
+def _message(language: str, text: str, value: Value) -> str | None:
     """One message: as it stands, or with another beginning or end than in the source."""
     if next(_tries.get(), None) is None:
         raise _TooManyTries
@@ -163,7 +148,7 @@ def _one(language: str, text: str, value: Value) -> str | None:
     tail = text[len(body) :]
     for given, end in ((text, ""), (body, tail)):
         for form, before, after in _forms(given):
-            found = _exact(language, form) or _fit_pattern(language, form, value)
+            found = _whole(language).get(form) or _fit_pattern(language, form, value)
             if found is not None:
                 found = found.removeprefix(before).removesuffix(after)
                 same = given[:1].isupper() and form[:1].islower()
@@ -177,26 +162,26 @@ def _forms(text: str) -> list[tuple[str, str, str]]:
     return [(case, "", "") for case in cases] + [(f" {text}", " ", ""), (f"{text}.", "", "."), (f"{text} ", "", " ")]
 
 
-def _exact(language: str, text: str) -> str | None:
-    found = translations(language).ugettext(text)
-    return found if found != text or text in _same(language) else None
-
-
 @cache
-def _same(language: str) -> frozenset[str]:
-    """Messages whose translation is the English word."""
-    return frozenset(str(entry.id) for entry in catalogue(language) if entry.id and entry.id == entry.string)
+def _whole(language: str) -> dict[str, str]:
+    """What messages become as they stand, with the form for one."""
+    entries = (entry for entry in catalogue(language) if entry.id and not entry.fuzzy)
+    return {_one(entry.id): _one(entry.string) for entry in entries if _one(entry.string)}
+
+
+def _one(forms: str | tuple[str, ...]) -> str:
+    return forms if isinstance(forms, str) else forms[0]
 
 
 @cache
 def _written(language: str) -> frozenset[str]:
     """What translations become: a text that is in the page's language already stays."""
-    return frozenset(str(entry.string) for entry in catalogue(language) if isinstance(entry.string, str))
+    return frozenset(_whole(language).values())
 
 
 def _fit_pattern(language: str, text: str, value: Value) -> str | None:
     for pattern in _candidates(language, text.strip(_AROUND).lower()):
-        if pattern.literal in text and (fit := pattern.fit(text)) is not None:
+        if (fit := pattern.fit(text)) is not None:
             values = [
                 _places(language, part, names, pattern, value) for part, names in zip(fit, pattern.places, strict=True)
             ]
@@ -239,12 +224,9 @@ def _likely(language: str, text: str, pattern: Pattern) -> str | None:
 @cache
 def _patterns(language: str) -> tuple[Pattern, ...]:
     """The messages with places, the most literal first."""
-    made = [
-        _pattern(entry.id, str(entry.string))
-        for entry in catalogue(language)
-        if isinstance(entry.id, str) and entry.string and not entry.fuzzy and _PLACE.search(entry.id)
-    ]
-    return tuple(sorted((entry for entry in made if entry.literal.strip()), key=lambda entry: -entry.weight))
+    entries = [(str(entry.id), str(entry.string)) for entry in catalogue(language) if isinstance(entry.id, str)]
+    made = [_pattern(message, becomes) for message, becomes in entries if becomes and _PLACE.search(message)]
+    return tuple(sorted((entry for entry in made if "".join(entry.literals).strip()), key=lambda entry: -entry.weight))
 
 
 def _pattern(message: str, becomes: str) -> Pattern:
@@ -261,6 +243,5 @@ def _pattern(message: str, becomes: str) -> Pattern:
             literals.append(literal)
     ends_in_place = bool(places) and not given[-1] and not becomes.endswith(f"%({places[-1][-1]})s")
     weight = len(re.findall("[A-Za-z]", "".join(given)))
-    longest = max(given, key=len)
-    key = longest.strip(_AROUND).lower()
-    return Pattern(tuple(literals), tuple(places), ends_in_place, longest, key, becomes, weight)
+    key = max(given, key=len).strip(_AROUND).lower()
+    return Pattern(tuple(literals), tuple(places), ends_in_place, key, becomes, weight)

@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import Request
 
 from stimrig.api import decisions
-from stimrig.api.clinical_words import decision_words
+from stimrig.api.clinical_words import WORDS
 from stimrig.api.language import _, lazy, localised, plain, translated
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import profiles
@@ -28,7 +28,7 @@ ARCHIVED = {"create participant": lazy("not in the archive"), "archive": lazy("i
             "unarchive": lazy("not in the archive")}  # fmt: skip
 PLAN = {"duration": ("max_duration_s", "s"), "current": ("current_ma", "mA"), "width": ("max_pulse_width_us", "µs")}
 """Fields of a key's form, with their units."""
-DECIDED = {"approve": "approved", "reject": "rejected"}
+DECIDED = {"approve": WORDS["decision"]["approved"], "reject": WORDS["decision"]["rejected"]}
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def words(entry: dict[str, Any] | None, of: str) -> str:
         return _("nothing decided")
     detail = entry["detail"]
     if entry["action"] in DECIDED:
-        return ": ".join(part for part in (decision_words(DECIDED[entry["action"]]), detail.get("reason")) if part)
+        return ": ".join(part for part in (str(DECIDED[entry["action"]]), detail.get("reason")) if part)
     if of in ARCHIVED and entry["action"] in ARCHIVED:
         return str(ARCHIVED[entry["action"]])
     if detail.get("ran_by"):
@@ -155,7 +155,7 @@ def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[st
         return [str(ARCHIVED[action])]
     if "model_id" in names:
         model, decided = model_words(names["model_id"]), DECIDED.get(action)
-        return [model if decided is None else f"{model}: {decision_words(decided)}"]
+        return [model if decided is None else f"{model}: {decided}"]
     if "ran_by" in texts:
         return [texts["ran_by"]]
     if action == "keys":

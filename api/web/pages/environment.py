@@ -71,13 +71,9 @@ environment.filters.update({name: in_its_language(words_of) for name, words_of i
     "number": number, "followed": followed, "figures": figures, "when": language.when, "clock": language.clock,
     "day": language.day, "until": language.until,
     "translated": language.translated, "plain_words": language.plain, "localised": language.localised,
-    "segment_words": clinical_words.segment_words, "adaptive_end_words": clinical_words.adaptive_end_words,
-    "verdict_words": clinical_words.verdict_words,
+    "words": clinical_words.words, "segment_words": clinical_words.segment_words, "degrees": clinical_words.degrees,
     "effect_words": effect_words.effect_words, "effects_words": effect_words.effects_words,
-    "decision_words": clinical_words.decision_words, "test_kind_words": clinical_words.test_kind_words,
-    "test_state_words": clinical_words.test_state_words, "joint_end_words": clinical_words.joint_end_words,
-    "degrees": clinical_words.degrees, "test_title": clinical_words.test_title,
 }.items()})  # fmt: skip
 environment.globals["chart_config"] = PAGE_CONFIG
 environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": in_words}
-environment.globals["language"] = language
+environment.globals |= {"language": language, "known_words": clinical_words.WORDS}

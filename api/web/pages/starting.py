@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from stimrig.api.clinical_words import degrees, test_kind_words
+from stimrig.api.clinical_words import degrees, words
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised, translated, until, when
 from stimrig.api.models.places import Site, site_of
@@ -79,7 +79,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
     joint = preview.get("joint")
     question = Question(
         participant=row.code,
-        title=_("Start the %(kind)s of %(code)s?", kind=test_kind_words(body.kind), code=row.code),
+        title=_("Start the %(kind)s of %(code)s?", kind=words(body.kind, "kind"), code=row.code),
         button=_("Start now: %(strength)s", strength=strength) if stimulates else _("Start now: no stimulation"),
         action=action,
         rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context)),
