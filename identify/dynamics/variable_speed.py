@@ -189,12 +189,11 @@ def run_core(
     given = multiplier.shape[0]
     torque = np.zeros((rows, size + 1))
     rate = np.zeros((rows, size + 1))
-    first, none, even, step = np.empty((4, size)), np.empty((4, 0)), np.zeros((4, 4)), np.zeros((4, 4))
-    four, plain, many, few = np.zeros(4, np.int64), np.zeros(4, np.int64), 0, 0
+    first, none, even = np.empty((4, size)), np.empty((4, 0)), np.zeros((rows, 4))
+    listed, counts = np.empty((2, rows), np.int64), np.zeros(2, np.int64)  # rows without a law; those like row 0
     varied = False
     for m in range(rows):
         base = time_constant_s[m]
-        b11, b12, b21, b22 = step_matrix(base, damping[m], step_s)
         slow_s = base * (damping[m] + np.sqrt(max(damping[m] * damping[m] - 1.0, 0.0)))
         quick_s = 2.0 * damping[m] * base - slow_s
         lawful = False
@@ -208,18 +207,11 @@ def run_core(
         quick_second = law[m, SpeedLaw.QUICK_SECOND_ACTIVATION] != 0.0 or law[m, SpeedLaw.QUICK_SECOND_ATTACHED] != 0.0
         last = 1.0
         forget = np.exp(-step_s / PARTS / max(quick_s if law[m, SpeedLaw.SLOW_CALCIUM] != 0.0 else slow_s, 1e-4))
-        if alike and varied:
-            four[many % 4] = m
-            many += 1
-            if many % 4 == 0:
-                through(drive, torque, rate, four, even, first, begins, initial)
-            continue
-        if not lawful and given == 0:
-            plain[few % 4] = m
-            step[few % 4, 0], step[few % 4, 1], step[few % 4, 2], step[few % 4, 3] = b11, b12, b21, b22
-            few += 1
-            if few % 4 == 0:
-                through(drive, torque, rate, plain, step, none, begins, initial)
+        kind = 1 if alike and varied else 0
+        if kind or (not lawful and given == 0):
+            listed[kind, counts[kind]] = m
+            counts[kind] += 1
+            even[m, 0], even[m, 1], even[m, 2], even[m, 3] = step_matrix(base, damping[m], step_s)
             continue
         h = step_s / PARTS
         for k in range(size):
@@ -268,16 +260,14 @@ def run_core(
                 first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22
             torque[m, k + 1] = y
             rate[m, k + 1] = v
-    if many % 4:
-        for r in range(many % 4, 4):
-            four[r] = four[0]
-        through(drive, torque, rate, four, even, first, begins, initial)
-    if few % 4:
-        for r in range(few % 4, 4):
-            plain[r] = plain[0]
-            for j in range(4):
-                step[r, j] = step[0, j]
-        through(drive, torque, rate, plain, step, none, begins, initial)
+    four, step = np.zeros(4, np.int64), np.zeros((4, 4))
+    for kind in range(2):
+        for i in range(0, counts[kind], 4):
+            for r in range(4):
+                four[r] = listed[kind, min(i + r, counts[kind] - 1)]
+                for j in range(4):
+                    step[r, j] = even[four[r], j]
+            through(drive, torque, rate, four, step, first if kind else none, begins, initial)
     return torque, rate
 
 

@@ -429,7 +429,7 @@ def slow_gain(
 
     def used(drive: np.ndarray, p: Values, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0)
-        a = np.broadcast_to(scene.on, drive.shape) if by_pulses else level
+        a = np.tile(scene.on, (len(drive), 1)) if by_pulses else level
         onset_s, recovery_s, begin = p[parameters[1].name][:, 0], p["recovery_s"][:, 0], scene.states.get(effect, 0.0)
         return adapt(a, onset_s, recovery_s, constant, scene.step_s, scene.rest_s, begin)
 

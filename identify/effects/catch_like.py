@@ -37,9 +37,7 @@ def _trains(name: str, equation: str, least_gap_s: float) -> Form:
 
 
 @njit(cache=True, nogil=True)
-def _train(
-    on: np.ndarray, step_s: float, least_gap_s: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+def _train(on: np.ndarray, step_s: float, least_gap_s: float) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
     """Time under pulses since the onset of the present train, and the silence before that train, s.
 
     A silence longer than `least_gap_s` ends a train.
@@ -112,7 +110,7 @@ def counts(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 @form("gain", "w = (1 + gain·r/(1 + r)·exp(-t/decay)) f(u), r = (silence/recovery)^2.5", _GAIN, _QUICK, _RECOVERY)
 def sharp(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     """As `after_silence`, but the recovery has a threshold: after half the recovery time little has recovered."""
-    since, gap = _train(scene.on, scene.step_s)
+    since, gap = _train(scene.on, scene.step_s, 0.0)
     back = (gap / p["recovery_s"]) ** 2.5
     return drive * (1.0 + p["gain"] * back / (1.0 + back) * np.exp(-since / p["decay_s"]))
 
@@ -130,14 +128,14 @@ def engaged(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     since, gap = np.empty_like(drive), np.empty_like(drive)
     for m in range(drive.shape[0]):
         working = (np.abs(drive[m]) > ENGAGED * scene.scale_nm).astype(float)
-        since[m], gap[m] = _train(working, scene.step_s)
+        since[m], gap[m] = _train(working, scene.step_s, 0.0)
     z = np.minimum(since / p["decay_s"], 50.0)
     return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * (z + 0.3) * np.exp(-z))
 
 
 @form("gain", "w = (1 + gain (1 - exp(-silence/recovery)) exp(-(t/length)³)) f(u)", _GAIN, _LENGTH, _RECOVERY)
 def flat(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    since, gap = _train(scene.on, scene.step_s)
+    since, gap = _train(scene.on, scene.step_s, 0.0)
     fade = np.exp(-np.minimum((since / p["length_s"]) ** 3, 200.0))
     return drive * (1.0 + p["gain"] * -np.expm1(-gap / p["recovery_s"]) * fade)
 

@@ -52,29 +52,17 @@ def _follow(
     return out, rate
 
 
-@njit(cache=True, nogil=True)
-def _exponential(matrix: np.ndarray) -> np.ndarray:  # pragma: no cover
+def _exponential(matrix: np.ndarray) -> np.ndarray:
     """Matrix exponential of a small matrix of norm up to about 20, by scaled Taylor series."""
     size = matrix.shape[0]
     scaled = matrix / 64.0
     term, total = np.eye(size), np.eye(size)
     for n in range(1, 13):
-        term = _product(term, scaled) / n
+        term = term @ scaled / n
         total += term
     for _ in range(6):
-        total = _product(total, total)
+        total = total @ total
     return total
-
-
-@njit(cache=True, nogil=True)
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:  # pragma: no cover
-    size = a.shape[0]
-    out = np.zeros((size, size))
-    for i in range(size):
-        for k in range(size):
-            for j in range(size):
-                out[i, j] += a[i, k] * b[k, j]
-    return out
 
 
 def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -143,28 +131,27 @@ SPRING_PARTS = 12
 
 @njit(cache=True, nogil=True)
 def _follow_curved(
-    torque: np.ndarray,
-    slope: np.ndarray,
+    x0: np.ndarray,
+    v0: np.ndarray,
     omega: np.ndarray,
     damping: np.ndarray,
     curved: np.ndarray,
     toe: bool,
     step_s: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """A mass on a nonlinear spring, driven by the cubic x through boundary states.
+    """A mass on a nonlinear spring, driven by the cubic through boundary states x0 and, times the step, rates v0.
 
     With a toe q'' = ω² (x - z) - 2 ζ ω q', z = q (1 + β q²) the spring's torque; else z'' = ω² (1 + β |z|)(x - z) -
-    2 ζ ω z'. Shapes (M, K) and (M,); β in 1/(N·m)² or 1/(N·m).
+    2 ζ ω z'. Shapes (K, M) and (M,); β in 1/(N·m)² or 1/(N·m).
     """
-    rows, size = torque.shape
+    size, rows = x0.shape
     h = step_s / SPRING_PARTS
     out, rate = np.zeros((size, rows)), np.zeros((size, rows))
-    x0, v0 = np.ascontiguousarray(torque.T), np.ascontiguousarray(slope.T)
-    q, v = x0[0].copy(), np.zeros(rows)
-    out[0] = q
-    w2 = h * omega * omega
-    c = damping * omega * h
-    keep, give = (1.0 - c) / (1.0 + c), w2 / (1.0 + c)
+    q, v, keep, give = np.zeros(rows), np.zeros(rows), np.zeros(rows), np.zeros(rows)
+    for m in range(rows):
+        q[m] = out[0, m] = x0[0, m]
+        c = damping[m] * omega[m] * h
+        keep[m], give[m] = (1.0 - c) / (1.0 + c), h * omega[m] * omega[m] / (1.0 + c)
     for k in range(size - 1):
         for i in range(SPRING_PARTS):
             s = (i + 0.5) / SPRING_PARTS
@@ -182,7 +169,7 @@ def _follow_curved(
             bent = curved[m] * q[m] * q[m] if toe else 0.0
             out[k + 1, m] = q[m] * (1.0 + bent)
             rate[k + 1, m] = v[m] * (1.0 + 3.0 * bent)
-    return np.ascontiguousarray(out.T), np.ascontiguousarray(rate.T)
+    return out, rate
 
 
 def _curved(x: Motion, p: Values, scene: Scene, toe: bool) -> Motion:
@@ -190,8 +177,9 @@ def _curved(x: Motion, p: Values, scene: Scene, toe: bool) -> Motion:
     if np.all(np.isinf(frequency)):
         return x
     beta = p["stiffening"][:, 0] / scene.scale_nm ** (2 if toe else 1)
-    damping = p["damping"][:, 0]
-    return _follow_curved(x[0], x[1] * scene.step_s, 2 * np.pi * frequency, damping, beta, toe, scene.step_s)
+    x0, v0 = np.ascontiguousarray(x[0].T), np.ascontiguousarray((x[1] * scene.step_s).T)
+    found = _follow_curved(x0, v0, 2 * np.pi * frequency, p["damping"][:, 0], beta, toe, scene.step_s)
+    return np.ascontiguousarray(found[0].T), np.ascontiguousarray(found[1].T)
 
 
 @form(

@@ -149,9 +149,10 @@ def _squares(row, start, stop, ar1, share):  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
-    """Minus the profiled log-likelihood of one residual, up to a constant."""
+    """Minus the profiled log-likelihood of one residual, up to a constant, and its variance."""
     squares, logdet, total = _squares(row, start, stop, ar1, share)
-    return 0.5 * total * np.log(max(squares / max(total, 1), 1e-24)) + logdet
+    variance = max(squares / max(total, 1), 1e-24)
+    return 0.5 * total * np.log(variance) + logdet, variance
 
 
 @njit(cache=True, nogil=True)
@@ -168,21 +169,21 @@ def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
         total += stop[i] - start[i]
     # a = log(1 - ar1), from log(SHORTEST) (long memory) to 0 (none).
     low, high = np.log(SHORTEST), 0.0
-    a = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high)
-    b = min(max(share, 0.0), 2.0)
-    best = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
+    own = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high)
+    a, b, best, variance = own, min(max(share, 0.0), 2.0), np.inf, 0.0
     for guess_a, guess_b in (
+        (own, b),
         (np.log(0.3), 0.9),
         (np.log(0.03), 0.3),
         (np.log(0.03), 1.0),
         (np.log(0.5), 0.02),
         (np.log(0.3), 1.7),
     ):
+        value, squares = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
+        if value < best:
+            best, a, b, variance = value, guess_a, guess_b, squares
         if not wide:
             break
-        value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
-        if value < best:
-            best, a, b = value, guess_a, guess_b
     da, db = (0.6, 0.2) if wide else (0.15, 0.05)
     while da > 0.01:
         moved = False
@@ -192,15 +193,12 @@ def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
             na, nb = min(max(na, low), high), min(max(nb, 0.0), 2.0)
             if na == a and nb == b:
                 continue
-            value = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(na), nb)
+            value, squares = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(na), nb)
             if value < best - 1e-9:
-                best, a, b, moved = value, na, nb, True
+                best, a, b, variance, moved = value, na, nb, squares, True
         if not moved:
             da, db = 0.5 * da, 0.5 * db
-    ar1 = 1.0 - np.exp(a)
-    squares = _squares(row, start, stop, ar1, b)[0]
-    sd = np.sqrt(max(squares / max(total, 1), 1e-24))
-    return ar1, b, sd, -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
+    return 1.0 - np.exp(a), b, np.sqrt(variance), -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
 
 
 @njit(cache=True, nogil=True)
@@ -291,8 +289,8 @@ def whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no c
 
 
 @njit(cache=True, nogil=True)
-def _band_squares(row, start, stop, x):  # pragma: no cover
-    """Sum of squared innovations, count and half the log determinant.
+def _band_cost(row, start, stop, x):  # pragma: no cover
+    """Minus the profiled log-likelihood, up to a constant, the variance, and the count.
 
     At x = (log(1 - ar1), slow share of the rest, turn, log(1 - keep), band).
     """
@@ -301,21 +299,16 @@ def _band_squares(row, start, stop, x):  # pragma: no cover
     squares = 0.0
     for k in range(white.shape[1]):
         squares += white[0, k] * white[0, k]
-    return squares, white.shape[1], logdet
-
-
-@njit(cache=True, nogil=True)
-def _band_cost(row, start, stop, x):  # pragma: no cover
-    """Minus the profiled log-likelihood, up to a constant."""
-    squares, size, logdet = _band_squares(row, start, stop, x)
-    return 0.5 * size * np.log(max(squares / size, 1e-24)) + logdet
+    size = white.shape[1]
+    variance = max(squares / size, 1e-24)
+    return 0.5 * size * np.log(variance) + logdet, variance, size
 
 
 @njit(cache=True, nogil=True)
 def profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no cover
     """Coordinate search from x, halving its steps to `least`; returns x, sd and log-likelihood."""
     rows = row.reshape(1, row.size)
-    best = _band_cost(rows, start, stop, x)
+    best, variance, total = _band_cost(rows, start, stop, x)
     scale = 1.0
     while scale > least:
         moved = False
@@ -325,16 +318,14 @@ def profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no 
                 trial[i] = min(max(x[i] + sign * scale * step[i], lower[i]), upper[i])
                 if trial[i] == x[i]:
                     continue
-                value = _band_cost(rows, start, stop, trial)
+                value, squares, _ = _band_cost(rows, start, stop, trial)
                 if value < best - 1e-7:
-                    best, moved = value, True
+                    best, variance, moved = value, squares, True
                     x = trial
                     break
         if not moved:
             scale *= 0.5
-    squares, total, _ = _band_squares(rows, start, stop, x)
-    sd = np.sqrt(max(squares / total, 1e-24))
-    return x, sd, -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
+    return x, np.sqrt(variance), -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
 
 
 @njit(cache=True, nogil=True)

@@ -212,7 +212,8 @@ class _StagePass:
 
     @staticmethod
     def named(chosen: Chosen, values: np.ndarray) -> dict[str, np.ndarray]:
-        return {p.name: values[:, i : i + 1] for i, p in enumerate(chosen.parameters)}
+        columns = np.ascontiguousarray(values.T)  # compiled functions are then compiled for one layout alone
+        return {p.name: columns[i, :, None] for i, p in enumerate(chosen.parameters)}
 
     def to_boundaries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """States at the ends of the intervals (torque, rate), and for each row its delay, s, and which states it
