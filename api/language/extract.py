@@ -18,7 +18,7 @@ from babel.messages.catalog import Catalog
 from babel.messages.extract import extract_from_file
 from babel.messages.pofile import write_po
 
-from stimrig.api.language.words import CODES, DEFAULT, HERE, catalogue
+from stimrig.api.language.words import CODES, DEFAULT, HERE, catalogue, first
 
 ROOT = HERE.parents[1]
 KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}
@@ -198,7 +198,7 @@ def renewed(code: str) -> Catalog:
     fresh = Catalog(locale=code, charset="utf-8", fuzzy=False, header_comment=known.header_comment)
     for message in messages():
         if message:
-            old = known.get(_first(message))
+            old = known.get(first(message))
             fresh.add(message, old.string if old is not None and not old.fuzzy else "")
     fresh.creation_date = known.creation_date  # of the file: where no message changed, the file does not either
     return fresh
@@ -208,12 +208,8 @@ def missing(code: str) -> list[str]:
     """Messages that have no translation, and those that nothing shows any more (with a minus sign before them)."""
     fresh, known = renewed(code), catalogue(code)
     lacking = [str(entry.id) for entry in fresh if entry.id and not _has(entry.string)]
-    gone = [f"- {entry.id}" for entry in known if entry.id and fresh.get(_first(entry.id)) is None]
+    gone = [f"- {entry.id}" for entry in known if entry.id and fresh.get(first(entry.id)) is None]
     return lacking + gone
-
-
-def _first(message: str | list[str] | tuple[str, ...]) -> str:
-    return message if isinstance(message, str) else message[0]
 
 
 def _has(translation: object) -> bool:

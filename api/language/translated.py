@@ -15,7 +15,7 @@ from itertools import islice
 
 from markupsafe import Markup
 
-from stimrig.api.language.words import DEFAULT, catalogue, code, localised
+from stimrig.api.language.words import DEFAULT, catalogue, code, first, localised
 
 _PLACE = re.compile(r"%\((\w+)\)s")
 _END = re.compile(r"(?<=[.!?;:,]) ")
@@ -166,11 +166,7 @@ def _forms(text: str) -> list[tuple[str, str, str]]:
 def _whole(language: str) -> dict[str, str]:
     """What messages become as they stand, with the form for one."""
     entries = (entry for entry in catalogue(language) if entry.id and not entry.fuzzy)
-    return {_one(entry.id): _one(entry.string) for entry in entries if _one(entry.string)}
-
-
-def _one(forms: str | tuple[str, ...]) -> str:
-    return forms if isinstance(forms, str) else forms[0]
+    return {first(entry.id): first(entry.string) for entry in entries if entry.string and first(entry.string)}
 
 
 @cache

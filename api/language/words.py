@@ -43,6 +43,11 @@ def catalogue(code: str) -> Catalog:
         return read_po(file, locale=code)
 
 
+def first(message: str | list[str] | tuple[str, ...]) -> str:
+    """A message as it stands, or its form for one."""
+    return message if isinstance(message, str) else message[0]
+
+
 @cache
 def translations(code: str) -> Translations:
     """The catalogue as gettext uses it."""
