@@ -12,7 +12,6 @@ the clean torque of random levels.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -23,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.common import keep_lines, lines_of, parser, table
 from bench.particles import HOLD, Particles
 from stimrig import identify
 from stimrig.hardware_sim.hidden.library import STILL
@@ -265,17 +265,15 @@ def hidden(seed: int) -> dict[str, Any]:
 
 def told_of_hidden(rows: list[dict[str, Any]]) -> list[str]:
     """How often each test let the diagnosis name the effect."""
-    lines = [
-        "| test | n | named first | only others named | nothing named | dose, of the paper's, median |",
-        "|---" * 6 + "|",
-    ]
+    lines = []
     for test in ("ours", "paper", "paper twice"):
         first = sum(line[test]["named"][:1] == [line["effect"]] for line in rows)
         others = sum(bool(line[test]["named"]) and line["effect"] not in line[test]["named"] for line in rows)
         nothing = sum(not line[test]["named"] for line in rows)
         share = float(np.median([line[test]["dose_share"] for line in rows]))
-        lines.append(f"| {test} | {len(rows)} | {first} | {others} | {nothing} | {100 * share:.0f} % |")
-    return lines
+        lines.append([test, len(rows), first, others, nothing, f"{100 * share:.0f} %"])
+    heads = "test; n; named first; only others named; nothing named; dose, of the paper's, median"
+    return table(heads.split("; "), lines)
 
 
 def of_papers_muscle(trials: int, seed: int) -> list[str]:
@@ -293,13 +291,10 @@ def of_papers_muscle(trials: int, seed: int) -> list[str]:
     return lines
 
 
-def table(rows: list[dict[str, Any]]) -> list[str]:
+def medians(rows: list[dict[str, Any]]) -> list[str]:
     """Medians and counts as lines of a table."""
-    lines = [
-        "| patients | test | n | unseen, % | against the paper's test, points | dose, N·m·s | dose | time, s | time "
-        "| f covered | step covered |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    heads = "patients; test; n; unseen, %; against the paper's test, points; dose, N·m·s; dose; time, s; time"
+    cells = []
     for kind in dict.fromkeys(line["kind"] for line in rows):
         for peer in dict.fromkeys(line["peer"] for line in rows):
             own = [line for line in rows if line["kind"] == kind and line["peer"] == peer]
@@ -307,12 +302,12 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
                 continue
             mid = {key: float(np.median([line[key] for line in own])) for key in own[0] if _number(own[0][key])}
             curve, step = (sum(line[key] for line in own) for key in ("curve_covered", "step_covered"))
-            lines.append(
-                f"| {kind} | {peer} | {len(own)} | {mid['unseen']:.2f} | {mid['unseen_gain']:+.2f} "
-                f"| {mid['dose']:.1f} | {100 * mid['dose_share']:.0f} % | {mid['seconds']:.1f} "
-                f"| {100 * mid['time_share']:.0f} % | {curve} ({100 * curve / len(own):.0f} %) "
-                f"| {step} ({100 * step / len(own):.0f} %) |"
-            )
+            fit = [f"{mid['unseen']:.2f}", f"{mid['unseen_gain']:+.2f}"]
+            took = [f"{mid['dose']:.1f}", f"{100 * mid['dose_share']:.0f} %"]
+            took += [f"{mid['seconds']:.1f}", f"{100 * mid['time_share']:.0f} %"]
+            covered = [f"{count} ({100 * count / len(own):.0f} %)" for count in (curve, step)]
+            cells.append([kind, peer, len(own), *fit, *took, *covered])
+    lines = table([*heads.split("; "), "f covered", "step covered"], cells)
     ended = [line["ended"] for line in rows if line["peer"] == "ours, new"]
     lines.append(f"\nOurs, new, ended: {', '.join(f'{e} {ended.count(e)}' for e in dict.fromkeys(ended))}.")
     cpu = np.array([s for line in rows if line["peer"].startswith("ours") for s in line.get("cpu_s", [])])
@@ -326,38 +321,36 @@ def _number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def main() -> int:
+def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(prog="python -m bench.adaptive", description=__doc__)
-    parser.add_argument("--patients", type=int, default=150, help="of each kind")
-    parser.add_argument("--seeds", type=int, default=80_000, help="the first")
-    parser.add_argument("--kinds", default="sigmoid,shaped")
-    parser.add_argument("--peers", default="paper; short; staircase; random pieces; particles; ours, new; ours, known")
-    parser.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
-    parser.add_argument("--paper", type=int, default=0, help="trials of the paper's muscle")
-    parser.add_argument("--json", type=Path, help="every row goes here, one a line")
-    parser.add_argument("--rows", type=Path, help="print the table of rows that were written before")
-    settings = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--patients", type=int, default=150, help="of each kind")
+    made.add_argument("--seeds", type=int, default=80_000, help="the first")
+    made.add_argument("--kinds", default="sigmoid,shaped")
+    made.add_argument("--peers", default="paper; short; staircase; random pieces; particles; ours, new; ours, known")
+    made.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
+    made.add_argument("--paper", type=int, default=0, help="trials of the paper's muscle")
+    made.add_argument("--json", type=Path, help="every row goes here, one a line")
+    made.add_argument("--rows", type=Path, help="print the table of rows that were written before")
+    settings = made.parse_args()
     if settings.rows is not None:
-        print(*table([json.loads(line) for line in settings.rows.read_text().splitlines()]), sep="\n")
-        return 0
+        print(*medians(lines_of(settings.rows)), sep="\n")
+        return
     warnings.filterwarnings("ignore", category=RuntimeWarning)
     rows: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.patients):
         for kind in settings.kinds.split(","):
             rows += one(kind, seed, settings.peers)
             print(seed, kind, file=sys.stderr, flush=True)
-        if settings.json is not None:
-            settings.json.write_text("\n".join(json.dumps(line) for line in rows))
-    print(*(table(rows) if rows else []), sep="\n")
+        keep_lines(settings.json, rows)
+    print(*(medians(rows) if rows else []), sep="\n")
     found: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.hidden):
         found.append(hidden(seed))
         print(json.dumps(found[-1]), file=sys.stderr, flush=True)
     print(*(told_of_hidden(found) if found else []), sep="\n")
     print(*of_papers_muscle(settings.paper, settings.seeds), sep="\n")
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

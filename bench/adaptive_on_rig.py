@@ -10,7 +10,6 @@ newest sample that the decision knows to the rig's word that its piece is laid.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -22,16 +21,14 @@ from typing import Any
 import numpy as np
 
 from bench.adaptive import unseen_percent
-from stimrig.api.cli.launcher import Services
+from bench.common import keep_lines, parser, services, table
 from stimrig.api.client.documents import SessionTest
 from stimrig.api.client.errors import NotCompleted
 from stimrig.api.client.rest import Client
-from stimrig.api.settings import Settings
 from stimrig.identify.model import Model
 from stimrig.identify.records.recording import read_recording
 from tests.harness.adaptive import Muscle, sigmoid, sigmoid_of
 
-TOKEN = "token-of-the-adaptive-bench"
 PERSON = "BENCH"
 
 
@@ -64,8 +61,7 @@ def one(seed: int, folder: Path) -> dict[str, Any]:
     """Both tests of one patient."""
     muscle = patient_file(seed, folder / "patient.toml")
     emulator = ["--patient", str(folder / "patient.toml"), "--noise-seed", str(seed)]
-    with Services(Settings(data_dir=folder / "data", port=0), emulator, TOKEN) as services:
-        client = Client(services.url, TOKEN)
+    with services(*emulator) as (_, client):
         client.ensure_participant(PERSON)
         ours = client.run_test(PERSON, kind="adaptive")
         told = ours["adaptive"]
@@ -82,15 +78,14 @@ def one(seed: int, folder: Path) -> dict[str, Any]:
         }
 
 
-def lines_of(rows: list[dict[str, Any]]) -> list[str]:
+def medians(rows: list[dict[str, Any]]) -> list[str]:
     """Medians, as lines."""
-    lines = ["| test | n | time, s | dose, N·m·s | unseen, % | dropped pulses |", "|---" * 6 + "|"]
+    cells = []
     for test in ("ours", "paper"):
         mid = {key: float(np.median([row[test][key] for row in rows])) for key in ("seconds", "dose", "unseen")}
         dropped = sum(row[test]["dropped"] for row in rows)
-        lines.append(
-            f"| {test} | {len(rows)} | {mid['seconds']:.1f} | {mid['dose']:.1f} | {mid['unseen']:.2f} | {dropped} |"
-        )
+        figures = [f"{mid['seconds']:.1f}", f"{mid['dose']:.1f}", f"{mid['unseen']:.2f}"]
+        cells.append([test, len(rows), *figures, dropped])
     share = {
         key: 100.0 * float(np.median([row["ours"][key] / row["paper"][key] for row in rows]))
         for key in ("seconds", "dose")
@@ -101,7 +96,7 @@ def lines_of(rows: list[dict[str, Any]]) -> list[str]:
     refused = sum(len(row["refused"]) for row in rows)
     ends = Counter(row["ended"] for row in rows)
     return [
-        *lines,
+        *table(["test", "n", "time, s", "dose, N·m·s", "unseen, %", "dropped pulses"], cells),
         f"Of the same patient's paper's test, median: time {share['seconds']:.0f} %, dose {share['dose']:.0f} %, "
         f"unseen {worse:+.2f} points.",
         f"Ended: {', '.join(f'{end} {count}' for end, count in ends.items())}. "
@@ -110,13 +105,13 @@ def lines_of(rows: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def main() -> int:
+def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m bench.adaptive_on_rig", description=__doc__)
-    parser.add_argument("--patients", type=int, default=20)
-    parser.add_argument("--seeds", type=int, default=84_000, help="the first")
-    parser.add_argument("--json", type=Path, help="every row goes here, one a line")
-    settings = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--patients", type=int, default=20)
+    made.add_argument("--seeds", type=int, default=84_000, help="the first")
+    made.add_argument("--json", type=Path, help="every row goes here, one a line")
+    settings = made.parse_args()
     rows: list[dict[str, Any]] = []
     failed: list[str] = []
     for seed in range(settings.seeds, settings.seeds + settings.patients):
@@ -128,11 +123,9 @@ def main() -> int:
                 print(failed[-1], file=sys.stderr, flush=True)
                 continue
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-        if settings.json is not None:
-            settings.json.write_text("\n".join(json.dumps(row) for row in rows))
-    print(*(lines_of(rows) if rows else []), *failed, sep="\n")
-    return 0
+        keep_lines(settings.json, rows)
+    print(*(medians(rows) if rows else []), *failed, sep="\n")
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

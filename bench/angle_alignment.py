@@ -9,15 +9,11 @@ the true one. The stated error contains that of the torque against the pulses; t
 
 from __future__ import annotations
 
-import argparse
-import sys
-import tempfile
-from pathlib import Path
-
 import h5py
 import numpy as np
 
-from tests.harness.processes import Bench, default_plan
+from bench.common import emulated_rig, line, parser, table
+from tests.harness.processes import RigClient, default_plan
 
 WAYS: dict[str, tuple[str, ...]] = {
     "socketcand, clocks differ, jitter 0.2 ms": ("--angle-clock-ppm", "150", "--angle-jitter-us", "200"),
@@ -28,51 +24,41 @@ WAYS: dict[str, tuple[str, ...]] = {
 }
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="bench.angle_alignment", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--tests", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--speed", type=float, default=1.0)
-    options = parser.parse_args(arguments)
-    print("| how the angle comes | method | stated, ms | median, ms | worst, ms | drift, ppm |")
-    print("|---|---|---|---|---|---|")
+    made = parser(__doc__)
+    made.add_argument("--tests", type=int, default=3)
+    made.add_argument("--seconds", type=float, default=10.0)
+    made.add_argument("--speed", type=float, default=1.0)
+    options = made.parse_args()
+    heads = ["how the angle comes", "method", "stated, ms", "median, ms", "worst, ms", "drift, ppm"]
+    print(*table(heads, []), sep="\n")
     for way, settings in WAYS.items():
         print(row(way, settings, options.tests, options.seconds, options.speed), flush=True)
-    return 0
 
 
 def row(way: str, settings: tuple[str, ...], tests: int, seconds: float, speed: float) -> str:
     """One line: all tests of one way together."""
-    with tempfile.TemporaryDirectory() as folder:
-        bench = Bench(Path(folder), "--arm", "held", "--noise-seed", "7", *settings, speed=speed)
-        try:
-            found = [measured(bench, settings, f"t{n}", seconds) for n in range(tests)]
-        finally:
-            bench.close()
+    with emulated_rig("--arm", "held", "--noise-seed", "7", *settings, speed=speed) as (_, client):
+        found = [measured(client, settings, f"t{n}", seconds) for n in range(tests)]
     methods = ", ".join(sorted({method for method, _, _, _ in found}))
     stated = max(error_ms for _, error_ms, _, _ in found)
     off_ms = np.concatenate([errors_ms for _, _, errors_ms, _ in found])
     drift = max((ppm for _, _, _, ppm in found), key=abs)
     worst = off_ms[np.argmax(np.abs(off_ms))]
-    return f"| {way} | {methods} | {stated:.2f} | {np.median(off_ms):+.3f} | {worst:+.3f} | {drift:+.0f} |"
+    return line([way, methods, f"{stated:.2f}", f"{np.median(off_ms):+.3f}", f"{worst:+.3f}", f"{drift:+.0f}"])
 
 
 def measured(
-    bench: Bench, settings: tuple[str, ...], test_id: str, seconds: float
+    client: RigClient, settings: tuple[str, ...], test_id: str, seconds: float
 ) -> tuple[str, float, np.ndarray, float]:
     """Play a test: the method, the error that is stated, the true errors (ms), and their drift (ppm)."""
-    client = bench.client() if bench.rig is not None else bench.start_rig()
-    client.ask("subscribe")
     rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.5}}
-    steps = {"name": "steps", "sequence": "steps", "settings": {"on_s": seconds - 1.0, "off_s": 0.5}}
-    reply = client.start(
-        default_plan(test_id, segments=[rest, {**steps, "settings": {**steps["settings"], "repeats": 1}}])
-    )
+    steps = {"name": "steps", "sequence": "steps", "settings": {"on_s": seconds - 1.0, "off_s": 0.5, "repeats": 1}}
+    reply = client.start(default_plan(test_id, segments=[rest, steps]))
     assert reply["ok"], reply
     event = client.wait_finished(test_id, timeout_s=seconds + 60)
     assert event["outcome"] == "completed", event
-    client.close()
     given = dict(zip(settings[::2], settings[1::2], strict=True))
     rate_hz = float(given.get("--angle-rate-hz", "200")) * (1 + 1e-6 * float(given.get("--angle-clock-ppm", "0")))
     with h5py.File(event["recording_path"]) as file:
@@ -92,4 +78,4 @@ def measured(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

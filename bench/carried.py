@@ -11,15 +11,13 @@ library's.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
+from bench.common import in_processes, keep, parser, table
 from stimrig import identify
 from stimrig.hardware_sim.hidden.scenario import Scenario
 from stimrig.identify.caution import caution
@@ -61,8 +59,8 @@ def second(of: Scenario, seed: int, label: str, approved: identify.Model) -> dic
     }
 
 
-def counts(rows: list[dict[str, Any]]) -> list[str]:
-    """The counts as lines of a table."""
+def counts(rows: list[dict[str, Any]]) -> list[list[object]]:
+    """The counts as rows of a table."""
     total: Counter[str] = Counter()
     right: Counter[str] = Counter()
     open_: Counter[str] = Counter()
@@ -81,29 +79,23 @@ def counts(rows: list[dict[str, Any]]) -> list[str]:
             total["the new effect is named"] += 1
             right["the new effect is named"] += row["effects"][2] in row["new"]
             open_["the new effect is named"] += not row["new"] and row["new_is_open"]
-    return [f"| {line} | {right[line]} of {total[line]} | {open_[line] or ''} |" for line in total]
+    return [[line, f"{right[line]} of {total[line]}", open_[line] or ""] for line in total]
 
 
-def main() -> int:
+def main() -> None:
     """Print the counts."""
-    parser = argparse.ArgumentParser(prog="python -m bench.carried", description=__doc__)
-    parser.add_argument("--seeds", default="5101:5131", help="first:last, last not included")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write every row here")
-    settings = parser.parse_args()
-    first, last = (int(part) for part in settings.seeds.split(":"))
+    made = parser(__doc__, "5101:5131")
+    made.add_argument("--workers", type=int, default=2)
+    options = made.parse_args()
     rows: list[dict[str, Any]] = []
-    with ProcessPoolExecutor(settings.workers) as pool:
-        for found in pool.map(one, range(first, last)):
-            rows += found
-            print(*(json.dumps(row) for row in found), sep="\n", file=sys.stderr, flush=True)
-    print("| second sessions of muscles seen before | right | undecided |", "|---|---|---|", *counts(rows), sep="\n")
+    for found in in_processes(one, options.seeds, options.workers):
+        rows += found
+        print(*map(json.dumps, found), sep="\n", file=sys.stderr, flush=True)
+    print(*table(["second sessions of muscles seen before", "right", "undecided"], counts(rows)), sep="\n")
     slow = sorted(row["seconds"] for row in rows if "seconds" in row)
     print(f"\ncarrying over took {slow[len(slow) // 2]:.1f} s in the middle, {slow[-1]:.1f} s at most")
-    if settings.json is not None:
-        settings.json.write_text(json.dumps(rows, indent=1))
-    return 0
+    keep(options.json, rows)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

@@ -9,16 +9,15 @@ session, and the earlier model's effects in another order. Seeds 5131 to 5140 we
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bench.common import keep, parser, table
 from stimrig import identify
 from stimrig.hardware_sim.hidden.scenario import rng_of
 from stimrig.hardware_sim.hidden_records import SLOWEST_SIMULATION_HZ
@@ -123,26 +122,21 @@ def one(seed: int) -> list[dict[str, Any]]:
     return found
 
 
-def main() -> int:
+def main() -> None:
     """Print how many answers and how many muscles changed."""
-    parser = argparse.ArgumentParser(prog="python -m bench.carried_invariance", description=__doc__)
-    parser.add_argument("--seeds", default="5141:5151", help="first:last, last not included")
-    parser.add_argument("--json", type=Path, help="write every row here")
-    settings = parser.parse_args()
-    first, last = (int(part) for part in settings.seeds.split(":"))
+    options = parser(__doc__, "5141:5151").parse_args()
     found: list[dict[str, Any]] = []
-    for seed in range(first, last):
+    for seed in options.seeds:
         found += one(seed)
         print(*(json.dumps(row) for row in found if row["seed"] == seed and not row["same"]), sep="\n", file=sys.stderr)
-    print("| change | sessions with another answer | muscles with one |", "|---|---|---|", sep="\n")
+    lines = []
     for change in (*CHANGES, REVERSED):
         of_change = [row for row in found if row["change"] == change]
         other = [row for row in of_change if not row["same"]]
-        print(f"| {change} | {len(other)} of {len(of_change)} | {len({row['seed'] for row in other})} |")
-    if settings.json is not None:
-        settings.json.write_text(json.dumps(found, indent=1))
-    return 0
+        lines.append([change, f"{len(other)} of {len(of_change)}", len({row["seed"] for row in other})])
+    print(*table(["change", "sessions with another answer", "muscles with one"], lines), sep="\n")
+    keep(options.json, found)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

@@ -27,12 +27,12 @@ import h5py
 import httpx
 import numpy as np
 
-from bench.centre_load_parts import PATIENCE_S, Kept, Lines, Seen, all_over, free_port, look
-from bench.stamp import RESULTS, written_by
+from bench.centre_load_parts import PATIENCE_S, Kept, Lines, Seen, all_over, look
+from bench.common import RESULTS, TOKEN, parser, table, written_by
+from tests.harness.postgres import free_port
 
 CENTRE = [sys.executable, "-m", "stimrig.api.centre.server"]
 """The centre's process; its settings are STIMRIG_CENTRE_…"""
-TOKEN = "administrator-of-the-load"
 UPLOADERS = 3
 SERVICE_KILLS, PUSHER_KILLS, CENTRE_KILLS = 1, 2, 6
 SETTLE_S = 1200.0
@@ -132,14 +132,11 @@ def chaos(rigs: list[Rig], centre: Kept, chance: random.Random, busy: threading.
 
 def main() -> None:
     """Play, compare, print and write; exit 1 where anything is lost, doubled, out of order or wrong."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rigs", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--sessions", type=int, default=5)
-    parser.add_argument("--recordings", type=int, default=11)
-    parser.add_argument("--megabytes", type=float, default=1.2)
-    parser.add_argument("--postgres", action="store_true", help="the centre's database is PostgreSQL")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    for name, default in (("rigs", 20), ("seed", 1), ("sessions", 5), ("recordings", 11), ("megabytes", 1.2)):
+        made.add_argument(f"--{name}", type=type(default), default=default)
+    made.add_argument("--postgres", action="store_true", help="the centre's database is PostgreSQL")
+    options = made.parse_args()
     began_s = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="centre-load-") as name, ExitStack() as ends:
 
@@ -153,7 +150,7 @@ def main() -> None:
             signal.signal(number, leave)
         seen, figures = play(Path(name), options, ends)
     wall_s = time.monotonic() - began_s
-    words = table(seen, {**figures, "wall time": f"{wall_s / 60:.1f} min"})
+    words = in_words(seen, {**figures, "wall time": f"{wall_s / 60:.1f} min"})
     print(words)
     command = "python -m bench.centre_load " + " ".join(sys.argv[1:])
     (RESULTS / "centre.md").write_text(document(command.strip(), options, words), encoding="utf-8")
@@ -237,7 +234,7 @@ def harm_and_load(
     return seen, figures
 
 
-def table(seen: Seen, figures: dict[str, str]) -> str:
+def in_words(seen: Seen, figures: dict[str, str]) -> str:
     """The figures as a table."""
     kinds = ", ".join(f"{count} {kind}" for kind, count in seen.kinds.most_common())
     rows = {
@@ -250,7 +247,7 @@ def table(seen: Seen, figures: dict[str, str]) -> str:
         "wrong hashes": str(seen.wrong_hashes),
         **figures,
     }
-    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+    return "\n".join(table(["", ""], rows.items()))
 
 
 def document(command: str, options: argparse.Namespace, words: str) -> str:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import json
 import os
 import random
 import signal
-import socket
 import sqlite3
 import subprocess
 import threading
@@ -24,15 +22,11 @@ from typing import Any
 import httpx
 from sqlalchemy import create_engine, text
 
-ROOT = Path(__file__).parents[1]
+from bench.common import ROOT
+from tests.harness.fake_centre import FIELDS, ZEROS, canonical, sha256
+from tests.harness.hostile_files import peak
+
 PATIENCE_S = 300.0
-FIELDS = ("seq", "kind", "key", "sha256", "file", "file_bytes", "at_utc", "previous")
-
-
-def free_port() -> int:
-    with socket.socket() as line:
-        line.bind(("127.0.0.1", 0))
-        return line.getsockname()[1]
 
 
 @dataclass
@@ -84,11 +78,7 @@ class Kept:
 
     def peak_mb(self) -> float:
         """The most memory that it has had, MB."""
-        with contextlib.suppress(OSError, AssertionError, StopIteration):
-            assert self.popen is not None
-            lines = Path(f"/proc/{self.popen.pid}/status").read_text().splitlines()
-            return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024
-        return 0.0
+        return 0.0 if self.popen is None else peak(self.popen.pid)
 
 
 class Lines:
@@ -216,10 +206,7 @@ def of_centre(url: str) -> dict[str, list[dict[str, Any]]]:
 
 def item_hash(item: dict[str, Any]) -> str:
     """As decision 0013 says it, computed here once more."""
-    held = {name: item[name] for name in FIELDS}
-    return hashlib.sha256(
-        json.dumps(held, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()
-    ).hexdigest()
+    return sha256(canonical({name: item[name] for name in FIELDS}))
 
 
 def all_over(folders: dict[str, Path], centre_url: str, bucket: Path) -> bool:
@@ -264,7 +251,7 @@ def _gaps(items: Iterable[dict[str, Any]]) -> int:
     last: dict[str, tuple[int, str]] = {}
     count = 0
     for item in items:
-        seq, before = last.get(item["chain"], (0, "0" * 64))
+        seq, before = last.get(item["chain"], (0, ZEROS))
         count += (item["seq"], item["previous"]) != (seq + 1, before)
         last[item["chain"]] = (item["seq"], item["hash"])
     return count

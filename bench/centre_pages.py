@@ -9,21 +9,20 @@ ask them. `--write` renews docs/results/centre-pages.md.
 
 from __future__ import annotations
 
-import argparse
 import gc
 import hashlib
 import json
 import random
-import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator
 from datetime import date, timedelta
+from itertools import chain
 from typing import Any
 
 import psycopg
 from sqlalchemy import event, text
 
-from bench.stamp import RESULTS, written_by
+from bench.common import RESULTS, parser, spread, table, written_by
 from stimrig.api.centre import directory, pages, warnings
 from stimrig.api.centre.directory import Cohort, Search
 from stimrig.api.charts import trend_charts
@@ -65,61 +64,66 @@ class Trial:
                 seen.add((code, day, rig))
                 yield code, day, rig, self.draw.choice(VERDICTS)
 
-    def tables(self) -> Iterator[tuple[str, tuple[str, ...], Iterable[tuple[Any, ...]]]]:
-        """Table, columns, rows; in an order that foreign keys allow."""
-        yield (
-            "centre_rigs",
-            ("id", "name", "key_hash", "key_prefix", "created_utc", "created_by", "recordings"),
-            (
-                (n, f"Ward {n:02}", f"{n:064}", "stimrig_rig_", "2021-01-01T00:00:00.000Z", "bench", 100_000)
-                for n in range(1, RIGS + 1)
-            ),
-        )
+    def tables(self) -> Iterator[tuple[str, Iterable[dict[str, Any]]]]:
+        """Table and rows; in an order that foreign keys allow."""
+        yield "centre_rigs", (
+            {
+                "id": n, "name": f"Ward {n:02}", "key_hash": f"{n:064}", "key_prefix": "stimrig_rig_",
+                "created_utc": "2021-01-01T00:00:00.000Z", "created_by": "bench", "recordings": 100_000,
+            }
+            for n in range(1, RIGS + 1)
+        )  # fmt: skip
         people: dict[tuple[str, int], list[str]] = {}
         for code, day, rig, _verdict in self.sessions:
             people.setdefault((code, rig), []).append(day)
-        names = ("code", "rig_id", "sessions", "recordings", "last_utc", "verdict")
-        yield (
-            "centre_participants",
-            names,
-            (
-                (code, rig, len(days), 11 * len(days), f"{max(days)}T09:00:00.000Z", "usable")
-                for (code, rig), days in people.items()
-            ),
-        )
-        names = ("participant", "day", "rig_id", "at_utc", "tests", "recordings", "model_id", "model_utc", "verdict",
-                 "approved_by")  # fmt: skip
-        yield "centre_sessions", names, (
-            (code, day, rig, f"{day}T08:00:00.000Z", 2, 11, f"{code}-{day}", f"{day}T08:10:00.000Z", verdict,
-             "Ada" if verdict == "usable" else None)
+        yield "centre_participants", (
+            {
+                "code": code, "rig_id": rig, "sessions": len(days), "recordings": 11 * len(days),
+                "last_utc": f"{max(days)}T09:00:00.000Z", "verdict": "usable",
+            }
+            for (code, rig), days in people.items()
+        )  # fmt: skip
+        yield "centre_sessions", (
+            {
+                "participant": code, "day": day, "rig_id": rig, "at_utc": f"{day}T08:00:00.000Z", "tests": 2,
+                "recordings": 11, "model_id": f"{code}-{day}", "model_utc": f"{day}T08:10:00.000Z", "verdict": verdict,
+                "approved_by": "Ada" if verdict == "usable" else None,
+            }
             for code, day, rig, verdict in self.sessions
         )  # fmt: skip
-        names = ("rig_id", "id", "participant", "recording_id", "method", "effects", "verdict", "fit", "created_utc",
-                 "file", "file_bytes")  # fmt: skip
-        yield "centre_models", names, (
-            (rig, f"{code}-{day}", code, f"{code}-{day}-0", "maximum-likelihood", json.dumps(self._held()), verdict,
-             json.dumps(self._fit(verdict)), f"{day}T08:10:00.000Z", _sha(f"m{code}{day}"), 40_000)
+        yield "centre_models", (
+            {
+                "rig_id": rig, "id": f"{code}-{day}", "participant": code, "recording_id": f"{code}-{day}-0",
+                "method": "maximum-likelihood", "effects": json.dumps(self._held()), "verdict": verdict,
+                "fit": json.dumps(self._fit(verdict)), "created_utc": f"{day}T08:10:00.000Z",
+                "file": _sha(f"m{code}{day}"), "file_bytes": 40_000,
+            }
             for code, day, rig, verdict in self.sessions
         )  # fmt: skip
-        names = ("rig_id", "id", "participant", "kind", "state", "reason", "recording_id", "model_id", "requested_utc")
-        yield "centre_tests", names, (
-            (rig, f"{code}-{day}-{n}", code, "pre-session", "completed", "", f"{code}-{day}-{n}", f"{code}-{day}",
-             f"{day}T08:0{n}:00.000Z")
+        yield "centre_tests", (
+            {
+                "rig_id": rig, "id": f"{code}-{day}-{n}", "participant": code, "kind": "pre-session",
+                "state": "completed", "reason": "", "recording_id": f"{code}-{day}-{n}", "model_id": f"{code}-{day}",
+                "requested_utc": f"{day}T08:0{n}:00.000Z",
+            }
             for code, day, rig, _verdict in self.sessions for n in range(2)
         )  # fmt: skip
-        names = ("rig_id", "sha256", "participant", "model_id", "approved", "reason", "by", "at_utc")
-        yield "centre_decisions", names, (
-            (rig, _sha(f"d{code}{day}"), code, f"{code}-{day}", verdict == "usable", "", "Ada",
-             f"{day}T08:12:00.000Z")
+        yield "centre_decisions", (
+            {
+                "rig_id": rig, "sha256": _sha(f"d{code}{day}"), "participant": code, "model_id": f"{code}-{day}",
+                "approved": verdict == "usable", "reason": "", "by": "Ada", "at_utc": f"{day}T08:12:00.000Z",
+            }
             for code, day, rig, verdict in self.sessions
         )  # fmt: skip
         yield (
             "centre_effects",
-            ("effect", "participant", "rig_id"),
-            ((effect, code, rig) for (code, rig) in people for effect in self.draw.sample(EFFECTS, 2)),
+            (
+                {"effect": effect, "participant": code, "rig_id": rig}
+                for code, rig in people
+                for effect in self.draw.sample(EFFECTS, 2)
+            ),
         )
-        names = ("rig_id", "recording_id", "participant", "test_id", "origin", "created_utc", "file", "file_bytes")
-        yield "centre_recordings", names, self._recordings()
+        yield "centre_recordings", self._recordings()
 
     def _held(self) -> list[str]:
         return self.draw.sample(EFFECTS, self.draw.randrange(3))
@@ -135,14 +139,15 @@ class Trial:
         }
         return {"verdict": verdict, "fit_percent": 92.1, "noise_sd_nm": 0.1, "words": "x" * 80, "figures": held}
 
-    def _recordings(self) -> Iterator[tuple[Any, ...]]:
+    def _recordings(self) -> Iterator[dict[str, Any]]:
         each, more = divmod(self.recordings_count, len(self.sessions))
         for number, (code, day, rig, _verdict) in enumerate(self.sessions):
             for n in range(each + (number < more)):
-                at_utc = f"{day}T08:{n:02}:{number % 60:02}.000Z"
-                yield (
-                    rig, f"{code}-{day}-{n}", code, f"{code}-{day}-{n}", "rig", at_utc, _sha(f"{number} {n}"), 1_200_000
-                )  # fmt: skip
+                name, at_utc = f"{code}-{day}-{n}", f"{day}T08:{n:02}:{number % 60:02}.000Z"
+                yield {
+                    "rig_id": rig, "recording_id": name, "participant": code, "test_id": name, "origin": "rig",
+                    "created_utc": at_utc, "file": _sha(f"{number} {n}"), "file_bytes": 1_200_000,
+                }  # fmt: skip
 
 
 def _sha(name: str) -> str:
@@ -153,13 +158,13 @@ def fill(address: str, trial: Trial) -> float:
     """Fill the tables; how long it took, s."""
     begun = time.monotonic()
     with psycopg.connect(address) as connection, connection.cursor() as cursor:
-        for table, columns, rows in trial.tables():
-            count = 0
-            with cursor.copy(f"COPY {table} ({', '.join(columns)}) FROM STDIN") as copy:
-                for row in rows:
-                    copy.write_row(row)
+        for name, rows in trial.tables():
+            first, count = next(rows := iter(rows)), 0
+            with cursor.copy(f"COPY {name} ({', '.join(first)}) FROM STDIN") as copy:
+                for row in chain([first], rows):
+                    copy.write_row(list(row.values()))
                     count += 1
-            print(f"{table}: {count} rows", flush=True)
+            print(f"{name}: {count} rows", flush=True)
     with psycopg.connect(address, autocommit=True) as connection:
         connection.execute("VACUUM ANALYZE")
     return time.monotonic() - begun
@@ -215,8 +220,9 @@ def measured(ask: Callable[[], Any], times: int = SEEN) -> tuple[float, float]:
     for _ in range(times):
         begun = time.perf_counter()
         ask()
-        found.append(1e3 * (time.perf_counter() - begun))
-    return statistics.median(found), sorted(found)[int(0.99 * times)]
+        found.append(time.perf_counter() - begun)
+    figures = spread(found)
+    return figures["median"], figures["p99"]
 
 
 def plans(store: Store, ask: Callable[[], Any]) -> list[str]:
@@ -241,11 +247,11 @@ def plans(store: Store, ask: Callable[[], Any]) -> list[str]:
 
 def main() -> None:
     """Fill, ask, tell."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recordings", type=int, default=2_000_000)
-    parser.add_argument("--sessions", type=int, default=184_000)
-    parser.add_argument("--write", action="store_true", help="renew docs/results/centre-pages.md")
-    given = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--recordings", type=int, default=2_000_000)
+    made.add_argument("--sessions", type=int, default=184_000)
+    made.add_argument("--write", action="store_true", help="renew docs/results/centre-pages.md")
+    given = made.parse_args()
     trial = Trial(given.sessions, given.recordings)
     with running() as cluster:
         address = cluster.empty("centre")
@@ -274,8 +280,10 @@ def main() -> None:
 def page(given: Any, told: list[tuple[str, float, float]], scans: dict[str, list[str]], filled_s: float, size: int,
          version: str) -> str:  # fmt: skip
     """The results file."""
-    rows = "\n".join(f"| {name} | {median:.1f} | {p99:.1f} |" for name, median, p99 in told)
-    plan = "\n".join(f"| {name} | {'<br>'.join(scans[name]) or '–'} |" for name, _, _ in told)
+    figures = [[name, f"{median:.1f}", f"{p99:.1f}"] for name, median, p99 in told]
+    rows = "\n".join(table(["question", "median (ms)", "p99 (ms)"], figures))
+    found = [[name, "<br>".join(scans[name]) or "–"] for name, *_ in told]
+    plan = "\n".join(table(["question", "scans"], found))
     whole = sorted(
         {scan for found in scans.values() for scan in found if any(f"Seq Scan on {big}" in scan for big in BIG)}
     )
@@ -291,16 +299,12 @@ asked {SEEN} times through the functions that the pages call, of participants dr
 
 Goal: a participant's page asks for less than {GOAL_MS:.0f} ms. Its 99th percentile is {worst:.1f} ms.
 
-| question | median (ms) | p99 (ms) |
-|---|---|---|
 {rows}
 
 ## How PostgreSQL finds it
 
 {seq}
 
-| question | scans |
-|---|---|
 {plan}
 """
 

@@ -10,22 +10,18 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-import httpx
 from playwright.sync_api import Locator, Page, sync_playwright
 
-from stimrig.api.client.connection import SendsVersions
+from bench.common import services, sign_in
 from tests.api.browser import ARGUMENTS, CHROMIUM, PASSWORD
 
-TOKEN = "administrator-token-of-the-bench"
 PERSON = {"sensory": 60.0, "motor": 100.0, "comfort": 300.0}
 REST = "#calibration[data-open]:not([data-playing])"
 EFFECT_SEED = 3
@@ -152,45 +148,6 @@ def places(page: Page, size: tuple[int, int]) -> dict[str, float]:
     return found | {"screen": size[1]}
 
 
-@contextmanager
-def served(emulate: str = "", tree: str = "") -> Iterator[str]:
-    """A service of its own, with its emulated rig; its address. `tree`: of the checkout there."""
-    with tempfile.TemporaryDirectory(prefix="stimrig-day-") as folder:
-        command = [
-            sys.executable,
-            "-m",
-            "stimrig",
-            "serve",
-            "--port",
-            "0",
-            "--data",
-            folder,
-            "--emulate",
-            emulate,
-        ]
-        environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": tree}
-        at = {"cwd": tree or None, "env": environment}
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, **at) as process:
-            assert process.stdout is not None
-            try:
-                yield next(
-                    word.rstrip("/,.") for line in process.stdout for word in line.split() if word[:7] == "http://"
-                )
-            finally:
-                process.terminate()
-
-
-def sign_in(page: Page, url: str) -> None:
-    """As the clinician Ada."""
-    with httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=30) as http:
-        http.post("/v1/users", json={"name": "Ada", "password": PASSWORD}).raise_for_status()
-    page.goto(f"{url}/")
-    page.get_by_label("Name", exact=True).fill("Ada")
-    page.get_by_label("Password").fill(PASSWORD)
-    page.get_by_role("button", name="Sign in", exact=True).click()
-    page.get_by_role("heading", name="Participants").wait_for()
-
-
 def main() -> None:
     """Live the four days, print what they took."""
     found: dict[str, Any] = {}
@@ -198,11 +155,11 @@ def main() -> None:
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
         for name, emulate in patients.items():
-            with served(emulate) as url:
+            with services(*emulate.split()) as (running, _):
                 page = browser.new_page(viewport={"width": 1366, "height": 768})
-                sign_in(page, url)
+                sign_in(page, running.url, PASSWORD)
                 for who, new in (("new", True), ("known", False)):
-                    found[f"{who}, {name}"] = live(Day(page), url, "P017", new)
+                    found[f"{who}, {name}"] = live(Day(page), running.url, "P017", new)
                     print(f"{who}, {name}: {json.dumps(found[f'{who}, {name}'])}", file=sys.stderr)
                 page.close()
         browser.close()

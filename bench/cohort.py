@@ -12,8 +12,6 @@ million on paper.
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import os
 import statistics
@@ -26,7 +24,7 @@ from typing import Any
 import psutil
 import pyarrow.parquet as pq
 
-from bench.stamp import written_by
+from bench.common import keep, parser, table, written_by
 from stimrig.api.cohort import record
 from stimrig.api.cohort.cluster import Workers, connected
 from stimrig.api.cohort.computing import Bounds
@@ -45,6 +43,31 @@ SEALED = {"design": "full", "rate_hz": 1600.0}
 """As the rig seals them."""
 PLANNED = 2_000_000
 CORES = 100
+PACES = {
+    "one worker": "one_per_s",
+    "two workers": "two_per_s",
+    "reference: one bare process": "plain_one_per_s",
+    "reference: two bare processes": "plain_two_per_s",
+}
+MEMORY = {
+    "process that computes, renewed after {renewed_after} records": "computing_mb",
+    "worker of Dask": "worker_mb",
+    "the run itself, with the scheduler": "client_mb",
+}
+COSTS = {
+    "recordings measured": "records",
+    "processor time, s, mean": "processor_s",
+    "processor time, s, longest": "longest_processor_s",
+    "time, s, mean": "took_s",
+    "read, MB, mean": "read_mb",
+    "memory of its process, MB, largest": "memory_mb",
+}
+ON_PAPER = {
+    "processor time, h": "processor_h",
+    f"time with {CORES} cores, h": "wall_h",
+    "read, TB": "read_tb",
+    "read by all together, MB/s": "read_mb_per_s",
+}
 MB = 1e6
 
 
@@ -197,60 +220,33 @@ def report(found: dict[str, Any]) -> list[str]:
         f"{found['processors']} processors, load average {load} at the start and "
         f"{', '.join(f'{value:.1f}' for value in found['load_after'])} at the end.",
         "",
-        f"| throughput, records a second, two runs each | {' | '.join(pace)} |",
-        "|---" * (1 + len(pace)) + "|",
-        *(
-            f"| {words} | {' | '.join(both(one[name]) for one in pace.values())} |"
-            for words, name in (
-                ("one worker", "one_per_s"),
-                ("two workers", "two_per_s"),
-                ("reference: one bare process", "plain_one_per_s"),
-                ("reference: two bare processes", "plain_two_per_s"),
-            )
+        *table(
+            ["throughput, records a second, two runs each", *pace],
+            [
+                *([words, *(both(one[name]) for one in pace.values())] for words, name in PACES.items()),
+                ["ratio (goal 1.8)", *(format(one["ratio"], ".2f") for one in pace.values())],
+                ["ratio of the reference", *(format(one["plain_ratio"], ".2f") for one in pace.values())],
+                ["recordings a run", *(one["records"] for one in pace.values())],
+            ],
         ),
-        f"| ratio (goal 1.8) | {' | '.join(format(one['ratio'], '.2f') for one in pace.values())} |",
-        f"| ratio of the reference | {' | '.join(format(one['plain_ratio'], '.2f') for one in pace.values())} |",
-        f"| recordings a run | {' | '.join(str(one['records']) for one in pace.values())} |",
         "",
-        f"| memory over {mem['records']} records, 2 workers, MB | first tenth | last tenth | largest |",
-        "|---|---|---|---|",
-        *(
-            f"| {words} | {mem[name][0]:.0f} | {mem[name][1]:.0f} | {mem[name][2]:.0f} |"
-            for words, name in (
-                (f"process that computes, renewed after {mem['renewed_after']} records", "computing_mb"),
-                ("worker of Dask", "worker_mb"),
-                ("the run itself, with the scheduler", "client_mb"),
-            )
+        *table(
+            [f"memory over {mem['records']} records, 2 workers, MB", "first tenth", "last tenth", "largest"],
+            ([words.format(**mem), *(f"{mb:.0f}" for mb in mem[name])] for words, name in MEMORY.items()),
         ),
         "",
         f"{mem['ok']} of {mem['records']} with a result, {mem['records_per_s']:.1f} a second.",
         "",
-        "| cost of a recording (48 s at 1600 samples/s) | fit | diagnose |",
-        "|---|---|---|",
-        *(
-            f"| {words} | {cost['fit'][name]:.3g} | {cost['diagnose'][name]:.3g} |"
-            for words, name in (
-                ("recordings measured", "records"),
-                ("processor time, s, mean", "processor_s"),
-                ("processor time, s, longest", "longest_processor_s"),
-                ("time, s, mean", "took_s"),
-                ("read, MB, mean", "read_mb"),
-                ("memory of its process, MB, largest", "memory_mb"),
-            )
-        ),
+        *of_verbs("cost of a recording (48 s at 1600 samples/s)", cost, COSTS),
         "",
-        f"| {PLANNED:,}".replace(",", " ") + " such recordings, on paper | fit | diagnose |",
-        "|---|---|---|",
-        *(
-            f"| {words} | {found['plan']['fit'][name]:.3g} | {found['plan']['diagnose'][name]:.3g} |"
-            for words, name in (
-                ("processor time, h", "processor_h"),
-                (f"time with {CORES} cores, h", "wall_h"),
-                ("read, TB", "read_tb"),
-                ("read by all together, MB/s", "read_mb_per_s"),
-            )
-        ),
+        *of_verbs(f"{PLANNED:,}".replace(",", " ") + " such recordings, on paper", found["plan"], ON_PAPER),
     ]
+
+
+def of_verbs(title: str, found: dict[str, Any], rows: dict[str, str]) -> list[str]:
+    """Figures of both verbs."""
+    verbs = ("fit", "diagnose")
+    return table([title, *verbs], ([words, *(f"{found[v][name]:.3g}" for v in verbs)] for words, name in rows.items()))
 
 
 def both(values: list[float]) -> str:
@@ -258,15 +254,15 @@ def both(values: list[float]) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
 
 
-def main() -> int:
+def main() -> None:
     """Print the page."""
-    parser = argparse.ArgumentParser(prog="python -m bench.cohort", description=__doc__.partition("\n")[0])
-    parser.add_argument("--records", type=int, default=10_000, help="of the run over which memory is looked at")
-    parser.add_argument("--pairs", type=int, default=200, help="of each run that compares one worker with two")
-    parser.add_argument("--costs", type=int, default=12, help="recordings as sealed, fitted and diagnosed")
-    parser.add_argument("--renew", type=int, default=500, help="records after which a computing process is renewed")
-    parser.add_argument("--json", type=Path, help="write the figures here, too")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--records", type=int, default=10_000, help="of the run over which memory is looked at")
+    made.add_argument("--pairs", type=int, default=200, help="of each run that compares one worker with two")
+    made.add_argument("--costs", type=int, default=12, help="recordings as sealed, fitted and diagnosed")
+    made.add_argument("--renew", type=int, default=500, help="records after which a computing process is renewed")
+    made.add_argument("--json", type=Path, help="write the figures here, too")
+    options = made.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-bench-cohort-") as scratch:
         folder, place = Path(scratch) / "records", Path(scratch) / "results"
         place.mkdir()
@@ -282,10 +278,8 @@ def main() -> int:
     found["load_after"] = os.getloadavg()
     command = f"python -m bench.cohort --records {options.records} --pairs {options.pairs} --costs {options.costs}"
     print(written_by(command), "", *report(found), sep="\n")
-    if options.json is not None:
-        options.json.write_text(json.dumps(found, indent=1))
-    return 0
+    keep(options.json, found)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

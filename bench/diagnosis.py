@@ -16,12 +16,11 @@ import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bench.common import in_processes, keep, parser, share
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.diagnosis.thresholds import STRUCTURE
@@ -155,11 +154,6 @@ def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str,
         sets = [{}, {"noise": "ar1"}, {"steep": True}, {"noise": "slow"}]
         return [("", "middle", seed, options) for options in sets for seed in many]
     raise SystemExit(f"no set {kind!r}")
-
-
-def share(flags: list[bool]) -> str:
-    """A proportion with its count."""
-    return f"{100 * np.mean(flags):.0f} % ({sum(flags)}/{len(flags)})" if flags else "none"
 
 
 def tell(kind: str, rows: list[dict[str, Any]]) -> None:
@@ -296,36 +290,27 @@ def _recorders(text: str) -> list[str]:
 
 def run(arguments: list[str] | None = None) -> None:
     """Make, diagnose, tell."""
-    parser = argparse.ArgumentParser(prog="python -m bench.diagnosis", description=__doc__)
-    parser.add_argument("--seeds", default="1003:1004", help="first:last, last not included")
-    parser.add_argument("--only", default=",".join(SETS))
-    parser.add_argument(
-        "--recorder",
-        type=_recorders,
-        default=["plain"],
-        help="with commas: both, joined, or as in hardware_sim.recorders",
-    )
-    parser.add_argument("--json", type=Path, default=None)
-    settings = parser.parse_args(arguments)
-    first, last = (int(part) for part in settings.seeds.split(":"))
+    made = parser(__doc__, "1003:1004")
+    made.add_argument("--only", default=",".join(SETS))
+    words = "with commas: both, joined, or as in hardware_sim.recorders"
+    made.add_argument("--recorder", type=_recorders, default=["plain"], help=words)
+    settings = made.parse_args(arguments)
     everything = {}
-    with ProcessPoolExecutor(2) as pool:
-        for kind in settings.only.split(","):
-            asked = [
-                (effect, strength, seed, options | {"recorder": recorder})
-                for effect, strength, seed, options in jobs(kind, range(first, last))
-                for recorder in settings.recorder
-            ]
-            rows = [row for row in pool.map(one, asked) if row is not None]
-            if kind == "kept":
-                rows = [_sealed(row) for row in rows]
-            print(f"{kind}, seeds {first} to {last - 1}, {len(rows)} records")
-            if rows:
-                tell(kind, rows)
-            sys.stdout.flush()
-            everything[kind] = rows
-            if settings.json is not None:
-                settings.json.write_text(json.dumps(everything, default=float))
+    for kind in settings.only.split(","):
+        asked = [
+            (effect, strength, seed, options | {"recorder": recorder})
+            for effect, strength, seed, options in jobs(kind, settings.seeds)
+            for recorder in settings.recorder
+        ]
+        rows = [row for row in in_processes(one, asked) if row is not None]
+        if kind == "kept":
+            rows = [_sealed(row) for row in rows]
+        print(f"{kind}, seeds {settings.seeds.start} to {settings.seeds.stop - 1}, {len(rows)} records")
+        if rows:
+            tell(kind, rows)
+        sys.stdout.flush()
+        everything[kind] = rows
+        keep(settings.json, everything, None)
 
 
 if __name__ == "__main__":

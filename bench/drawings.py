@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from bench.common import ROOT, pyplot
 from stimrig import identify
 from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import SecondOrder
 
-FOLDER = Path(__file__).parent.parent / "docs" / "img"
+FOLDER = ROOT / "docs" / "img"
 TRIALS = 20
 POINTS = 400
 """Points a line in a drawing: small files, nothing lost at their size."""
@@ -18,22 +19,17 @@ POINTS = 400
 
 def run() -> None:
     """Draw all three."""
-    import matplotlib
-
-    matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "stimrig", "font.size": 9, "svg.fonttype": "none"})
+    plt = pyplot()
     FOLDER.mkdir(exist_ok=True)
     for draw in (figure_4, figure_5, figure_7):
         path = FOLDER / f"{draw.__name__.replace('_', '-')}.svg"
-        figure = draw()
+        figure = draw(plt)
         figure.savefig(path, metadata={"Date": None}, bbox_inches="tight")
         print(f"wrote {path.name} ({path.stat().st_size // 1024} kB)")
 
 
-def figure_4():
+def figure_4(plt: Any) -> Any:
     """Input and output of a PRBS test and of a triangular ramp test, with the model's free run."""
-    import matplotlib.pyplot as plt
-
     record, _ = paper.simulate(0.05, 1, 1600.0)
     predicted = identify.predict(identify.fit(record), record)
     names = np.array(record.segment_names)[record.segment]
@@ -53,10 +49,8 @@ def figure_4():
     return figure
 
 
-def figure_5():
+def figure_5(plt: Any) -> Any:
     """The simulated muscle: recruitment curve and step response, with what is identified at 40 Hz and 0.10 N·m."""
-    import matplotlib.pyplot as plt
-
     record, _ = paper.simulate(0.10, 1)
     model = identify.fit(record)
     curve, step = model.bands["recruitment"], model.bands["step_response"]
@@ -75,10 +69,8 @@ def figure_5():
     return figure
 
 
-def figure_7():
+def figure_7(plt: Any) -> Any:
     """Best fit against noise: the paper's and ours on the noisy ramp, the ceiling, and ours on unseen input."""
-    import matplotlib.pyplot as plt
-
     rows = paper.table1(TRIALS)["rows"]
     figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3.2), sharex=True)
     noise = paper.NOISE_NM
@@ -101,6 +93,3 @@ def figure_7():
     right.set(xlabel="noise, N·m", title="unseen input, without noise", ylim=(60, 101))
     left.legend(frameon=False, fontsize=7, loc="lower left")
     return figure
-
-
-__all__ = ["figure_4", "figure_5", "figure_7", "run"]

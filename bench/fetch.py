@@ -7,7 +7,6 @@ has; without it all ask as fast as they are answered.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
@@ -17,15 +16,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import httpx
 import numpy as np
 
+from bench.common import TOKEN, http_client, parser, spread
 from stimrig.api.cli.child import Child
-from stimrig.api.client.connection import SendsVersions
-from stimrig.api.settings import Settings
 from tests.harness.patients import Patient, make_record
-
-TOKEN = "bench-of-the-fetch-is-not-a-secret"
 
 
 def csv_of_a_muscle() -> str:
@@ -83,29 +78,21 @@ def clients(
 
 def main() -> None:
     """Measure and say."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--clients", type=int, default=50)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--every", type=float, default=0.0, help="pause of each client, ms")
-    parser.add_argument("--in-step", action="store_true", help="all ask at the same instants")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--clients", type=int, default=50)
+    made.add_argument("--seconds", type=float, default=10.0)
+    made.add_argument("--every", type=float, default=0.0, help="pause of each client, ms")
+    made.add_argument("--in-step", action="store_true", help="all ask at the same instants")
+    options = made.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-fetch-") as folder:
-        settings = Settings(data_dir=Path(folder))
         api = Child("api", [sys.executable, "-m", "stimrig.api.web.server"], Path(folder) / "api.log")
-        api.environment = {
-            "STIMRIG_DATA_DIR": str(settings.data_dir),
-            "STIMRIG_PORT": "0",
-            "STIMRIG_ADMIN_TOKEN": TOKEN,
-        }
+        api.environment = {"STIMRIG_DATA_DIR": folder, "STIMRIG_PORT": "0", "STIMRIG_ADMIN_TOKEN": TOKEN}
         ready = api.start()
-        url = ready["url"]
         try:
-            with httpx.Client(
-                base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=120
-            ) as admin:
+            with http_client(ready["url"]) as admin:
                 admin.post("/v1/participants", json={"code": "P1"}).raise_for_status()
-                made = admin.post("/v1/participants/P1/recordings", content=csv_of_a_muscle()).raise_for_status().json()
-                admin.post(f"/v1/models/{made['model']['id']}/approve", json={"reason": "bench"}).raise_for_status()
+                sent = admin.post("/v1/participants/P1/recordings", content=csv_of_a_muscle()).raise_for_status().json()
+                admin.post(f"/v1/models/{sent['model']['id']}/approve", json={"reason": "bench"}).raise_for_status()
                 keys = [
                     admin.post("/v1/controller-keys", json={"name": f"c{k}"}).json()["key"]
                     for k in range(options.clients)
@@ -117,20 +104,15 @@ def main() -> None:
             used = (api.cpu_s() or 0.0) - used
         finally:
             api.end()
-    every = np.array(times[200] + times[304])
-    print(
-        json.dumps(
-            {
-                "clients": options.clients, "pause_ms": options.every, "in_step": options.in_step, "model_bytes": size,
-                "fetches_per_s": round(every.size / options.seconds, 1),
-                "server_ms_each": round(1000 * used / every.size, 3),
-                "median_ms": round(1000 * float(np.median(every)), 2),
-                "p99_ms": round(1000 * float(np.percentile(every, 99)), 2),
-                "p99_304_ms": round(1000 * float(np.percentile(times[304], 99)), 2),
-                "max_ms": round(1000 * float(every.max()), 2), "load_average": os.getloadavg(), "cores": os.cpu_count(),
-            }
-        )
-    )  # fmt: skip
+    every = times[200] + times[304]
+    ms = {f"{what}_ms": round(value, 2) for what, value in spread(every).items()}
+    told = {"clients": options.clients, "pause_ms": options.every, "in_step": options.in_step, "model_bytes": size}
+    told |= {
+        "fetches_per_s": round(len(every) / options.seconds, 1),
+        "server_ms_each": round(1e3 * used / len(every), 3),
+    }
+    told |= ms | {"p99_304_ms": round(spread(times[304])["p99"], 2)}
+    print(json.dumps(told | {"load_average": os.getloadavg(), "cores": os.cpu_count()}))
 
 
 if __name__ == "__main__":

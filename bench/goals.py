@@ -11,14 +11,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.stamp import RESULTS, written_by
+from bench.common import RESULTS, in_processes, table, written_by
 from stimrig import identify
 from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import SecondOrder
@@ -78,27 +76,11 @@ def run() -> None:
     TARGET.write_text("\n".join(lines))
 
 
-def spread(work: Callable[[int], Any], seeds: range) -> list[Any]:
-    """Results for each seed, on all cores."""
-    with ProcessPoolExecutor() as pool:
-        return list(pool.map(work, seeds, chunksize=5))
-
-
 def one_accuracy(task: tuple[float, float, int]) -> tuple[float, float, float]:
     """Clean ramp %, unseen %, and points above the true ceiling, of one record of the paper's muscle."""
     rate, noise, seed = task
-    record, clean = simulate(noise, seed, rate)
-    model = identify.fit(record)
-    predicted = identify.predict(model, record)
-    names = np.array(record.segment_names)[record.segment]
-    ramp, unseen = names == "ramp", names == "validate"
-    measured = record.torque_nm[ramp]
-    ceiling = best_fit_percent(measured, clean[ramp])
-    return (
-        best_fit_percent(clean[ramp], predicted[ramp]),
-        best_fit_percent(clean[unseen], predicted[unseen]),
-        best_fit_percent(measured, predicted[ramp]) - ceiling,
-    )
+    found = paper.score(*simulate(noise, seed, rate), "maximum-likelihood")
+    return found["clean"], found["unseen"], found["noisy"] - found["ceiling"]
 
 
 def accuracy() -> list[str]:
@@ -109,19 +91,18 @@ def accuracy() -> list[str]:
         "Clean ramp and unseen multi-level input, best fit % (mean, smallest); worst of the noisy fit beside the true",
         "system's own fit to the same noise, points.",
         "",
-        "| noise, N·m | 40 Hz: ramp | unseen | beside ceiling | 1600 Hz: ramp | unseen | beside ceiling |",
-        "|---|---|---|---|---|---|---|",
     ]
+    rows = []
     for noise in NOISE_NM:
         cells = []
         for rate in (40.0, 1600.0):
             seeds = ACCURACY_SEEDS if noise else ACCURACY_SEEDS[:1]
-            with ProcessPoolExecutor() as pool:
-                found = np.array(list(pool.map(one_accuracy, [(rate, noise, seed) for seed in seeds])))
+            found = np.array([*in_processes(one_accuracy, [(rate, noise, seed) for seed in seeds], None)])
             cells += [f"{found[:, column].mean():.3f} ({found[:, column].min():.2f})" for column in (0, 1)]
             cells += [f"{found[:, 2].min():+.3f}"]
-        lines.append(f"| {noise:.2f} | " + " | ".join(cells) + " |")
-    return lines
+        rows.append([f"{noise:.2f}", *cells])
+    heads = "noise, N·m; 40 Hz: ramp; unseen; beside ceiling; 1600 Hz: ramp; unseen; beside ceiling"
+    return lines + table(heads.split("; "), rows)
 
 
 def one_patient(seed: int) -> dict[str, Any]:
@@ -149,7 +130,7 @@ def one_patient(seed: int) -> dict[str, Any]:
 
 def patients() -> list[str]:
     """300 simulated patients."""
-    found = spread(one_patient, PATIENT_SEEDS)
+    found = [*in_processes(one_patient, PATIENT_SEEDS, None)]
     fitted = [f for f in found if not f["failed"]]
     failed = len(found) - sum(f["converged"] for f in fitted)
     bad = [f for f in fitted if f["gap"] > 1.0]
@@ -213,7 +194,7 @@ def one_calibration(seed: int) -> dict[str, float]:
 
 def calibration() -> list[str]:
     """How often 95 % bands cover the truth."""
-    found = spread(one_calibration, CALIBRATION_SEEDS)
+    found = [*in_processes(one_calibration, CALIBRATION_SEEDS, None)]
     lines = [
         f"## Do 95 % bands cover the truth? ({len(found)} records, 400 Hz, noise 0.05 N·m, patients drawn as above)",
         "",
@@ -263,8 +244,7 @@ def other_curves() -> list[str]:
         "",
     ]
     for kind, name in ((TwoPools, "two pools"), (SharpThreshold, "sharp threshold")):
-        with ProcessPoolExecutor() as pool:
-            found = list(pool.map(one_other_curve, [(kind, seed) for seed in OTHER_SEEDS], chunksize=5))
+        found = [*in_processes(one_other_curve, [(kind, seed) for seed in OTHER_SEEDS], None)]
         one, whole = 100 * np.mean(found, axis=0)
         lines.append(f"- {name}: at any one width {one:.1f} %, the whole curve {whole:.1f} %")
     return lines

@@ -7,24 +7,24 @@ them, `tests/harness/hostile_shapes.py` makes them.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import logging
 import sys
 from dataclasses import asdict
 
+from bench.common import parser
 from tests.harness.hostile_files import run
 from tests.harness.hostile_shapes import all_files
 
 
 def main() -> int:
     """Run; 1 where something was not as it should be."""
-    parser = argparse.ArgumentParser(prog="bench.hostile_files")
-    parser.add_argument("--count", type=int, default=400)
-    parser.add_argument("--seed", type=int, default=9)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--count", type=int, default=400)
+    made.add_argument("--seed", type=int, default=9)
+    made.add_argument("--json", action="store_true")
+    options = made.parse_args()
     logging.disable(logging.WARNING)  # each refusal would be a line
     tally = asyncio.run(
         run(lambda folder: all_files(folder, options.seed, options.count), lambda line: print(line, file=sys.stderr))

@@ -20,14 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.stamp import written_by
+from bench.common import ROOT, pyplot, reveal, services, table, written_by
 from examples import ilc_controller as ilc
-from stimrig.api.cli.launcher import Services
-from stimrig.api.client.rest import Client
-from stimrig.api.settings import Settings
 
-ROOT = Path(__file__).parents[1]
-TOKEN = "bench-of-the-learning-controller"
 SEEDS = (59, 29)
 """Muscles with a hidden effect that were not looked at in development (that was on 14, 20 and 17)."""
 WITH_MODEL = "identified model"
@@ -37,17 +32,12 @@ PAPER = "the paper's muscle"
 
 def case(emulate: str, speed: float, trials: int, work: Any, widest_us: float = 300.0) -> dict[str, Any]:
     """Start a rig, make the first model, and hand over."""
-    with tempfile.TemporaryDirectory(prefix="stimrig-ilc-") as folder:
-        settings = Settings(data_dir=Path(folder))
-        settings.port = 0
-        with Services(settings, [*emulate.split(), "--speed", f"{speed:g}", "--rate-hz", "400"], TOKEN) as services:
-            service = Patient(Client(services.url, TOKEN), "ILC")
-            client = service.client
-            profile = {"current_ma": 20.0, "max_pulse_width_us": widest_us, "max_torque_nm": 30.0}
-            client.make_participant("ILC", profile)
-            test = client.run_test("ILC")
-            approve(service, test["model_id"])
-            return work(service, test, trials)
+    with services(*emulate.split(), "--speed", f"{speed:g}", "--rate-hz", "400") as (_, client):
+        service = Patient(client, "ILC")
+        client.make_participant("ILC", {"current_ma": 20.0, "max_pulse_width_us": widest_us, "max_torque_nm": 30.0})
+        test = client.run_test("ILC")
+        approve(service, test["model_id"])
+        return work(service, test, trials)
 
 
 class Patient(ilc.Service):
@@ -101,33 +91,19 @@ def ramp_deconvolution(service: ilc.Service, test: dict[str, Any]) -> dict[str, 
     with tempfile.TemporaryDirectory() as folder:
         data, model = Path(folder) / "first.h5", Path(folder) / "MODEL.json"
         data.write_bytes(service.client.recording(test["recording_id"]))
-        command = [
-            sys.executable,
-            "-m",
-            "stimrig",
-            "fit",
-            str(data),
-            "--method",
-            "ramp-deconvolution",
-            "-o",
-            str(model),
-        ]
+        words = ["fit", str(data), "--method", "ramp-deconvolution", "-o", str(model)]
+        command = [sys.executable, "-m", "stimrig", *words]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT)
         return json.loads(model.read_text())
 
 
-def before(service: Patient, _test: dict[str, Any], trials: int, peak_nm: float) -> dict[str, Any]:
-    """With the base model."""
-    reference = ilc.Reference.reach(peak_nm)
-    done = ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
-    return {"reference": reference, "trials": done, "repeated": service.repeated}
-
-
-def after(service: Patient, test: dict[str, Any], trials: int, peak_nm: float, effects: list[str]) -> dict[str, Any]:
-    """With what was hidden added, on a muscle from its beginning: what tires would burden a second run."""
-    why = "the bench knows what was hidden"
-    version = service.client.add_effects(test["model_id"], effects, force=True, reason=why)
-    approve(service, version["id"])
+def knowing(service: Patient, test: dict[str, Any], trials: int, peak_nm: float, effects: list[str]) -> dict[str, Any]:
+    """With the base model, or with what was hidden added; each on a muscle from its beginning, as what tires would
+    burden a second run."""
+    if effects:
+        why = "the bench knows what was hidden"
+        version = service.client.add_effects(test["model_id"], effects, force=True, reason=why)
+        approve(service, version["id"])
     reference = ilc.Reference.reach(peak_nm)
     done = ilc.learn(service, service.fetch(), reference, "norm-optimal", trials)
     return {"reference": reference, "trials": done, "repeated": service.repeated}
@@ -148,13 +124,12 @@ def main() -> None:
     if not options.only_hidden:
         wanted[PAPER] = {name: partial(case, "", work=partial(one_run, **run)) for name, run in RUNS.items()}
     for seed in options.seeds:
-        effects, base = revealed(seed)
+        hides = reveal(seed)
+        effects, base = hides["effects"], hides["base"]
         emulate, widest_us, peak_nm = f"--hidden {seed}", base["largest_width_us"], 0.6 * base["largest_torque_nm"]
         wanted[f"hidden effect, seed {seed} ({', '.join(effects)})"] = {
-            "before": partial(case, emulate, widest_us=widest_us, work=partial(before, peak_nm=peak_nm)),
-            f"after adding {', '.join(effects)}": partial(
-                case, emulate, widest_us=widest_us, work=partial(after, peak_nm=peak_nm, effects=effects)
-            ),
+            run: partial(case, emulate, widest_us=widest_us, work=partial(knowing, peak_nm=peak_nm, effects=added))
+            for run, added in (("before", []), (f"after adding {', '.join(effects)}", effects))
         }
     cases = play_all(wanted, options)
     draw(options.out / "img" / "ilc.svg", cases)
@@ -182,13 +157,6 @@ def play_all(wanted: dict[str, dict[str, Any]], options: argparse.Namespace) -> 
         case_["repeated"] += found["repeated"]
         case_ |= {"floor": found["floor"]} if "floor" in found else {}
     return cases
-
-
-def revealed(seed: int) -> tuple[list[str], dict[str, Any]]:
-    """What the seed hid, and the muscle without it (its largest width is the participant's comfort maximum)."""
-    command = [sys.executable, "-m", "stimrig.hardware_sim", "--reveal", str(seed)]
-    found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout)
-    return found["effects"], found["base"]
 
 
 def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
@@ -219,23 +187,14 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
             f"Pulses dropped because the host was late: {lost}; trials repeated after a fault: {found['repeated']}."
         )
         count = len(next(iter(found["runs"].values())))
-        lines += ["", f"| trial | {' | '.join(map(str, range(1, count + 1)))} |", "|---|" + "---|" * count]
-        lines += [
-            f"| {run} | " + " | ".join(f"{trial.error_percent:.2f}" for trial in trials) + " |"
-            for run, trials in found["runs"].items()
-        ]
+        errors = [[run, *(f"{one.error_percent:.2f}" for one in trials)] for run, trials in found["runs"].items()]
+        lines += ["", *table(["trial", *map(str, range(1, count + 1))], errors)]
     return "\n".join(lines) + "\n"
 
 
 def draw(path: Path, cases: dict[str, dict[str, Any]]) -> None:
     """Error over trials, a panel for each muscle."""
-    import matplotlib
-
-    matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "stimrig", "font.size": 9, "svg.fonttype": "none"})
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, len(cases), figsize=(3.6 * len(cases) + 2, 3.8), sharey=True, squeeze=False)
+    figure, axes = pyplot().subplots(1, len(cases), figsize=(3.6 * len(cases) + 2, 3.8), sharey=True, squeeze=False)
     for axis, (name, found) in zip(axes[0], cases.items(), strict=True):
         for run, trials in found["runs"].items():
             dashes = "--" if STATIC in run else "-"

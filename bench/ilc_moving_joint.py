@@ -9,24 +9,20 @@ begins up to 80 ms early or late, is 3 % faster or slower, and 2 degrees beside.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bench.common import ROOT, in_processes, keep, parser, written_by
 from bench.moving_joint import MOVING_JOINT, as_record, guided_tests, joined
-from bench.stamp import written_by
 from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
 from stimrig.identify.simulation.pulses import Motion, above_rest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+sys.path.insert(0, str(ROOT / "examples"))
 from ilc_controller import Reference
 from ilc_moving_joint import learn_moving
 
@@ -93,22 +89,18 @@ def one(job: tuple[int, int]) -> dict[str, Any]:
 
 def main() -> None:
     """Run."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--arms", default="1100:1108", help="first:last, last not included")
-    parser.add_argument("--trials", type=int, default=8)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    first, last = (int(part) for part in options.arms.split(":"))
-    with ProcessPoolExecutor(2) as pool:
-        rows = list(pool.map(one, [(seed, options.trials) for seed in range(first, last)]))
-    print(written_by(f"python -m bench.ilc_moving_joint --arms {options.arms} --trials {options.trials}"))
+    made = parser(__doc__, "1100:1108", "--arms")
+    made.add_argument("--trials", type=int, default=8)
+    options = made.parse_args()
+    rows = list(in_processes(one, [(seed, options.trials) for seed in options.arms]))
+    arms = f"{options.arms.start}:{options.arms.stop}"
+    print(written_by(f"python -m bench.ilc_moving_joint --arms {arms} --trials {options.trials}"))
     print("error in % of the stimulated torque's rms, median over arms (largest)")
     print("trial  with g and h        without")
     for number in range(options.trials):
         cells = [np.array([row[name][number] for row in rows]) for name in ("with g and h", "without")]
         print(f"{number + 1:5d}  " + "  ".join(f"{np.median(cell):6.2f} ({cell.max():6.2f})" for cell in cells))
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1))
+    keep(options.json, rows)
 
 
 if __name__ == "__main__":

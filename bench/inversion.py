@@ -10,12 +10,12 @@ were no dynamics; and the model without its effects. Seed 2 was developed on. Ti
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 
 import numpy as np
 
+from bench.common import parser
 from examples.ilc_controller import Reference as Moves
 from stimrig import identify
 from stimrig.identify.inversion import Reference, invert
@@ -30,9 +30,9 @@ REPEATS = 5
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, nargs="+", default=[3, 4, 6, 7])
-    seeds = parser.parse_args().seeds
+    made = parser(__doc__)
+    made.add_argument("--seeds", type=int, nargs="+", default=[3, 4, 6, 7])
+    seeds = made.parse_args().seeds
     print(f"median of seeds {seeds}; error of the muscle's torque in % of the reference's rms")
     print(
         f"{'hidden':26s}{'curve alone':>12s}{'no effects':>12s}{'ours':>8s}{'foretold':>10s}{'times a prediction':>20s}"

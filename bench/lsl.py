@@ -9,20 +9,18 @@ record; the ratio of the 99th percentiles in each pair. `--write` writes docs/re
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
-from bench.stamp import RESULTS, written_by
+from bench.common import RESULTS, emulated_rig, parser, spread, table, written_by
 from tests.harness.lsl_recorder import Streams, compare, on_this_machine
-from tests.harness.processes import Bench, RigClient, busy_process, default_plan
+from tests.harness.processes import Bench, RigClient, default_plan
 
 
 @dataclass
@@ -88,12 +86,7 @@ def measure(pairs: int, busy: int) -> Found:
     found = Found()
     with tempfile.TemporaryDirectory(prefix="lsl-bench-") as folder, contextlib.ExitStack() as stack:
         stack.enter_context(on_this_machine(Path(folder)))
-        bench = Bench(Path(folder), "--noise-seed", "7", "--clock-ppm", "80")
-        stack.callback(bench.close)
-        client = bench.start_rig()
-        client.ask("subscribe")
-        for _ in range(busy):
-            stack.enter_context(busy_process())
+        bench, client = stack.enter_context(emulated_rig("--noise-seed", "7", "--clock-ppm", "80", busy=busy))
         for pair in range(pairs):
             found.load.append(os.getloadavg()[0])
             steps = [
@@ -108,11 +101,11 @@ def measure(pairs: int, busy: int) -> Found:
     return found
 
 
-def row(name: str, values_s: list[np.ndarray]) -> str:
-    """Percentiles in ms."""
-    values_ms = np.concatenate(values_s) * 1e3
-    p50, p99, most = np.percentile(values_ms, [50, 99, 100])
-    return f"| {name} | {len(values_ms)} | {p50:.3f} | {p99:.3f} | {most:.3f} |"
+def percentiles(title: str, rows: dict[str, list[np.ndarray]]) -> list[str]:
+    """A table of them, in ms."""
+    values_s = {name: np.concatenate(values) for name, values in rows.items()}
+    cells = [[name, len(s), *(f"{ms:.3f}" for ms in spread(s).values())] for name, s in values_s.items()]
+    return table([title, "number", "p50", "p99", "max"], cells)
 
 
 def report(found: Found, busy: int) -> str:
@@ -127,15 +120,15 @@ def report(found: Found, busy: int) -> str:
         f"priority. Load of the machine before each pair: "
         f"{', '.join(f'{load:.1f}' for load in found.load)} ({os.cpu_count()} processors).",
         "",
-        "| time stamp of LSL against the sealed recording, ms | number | p50 | p99 | max |",
-        "|---|---|---|---|---|",
-        row("torque samples", found.torque_apart_s),
-        row("pulses", found.pulses_apart_s),
+        *percentiles(
+            "time stamp of LSL against the sealed recording, ms",
+            {"torque samples": found.torque_apart_s, "pulses": found.pulses_apart_s},
+        ),
         "",
-        "| lateness of pulses by the rig's own record, ms | number | p50 | p99 | max |",
-        "|---|---|---|---|---|",
-        row("without outlets", found.without_s),
-        row("with outlets and a recorder", found.beside_s),
+        *percentiles(
+            "lateness of pulses by the rig's own record, ms",
+            {"without outlets": found.without_s, "with outlets and a recorder": found.beside_s},
+        ),
         "",
         f"Ratio of the 99th percentiles, with to without: {pooled:.2f} over all pulses; in each pair {shown} "
         f"(median {np.median(ratios):.2f}). Pulses dropped: {found.dropped['without']} without, "
@@ -144,13 +137,13 @@ def report(found: Found, busy: int) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--pairs", type=int, default=6)
-    parser.add_argument("--busy", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help="write docs/results/lsl.md")
-    options: Any = parser.parse_args(arguments)
+    made = parser(__doc__)
+    made.add_argument("--pairs", type=int, default=6)
+    made.add_argument("--busy", type=int, default=0)
+    made.add_argument("--write", action="store_true", help="write docs/results/lsl.md")
+    options = made.parse_args()
     text = report(measure(options.pairs, options.busy), options.busy)
     print(text)
     if options.write:

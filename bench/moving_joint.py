@@ -9,17 +9,13 @@ The arms come from `hardware_sim.arm_patient`, whose laws and distributions were
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.stamp import written_by
+from bench.common import in_processes, keep, parser, written_by
 from stimrig.api.sessions import joint_plan
 from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.arm_records import record
@@ -28,19 +24,9 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.predict import predict
+from tests.harness.carried_sessions import as_record
 
 PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0
-COLUMNS = ("time_s", "pulse_width_us", "torque_nm")
-
-
-def as_record(made: dict[str, Any]) -> Record:
-    """A made record, as identify takes it."""
-    return Record.from_arrays(
-        *(made[name] for name in COLUMNS),
-        list(made["segment"]),
-        angle_rad=made["angle_rad"],
-        velocity_rad_s=made["velocity_rad_s"],
-    )
 
 
 def torque_time_nms(arm: ArmPatient, made: dict[str, Any]) -> float:
@@ -173,24 +159,20 @@ def tell(rows: list[dict[str, Any]]) -> None:
     print(f"torque-time of the three over the paper's test: median {np.median(share):.2f}, largest {share.max():.2f}")
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main() -> None:
     """Run."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--arms", default="1000:1050", help="first:last, last not included")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args(arguments)
-    first, last = (int(part) for part in options.arms.split(":"))
+    made = parser(__doc__, "1000:1050", "--arms")
+    made.add_argument("--workers", type=int, default=2)
+    options = made.parse_args()
     rows = []
-    with ProcessPoolExecutor(options.workers) as pool:
-        for row in pool.map(one, range(first, last)):
-            rows.append(row)
-            print(f"arm {row['seed']}: {row['laws']} {row['all']['h']['rms']:.3f} {row['all']['g']['rms']:.3f} "
-                  f"{row['all']['unseen_over_noise']:.2f}", file=sys.stderr, flush=True)  # fmt: skip
-    print(written_by(f"python -m bench.moving_joint --arms {options.arms}"))
+    for row in in_processes(one, options.arms, options.workers):
+        rows.append(row)
+        errors = [row["all"]["h"]["rms"], row["all"]["g"]["rms"]]
+        told = f"{errors[0]:.3f} {errors[1]:.3f} {row['all']['unseen_over_noise']:.2f}"
+        print(f"arm {row['seed']}: {row['laws']} {told}", file=sys.stderr, flush=True)
+    print(written_by(f"python -m bench.moving_joint --arms {options.arms.start}:{options.arms.stop}"))
     tell(rows)
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1))
+    keep(options.json, rows)
 
 
 if __name__ == "__main__":

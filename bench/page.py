@@ -6,7 +6,6 @@ machine, Debian's chromium. *Cold*: an empty cache; *warm*: the cache of the pag
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -17,6 +16,7 @@ from typing import Any
 import httpx
 from playwright.sync_api import sync_playwright
 
+from bench.common import parser
 from stimrig.api.workers.pool import WORKER
 from tests.api.browser import ARGUMENTS, CHROMIUM, participant, sign_in, start
 from tests.api.conftest import Service, run_service, run_test
@@ -87,9 +87,9 @@ def live(browser: Any, service: Service) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and say."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--runs", type=int, default=5)
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--runs", type=int, default=5)
+    options = made.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-page-") as folder:
         for service in run_service(Path(folder), Path(folder), WORKER):
             with service.client() as http:

@@ -8,8 +8,8 @@ import warnings
 
 import numpy as np
 
+from bench.common import RESULTS, table, written_by
 from bench.contenders import CONTENDERS, Contender, Task
-from bench.stamp import RESULTS, written_by
 from stimrig.identify import paper
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.records.record import Record
@@ -96,13 +96,11 @@ def document(results: dict[tuple[str, float, float], dict[str, float] | str]) ->
         "",
     ]
     for rate in SEEDS:
-        lines += [f"## {rate:g} samples a second", ""]
-        lines += ["| | what | " + " | ".join(f"noise {noise:g} N·m" for noise in NOISE_NM) + " |"]
-        lines += ["|---|---|" + "---|" * len(NOISE_NM)]
-        for contender in CONTENDERS:
-            cells = [cell(results[contender.name, rate, noise]) for noise in NOISE_NM]
-            lines += [f"| {contender.name} | {contender.what} | " + " | ".join(cells) + " |"]
-        lines += [""]
+        heads = ["", "what", *(f"noise {noise:g} N·m" for noise in NOISE_NM)]
+        rows = [
+            [one.name, one.what, *(cell(results[one.name, rate, noise]) for noise in NOISE_NM)] for one in CONTENDERS
+        ]
+        lines += [f"## {rate:g} samples a second", "", *table(heads, rows), ""]
     lines += speed(results)
     return "\n".join(lines) + "\n"
 

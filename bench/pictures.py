@@ -6,31 +6,25 @@ arm's isometric test and its guided tests, joined. A service on the emulated rig
 
 from __future__ import annotations
 
-import argparse
 import io
 import os
 import tempfile
 from pathlib import Path
 from typing import Any
 
-import httpx
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
+from bench.common import ROOT, http_client, parser, services, sign_in
 from bench.moving_joint import as_record, guided_tests, joined
-from stimrig.api.cli.launcher import Services
-from stimrig.api.client.connection import SendsVersions
-from stimrig.api.settings import Settings
 from stimrig.hardware_sim import hidden_records
 from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.fitting import fit
 from stimrig.identify.records.join import write_joined
-from tests.api.browser import CHROMIUM
+from tests.api.browser import CHROMIUM, PASSWORD
 
-IMAGES = Path(__file__).parents[1] / "docs" / "img"
-TOKEN = "bench-of-the-pictures-of-the-page"
-NAME, PASSWORD = "Ada", "correct horse battery"
+IMAGES = ROOT / "docs" / "img"
 WIDTH, HEIGHT, MARGIN, COLOURS = 1366, 768, 14, 128
 ARM = 3
 """Whose joint is shown: one of those that were developed on."""
@@ -40,7 +34,7 @@ def prepared(url: str, folder: Path) -> str:
     """A participant with a recording, and its diagnosis; the id of the model."""
     path = folder / "record.csv"
     hidden_records.write_csv(hidden_records.generate("recruitment_hysteresis", "strong", seed=4, rate_hz=400), path)
-    with client(url) as http:
+    with http_client(url) as http:
         model = str(taken(http, "P017", path)["model"]["id"])
         http.get(f"/v1/models/{model}/diagnosis").raise_for_status()
     return model
@@ -53,19 +47,14 @@ def prepared_joint(url: str, folder: Path) -> str:
     guided = guided_tests(arm, fit(as_record(isometric)), isometric, ARM)
     path = folder / "joint.csv"
     write_joined(joined([isometric, *guided]), path)
-    with client(url) as http:
+    with http_client(url) as http:
         recording = taken(http, "P018", path)["recording_id"]
         return str(
             http.post("/v1/participants/P018/models", json={"recordings": [recording]}).raise_for_status().json()["id"]
         )
 
 
-def client(url: str) -> httpx.Client:
-    """The administrator's."""
-    return httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=180)
-
-
-def taken(http: httpx.Client, code: str, path: Path) -> dict[str, Any]:
+def taken(http: Any, code: str, path: Path) -> dict[str, Any]:
     """What the service says of a new participant's recording."""
     http.post("/v1/participants", json={"code": code}).raise_for_status()
     headers = {"Content-Type": "text/csv"}
@@ -79,17 +68,6 @@ def keep(name: str, content: bytes) -> None:
     picture = Image.open(io.BytesIO(content)).convert("RGB")
     picture.quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size // 1000} kB")
-
-
-def signed_in(page: Page, url: str) -> None:
-    """As the clinician."""
-    with client(url) as http:
-        http.post("/v1/users", json={"name": NAME, "password": PASSWORD}).raise_for_status()
-    page.goto(f"{url}/sign-in")
-    page.fill("input[name=name]", NAME)
-    page.fill("input[name=password]", PASSWORD)
-    page.press("input[name=password]", "Enter")
-    page.wait_for_url(f"{url}/")
 
 
 def cut(page: Page, above: str, below: str) -> bytes:
@@ -130,22 +108,19 @@ PICTURES = {"model": (prepared, photograph), "joint": (prepared_joint, photograp
 
 def main() -> None:
     """Those that are asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", metavar="model|joint", help="default: both")
-    names = parser.parse_args().names or list(PICTURES)
+    made = parser(__doc__)
+    made.add_argument("names", nargs="*", metavar="model|joint", help="default: both")
+    names = made.parse_args().names or list(PICTURES)
     if unknown := set(names) - set(PICTURES):
-        parser.error(f"no picture {sorted(unknown)[0]}; take one of {', '.join(PICTURES)}")
-    with tempfile.TemporaryDirectory(prefix="stimrig-pictures-") as folder:
-        settings = Settings(data_dir=Path(folder) / "data")
-        settings.port = 0
-        with Services(settings, [], TOKEN) as services, sync_playwright() as playwright:
-            chromium = os.environ.get("CHROMIUM", str(CHROMIUM))
-            browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, locale="en-GB")
-            signed_in(page, services.url)
-            for prepare, take in (PICTURES[name] for name in names):
-                take(page, services.url, prepare(services.url, Path(folder)))
-            browser.close()
+        made.error(f"no picture {sorted(unknown)[0]}; take one of {', '.join(PICTURES)}")
+    with tempfile.TemporaryDirectory() as folder, services() as (running, _), sync_playwright() as playwright:
+        chromium = os.environ.get("CHROMIUM", str(CHROMIUM))
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, locale="en-GB")
+        sign_in(page, running.url, PASSWORD)
+        for prepare, take in (PICTURES[name] for name in names):
+            take(page, running.url, prepare(running.url, Path(folder)))
+        browser.close()
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ copied, never changed. Writes docs/results/planted.md where nothing is left out.
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -19,11 +18,10 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from bench.stamp import written_by
+from bench.common import RESULTS, ROOT, line, parser, table, written_by
 
-ROOT = Path(__file__).parents[1]
 FAULTS = ROOT / "tests" / "planted_faults.toml"
-TARGET = ROOT / "docs" / "results" / "planted.md"
+TARGET = RESULTS / "planted.md"
 LONGEST_S = 1200.0
 """A suite that hangs on a fault has found it."""
 PYTEST = ("-m", "pytest", "-x", "-q", "-n", "2", "-p", "no:cacheprovider")
@@ -108,7 +106,7 @@ def run(old: Path | None, only: str) -> None:
         for name, found in (("old", any(before.values())), *here.items(), ("together", together)):
             totals[name] += found
         words = [_word(any(before.values())) if old else "–", *map(_word, here.values())]
-        rows.append(f"| {fault['name']} | {' | '.join(words)} |")
+        rows.append([fault["name"], *words])
     count = len(faults)
     lines = [
         "# Planted faults: which suite finds them",
@@ -118,10 +116,8 @@ def run(old: Path | None, only: str) -> None:
         "commit c6ff60e, up to the first that fails. Simulator: 200 lives from seed 900000, used here alone. Unit",
         "tests: `tests/rig` without what needs real time.",
         "",
-        "| fault | old suite | simulator | unit tests |",
-        "|---|---|---|---|",
-        *rows,
-        f"| **found of {count}** | {totals['old']} | {totals['simulator']} | {totals['units']} |",
+        *table(["fault", "old suite", "simulator", "unit tests"], rows),
+        line([f"**found of {count}**", totals["old"], totals["simulator"], totals["units"]]),
         "",
         f"Simulator and unit tests together: {totals['together']} of {count}.",
     ]
@@ -135,8 +131,8 @@ def _word(found: bool) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--old", type=Path, help="a tree of commit c6ff60e")
-    parser.add_argument("--only", default="", help="only faults whose names hold these words")
-    given = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--old", type=Path, help="a tree of commit c6ff60e")
+    made.add_argument("--only", default="", help="only faults whose names hold these words")
+    given = made.parse_args()
     run(given.old, given.only)

@@ -1,24 +1,23 @@
 """The rig's protocols on the same simulated muscles: accuracy on unseen input, dose and time, beside the paper's test.
 
-    python -m bench.protocols [--seeds 1000:1020] [--steep] [--noise-sd-nm 0.05] [--json]
+    python -m bench.protocols [--seeds 1000:1020] [--steep] [--noise-sd-nm 0.05]
     python -m bench.protocols --hidden [--strengths middle,strong] [--seeds 1100:1164]
 
 Plain Hammerstein muscles of the emulator (`hardware_sim.hidden`), sampled at 400 Hz. Each protocol's record is
 fitted; the model then predicts 30 s of levels that no protocol plays, without noise. Development used seeds below 100.
 With `--hidden` each seed is a muscle with one hidden effect, in turn every effect in each strength, and every fourth
-one a muscle without any; told is what the diagnosis of each protocol's record names. `--steep` and `--json` have no
-part in that.
+one a muscle without any; told is what the diagnosis of each protocol's record names. `--steep` has no part in that.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from typing import Any
 
 import numpy as np
 
+from bench.common import parser, seed_range, table
 from stimrig.hardware_sim.hidden.design import Design, make_design
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario, rng_of
@@ -79,10 +78,8 @@ def name_hidden(seeds: range, strengths: list[str], noise_sd_nm: float) -> list[
 
 
 def _told_of_hidden(rows: list[dict[str, Any]]) -> None:
-    print(
-        "| protocol | named first | and 'effect missing' | or in its group | nothing named | nothing hidden, said so |"
-    )
-    print("|---" * 6 + "|")
+    heads = "protocol, named first, and 'effect missing', or in its group, nothing named, nothing hidden: said so"
+    lines = []
     for protocol in protocols.LIBRARY:
         of = [row for row in rows if row["protocol"] == protocol and row["effect"]]
         first = sum(row["named"][:1] == [row["effect"]] for row in of)
@@ -91,7 +88,8 @@ def _told_of_hidden(rows: list[dict[str, Any]]) -> None:
         nothing = sum(not row["named"] for row in of)
         plain = [row["verdict"] for row in rows if row["protocol"] == protocol and not row["effect"]]
         said = f"{plain.count('nothing_missing')} of {len(plain)}"
-        print(f"| {protocol} | {first} of {len(of)} | {sure} | {group} | {nothing} | {said} |")
+        lines.append([protocol, f"{first} of {len(of)}", sure, group, nothing, said])
+    print(*table(heads.split(", "), lines), sep="\n")
 
 
 def _design(protocol: str, largest_us: float) -> Design:
@@ -121,29 +119,26 @@ def _unseen(record: Record, truth: Record) -> float:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seeds", default="1000:1020", help="first:last, last not included")
-    parser.add_argument("--steep", action="store_true", help="recruitment that rises within 5 to 25 µs")
-    parser.add_argument("--hidden", action="store_true", help="what the diagnosis names")
-    parser.add_argument("--strengths", default="middle,strong", help="of the hidden effects")
-    parser.add_argument("--noise-sd-nm", type=float, default=0.05)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    first, last = map(int, options.seeds.split(":"))
+    made = parser(__doc__)
+    made.add_argument("--seeds", type=seed_range, default="1000:1020", help="first:last, last not included")
+    made.add_argument("--steep", action="store_true", help="recruitment that rises within 5 to 25 µs")
+    made.add_argument("--hidden", action="store_true", help="what the diagnosis names")
+    made.add_argument("--strengths", default="middle,strong", help="of the hidden effects")
+    made.add_argument("--noise-sd-nm", type=float, default=0.05)
+    options = made.parse_args()
     if options.hidden:
-        _told_of_hidden(name_hidden(range(first, last), options.strengths.split(","), options.noise_sd_nm))
+        _told_of_hidden(name_hidden(options.seeds, options.strengths.split(","), options.noise_sd_nm))
         return
-    rows = measure(range(first, last), options.steep, options.noise_sd_nm)
-    if options.json:
-        print(json.dumps(rows))
-        return
-    print("| protocol | time s | dose of the paper's | unseen fit %, median | lowest |\n|---|---|---|---|---|")
+    rows = measure(options.seeds, options.steep, options.noise_sd_nm)
     paper_nms = np.array([row["torque_time_nms"] for row in rows if row["protocol"] == protocols.DEFAULT])
+    lines = []
     for protocol in protocols.LIBRARY:
         of = [row for row in rows if row["protocol"] == protocol]
         dose = float(np.median([row["torque_time_nms"] for row in of] / paper_nms))
         fits = [row["unseen_fit"] for row in of]
-        print(f"| {protocol} | {of[0]['duration_s']:.1f} | {dose:.2f} | {np.median(fits):.2f} | {min(fits):.2f} |")
+        figures = (of[0]["duration_s"], dose, np.median(fits), min(fits))
+        lines.append([protocol, *map(format, figures, (".1f", ".2f", ".2f", ".2f"))])
+    print(*table(["protocol", "time s", "dose of the paper's", "unseen fit %, median", "lowest"], lines), sep="\n")
 
 
 if __name__ == "__main__":

@@ -10,28 +10,23 @@ half a request and are held. Each stop falls at a random moment. Printed for eac
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import random
 import socket
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 
+from bench.common import http_client, parser, services, spread
 from stimrig.api.cli.launcher import Services
-from stimrig.api.client.connection import SendsVersions
-from stimrig.api.settings import Settings
 from stimrig.rig.messages import stop_socket
 from tests.harness.processes import RigClient, control
 
-TOKEN = "administrator-token-of-the-bench"
 HOLD = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 1.2}},
     {"name": "hold", "sequence": "steps", "settings": {"on_s": 30.0, "off_s": 0.0, "repeats": 1}},
@@ -59,18 +54,13 @@ class Crowd:
 
     def _ask(self) -> None:
         body = {"participant": "P01", "segments": LONGEST}
-        with client(self.url) as http:
+        with http_client(self.url, 30) as http:
             while not self.ended.is_set():
                 try:
                     status: Any = http.post("/v1/preview", json=body).status_code
                 except httpx.HTTPError as error:
                     status = type(error).__name__
                 self.statuses[status] = self.statuses.get(status, 0) + 1
-
-
-def client(url: str) -> httpx.Client:
-    """The administrator's."""
-    return httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=30)
 
 
 @contextlib.contextmanager
@@ -133,31 +123,27 @@ def one_stop(services: Services, http: httpx.Client) -> tuple[float, float]:
 
 def measure(stops: int, previews: int, connections: int) -> tuple[np.ndarray, dict[Any, int]]:
     """Each stop's times, shape (stops, 2), and how the previews were answered."""
-    with tempfile.TemporaryDirectory(prefix="stimrig-choke-") as folder, contextlib.ExitStack() as stack:
-        settings = Settings(data_dir=Path(folder), port=0)  # pyright: ignore[reportCallIssue]
-        services = stack.enter_context(Services(settings, ["--noise-seed", "7"], admin_token=TOKEN))
-        http = stack.enter_context(client(services.url))
+    with services("--noise-seed", "7") as (running, _), http_client(running.url, 30) as http:
         assert http.post("/v1/participants", json={"code": "P01"}).status_code == 201
-        stack.enter_context(half_open(services, connections))
-        crowd = stack.enter_context(Crowd(services.url, previews))
-        found = np.array([one_stop(services, http) for _ in range(stops)])
+        with half_open(running, connections), Crowd(running.url, previews) as crowd:
+            found = np.array([one_stop(running, http) for _ in range(stops)])
     return found, crowd.statuses
 
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--stops", type=int, default=50)
-    parser.add_argument("--previews", type=int, default=40)
-    parser.add_argument("--half-open", type=int, default=1200)
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--stops", type=int, default=50)
+    made.add_argument("--previews", type=int, default=40)
+    made.add_argument("--half-open", type=int, default=1200)
+    options = made.parse_args()
     cases = [(0, 0), (options.previews, 0), (0, options.half_open), (options.previews, options.half_open)]
     for previews, connections in cases:
         found, statuses = measure(options.stops, previews, connections)
         print(f"{previews} previews at once, {connections} half-open connections at each door, {len(found)} stops")
         for name, values in zip(MEASURES, found.T, strict=True):
-            p50, p99, most = np.nanpercentile(values, [50, 99, 100])
-            print(f"  {name}: p50 {p50:.0f} ms, p99 {p99:.0f} ms, max {most:.0f} ms")
+            figures = spread(values[np.isfinite(values)], 1.0)
+            print(f"  {name}: " + ", ".join(f"{what} {ms:.0f} ms" for what, ms in figures.items()))
         if statuses:
             print(f"  previews answered: {json.dumps({str(key): n for key, n in sorted(statuses.items(), key=str)})}")
 

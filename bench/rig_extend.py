@@ -1,6 +1,6 @@
 """How soon a test is extended and how old a watcher's samples are; the reply to a status is the reference.
 
-    python -m bench.rig_extend [--seconds S] [--busy N] [--json]
+    python -m bench.rig_extend [--seconds S] [--busy N]
 
 Extends one test second by second, in real time, on the emulated rig. Half a second before each boundary it asks for the
 status, then adds a PRBS of one second.
@@ -8,18 +8,15 @@ status, then adds a PRBS of one second.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import json
 import queue
-import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tests.harness.processes import Bench, RigClient, busy_process, default_plan
+from bench.common import emulated_rig, parser, spread
+from tests.harness.processes import RigClient, default_plan
 
 KEY = "0123456789abcdef"
 SECOND = {"name": "prbs", "sequence": "prbs", "settings": {"bits": 5, "chips": 20, "clock_pulses": 2}}
@@ -28,14 +25,9 @@ FIXED = [{"name": "rest", "sequence": "rest", "settings": {"duration_s": 2.0}}]
 
 def measure(seconds: float, busy: int) -> dict[str, Any]:
     """Replies to extensions and to statuses, ages of samples, and the finished test's lateness, ms."""
-    with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
-        bench = Bench(Path(folder))
-        stack.callback(bench.close)
-        client = bench.start_rig()
+    with emulated_rig(busy=busy) as (bench, client):
         watcher = bench.client()
         watcher.ask("subscribe", samples=True)
-        for _ in range(busy):
-            stack.enter_context(busy_process())
         bounds = {"max_duration_s": seconds + 4.0, "max_torque_time_nms": 1e6}
         reply = client.ask("start", plan=default_plan("bench", segments=FIXED, adaptive=bounds), key=KEY)
         if not reply["ok"]:
@@ -67,9 +59,9 @@ def _watch(watcher: RigClient, client: RigClient, seconds: float) -> dict[str, A
     summary = event["summary"]
     return {
         "extensions": len(took["extend"]), "late": late, "outcome": event["outcome"], "reason": event["reason"],
-        "extend_ms": _spread(took["extend"]), "status_ms": _spread(took["status"]),
+        "extend_ms": spread(took["extend"]), "status_ms": spread(took["status"]),
         "extend_over_status": float(np.median(took["extend"]) / np.median(took["status"])),
-        "sample_age_ms": _spread(_ages(events)), "lateness_ms": summary["lateness_ms"],
+        "sample_age_ms": spread(_ages(events)), "lateness_ms": summary["lateness_ms"],
         "dropped_pulses": summary["dropped_pulses"],
     }  # fmt: skip
 
@@ -92,27 +84,16 @@ def _ages(events: list[tuple[float, dict[str, Any]]]) -> list[float]:
     ]
 
 
-def _spread(values_s: list[float]) -> dict[str, float]:
-    """Median, 99th percentile and maximum, ms."""
-    found = np.asarray(values_s) * 1e3
-    return {"median": float(np.median(found)), "p99": float(np.percentile(found, 99)), "max": float(np.max(found))}
-
-
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=40.0)
-    parser.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--seconds", type=float, default=40.0)
+    made.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
+    options = made.parse_args()
     found = measure(options.seconds, options.busy)
-    if options.json:
-        print(json.dumps(found))
-        return
     print(f"{found['extensions']} extensions, {found['late']} late; {found['outcome']} {found['reason']}")
     for name in ("extend_ms", "status_ms", "sample_age_ms", "lateness_ms"):
-        spread = found[name]
-        print(f"{name:14} median {spread['median']:.2f}, p99 {spread['p99']:.2f}, max {spread['max']:.2f}")
+        print(f"{name:14} " + ", ".join(f"{what} {value:.2f}" for what, value in found[name].items()))
     print(f"extend over status {found['extend_over_status']:.2f}; {found['dropped_pulses']} pulses dropped")
 
 

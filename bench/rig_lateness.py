@@ -1,33 +1,21 @@
 """Figures of the rig over the wire: lateness of pulses, lost samples, CPU, alignment; idle and beside a busy process.
 
-    python -m bench.rig_lateness [--fit] [--busy N] [--tests N] [--no-sync] [--load-cell slcan] [--json]
+    python -m bench.rig_lateness [--fit] [--busy N] [--tests N] [--no-sync] [--load-cell slcan]
 
 Plays the default test in real time (38.7 s each) on the emulated rig.
 """
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import json
-import tempfile
-from pathlib import Path
 from typing import Any
 
-from tests.harness.processes import CLINIC_WATCH, Bench, busy_process, default_plan
-from tests.harness.soak import fitting_one
+from bench.common import beside, emulated_rig, parser, table
+from tests.harness.processes import CLINIC_WATCH, default_plan
 
 
 def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = False) -> list[dict[str, Any]]:
     """Summaries of `tests` default tests with `busy` CPU-bound processes beside them."""
-    with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
-        bench = Bench(Path(folder), *emulator_options)
-        stack.callback(bench.close)
-        client = bench.start_rig(watch=CLINIC_WATCH)
-        client.ask("subscribe")
-        stack.enter_context(fitting_one(bench, client, fit))
-        for _ in range(busy):
-            stack.enter_context(busy_process())
+    with emulated_rig(*emulator_options, busy=busy, fit=fit, watch=CLINIC_WATCH) as (_, client):
         events = []
         for number in range(tests):
             reply = client.start(default_plan(f"bench{number}"))
@@ -42,35 +30,26 @@ def measure(busy: int, tests: int, emulator_options: list[str], fit: bool = Fals
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--fit", action="store_true", help="fit a recording again and again in another process")
-    parser.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
-    parser.add_argument("--tests", type=int, default=1)
-    parser.add_argument("--no-sync", action="store_true")
-    parser.add_argument("--load-cell", choices=["socketcand", "slcan"], default="socketcand")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
+    made = beside(parser(__doc__))
+    made.add_argument("--tests", type=int, default=1)
+    made.add_argument("--no-sync", action="store_true")
+    made.add_argument("--load-cell", choices=["socketcand", "slcan"], default="socketcand")
+    options = made.parse_args()
     emulator = ["--load-cell", options.load_cell, *(["--no-sync"] if options.no_sync else [])]
     summaries = measure(options.busy, options.tests, emulator, options.fit)
-    if options.json:
-        print(json.dumps(summaries))
-        return
-    beside = f"{options.busy} busy processes" + (" and a fit" if options.fit else "")
-    print(f"{beside}, {options.load_cell}, {'no ' if options.no_sync else ''}sync line")
-    print(
-        "| pulses | dropped | late median ms | p99 | max | ack p99 ms | max | samples | lost | rig CPU % | alignment "
-        "| error ms |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
-    for s in summaries:
-        if not s["lateness_ms"]:
-            continue  # ended before its first pulse; said above
-        late, ack, alignment = s["lateness_ms"], s["ack_delay_ms"], s["alignment"]
-        print(
-            f"| {s['pulses']} | {s['dropped_pulses']} | {late['median']:.3f} | {late['p99']:.3f} | {late['max']:.3f} "
-            f"| {ack['p99']:.3f} | {ack['max']:.3f} | {s['samples']} | {s['lost_samples']} | {s['cpu_percent']:.1f} "
-            f"| {alignment['method']} | {alignment['error_ms']:.3f} |"
-        )
+    others = f"{options.busy} busy processes" + (" and a fit" if options.fit else "")
+    print(f"{others}, {options.load_cell}, {'no ' if options.no_sync else ''}sync line")
+    heads = "pulses, dropped, late median ms, p99, max, ack p99 ms, max, samples, lost, rig CPU %, alignment, error ms"
+    print(*table(heads.split(", "), [figures(s) for s in summaries if s["lateness_ms"]]), sep="\n")
+
+
+def figures(s: dict[str, Any]) -> list[object]:
+    """A line of the table, of a test that did not end before its first pulse."""
+    late, ack, alignment = s["lateness_ms"], s["ack_delay_ms"], s["alignment"]
+    times_ms = [late["median"], late["p99"], late["max"], ack["p99"], ack["max"]]
+    counts = [s["samples"], s["lost_samples"], f"{s['cpu_percent']:.1f}"]
+    found = [s["pulses"], s["dropped_pulses"], *(f"{ms:.3f}" for ms in times_ms), *counts]
+    return [*found, alignment["method"], f"{alignment['error_ms']:.3f}"]
 
 
 if __name__ == "__main__":

@@ -8,12 +8,12 @@ passes it by its own doing.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import sys
 import tempfile
 from pathlib import Path
 
+from bench.common import line, parser, table
 from tests.harness.device_pairs import CELLS, STIMULATORS, TRANSPORTS, check_all, options
 from tests.harness.processes import Bench
 
@@ -30,12 +30,10 @@ COLUMNS = {
 
 def main() -> None:
     """Run and print one line for each pair; exit 1 if one fails."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--speed", type=float, default=2.0)
-    speed = parser.parse_args().speed
-    failed = 0
-    titles = ["stimulator", "cell", "transport", *(title for title, _ in COLUMNS.values())]
-    print("| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
+    made = parser(__doc__)
+    made.add_argument("--speed", type=float, default=2.0)
+    speed, failed = made.parse_args().speed, 0
+    print(*table(["stimulator", "cell", "transport", *(title for title, _ in COLUMNS.values())], []), sep="\n")
     for pair in itertools.product(STIMULATORS, CELLS, TRANSPORTS):
         with tempfile.TemporaryDirectory(prefix="rig-pairs-") as folder:
             bench = Bench(Path(folder), *options(*pair), speed=speed)
@@ -49,7 +47,7 @@ def main() -> None:
                 cells = ["FAILED: " + " ".join(str(error).split())[:200]]
             finally:
                 bench.close()
-        print("| " + " | ".join([*pair, *cells]) + " |", flush=True)
+        print(line([*pair, *cells]), flush=True)
     sys.exit(1 if failed else 0)
 
 

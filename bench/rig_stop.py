@@ -7,17 +7,11 @@ Each stop falls at a random moment of a steady stimulation on the emulated rig, 
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import random
-import tempfile
 import time
-from pathlib import Path
 
-import numpy as np
-
-from tests.harness.processes import CLINIC_WATCH, Bench, busy_process, control, default_plan
-from tests.harness.soak import fitting_one
+from bench.common import beside, emulated_rig, parser, spread
+from tests.harness.processes import CLINIC_WATCH, control, default_plan
 
 STEPS = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 1.0}},
@@ -28,14 +22,7 @@ STEPS = [
 def measure(busy: int, stops: int, fit: bool = False) -> tuple[list[float], list[float]]:
     """Milliseconds from request to last pulse (negative: before it) and to the answer, one each per stop."""
     last_pulse_ms, answer_ms = [], []
-    with tempfile.TemporaryDirectory(prefix="rig-bench-") as folder, contextlib.ExitStack() as stack:
-        bench = Bench(Path(folder))
-        stack.callback(bench.close)
-        client = bench.start_rig(watch=CLINIC_WATCH)
-        client.ask("subscribe")
-        stack.enter_context(fitting_one(bench, client, fit))
-        for _ in range(busy):
-            stack.enter_context(busy_process())
+    with emulated_rig(busy=busy, fit=fit, watch=CLINIC_WATCH) as (bench, client):
         for number in range(stops):
             assert client.start(default_plan(f"stop{number}", segments=STEPS))["ok"]
             client.wait_state("running")
@@ -54,16 +41,14 @@ def measure(busy: int, stops: int, fit: bool = False) -> tuple[list[float], list
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--fit", action="store_true", help="fit a recording again and again in another process")
-    parser.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
-    parser.add_argument("--stops", type=int, default=30)
-    options = parser.parse_args()
+    made = beside(parser(__doc__))
+    made.add_argument("--stops", type=int, default=30)
+    options = made.parse_args()
     last_pulse_ms, answer_ms = measure(options.busy, options.stops, options.fit)
-    beside = f"{options.busy} busy processes" + (" and a fit" if options.fit else "")
-    print(f"{beside}, {options.stops} stops (ms: median / p99 / max)")
+    others = f"{options.busy} busy processes" + (" and a fit" if options.fit else "")
+    print(f"{others}, {options.stops} stops (ms: median / p99 / max)")
     for name, values in (("request to last pulse", last_pulse_ms), ("request to confirmed answer", answer_ms)):
-        print(f"{name}: {np.median(values):.1f} / {np.percentile(values, 99):.1f} / {max(values):.1f}")
+        print(f"{name}: {' / '.join(f'{value:.1f}' for value in spread(values, 1.0).values())}")
 
 
 if __name__ == "__main__":

@@ -7,20 +7,20 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 
+from bench.common import parser
 from tests.harness.soak import soak
 
 
 def main() -> None:
     """Run and print; exit 1 where a sample was lost or a test did not complete."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--every-minutes", type=float, default=5.0)
-    parser.add_argument("--no-fit", action="store_true")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--minutes", type=float, default=60.0)
+    made.add_argument("--every-minutes", type=float, default=5.0)
+    made.add_argument("--no-fit", action="store_true")
+    options = made.parse_args()
     found = soak(options.minutes, options.every_minutes, not options.no_fit)
     print(json.dumps(found, indent=1))
     sys.exit(0 if found["lost_samples"] == 0 and found["completed"] == found["tests"] else 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.stamp import RESULTS, written_by
+from bench.common import RESULTS, table, written_by
 from stimrig import identify
 from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
@@ -45,6 +45,11 @@ def shown(value: float) -> str:
     return f"{value:.2f}" if value > -100 else "runs away"
 
 
+def both(found: dict[str, float]) -> str:
+    """Clean ramp and unseen input."""
+    return f"{shown(found['clean'])} / {shown(found['unseen'])}"
+
+
 def main_table() -> list[str]:
     found = paper.table1(TRIALS)
     lines = [
@@ -58,18 +63,16 @@ def main_table() -> list[str]:
         "multi-level part. Best fit, %. *noisy*: against the noisy ramp; *ceiling*: the true system's own score there;",
         "*clean*: against the ramp without noise; *unseen*: on the multi-level part without noise, never fitted.",
         "",
-        "| noise | method | paper | ours, noisy | ceiling | clean | unseen |",
-        "|---|---|---|---|---|---|---|",
     ]
+    rows = []
     for row in found["rows"]:
         printed = "–" if row["paper"] is None else f"{row['paper']:.2f} ± {row['paper_sd']:.2f}"
         ours = f"{row['ours']:.2f} ± {row['ours_sd']:.2f}"
-        lines.append(
-            f"| {row['noise_nm']:.2f} | {row['method']} | {printed} | {ours} | {row['ceiling']:.2f} "
-            f"| {row['clean']:.2f} | {row['unseen']:.2f} |"
-        )
+        others = [f"{row[name]:.2f}" for name in ("ceiling", "clean", "unseen")]
+        rows.append([f"{row['noise_nm']:.2f}", row["method"], printed, ours, *others])
     return [
         *lines,
+        *table(["noise", "method", "paper", "ours, noisy", "ceiling", "clean", "unseen"], rows),
         "",
         "What it tells: two-stage and maximum-likelihood score what the true system scores, to a few hundredths (a",
         "fit even gains a little on the noise it was fitted to). The paper's column therefore measures the noise.",
@@ -103,18 +106,19 @@ def scored_rows() -> list[str]:
         "the s it stands for is that of PRBS and ramp together. On the right, the two rivals without noise on the",
         "same rows (the paper: 91.24 and 92.06).",
         "",
-        "| scored on | s, N·m | " + " | ".join(f"λ = {level:g}" for level in levels) + " | ramp dec. | SLS |",
-        "|---|---|" + "---|" * (len(levels) + 2),
     ]
+    scored = []
     for name, rows in sets.items():
         spread = float(np.std(clean[rows]))
         cells = [f"{100 * (1 - level / spread):.2f}" for level in levels]
         cells += [f"{best_fit_percent(clean[rows], predicted[rows]):.2f}" for predicted in rivals]
-        lines.append(f"| {name} | {spread:.2f} | {' | '.join(cells)} |")
+        scored.append([name, f"{spread:.2f}", *cells])
     printed = [value for value, _ in paper.PAPER["two-stage"][1:]]
     spread = float(np.mean([level / (1 - value / 100) for level, value in zip(levels, printed, strict=True)]))
-    cells = [*(f"{value:.2f}" for value in printed), "91.24", "92.06"]
-    return [*lines, f"| the paper's two-stage column | {spread:.2f} | {' | '.join(cells)} |"]
+    scored.append(["the paper's two-stage column", f"{spread:.2f}", *(f"{value:.2f}" for value in printed)])
+    scored[-1] += ["91.24", "92.06"]
+    heads = ["scored on", "s, N·m", *(f"λ = {level:g}" for level in levels), "ramp dec.", "SLS"]
+    return [*lines, *table(heads, scored)]
 
 
 def poles_as_constants(block: Discrete) -> tuple[float, float]:
@@ -146,28 +150,22 @@ def where_noise_enters() -> list[str]:
         "wrong when it is added to the torque, as a load cell does and as section V says. Two-stage, (l, n, d) =",
         f"(2, 1, 1), noise of 0.02 N·m at the output either way, median of {FEW} trials. True: 0.528 and 0.637.",
         "",
-        "| noise | linear stage | Tω, s | ζ | clean ramp | unseen |",
-        "|---|---|---|---|---|---|",
     ]
+    cells = []
     for through_a in (True, False):
         for linear in ("equation-error", "output-error"):
             rows = []
             for trial in range(FEW):
                 record, clean = literal(0.02, SEED + trial, through_a=through_a)
-                model = identify.fit(record, method="two-stage", order="2,1,1", linear=linear)
-                predicted = identify.predict(model, record)
-                names = np.array(record.segment_names)[record.segment]
-                assert isinstance(model.linear, Discrete)
-                rows.append(
-                    [
-                        *poles_as_constants(model.linear),
-                        best_fit_percent(clean[names == "ramp"], predicted[names == "ramp"]),
-                        best_fit_percent(clean[names == "validate"], predicted[names == "validate"]),
-                    ]
-                )
+                options = {"order": "2,1,1", "linear": linear}
+                block = identify.fit(record, method="two-stage", **options).linear
+                assert isinstance(block, Discrete)
+                scores = paper.score(record, clean, "two-stage", **options)
+                rows.append([*poles_as_constants(block), scores["clean"], scores["unseen"]])
             t, z, ramp, unseen = np.median(rows, axis=0)
             place = "through 1/A, as (9)" if through_a else "at the output, as section V"
-            lines.append(f"| {place} | {linear} | {t:.3f} | {z:.3f} | {shown(ramp)} | {shown(unseen)} |")
+            cells.append([place, linear, f"{t:.3f}", f"{z:.3f}", shown(ramp), shown(unseen)])
+    lines += table(["noise", "linear stage", "Tω, s", "ζ", "clean ramp", "unseen"], cells)
     return [*lines, "", "The output-error linear stage is right in both; it is the default."]
 
 
@@ -180,9 +178,8 @@ def inverting() -> list[str]:
         "decay, and G⁻¹ itself multiplies noise by hundreds. Clean ramp / unseen, two-stage with (2, 1, 1), the linear",
         "stage by output error; on the right how often (25) as printed puts a zero outside the unit circle:",
         "",
-        "| noise | spline through G (default) | spline on w = G⁻¹y | unstable inverse, linear stage (25) |",
-        "|---|---|---|---|",
     ]
+    cells = []
     for noise in (0.0, 0.02, 0.10):
         forward, back = (fits(noise, "two-stage", order="2,1,1", inverse=inverse) for inverse in (False, True))
         outside = 0
@@ -192,11 +189,9 @@ def inverting() -> list[str]:
             block = identify.fit(record, method="two-stage", order="2,1,1", linear="equation-error").linear
             assert isinstance(block, Discrete)
             outside += bool(np.any(np.abs(np.roots(block.b)) >= 1))
-        lines.append(
-            f"| {noise:.2f} | {shown(forward['clean'])} / {shown(forward['unseen'])} "
-            f"| {shown(back['clean'])} / {shown(back['unseen'])} | {outside} of {count} |"
-        )
-    return lines
+        cells.append([f"{noise:.2f}", both(forward), both(back), f"{outside} of {count}"])
+    heads = "noise, spline through G (default), spline on w = G⁻¹y"
+    return lines + table([*heads.split(", "), "unstable inverse, linear stage (25)"], cells)
 
 
 def sampling_rate() -> list[str]:
@@ -206,13 +201,10 @@ def sampling_rate() -> list[str]:
         "Figure 4 says 1600 samples a second. A fit against 1600 noisy samples a second has the same ceiling, but",
         "forty times the information: the clean fits rise. Noise 0.10 N·m, clean ramp / unseen:",
         "",
-        "| method | 40 Hz | 400 Hz | 1600 Hz |",
-        "|---|---|---|---|",
     ]
-    for method in paper.OURS:
-        cells = [fits(0.10, method, rate, trials=5) for rate in (40.0, 400.0, 1600.0)]
-        lines.append(f"| {method} | " + " | ".join(f"{c['clean']:.2f} / {c['unseen']:.2f}" for c in cells) + " |")
-    return lines
+    rates = (40.0, 400.0, 1600.0)
+    cells = [[method, *(both(fits(0.10, method, rate, trials=5)) for rate in rates)] for method in paper.OURS]
+    return lines + table(["method", *(f"{rate:g} Hz" for rate in rates)], cells)
 
 
 def taps() -> list[str]:
@@ -221,22 +213,16 @@ def taps() -> list[str]:
         "",
         "The muscle's memory is about 4 s. Without noise, clean ramp / unseen:",
         "",
-        "| taps (memory) | fitted on PRBS and ramp | fitted on the ramp alone |",
-        "|---|---|---|",
     ]
+    cells = []
     for count in (41, 81, 121, 161):
-        both = fits(0.0, "separable-least-squares", taps=count)
-        record, clean = paper.simulate(0.0, SEED)
-        model = identify.fit(record, method="separable-least-squares", fit_on=("ramp",), taps=count)
-        predicted = identify.predict(model, record)
-        names = np.array(record.segment_names)[record.segment]
-        alone = [best_fit_percent(clean[names == n], predicted[names == n]) for n in ("ramp", "validate")]
-        lines.append(
-            f"| {count} ({(count - 1) / 40:g} s) | {both['clean']:.2f} / {both['unseen']:.2f} "
-            f"| {shown(alone[0])} / {shown(alone[1])} |"
+        of_both, alone = (
+            fits(0.0, "separable-least-squares", taps=count, fit_on=segments) for segments in (None, ("ramp",))
         )
+        cells.append([f"{count} ({(count - 1) / 40:g} s)", both(of_both), both(alone)])
     return [
         *lines,
+        *table(["taps (memory)", "fitted on PRBS and ramp", "fitted on the ramp alone"], cells),
         "",
         "The paper's 92.06 % lies between the two ways of fitting 41 taps; which rows it used it doesn't say. With",
         "4 s of memory the method nearly reaches the others without noise.",
@@ -249,9 +235,8 @@ def natural_frequency() -> list[str]:
         "",
         "Critically damped, 0.85π rad/s, against the muscle's ζ of 0.637. Without noise, clean ramp / unseen:",
         "",
-        "| natural frequency | Tω, s | ramp | unseen |",
-        "|---|---|---|---|",
     ]
+    cells = []
     for label, frequency in (
         ("0.85π rad/s (the paper's)", 0.85 * np.pi),
         ("0.85 Hz", 2 * np.pi * 0.85),
@@ -259,9 +244,10 @@ def natural_frequency() -> list[str]:
         ("same slow-input lag as the muscle, 1/(ζTω)", 1 / (paper.DAMPING * paper.TIME_CONSTANT_S)),
     ):
         found = fits(0.0, "ramp-deconvolution", natural_frequency_rad_s=frequency)
-        lines.append(f"| {label} | {1 / frequency:.3f} | {found['clean']:.2f} | {found['unseen']:.2f} |")
+        cells.append([label, f"{1 / frequency:.3f}", f"{found['clean']:.2f}", f"{found['unseen']:.2f}"])
     return [
         *lines,
+        *table(["natural frequency", "Tω, s", "ramp", "unseen"], cells),
         "",
         "A ramp tells little more than the lag 2ζTω: dynamics with about that lag fit it, and fail on steps. Our",
         "deconvolution is regularised (a spline in time), which a bare inverse with two derivatives isn't.",
@@ -274,16 +260,13 @@ def iterations() -> list[str]:
         "",
         "Two-stage, noise 0.10 N·m, 40 Hz: clean ramp / unseen.",
         "",
-        "| iterations | clean ramp | unseen |",
-        "|---|---|---|",
     ]
-    for count in (0, 1, 2, 4):
-        found = fits(0.10, "two-stage", iterations=count)
-        lines.append(f"| {count} | {found['clean']:.2f} | {found['unseen']:.2f} |")
-    found = fits(0.10, "maximum-likelihood")
-    lines.append(f"| maximum-likelihood (joint) | {found['clean']:.2f} | {found['unseen']:.2f} |")
+    found: dict[object, dict[str, float]] = {n: fits(0.10, "two-stage", iterations=n) for n in (0, 1, 2, 4)}
+    found["maximum-likelihood (joint)"] = fits(0.10, "maximum-likelihood")
+    cells = [[label, f"{scores['clean']:.2f}", f"{scores['unseen']:.2f}"] for label, scores in found.items()]
     return [
         *lines,
+        *table(["iterations", "clean ramp", "unseen"], cells),
         "",
         "The paper's belief that one iteration is enough holds; the joint estimate gains a little more.",
     ]

@@ -2,28 +2,25 @@
 
     python -m bench.tracking [--seeds 94000:94020] [--cases fatigue …] [--who tracking …] [--json FILE]
 
-For each muscle and each case of `bench.tracking_cases`: the paper's test, a model fitted on it, a minute of rest, then
-ten trials of `examples/ilc_controller.py` with 15 s of rest between them, each time from the same state of the muscle
-and with the same noise. Told is the error of a trial, rms of reference minus torque, % of the reference's rms.
+For each muscle, drawn by its seed, and each case of `CASES`: the paper's test, a model fitted on it, a minute of rest,
+then ten trials of `examples/ilc_controller.py` with 15 s of rest between them, each time from the same state of the
+muscle and with the same noise. Told is the error of a trial, rms of reference minus torque, % of the reference's rms.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import copy
 import io
-import json
 import sys
 import time
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.adaptive import paper_test
-from bench.tracking_cases import CASES, NOTHING, PEAK_SHARE, patient
+from bench.common import keep_lines, parser, table
 from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
 from stimrig import identify
@@ -35,6 +32,47 @@ from stimrig.identify.records.record import Record
 RATE_HZ, NOISE_NM, CURRENT_MA, LARGEST_US = 400.0, 0.05, 20.0, 300.0
 TRIALS, REST_S, APPROVAL_S = 10, 15.0, 60.0
 PER = round(RATE_HZ / ilc.PULSE_RATE_HZ)
+FIRST_TRIAL = 2
+"""The pre-session test is a muscle's first contraction."""
+NOTHING = "nothing changes"
+DISTURBED_TRIAL = 5
+PEAK_SHARE = 0.4
+"""The reference's peak, of the largest torque: a muscle that has lost 40 % of it can still reach it."""
+
+# The test before the trials tires, too: with this share of fatigue 40 % of the gain are lost from the begin of the
+# first trial to the end of the tenth.
+CASES = {
+    NOTHING: {},
+    "fatigue": {"fatigue_share": 0.55, "fatigue_recovery_s": 600.0},
+    "potentiation": {"potentiation_share": 0.3},
+    "threshold drift": {"drift_us": 15.0},
+    "slow change of speed": {"slowing_share": 0.3},
+    "spasm in trial 5": {"spasm_contraction": FIRST_TRIAL + DISTURBED_TRIAL - 1},
+    "effort in trial 5": {"effort_contraction": FIRST_TRIAL + DISTURBED_TRIAL - 1},
+}
+
+
+def patient(seed: int, case: str) -> dict[str, Any]:
+    """Parameters of `hardware_sim.patients.changing` for a muscle and a case; the muscle is the same in each case."""
+    rng = np.random.default_rng([seed, 14])
+    largest_nm = float(rng.uniform(3.0, 12.0))
+    muscle = {
+        "largest_nm": largest_nm,
+        "threshold_us": float(rng.uniform(40.0, 110.0)),
+        "spread_us": float(rng.uniform(50.0, 120.0)),
+        "shape": float(rng.uniform(1.3, 3.0)),
+        "natural_period_s": float(rng.uniform(0.12, 0.45)),
+        "damping_ratio": float(rng.uniform(0.6, 1.1)),
+        "spasm_nm": largest_nm * float(rng.uniform(0.15, 0.4)),
+        "spasm_begins_s": float(rng.uniform(2.0, 8.0)),
+        "spasm_lasts_s": float(rng.uniform(0.2, 1.5)),
+        "effort_nm": largest_nm * float(rng.uniform(0.1, 0.25)),
+        "effort_begins_s": float(rng.uniform(1.0, 5.0)),
+        "effort_lasts_s": float(rng.uniform(2.0, 5.0)),
+    }
+    sign = 1.0 if rng.random() < 0.7 else -1.0
+    changes = {name: sign * value if name == "drift_us" else value for name, value in CASES[case].items()}
+    return muscle | changes
 
 
 class Person:
@@ -141,8 +179,7 @@ def tables(rows: list[dict[str, Any]]) -> list[str]:
     names = list(dict.fromkeys(row["who"] for row in rows))
     last = {(row["seed"], row["case"], row["who"]): float(row["errors"][-1]) for row in rows}
     muscles = {name: len({key[0] for key in last if key[2] == name}) for name in names}
-    lines = ["| case | " + " | ".join(f"{name}, n = {muscles[name]}" for name in names) + " |"]
-    lines += ["|---" * (len(names) + 1) + "|"]
+    lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
         cells = []
         for name in names:
@@ -157,8 +194,8 @@ def tables(rows: list[dict[str, Any]]) -> list[str]:
                 half, most = np.nanquantile(errors / still, [0.5, 0.9])
                 told += f" (× {half:.2f}, {most:.2f})"
             cells.append(told)
-        lines.append(f"| {case} | " + " | ".join(cells) + " |")
-    return lines
+        lines.append([case, *cells])
+    return table(["case", *(f"{name}, n = {muscles[name]}" for name in names)], lines)
 
 
 def seconds_of(rows: list[dict[str, Any]]) -> list[str]:
@@ -186,25 +223,20 @@ def moved_lines(rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def main() -> int:
+def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(prog="python -m bench.tracking", description=__doc__)
-    parser.add_argument("--seeds", default="94000:94020", help="first:end")
-    parser.add_argument("--cases", nargs="*", default=list(CASES))
-    parser.add_argument("--who", nargs="*", default=list(FOLLOWERS), help=f"e.g. '{UNTRACKED}'")
-    parser.add_argument("--json", type=Path, help="every row goes here, one a line")
-    options = parser.parse_args()
-    first, end = map(int, options.seeds.split(":"))
+    made = parser(__doc__, "94000:94020")
+    made.add_argument("--cases", nargs="*", default=list(CASES))
+    made.add_argument("--who", nargs="*", default=list(FOLLOWERS), help=f"e.g. '{UNTRACKED}'")
+    options = made.parse_args()
     rows: list[dict[str, Any]] = []
-    for seed in range(first, end):
+    for seed in options.seeds:
         for case in options.cases:
             rows += one(seed, case, options.who)
         print(f"seed {seed}", file=sys.stderr, flush=True)
-        if options.json is not None:
-            options.json.write_text("\n".join(json.dumps(row) for row in rows))
+        keep_lines(options.json, rows)
     print(*tables(rows), "", *seconds_of(rows), "", *moved_lines(rows), sep="\n")
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

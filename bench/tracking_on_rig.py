@@ -2,14 +2,13 @@
 
     python -m bench.tracking_on_rig [--seeds 94101 94102 94103] [--cases …] [--who …] [--json FILE] [--offline FILE]
 
-Muscles and cases are those of `bench.tracking_cases`; every session is on a rig of its own, from a rested muscle. The
+Muscles and cases are those of `bench.tracking`; every session is on a rig of its own, from a rested muscle. The
 controller is `examples/ilc_controller.py`. Rows that FILE holds already are not played again, so a long run can be
 done in parts. Writes docs/results/tracking.md; `--offline` adds what `bench.tracking --json` wrote.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -19,10 +18,22 @@ from typing import Any
 
 import numpy as np
 
+from bench.common import RESULTS, TOKEN, keep_lines, lines_of, parser, table, written_by
 from bench.ilc import Patient
-from bench.stamp import RESULTS, written_by
-from bench.tracking import APPROVAL_S, LARGEST_US, NOISE_NM, REST_S, TRIALS, moved_lines, moves, seconds_of, tables
-from bench.tracking_cases import CASES, PEAK_SHARE, patient
+from bench.tracking import (
+    APPROVAL_S,
+    CASES,
+    LARGEST_US,
+    NOISE_NM,
+    PEAK_SHARE,
+    REST_S,
+    TRIALS,
+    moved_lines,
+    moves,
+    patient,
+    seconds_of,
+    tables,
+)
 from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
 from stimrig.api.cli.launcher import Services
@@ -31,7 +42,7 @@ from stimrig.api.settings import Settings
 from stimrig.identify.model import Model
 from stimrig.identify.records.recording import read_recording
 
-TOKEN, PERSON = "token-of-the-tracking-bench", "TRACK"
+PERSON = "TRACK"
 LIMITS = {"gain_percent": 60.0, "threshold_percent": 60.0, "time_scale_percent": 60.0}
 """So far the muscle may be followed; the usual limits would ask for a new test after half of the fatigue."""
 
@@ -183,14 +194,13 @@ def rig_lines(rows: list[dict[str, Any]]) -> list[str]:
         "Errors are without what the approved model says these would have given; in the last column they are as "
         "played.",
         "",
-        "| muscle | case | follower | error of trials 1 to 10, % | dropped pulses | trials repeated | as played |",
-        "|---" * 7 + "|",
     ]
+    heads = "muscle; case; follower; error of trials 1 to 10, %; dropped pulses; trials repeated; as played"
+    sessions = []
     for row in rows:
         errors, played = (", ".join(f"{e:.2f}" for e in row[key]) for key in ("errors", "errors_as_played"))
-        cells = [row["seed"], row["case"], row["who"], errors, row["lost"], row["repeated"], played]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return lines
+        sessions.append([row["seed"], row["case"], row["who"], errors, row["lost"], row["repeated"], played])
+    return lines + table(heads.split("; "), sessions)
 
 
 def delay_lines(rows: list[dict[str, Any]]) -> list[str]:
@@ -211,22 +221,17 @@ def _words(what: dict[str, float]) -> str:
     return ", ".join(f"`{name}` {value:g}" for name, value in what.items())
 
 
-def read_rows(path: Path | None) -> list[dict[str, Any]]:
-    """Rows, one JSON object a line."""
-    return [json.loads(line) for line in path.read_text().splitlines()] if path and path.exists() else []
-
-
-def main() -> int:
+def main() -> None:
     """Play what is not played yet, and write the page."""
-    parser = argparse.ArgumentParser(prog="python -m bench.tracking_on_rig", description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="*", default=[94101, 94102, 94103])
-    parser.add_argument("--cases", nargs="*", default=list(CASES))
-    parser.add_argument("--who", nargs="*", default=[OURS, UNTRACKED])
-    parser.add_argument("--json", type=Path, help="rows, one a line; those in it are not played again")
-    parser.add_argument("--keep", type=Path, help="a folder for each session's recordings")
-    parser.add_argument("--offline", type=Path, help="rows of bench.tracking")
-    options = parser.parse_args()
-    rows = read_rows(options.json)
+    made = parser(__doc__)
+    made.add_argument("--seeds", type=int, nargs="*", default=[94101, 94102, 94103])
+    made.add_argument("--cases", nargs="*", default=list(CASES))
+    made.add_argument("--who", nargs="*", default=[OURS, UNTRACKED])
+    made.add_argument("--json", type=Path, help="rows, one a line; those in it are not played again")
+    made.add_argument("--keep", type=Path, help="a folder for each session's recordings")
+    made.add_argument("--offline", type=Path, help="rows of bench.tracking")
+    options = made.parse_args()
+    rows = lines_of(options.json)
     done = {(row["seed"], row["case"], row["who"]) for row in rows}
     wanted = [(s, c, w) for s in options.seeds for c in options.cases for w in options.who if (s, c, w) not in done]
     for seed, case, who in wanted:
@@ -238,13 +243,11 @@ def main() -> int:
             except (Exception, SystemExit) as error:  # the machine stood still: told, and played again another time
                 print(f"{seed}, {case}, {who}: {error!r}", file=sys.stderr, flush=True)
                 continue
-        if options.json is not None:
-            options.json.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    words = page(rows, read_rows(options.offline))
+        keep_lines(options.json, rows)
+    words = page(rows, lines_of(options.offline))
     (RESULTS / "tracking.md").write_text(words, "utf-8")
     print(words)
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

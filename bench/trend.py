@@ -9,7 +9,6 @@ are identified and compared as the pages compare two sessions. The floors of `ap
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.stamp import RESULTS, written_by
+from bench.common import RESULTS, parser, seed_range, table, written_by
 from stimrig import identify
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
@@ -104,13 +103,11 @@ def bare(pair: Pair) -> int:
     return count
 
 
-def table(found: list[Pair]) -> list[str]:
+def rates(found: list[Pair]) -> list[str]:
     """The rates as Markdown."""
-    lines = [
-        "| two tests of a muscle that has not changed | pairs | any change claimed | figures claimed | of "
-        "| without the floors | plateau 2 % lower found | 5 % | 20 % |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    heads = "two tests of a muscle that has not changed; pairs; any change claimed; figures claimed; of"
+    heads += "; without the floors; plateau 2 % lower found; 5 %; 20 %"
+    lines = []
     for kind, words in SETS.items():
         here = [pair for pair in found if pair.kind == kind]
         claims = [pair.claims() for pair in here]
@@ -119,12 +116,9 @@ def table(found: list[Pair]) -> list[str]:
             sum(any(one["figure"] == "plateau_nm" for one in lowered(pair, share).claims()) for pair in here)
             for share in LOWER
         ]
-        cells = [
-            f"{kind}: {words}", str(len(here)), str(sum(bool(one) for one in claims)), str(sum(map(len, claims))),
-            str(compared), str(sum(map(bare, here))), *map(str, seen),
-        ]  # fmt: skip
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
+        counts = [len(here), sum(bool(one) for one in claims), sum(map(len, claims)), compared, sum(map(bare, here))]
+        lines.append([f"{kind}: {words}", *counts, *seen])
+    return table(heads.split("; "), lines)
 
 
 def told(found: list[Pair]) -> list[str]:
@@ -135,13 +129,12 @@ def told(found: list[Pair]) -> list[str]:
 
 def run(arguments: list[str] | None = None) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m bench.trend")
-    parser.add_argument("--seeds", default="6101:6141")
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args(arguments)
-    first, last = map(int, options.seeds.split(":"))
+    made = parser(__doc__)
+    made.add_argument("--seeds", type=seed_range, default="6101:6141")
+    made.add_argument("--write", action="store_true")
+    options = made.parse_args(arguments)
     found: list[Pair] = []
-    for seed in range(first, last):
+    for seed in options.seeds:
         try:
             found += pairs(seed)
         except IdentifyError as error:
@@ -152,12 +145,13 @@ def run(arguments: list[str] | None = None) -> None:
             print(
                 f"{pair.kind}, seed {pair.seed}, {pair.before.structure or pair.now.structure}: {one['figure']} {moved}"
             )
-    lines = [*table(found), "", f"Claimed without reason: {'; '.join(told(found)) or 'nothing'}."]
+    lines = [*rates(found), "", f"Claimed without reason: {'; '.join(told(found)) or 'nothing'}."]
     print("\n".join(lines))
     if options.write:
         file = RESULTS / "trend.md"
         text = file.read_text(encoding="utf-8").split("<!-- measured -->")[0] if file.exists() else ""
-        stamp = written_by(f"python -m bench.trend --seeds {options.seeds} --write")
+        seeds = f"{options.seeds.start}:{options.seeds.stop}"
+        stamp = written_by(f"python -m bench.trend --seeds {seeds} --write")
         file.write_text(text + "\n".join(["<!-- measured -->", stamp, "", *lines, ""]), encoding="utf-8")
 
 

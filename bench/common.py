@@ -1,0 +1,169 @@
+"""What benches share: options, seeds in processes, tables, services with their clients, and what wrote a figure."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results"
+"""Folder of the measured figures."""
+TOKEN = "administrator-token-of-the-bench"
+
+
+def commit() -> str:
+    """Short hash of the tree, with `-dirty` where files differ from it; "not known" outside a git checkout."""
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "not known"
+
+
+def written_by(command: str) -> str:
+    """The first sentence of a results file: command, date (UTC) and commit."""
+    return f"Written by `{command}` on {datetime.now(UTC):%Y-%m-%d}, commit {commit()}. Do not edit."
+
+
+def parser(doc: str | None, seeds: str = "", name: str = "--seeds") -> argparse.ArgumentParser:
+    """A bench's options, to which it adds its own; with seeds a range of them, and a file for the rows."""
+    made = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
+    if seeds:
+        made.add_argument(name, type=seed_range, default=seeds, help="first:last, last not included")
+        made.add_argument("--json", type=Path, help="write every row here")
+    return made
+
+
+def seed_range(text: str) -> range:
+    """Of `first:last`, or of one seed alone."""
+    first, _, last = text.partition(":")
+    return range(int(first), int(last or int(first) + 1))
+
+
+def in_processes(work: Callable[[Any], Any], jobs: Iterable[Any], workers: int | None = 2) -> Iterator[Any]:
+    """What becomes of each job, in their order."""
+    with ProcessPoolExecutor(workers) as pool:
+        yield from pool.map(work, jobs)
+
+
+def keep(path: Path | None, rows: Any, indent: int | None = 1) -> None:
+    """Write rows as JSON, where that is asked for."""
+    if path is not None:
+        path.write_text(json.dumps(rows, indent=indent, default=float))
+
+
+def keep_lines(path: Path | None, rows: Iterable[Any]) -> None:
+    """The same, a row a line."""
+    if path is not None:
+        path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
+def lines_of(path: Path | None) -> list[dict[str, Any]]:
+    """Rows that were kept so; none where there is no file."""
+    return [json.loads(line) for line in path.read_text().splitlines()] if path and path.exists() else []
+
+
+def table(heads: Sequence[str], rows: Iterable[Iterable[object]]) -> list[str]:
+    """Lines of a Markdown table."""
+    return [line(heads), "|---" * len(heads) + "|", *map(line, rows)]
+
+
+def line(cells: Iterable[object]) -> str:
+    """One line of it."""
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def spread(values: Iterable[float], scale: float = 1e3) -> dict[str, float]:
+    """Median, 99th percentile and maximum; of seconds in ms."""
+    found = np.asarray([*values]) * scale
+    return {"median": float(np.median(found)), "p99": float(np.percentile(found, 99)), "max": float(np.max(found))}
+
+
+def share(flags: Sequence[bool]) -> str:
+    """A proportion with its count."""
+    return f"{100 * np.mean(flags):.0f} % ({sum(flags)}/{len(flags)})" if flags else "none"
+
+
+@contextmanager
+def services(*emulator: str) -> Iterator[Any]:
+    """A service with its emulated rig, and its client."""
+    from stimrig.api.cli.launcher import Services
+    from stimrig.api.client.rest import Client
+    from stimrig.api.settings import Settings
+
+    with TemporaryDirectory(prefix="stimrig-bench-") as folder:
+        settings = Settings(data_dir=Path(folder), port=0)  # pyright: ignore[reportCallIssue]
+        with Services(settings, list(emulator), TOKEN) as running, Client(running.url, TOKEN, timeout_s=600) as client:
+            yield running, client
+
+
+def http_client(url: str, timeout_s: float = 180) -> Any:
+    """The administrator's, of HTTP alone."""
+    import httpx
+
+    from stimrig.api.client.connection import SendsVersions
+
+    return httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=timeout_s)
+
+
+def sign_in(page: Any, url: str, password: str) -> None:
+    """As the clinician Ada, who is made for it."""
+    with http_client(url) as http:
+        http.post("/v1/users", json={"name": "Ada", "password": password}).raise_for_status()
+    page.goto(f"{url}/sign-in")
+    page.get_by_label("Name", exact=True).fill("Ada")
+    page.get_by_label("Password").fill(password)
+    page.get_by_role("button", name="Sign in", exact=True).click()
+    page.wait_for_url(f"{url}/")
+
+
+@contextmanager
+def emulated_rig(
+    *emulator: str, busy: int = 0, fit: bool = False, speed: float = 1.0, **started: Any
+) -> Iterator[tuple[Any, Any]]:
+    """An emulator with a rig on it, and its client; so many busy processes beside, and one that fits a recording."""
+    from tests.harness.processes import Bench, busy_process
+    from tests.harness.soak import fitting_one
+
+    with TemporaryDirectory(prefix="rig-bench-") as folder, ExitStack() as stack:
+        bench = Bench(Path(folder), *emulator, speed=speed)
+        stack.callback(bench.close)
+        client = bench.start_rig(**started)
+        client.ask("subscribe")
+        stack.enter_context(fitting_one(bench, client, fit))
+        for _ in range(busy):
+            stack.enter_context(busy_process())
+        yield bench, client
+
+
+def beside(made: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """With what may run beside a rig."""
+    made.add_argument("--fit", action="store_true", help="fit a recording again and again in another process")
+    made.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
+    return made
+
+
+def reveal(seed: int, *more: str) -> dict[str, Any]:
+    """What the emulator hides, asked after the verdict; `more` are the emulator's options that change it."""
+    command = [sys.executable, "-m", "stimrig.hardware_sim", "--reveal", str(seed), *more]
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout)
+
+
+def pyplot() -> Any:
+    """matplotlib that draws the same SVG each time."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    matplotlib.rcParams.update({"svg.hashsalt": "stimrig", "font.size": 9, "svg.fonttype": "none"})
+    import matplotlib.pyplot as plt
+
+    return plt
