@@ -52,10 +52,10 @@ class Changing:
         return as_record(seen, widths_us, rate_hz, start_s=start_s)
 
 
-def reach_widths(patient: Patient, share: float = 0.4, seconds: float = 10.0) -> np.ndarray:
-    """Widths of a trial: a second of rest, moves between levels up to a share of the plateau, a second of rest."""
+def reach_widths(patient: Patient) -> np.ndarray:
+    """Widths of a trial: a second of rest, moves between levels up to 40 % of the plateau, a second of rest."""
     table_us = np.arange(0.0, 301.0)
-    levels = share * np.array([0.0, 0.5, 0.5, 1.0, 1.0, 0.15, 0.15]) * patient.gain
-    wanted = np.interp(np.linspace(0.0, 6.0, round(seconds * PULSE_RATE_HZ)), np.arange(7.0), levels)
+    levels = 0.4 * np.array([0.0, 0.5, 0.5, 1.0, 1.0, 0.15, 0.15]) * patient.gain
+    wanted = np.interp(np.linspace(0.0, 6.0, round(10.0 * PULSE_RATE_HZ)), np.arange(7.0), levels)
     widths = np.round(np.interp(wanted, patient.recruitment(table_us), table_us))
     return np.r_[np.zeros(40), widths, np.zeros(40)]

@@ -11,6 +11,7 @@ from stimrig.hardware_sim.hidden_records import generate
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.errors import Cancelled
 from stimrig.identify.records.record import Record
+from tests.harness.carried_sessions import as_record
 from tests.harness.patients import Patient
 from tests.identify import hidden_muscles
 from tests.identify.dear import diagnosed
@@ -68,7 +69,7 @@ def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, n
 @pytest.mark.parametrize("noise_nm", [5e-5, 5e-4])
 def test_a_spline_s_own_error_is_nothing_missing(noise_nm):
     made = generate(None, "middle", 1, noise_sd_nm=noise_nm)
-    result = diagnose(Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"]))
+    result = diagnose(as_record(made))
     assert result.verdict == "nothing_missing", result.missing
 
 

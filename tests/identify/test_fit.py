@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -62,31 +60,6 @@ def test_a_longer_delay_is_an_effect():
     assert model.fit["held_out_rms_nm"] < 1.05 * NOISY < plain_model.fit["held_out_rms_nm"]
 
 
-def test_scaling_torque_scales_the_recruitment_alone():
-    record, _ = make_record(Patient(), np.random.default_rng(2), noise_nm=NOISY)
-    model, other = identify.fit(record), identify.fit(record.with_torque(3.0 * record.torque_nm))
-    width = np.linspace(0, 300, 31)
-    assert other.linear.time_constant_s == pytest.approx(model.linear.time_constant_s, rel=1e-6)
-    assert other.linear.damping == pytest.approx(model.linear.damping, rel=1e-6)
-    assert other.recruitment(width) == pytest.approx(3.0 * model.recruitment(width), rel=1e-5, abs=1e-5)
-    assert other.fit["fit_percent"] == pytest.approx(model.fit["fit_percent"], abs=1e-6)
-
-
-def test_shifting_time_changes_nothing():
-    record, _ = make_record(Patient(), np.random.default_rng(3), noise_nm=NOISY)
-    model, predicted = fitted(record)
-    later, shifted = fitted(replace(record, time_s=record.time_s + 123.0))
-    assert later.linear.time_constant_s == pytest.approx(model.linear.time_constant_s, rel=1e-6)
-    assert np.max(np.abs(shifted - predicted)) < 1e-5
-
-
-def test_an_offset_goes_into_the_baseline_alone():
-    record, _ = make_record(Patient(), np.random.default_rng(3), noise_nm=NOISY)
-    model, other = identify.fit(record), identify.fit(record.with_torque(record.torque_nm + 7.0))
-    assert other.baseline_nm - model.baseline_nm == pytest.approx(7.0, abs=1e-6)
-    assert other.linear.damping == pytest.approx(model.linear.damping, rel=1e-6)
-
-
 def test_splitting_and_joining_segments_changes_nothing():
     record, _ = make_record(Patient(), np.random.default_rng(4), noise_nm=NOISY, validate=False)
     names = np.array(record.segment_names)[record.segment]
@@ -98,18 +71,6 @@ def test_splitting_and_joining_segments_changes_nothing():
         again, same = fitted(other)
         assert again.linear.time_constant_s == model.linear.time_constant_s
         assert np.array_equal(same, predicted)
-
-
-def test_resampling_changes_predictions_by_less_than_the_noise():
-    record, _ = make_record(Patient(delay_s=0.02), np.random.default_rng(6), rate_hz=1600, noise_nm=NOISY)
-    every = slice(None, None, 4)
-    names = np.array(record.segment_names)[record.segment]
-    coarse = Record.from_arrays(
-        record.time_s[every], record.pulse_width_us[every], record.torque_nm[every], names[every]
-    )
-    _, fine = fitted(record)
-    _, thin = fitted(coarse)
-    assert np.sqrt(np.mean((fine[every] - thin) ** 2)) < 0.2 * NOISY
 
 
 def test_held_out_rows_are_never_used():

@@ -14,7 +14,7 @@ from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.second_order import transition
 from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.estimation.projection import best_ar1, log_likelihood, whiten
+from stimrig.identify.estimation.projection import log_likelihood, whiten
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
 
@@ -176,12 +176,3 @@ def test_whitening_is_the_exact_likelihood() -> None:
     expected = -0.5 * (count * (np.log(2 * np.pi * variance) + 1) + logdet)
     assert log_likelihood(residual, parts, ar1) == pytest.approx(expected, rel=1e-12)
     assert whiten(residual, parts, ar1).size == count
-
-
-def test_best_ar1_finds_the_correlation() -> None:
-    rng = np.random.default_rng(4)
-    e = np.zeros(20_000)
-    for k in range(1, e.size):
-        e[k] = 0.8 * e[k - 1] + rng.normal()
-    assert best_ar1(e, [slice(0, e.size)]) == pytest.approx(0.8, abs=0.02)
-    assert best_ar1(rng.normal(size=20_000), [slice(0, 20_000)]) == pytest.approx(0.0, abs=0.03)

@@ -19,6 +19,7 @@ from stimrig.identify import plain_mat
 from stimrig.identify.records.mat import BadMat, variables
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
+from tests.identify.test_hostile_files import told
 
 pytestmark = pytest.mark.slow
 
@@ -118,16 +119,6 @@ def test_a_model_and_its_prediction_open_in_other_tools(tmp_path: Path, record: 
 
 
 # ---- what cannot be taken ------------------------------------------------------------------------------------
-
-
-def told(path: Path) -> str:
-    """The line in which a file is refused; empty where it is taken."""
-    try:
-        identify.read(path)
-    except identify.IdentifyError as error:
-        assert "\n" not in str(error) and str(path) in str(error) and len(str(error)) < 500
-        return str(error)
-    return ""
 
 
 @pytest.mark.parametrize(

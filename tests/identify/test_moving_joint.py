@@ -28,16 +28,11 @@ from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.pulses import Motion, above_rest
+from tests.harness.carried_sessions import as_record
 from tests.harness.made_once import made_once
 
 ARM = 12
 """Tissue that relaxes, a Hill muscle, moment arm and fibre length: one of the development arms."""
-COLUMNS = ("time_s", "pulse_width_us", "torque_nm")
-
-
-def as_record(made: dict[str, Any]) -> Record:
-    columns = {name: made[name] for name in ("angle_rad", "velocity_rad_s")}
-    return Record.from_arrays(*(made[name] for name in COLUMNS), list(made["segment"]), **columns)
 
 
 @cache
@@ -121,19 +116,13 @@ def test_an_unseen_movement_is_predicted_to_the_noise():
     assert np.sqrt(np.mean(error_nm**2)) < 1.3 * unseen["truth"]["noise_sd_nm"]
 
 
-def test_it_says_that_its_curve_was_chosen_again():
-    assert any("chosen again" in reason for reason in model().reasons)
-
-
-def test_at_its_own_angle_at_rest_g_is_one_and_h_is_zero():
+def test_at_its_own_angle_where_most_was_stimulated_at_rest_g_is_one_and_h_is_zero():
+    """Not where the record begins: the passive test, put first, begins elsewhere."""
     home = np.array([surfaces(model()).reference_rad])
+    assert home == pytest.approx(arm_patient(ARM).reference_rad, abs=0.05)
     assert surfaces(model()).g(home, 0 * home) == pytest.approx(1.0)
     assert surfaces(model()).h_nm(home, 0 * home) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_the_reference_is_where_most_was_stimulated_at_rest():
-    """Not where the record begins: the passive test, put first, begins elsewhere."""
-    assert surfaces(model()).reference_rad == pytest.approx(arm_patient(ARM).reference_rad, abs=0.05)
+    assert any("chosen again" in reason for reason in model().reasons), "of the curve"
 
 
 ALONE = {
@@ -196,20 +185,21 @@ def test_a_model_of_the_joint_refuses_to_predict_without_an_angle():
         above_rest(model(), np.full(40, 200.0), 40.0)
 
 
+def knowing_less(than: str) -> Model:
+    """The model without those settings of its effects that are named so."""
+    document = json.loads(model().to_json(None))
+    for entry in document["effects"]:
+        entry["settings"] = {name: value for name, value in entry["settings"].items() if than not in name}
+    return Model.from_dict(document)
+
+
 def test_a_model_that_does_not_know_its_range_of_angles_predicts_all_the_same():
-    content = json.loads(model().to_json(None))
-    for entry in content["effects"]:
-        del entry["settings"]["angle_range_rad"]
     motion = Motion.held(1.0, 40)
-    torque = above_rest(Model.from_json(json.dumps(content)), np.full(40, 150.0), 40.0, motion)
-    assert np.isfinite(torque).all()
+    assert np.isfinite(above_rest(knowing_less("angle_range_rad"), np.full(40, 150.0), 40.0, motion)).all()
 
 
 def test_a_model_that_does_not_know_its_own_angle_is_refused_on_other_records():
-    document = json.loads(model().to_json())
-    for entry in document["effects"]:
-        entry["settings"] = {k: v for k, v in entry["settings"].items() if "rad" not in k}
-    old = Model.from_dict(document)
+    old = knowing_less("rad")
     with pytest.raises(BadModel, match="at which angle"):
         old.predict(as_record(recorded_tests()[0]))
     assert np.isfinite(old.predict(joined(recorded_tests()))).all()

@@ -19,8 +19,9 @@ from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.methods.maximum_likelihood import METHOD
 from stimrig.identify.records.record import Record
 from tests.harness import few_effects
+from tests.harness.carried_sessions import as_record
 from tests.harness.made_once import made_once
-from tests.identify.test_moving_joint import as_record, joined
+from tests.identify.test_moving_joint import joined
 
 ARM = 56
 """A curve that bends in several places, of which the isometric test alone tells little: one of the development arms."""

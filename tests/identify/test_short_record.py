@@ -23,11 +23,6 @@ def short_test(muscle, seed: int, sign: float = 1.0, zero_nm: float = 0.0) -> Re
     return Record.from_arrays(record.time_s, record.pulse_width_us, zero_nm + sign * record.torque_nm)
 
 
-def mean_width(model: Model) -> float:
-    band = model.bands["recruitment"]
-    return float(np.mean(np.subtract(band["upper"], band["lower"])))
-
-
 def error_percent(model: Model, muscle) -> float:
     u = np.linspace(0.0, muscle.top_us, 61)
     return (

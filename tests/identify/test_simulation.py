@@ -7,15 +7,19 @@ import pytest
 
 from stimrig import identify
 from stimrig.hardware_sim.hidden_records import generate
+from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from stimrig.identify.effects import get
 from stimrig.identify.estimation.effect_fit import fitted_with, try_effect
 from stimrig.identify.estimation.joint import predict_fitted
 from stimrig.identify.estimation.plain import fit_plain, prepare
 from stimrig.identify.noise import NoiseLevel, band_part, profile, whitened
 from stimrig.identify.noise.kernels import whiten_rows
-from stimrig.identify.records.record import Record
+from stimrig.identify.records.join import join
 from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
+from tests.harness.carried_sessions import as_record
 from tests.identify import hidden_muscles
+from tests.identify.test_join import record
 
 
 def _covariance(size: int, n: NoiseLevel) -> np.ndarray:
@@ -72,12 +76,17 @@ def test_derivatives_are_those_of_central_differences(names):
     values = np.r_[[0.2, 0.8, 0.001, 0.1, 0.5, 0.2], np.linspace(0, 6, setup.basis.size)]
     starts = [p.start[0] for c in problem.chosen for p in c.parameters]
     theta = problem.from_physical(np.r_[values, starts])
-    _, slopes = problem.run(theta, derivatives=True)
-    assert slopes is not None
-    for place in [0, 1, 2, 3, 4, 5, 12, *range(problem.coefficients.stop, problem.size)]:
-        step = 2e-5 * (
-            1.0 if problem.log[place] else min(max(problem.upper[place] - problem.lower[place], 1e-3), 100.0)
-        )
+    places = [0, 1, 2, 3, 4, 5, 12, *range(problem.coefficients.stop, problem.size)]
+    spans = np.clip(problem.upper - problem.lower, 1e-3, 100.0)
+    assert_slopes(problem, theta, {place: 2e-5 * (1.0 if problem.log[place] else spans[place]) for place in places})
+
+
+def assert_slopes(problem: Problem, theta: np.ndarray, steps: dict[int, float]) -> None:
+    """Derivatives are those of central differences, of the parameters at these places with these steps."""
+    base, slopes = problem.run(theta, derivatives=True)
+    assert slopes is not None and slopes.shape == (problem.size, problem.setup.grid.size)
+    np.testing.assert_array_equal(base, problem.run(theta)[0])
+    for place, step in steps.items():
         ahead, back = theta.copy(), theta.copy()
         ahead[place] += step
         back[place] -= step
@@ -112,7 +121,7 @@ def test_an_effect_asked_for_gets_the_form_that_the_diagnosis_would_give():
     """A spring with a toe: the forms before it in the list hardly help, and must not end the search."""
     made = generate(("series_compliance",), "strong", 81)
     assert made["truth"]["formulation"] == ["mass on a spring that stiffens"]
-    record = Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"])
+    record = as_record(made)
     model = identify.fit(record, effects=["series_compliance"])
     assert model.effects[0]["form"] == "toe"
     assert model.fit["held_out_rms_nm"] < 1.3 * made["truth"]["noise"]["sd_nm"]
@@ -121,10 +130,50 @@ def test_an_effect_asked_for_gets_the_form_that_the_diagnosis_would_give():
 def test_a_form_whose_start_promises_little_is_followed_all_the_same():
     """Beside a spring of one stiffness the first step of one that stiffens promises a sixth of what it gains."""
     made = generate("series_compliance", "middle", 5, rate_hz=100)
-    record = Record.from_arrays(made["time_s"], made["pulse_width_us"], made["torque_nm"], made["segment"])
+    record = as_record(made)
     grid, _ = prepare(record)
     effect = get("series_compliance")
     found = try_effect(effect, fit_plain(grid, grid.fitted), [effect.form("series"), effect.form("toe")])
     assert found is not None
     assert found.form.name == "toe"
     assert found.gain > found.forms["series"] + 400
+
+
+@pytest.fixture(scope="module")
+def of_two_parts() -> Setup:
+    """Two parts of six seconds."""
+    grid, _ = prepare(join([record(400, name="a"), record(400, name="b", seed=2)], [0.0, 60.0]))
+    return fit_plain(grid, grid.fitted).problem.setup
+
+
+def test_every_part_has_its_baseline_and_its_initial_state(of_two_parts: Setup):
+    problem = Problem(of_two_parts, [("sensor_clipping", get("sensor_clipping").form("ceiling"))])
+    coefficients = tuple(f"recruitment_{i}_nm" for i in range(of_two_parts.basis.size))
+    assert problem.names[:-1] == (
+        "time_constant_s", "damping", "delay_s", "baseline_nm", "baseline_2_nm",
+        "initial_torque_nm", "initial_rate_nm_s", "initial_torque_2_nm", "initial_rate_2_nm_s", *coefficients,
+    )  # fmt: skip
+    assert problem.names[-1].startswith("sensor_clipping.")
+    span_nm = 6.0 * of_two_parts.scale_nm
+    table = {p.name: (p.lower, p.upper, p.scale, p.unit) for p in problem.table}
+    assert table["time_constant_s"] == (*TIME_CONSTANT_BOUNDS_S, "log", "s")
+    assert table["damping"] == (*DAMPING_BOUNDS, "log", "1")
+    assert table["delay_s"] == (*of_two_parts.delay_bounds_s, "linear", "s")
+    assert table["baseline_2_nm"] == (-span_nm, span_nm, "linear", "N·m")
+    assert table["initial_torque_2_nm"] == (-span_nm, span_nm, "linear", "N·m")
+    assert table["initial_rate_2_nm_s"] == (-10 * span_nm, 10 * span_nm, "linear", "N·m/s")
+    assert table["recruitment_0_nm"] == (-np.inf, np.inf, "linear", "N·m")
+    assert (problem.delay, problem.baselines, problem.initials) == (range(2, 3), range(3, 5), range(5, 9))
+    assert problem.chosen[0].places == range(9 + of_two_parts.basis.size, problem.size)
+
+
+@pytest.mark.parametrize("effect", ["sensor_clipping:both", "activation_dependent_speed:torque", ""])
+def test_derivatives_on_two_parts_are_those_of_central_differences(of_two_parts: Setup, effect: str):
+    name, _, form = effect.partition(":")  # "": the base
+    problem = Problem(of_two_parts, [(name, get(name).form(form))] if effect else [])
+    states = [0.1, -0.2, 0.5, 0.2, -0.3, 0.4]
+    starts = [p.start[0] for chosen in problem.chosen for p in chosen.parameters]
+    physical = np.r_[0.2, 0.8, 0.001, states, np.linspace(0, 6, of_two_parts.basis.size), starts]
+    theta = problem.from_physical(physical)
+    np.testing.assert_allclose(problem.physical(theta), physical, rtol=1e-12)
+    assert_slopes(problem, theta, {place: 0.1 * problem.step[place] for place in range(problem.size)})

@@ -10,7 +10,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.estimation.projection import ar1_or_white, best_ar1, log_likelihood, whiten
+from stimrig.identify.estimation.projection import ar1_or_white, best_ar1
 from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p
 from stimrig.identify.estimation.uncertainty import prediction_band
 from stimrig.identify.noise import NoiseLevel, correlation_slopes
@@ -143,19 +143,6 @@ def test_correlated_noise_widens_the_bands():
         band = identify.fit(record).bands["recruitment"]
         width[ar1] = np.mean(np.asarray(band["upper"]) - band["lower"])
     assert width[0.8] > 1.6 * width[0.0]
-
-
-def test_whitening_is_exact():
-    rng = np.random.default_rng(0)
-    ar1, size = 0.7, 50
-    lag = np.abs(np.arange(size)[:, None] - np.arange(size)[None, :])
-    covariance = 2.5 * ar1**lag / (1 - ar1**2)
-    residual = np.linalg.cholesky(covariance) @ rng.standard_normal(size)
-    white = whiten(residual, [slice(0, size)], ar1)
-    assert white @ white / 2.5 == pytest.approx(residual @ np.linalg.solve(covariance, residual))
-    variance = white @ white / size
-    exact = -0.5 * (size * np.log(2 * np.pi) + np.linalg.slogdet(covariance / 2.5 * variance)[1] + size)
-    assert log_likelihood(residual, [slice(0, size)], ar1) == pytest.approx(exact)
 
 
 def test_noise_evidence_finds_the_correlation():
