@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -17,6 +18,11 @@ from tests.hardware_sim.virtual_host import LAYOUT, VirtualHost
 ANGLE_FAULTS = sorted(name for name in library() if name.startswith("angle_"))
 
 
+Row = tuple[float, int, int, int]
+Rows = list[Row]
+NOISY = 3.0 * math.sqrt(2.0)
+
+
 class Bench(VirtualHost):
     """A host of an arm whose angle rises by 5 degrees a second from 60 on; its sensor shows 10 more."""
 
@@ -25,11 +31,11 @@ class Bench(VirtualHost):
         self.faults, self.encoder = self.devices.faults, self.devices.encoder
         self.encoder._angle_deg = lambda time_s: 60.0 + 5.0 * time_s  # pyright: ignore[reportOptionalMemberAccess]
 
-    def rows(self, seconds: float = 1.0) -> list[tuple[float, int, int, int]]:
+    def rows(self, seconds: float = 1.0) -> Rows:
         """The angle sensor's next frames."""
         return [LAYOUT.unpack(frame.data) for frame in self.frames(seconds) if frame.can_id == 0x182]
 
-    def broken(self, name: str, seconds: float = 1.0, **settings: Any) -> list[tuple[float, int, int, int]]:
+    def broken(self, name: str, seconds: float = 1.0, **settings: Any) -> Rows:
         """The next frames with this fault; it is off afterwards."""
         self.faults.on(name, settings)
         rows = self.rows(seconds)
@@ -44,11 +50,11 @@ def bench() -> Bench:
     return made
 
 
-def angles(rows: list[tuple[float, int, int, int]]) -> np.ndarray:
+def angles(rows: Rows) -> np.ndarray:
     return np.array([row[0] for row in rows])
 
 
-def steps(rows: list[tuple[float, int, int, int]]) -> set[int]:
+def steps(rows: Rows) -> set[int]:
     return {(after[1] - before[1]) & 0xFFFF for before, after in pairwise(rows)}
 
 
@@ -70,10 +76,45 @@ def test_each_ends_without_a_trace_in_the_readings(bench: Bench, name: str) -> N
     assert angles(rows) == pytest.approx(70.0 + 5.0 * (0.6 + 0.005 * np.arange(len(rows))), abs=0.05)
 
 
-def test_stuck(bench: Bench) -> None:
-    rows = bench.broken("angle_stuck")
-    assert len(set(angles(rows))) == 1
-    assert steps(rows) == {1}
+def jumps(rows: Rows, _: Row) -> bool:
+    """Of single readings."""
+    off_deg = np.diff(angles(rows))
+    return set(np.round(off_deg / 15.0)) >= {-1.0, 0.0, 1.0} and 0.05 < np.mean(np.abs(off_deg) > 7.0) < 0.15
+
+
+def turned(rows: Rows, last: Row) -> bool:
+    """From where it is: no jump gives it away."""
+    slope_deg_s = np.polyfit(0.005 * np.arange(len(rows)), angles(rows), 1)[0]
+    return rows[0][0] == pytest.approx(last[0], abs=0.1) and slope_deg_s == pytest.approx(-5.0, rel=0.01)
+
+
+SHOWN: list[tuple[str, float, dict[str, Any], Callable[[Rows, Row], Any]]] = [
+    ("stuck", 1.0, {}, lambda rows, _: len(set(angles(rows))) == 1 and steps(rows) == {1}),
+    ("jump", 5.0, {"step_deg": 15.0, "probability": 0.05}, jumps),
+    ("nan", 1.0, {}, lambda rows, _: np.isnan(angles(rows)).all()),
+    ("nan", 1.0, {"probability": 0.3}, lambda rows, _: 0.2 < np.isnan(angles(rows)).mean() < 0.4),
+    ("offset_step", 1.0, {"step_deg": 7.0}, lambda rows, last: rows[0][0] == pytest.approx(last[0] + 7.0, abs=0.05)),
+    ("reversed", 1.0, {}, turned),
+    ("reversed", 0.1, {"about_present": False}, lambda rows, _: np.all(angles(rows) - 10.0 < -60.0)),
+    ("noise_burst", 5.0, {"sd_deg": 3.0}, lambda rows, _: pytest.approx(np.diff(angles(rows)).std(), rel=0.1) == NOISY),
+    ("fault_bit", 1.0, {}, lambda rows, _: {row[2] for row in rows} == {1} and rows[-1][0] > rows[0][0]),
+    ("frames_lost", 10.0, {}, lambda rows, _: steps(rows) >= {1, 2} and len(rows) == pytest.approx(1800, abs=50)),
+    ("frames_repeated", 5.0, {}, lambda rows, _: steps(rows) == {0, 1}),
+    ("counter_jump", 1.0, {"step": 500}, lambda rows, last: rows[0][1] == last[1] + 501),
+    ("rate_off", 10.0, {"percent": -8.0}, lambda rows, _: len(rows) == pytest.approx(1840, abs=2)),
+]
+"""A fault, for how long, its settings, and what its frames must show after the last one before it."""
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds", "settings", "shows"), SHOWN, ids=[f"{name} {more}" for name, _, more, _ in SHOWN]
+)
+def test_it_shows(
+    bench: Bench, name: str, seconds: float, settings: dict[str, Any], shows: Callable[[Rows, Row], Any]
+) -> None:
+    last = bench.rows(0.1)[-1]
+    rows = bench.broken(f"angle_{name}", seconds, **settings)
+    assert shows(rows, last), rows[:20]
 
 
 def test_silent_and_unplugged_differ_in_the_counter(bench: Bench) -> None:
@@ -88,62 +129,12 @@ def test_silent_and_unplugged_differ_in_the_counter(bench: Bench) -> None:
     assert bench.rows(0.01)[0][1] == 0
 
 
-def test_jump_is_of_single_readings(bench: Bench) -> None:
-    off = np.diff(angles(bench.broken("angle_jump", 5.0, step_deg=15.0, probability=0.05)))
-    assert set(np.round(off / 15.0)) >= {-1.0, 0.0, 1.0}
-    assert 0.05 < np.mean(np.abs(off) > 7.0) < 0.15
-
-
-def test_nan(bench: Bench) -> None:
-    assert np.all(np.isnan(angles(bench.broken("angle_nan"))))
-    some = np.isnan(angles(bench.broken("angle_nan", probability=0.3)))
-    assert 0.2 < some.mean() < 0.4
-
-
-def test_offset_step(bench: Bench) -> None:
-    last = bench.rows(0.1)[-1][0]
-    assert bench.broken("angle_offset_step", step_deg=7.0)[0][0] == pytest.approx(last + 7.0, abs=0.05)
-
-
-def test_reversed_from_where_it_is_or_about_its_zero(bench: Bench) -> None:
-    last = bench.rows(0.1)[-1][0]
-    turned = angles(bench.broken("angle_reversed"))
-    assert turned[0] == pytest.approx(last, abs=0.1), "no jump gives it away"
-    assert np.polyfit(0.005 * np.arange(turned.size), turned, 1)[0] == pytest.approx(-5.0, rel=0.01)
-    true_deg = angles(bench.broken("angle_reversed", 0.1, about_present=False)) - 10.0
-    assert np.all(true_deg < -60.0)
-
-
-def test_noise_burst(bench: Bench) -> None:
-    noisy = angles(bench.broken("angle_noise_burst", 5.0, sd_deg=3.0))
-    assert np.diff(noisy).std() == pytest.approx(3.0 * math.sqrt(2.0), rel=0.1)
-
-
 def test_delayed_by_what_was_asked_and_stamped_as_if_not(bench: Bench) -> None:
     now = bench.devices.timeline.now_s
     rows = bench.broken("angle_delayed", 1.0, delay_s=0.2)
     late_deg = 70.0 + 5.0 * (now + 0.005 * np.arange(len(rows))) - angles(rows)
     assert late_deg[-1] == pytest.approx(1.0, abs=0.03)
     assert steps(rows) == {1}
-
-
-def test_fault_bit(bench: Bench) -> None:
-    rows = bench.broken("angle_fault_bit")
-    assert {row[2] for row in rows} == {1}
-    assert angles(rows)[-1] > angles(rows)[0]
-
-
-def test_lost_repeated_and_counter(bench: Bench) -> None:
-    lost = bench.broken("angle_frames_lost", 10.0)
-    assert steps(lost) >= {1, 2}
-    assert len(lost) == pytest.approx(1800, abs=50)
-    assert steps(bench.broken("angle_frames_repeated", 5.0)) == {0, 1}
-    before = bench.rows(0.1)[-1][1]
-    assert bench.broken("angle_counter_jump", step=500)[0][1] == before + 501
-
-
-def test_rate_off(bench: Bench) -> None:
-    assert len(bench.broken("angle_rate_off", 10.0, percent=-8.0)) == pytest.approx(1840, abs=2)
 
 
 def test_a_fault_of_the_bus_takes_both(bench: Bench) -> None:
