@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from inspect import isfunction
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -152,12 +153,7 @@ def requests_are_lost(life: Life, chance: random.Random) -> str:
 
 
 LIBRARY: dict[str, Accident] = {
-    accident.__name__: accident
-    for accident in (
-        device_fault, line_stalls, line_deviates, bus_stalls, host_pauses, step_stalls, wall_clock_jumps, disk_is_full,
-        disk_fails, disk_is_slow, rig_is_killed, rig_dies_in_a_step, rig_dies_after_a_stop, power_fails, rig_is_ended,
-        devices_lose_power, requests_are_lost,
-    )
-}  # fmt: skip
+    name: found for name, found in [*globals().items()] if isfunction(found) and found.__module__ == __name__
+}
 ODDS = {"device_fault": 6.0, "line_stalls": 3.0, "line_deviates": 3.0, "host_pauses": 3.0, "step_stalls": 2.0}
 """How often, beside 1 for the others."""

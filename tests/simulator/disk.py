@@ -16,6 +16,11 @@ from tests.simulator.world import World
 ROOM_BYTES = 10**9
 
 
+def error_of(number: int, path: Path) -> OSError:
+    """As the system gives it."""
+    return OSError(number, os.strerror(number), str(path))
+
+
 class _File:
     def __init__(self, data: bytes = b"", synced: int = 0) -> None:
         self.data, self.synced = bytearray(data), synced
@@ -70,13 +75,13 @@ class SimulatedDisk:
     def create(self, path: Path) -> SimulatedLog:
         self._may_write(path)
         if path in self.files:
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+            raise error_of(errno.EEXIST, path)
         self.files[path] = _File()
         return SimulatedLog(self, path)
 
     def read(self, path: Path) -> bytes:
         if path not in self.files:
-            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+            raise error_of(errno.ENOENT, path)
         return bytes(self.files[path].data)
 
     def replace(self, path: Path, data: bytes) -> None:
@@ -98,8 +103,7 @@ class SimulatedDisk:
         return sorted(path.name for path in self.files if path.parent == folder)
 
     def free_bytes(self, folder: Path) -> int:
-        if self.failing:
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(folder))
+        self._may_write(folder)
         return self.free
 
     def power_failure(self) -> None:
@@ -111,26 +115,24 @@ class SimulatedDisk:
     def append(self, path: Path, data: bytes) -> None:
         """Through to the kernel; a full disk takes a part."""
         self.access()
-        if self.failing:
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        self._may_write(path)
         taken = data if self.free >= len(data) else data[: max(0, self.free)]
         self.files[path].data += taken
         self.free -= len(taken)
         if len(taken) < len(data):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            raise error_of(errno.ENOSPC, path)
 
     def sync(self, path: Path) -> None:
         """As fdatasync."""
-        if self.failing:
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        self._may_write(path)
         if path in self.files:
             self.files[path].synced = len(self.files[path].data)
 
     def _may_write(self, path: Path, size: int = 0) -> None:
         if self.failing:
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+            raise error_of(errno.EIO, path)
         if self.free < size:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            raise error_of(errno.ENOSPC, path)
 
 
 class SimulatedLog:

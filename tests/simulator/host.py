@@ -6,12 +6,15 @@ import contextlib
 import inspect
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stimrig.rig.machine import Bus, Disk, Port
 from stimrig.rig.tasks import Outcome, Tasks
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.world import World
+
+if TYPE_CHECKING:
+    from tests.simulator.wires import Wires
 
 BORN_S = 5000.0
 """What the computer's monotonic clock shows at the world's time 0."""
@@ -88,7 +91,7 @@ class Computer:
 class Process:
     """One process on the computer: its tasks run as long as it lives."""
 
-    def __init__(self, computer: Computer, disk: SimulatedDisk, ports: Ports) -> None:
+    def __init__(self, computer: Computer, disk: SimulatedDisk, ports: Wires) -> None:
         self.computer, self.world, self.alive = computer, computer.world, True
         self.listens = False
         """Whether it takes requests: not before its devices were tried."""
@@ -199,16 +202,3 @@ def _tried(action: Callable[[], Any]) -> tuple[Any, BaseException | None]:
         return action(), None
     except Exception as error:
         return None, error
-
-
-class Ports:
-    """What a computer's ports and adapters are; see `tests.simulator.wires`."""
-
-    def port(self, process: Process, path: str) -> Port:
-        raise NotImplementedError
-
-    def open_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus:
-        raise NotImplementedError
-
-    def shared_bus(self, process: Process) -> Bus | None:
-        raise NotImplementedError

@@ -12,6 +12,7 @@ import io
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from functools import lru_cache
+from inspect import isgeneratorfunction
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
@@ -360,34 +361,10 @@ def recordings_hold_every_sample(life: Life) -> Iterator[str]:
             yield f"{path}: its pulses lie outside its samples"
 
 
-INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = (
-    every_pulse_is_within_the_limits,
-    pulses_are_apart_and_not_too_many,
-    a_test_is_no_longer_and_no_more_than_asked,
-    pulses_keep_their_pace,
-    tests_are_apart,
-    trains_rise_in_small_steps,
-    nothing_is_written_blind,
-    one_pulse_is_on_its_way,
-    a_missing_acknowledgement_ends_a_test,
-    a_computer_that_stands_still_ends_a_test,
-    a_torque_beyond_its_limit_ends_a_test,
-    nothing_is_written_while_stopped,
-    a_stop_is_undone_only_by_who_was_shown_it,
-    nothing_of_a_withdrawn_test_is_written,
-    a_calibrations_result_waits_until_it_is_stored,
-    no_pulse_is_felt_late,
-    a_stop_takes_back_what_has_not_left,
-    a_confirmed_stop_is_true,
-    every_test_ends_in_a_documented_state,
-    every_pulse_has_its_intent_and_its_record,
-    what_the_files_call_acknowledged_was_felt,
-    every_test_that_began_is_found,
-    every_request_is_answered,
-    recordings_are_whole_and_in_order,
-    what_is_left_out_makes_no_steeper_rise,
-    recordings_hold_every_sample,
+INVARIANTS: tuple[Callable[[Life], Iterator[str]], ...] = tuple(
+    found for name, found in [*globals().items()] if isgeneratorfunction(found) and not name.startswith("_")
 )
+"""All of the above."""
 
 
 def broken(life: Life) -> list[str]:

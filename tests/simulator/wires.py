@@ -10,14 +10,13 @@ from typing import Any
 from stimrig.hardware_sim.devices import Devices
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Bus, Frame, Listener, Port, Told
-from tests.simulator.host import Ports, Process
+from tests.simulator.host import Process
 from tests.simulator.world import World
 
 TRANSIT_S = 0.0002, 0.0008
 """How long a piece of bytes is on the line."""
 MOST_HELD_BYTES = 4096
 """What a computer holds for a line that takes nothing; then it takes no more."""
-DEVIANCES = "drop", "double", "corrupt", "reorder", "tear"
 
 
 class Direction:
@@ -96,7 +95,7 @@ class Direction:
         return [piece for piece in found if piece[0]]
 
 
-class Wires(Ports):
+class Wires:
     """Serial line and CAN bus of one rig.
 
     Parameters
