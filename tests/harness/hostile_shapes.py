@@ -8,6 +8,7 @@ import random
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from operator import setitem
 from pathlib import Path
 from typing import Any
 
@@ -83,68 +84,57 @@ def good(change: Change | None = None, folder: Path = Path(), libver: Any = None
     return target.getvalue()
 
 
-def put(path: str, **how: Any) -> Change:
-    """Another dataset in the place of one."""
+def instead(path: str, make: Change) -> Change:
+    """Something else in the place of a dataset or group."""
 
-    def change(file: h5py.File, _folder: Path) -> None:
+    def change(file: h5py.File, folder: Path) -> None:
         del file[path]
-        file.create_dataset(path, **how)
+        make(file, folder)
 
     return change
+
+
+def put(path: str, **how: Any) -> Change:
+    """Another dataset."""
+    return instead(path, lambda file, _: file.create_dataset(path, **how))
 
 
 def cell(path: str, index: int, value: float) -> Change:
     """One value changed."""
-
-    def change(file: h5py.File, _folder: Path) -> None:
-        file[path][index] = value
-
-    return change
+    return lambda file, _: setitem(file[path], index, value)
 
 
 def attribute(name: str, value: Any) -> Change:
     """One attribute changed."""
-
-    def change(file: h5py.File, _folder: Path) -> None:
-        file.attrs[name] = value
-
-    return change
+    return lambda file, _: setitem(file.attrs, name, value)
 
 
 def link(path: str, to: Callable[[Path], Any]) -> Change:
     """A link in the place of a dataset or group."""
-
-    def change(file: h5py.File, folder: Path) -> None:
-        del file[path]
-        file[path] = to(folder)
-
-    return change
+    return instead(path, lambda file, folder: setitem(file, path, to(folder)))
 
 
 def external(path: str, target: Callable[[Path], str], size: int) -> Change:
     """A dataset whose bytes are those of another file."""
 
-    def change(file: h5py.File, folder: Path) -> None:
-        del file[path]
+    def make(file: h5py.File, folder: Path) -> None:
         file.create_dataset(path, (size,), "u1", external=[(target(folder), 0, h5py.h5f.UNLIMITED)])
 
-    return change
+    return instead(path, make)
 
 
 def virtual(path: str, target: Callable[[Path], str], inside: str, unlimited: bool = False) -> Change:
     """A dataset that is a view of another file's."""
 
-    def change(file: h5py.File, folder: Path) -> None:
-        del file[path]
-        layout = h5py.VirtualLayout((1600,), "f8", maxshape=(None,) if unlimited else None)
-        source = h5py.VirtualSource(target(folder), inside, (1600,), "f8", maxshape=(None,) if unlimited else None)
-        if unlimited:
-            layout[: h5py.h5s.UNLIMITED] = source[: h5py.h5s.UNLIMITED]
-        else:
-            layout[:] = source
+    def make(file: h5py.File, folder: Path) -> None:
+        most = (None,) if unlimited else None
+        layout = h5py.VirtualLayout((1600,), "f8", maxshape=most)
+        source = h5py.VirtualSource(target(folder), inside, (1600,), "f8", maxshape=most)
+        whole = slice(h5py.h5s.UNLIMITED) if unlimited else slice(None)
+        layout[whole] = source[whole] if unlimited else source
         file.create_virtual_dataset(path, layout)
 
-    return change
+    return instead(path, make)
 
 
 def virtual_over_raw(file: h5py.File, folder: Path) -> None:

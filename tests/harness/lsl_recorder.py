@@ -112,7 +112,6 @@ class Compared:
     torque_apart_s: np.ndarray
     pulses_apart_s: np.ndarray
     samples_more: int
-    torque_from_s: float
 
 
 def compare(recorded: dict[str, Any], path: str | Path) -> Compared:
@@ -142,7 +141,6 @@ def compare(recorded: dict[str, Any], path: str | Path) -> Compared:
         np.abs(time_s[first:last] - wanted_s),
         np.abs(pulse_s - columns["pulses/written_time_s"][sent] / speed),
         len(time_s) - len(wanted_s),
-        float(time_s[0]),
     )
 
 

@@ -58,19 +58,6 @@ def test_the_default_frame():
     assert math.isnan(frame.decode(struct.pack("<fHBB", math.nan, 0, 0, 0)).values[0])
 
 
-def test_several_samples_of_big_endian_counts(tmp_path: Path):
-    path = tmp_path / "counts.dbc"
-    path.write_text(COUNTS)
-    frame = SampleFrame(str(path), "Value", ["First", "Second", "Third"], "Index", None)
-    assert (frame.message.frame_id, frame.counter_modulus, frame.samples_per_frame) == (610, 256, 3)
-    got = frame.decode(struct.pack(">hhhBB", 100, -200, 300, 9, 0))
-    assert got.values == pytest.approx((1.0, -2.0, 3.0))
-    assert (got.counter, got.flag) == (9, 255)
-    without = SampleFrame(str(path), None, ["Second"], None, None)
-    assert without.decode(bytes(8)).counter == -1
-    assert without.counter_modulus == 0
-
-
 def test_a_value_that_has_a_word_is_no_reading(tmp_path: Path):
     path = tmp_path / "words.dbc"
     path.write_text(COUNTS + 'VAL_ 610 First -32768 "no reading" 32767 "overload" ;\nVAL_ 610 Index 9 "nine" ;\n')
@@ -88,11 +75,6 @@ def test_a_float_has_no_words(tmp_path: Path):
         SampleFrame(str(path), None, ["Torque_Nm"], None, None)
 
 
-def test_a_short_frame_is_told():
-    with pytest.raises(WireError, match="does not fit Torque"):
-        SampleFrame(PACKAGED, None, ["Torque_Nm"], None, None).decode(b"\0\0")
-
-
 def test_a_file_that_is_no_dbc(tmp_path: Path):
     path = tmp_path / "x.dbc"
     path.write_text("BO_ hello")
@@ -102,23 +84,40 @@ def test_a_file_that_is_no_dbc(tmp_path: Path):
         SampleFrame("nothing", None, ["a"], None, None)
 
 
-def test_counts_like_those_of_a_gsv_4():
-    for n in (1, 2, 4):
-        frame = SampleFrame("counts_be16", None, [f"Torque{i + 1}_Nm" for i in range(n)], None, None)
-        assert (frame.message.frame_id, frame.samples_per_frame, frame.counter_modulus) == (610, n, 0)
-        data = b"".join(counts.to_bytes(2, "big") for counts in (32768, 65535, 1, 32768 + 655)[:n])
-        found = frame.decode(data)
-        assert found.values == pytest.approx((0.0, 50.0, -50.0, 655 * 50 / 32767)[:n], abs=1e-6)
-        assert (found.counter, found.flag) == (-1, 255)
-        with pytest.raises(WireError):
-            frame.decode(data[:-1])
+GSV_4 = b"".join(counts.to_bytes(2, "big") for counts in (32768, 65535, 1, 32768 + 655))
+GSV_4_NM = (0.0, 50.0, -50.0, 655 * 50 / 32767)
+LAYOUTS = {
+    "big-endian counts": (
+        ("counts", "Value", ["First", "Second", "Third"], "Index", None), (610, 256, 3),
+        struct.pack(">hhhBB", 100, -200, 300, 9, 0), (1.0, -2.0, 3.0), 9,
+    ),
+    "without a counter": (("counts", None, ["Second"], None, None), (610, 0, 1), bytes(8), (0.0,), -1),
+    "three samples, a counter of frames": (
+        ("torque_packed3", None, ["Torque1_Nm", "Torque2_Nm", "Torque3_Nm"], "Counter", None), (0x181, 65536, 3),
+        struct.pack("<hhhH", 500, -250, 1, 40_000), (1.0, -0.5, 0.002), 40_000,
+    ),
+    **{
+        f"like a GSV-4's, {n}": (
+            ("counts_be16", None, [f"Torque{i + 1}_Nm" for i in range(n)], None, None), (610, 0, n),
+            GSV_4[: 2 * n], GSV_4_NM[:n], -1,
+        )
+        for n in (1, 2, 4)
+    },
+}  # fmt: skip
+"""By what is meant: how it is described, number, modulus and samples of the frame, its bytes, values and counter."""
 
 
-def test_three_samples_a_frame_with_a_counter_of_frames():
-    frame = SampleFrame("torque_packed3", None, ["Torque1_Nm", "Torque2_Nm", "Torque3_Nm"], "Counter", None)
-    found = frame.decode(struct.pack("<hhhH", 500, -250, 1, 40_000))
-    assert found.values == pytest.approx((1.0, -0.5, 0.002))
-    assert (found.counter, frame.counter_modulus) == (40_000, 65536)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_several_samples_of_a_frame(tmp_path: Path, layout: str):
+    (dbc, *how), told, data, values, counter = LAYOUTS[layout]
+    (tmp_path / "counts.dbc").write_text(COUNTS)
+    frame = SampleFrame(str(tmp_path / "counts.dbc") if dbc == "counts" else dbc, *how)
+    assert (frame.message.frame_id, frame.counter_modulus, frame.samples_per_frame) == told
+    found = frame.decode(data)
+    assert found.values == pytest.approx(values, abs=1e-6)
+    assert (found.counter, found.flag) == (counter, 255)
+    with pytest.raises(WireError, match="does not fit"):
+        frame.decode(data[:-1] if dbc == "counts_be16" else b"\0\0")
 
 
 MACHINE = VirtualMachine()
