@@ -31,7 +31,7 @@ SLOW = (
     "tests/api/outbox/",
     *(f"tests/api/test_{name}.py" for name in ("adaptive_worker", "doctor", "languages", "migrations", "schemas")),
     *(f"tests/api/test_{name}.py" for name in ("languages", "tracking_worker", "why", "worker")),
-    *(f"tests/examples/test_ilc_{name}.py" for name in ("controller", "moving_joint", "tracked")),
+    *(f"tests/examples/test_ilc_{name}.py" for name in ("controller", "moving_joint")),
     *(f"tests/hardware_sim/test_{name}.py" for name in ("arm_records", "changing_patient", "hidden_records")),
     *(
         f"tests/identify/test_{name}.py"

@@ -14,7 +14,7 @@ import pytest
 
 from stimrig.api.store.holds import LIMITS_TURN
 from tests.api.conftest import Service, soon, wait_done
-from tests.api.test_access import csrf, signed_in
+from tests.api.test_people import csrf, signed_in
 from tests.api.test_problems import problem
 
 WHERE = "/v1/participants/P017/calibration"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -10,12 +11,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from stimrig import identify
 from stimrig.api.cli import main
 from stimrig.api.progress_bar import progress_bar
+from stimrig.api.workers import verbs
+from stimrig.hardware_sim import hidden_records
+from stimrig.identify.records.join import write_joined
 from tests.api.test_worker import made_up_csv
 from tests.harness import few_effects
+from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow
 
@@ -284,3 +291,178 @@ def test_a_verb_does_not_wait_for_the_libraries_of_others():
     code = "import sys; from stimrig.api.cli.main import build; build('diagnose'); print('sqlalchemy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+# ---- The verbs of the command line take several recordings as the parts of one; what does not go together is named
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """One record, and another one with an angle."""
+    folder = tmp_path_factory.mktemp("several")
+    plain = made_up_csv(folder / "plain.csv")
+    head, *rows = (row.split(",") for row in plain.read_text().splitlines())
+    moved = folder / "moved.csv"
+    more = [f"{t},{w},{0.97 * float(nm):.6f},{s},{0.8 + 0.001 * k:.4f},0.04" for k, (t, w, nm, s) in enumerate(rows)]
+    moved.write_text("\n".join([",".join([*head, "angle_rad", "velocity_rad_s"]), *more]))
+    return [plain, moved]
+
+
+def test_a_fit_of_two_is_of_both(parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "MODEL.json"
+    code, out, err = run(capsys, "fit", *parts, "-o", model, "--json")
+    assert code == 0, err
+    assert "plain.csv: no angle_rad, so it is left out of the joined record" in err
+    assert json.loads(out)["data"]["recording_id"] == "plain.csv + moved.csv"
+    code, out, err = run(capsys, "compare", model, *parts, "--html", tmp_path / "report.html")
+    assert code == 0 and "plain.csv and " in out, err
+    assert "plain.csv, moved.csv" in (tmp_path / "report.html").read_text("utf-8")
+    code, out, err = run(capsys, "diagnose", *parts, "--model", model, "--json")
+    assert code == 0 and json.loads(out)["verdict"], err
+
+
+def test_the_one_without_an_angle_is_named(parts: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = run(capsys, "fit", *parts, "--effects", "torque_angle")
+    assert (code, out) == (2, "")
+    assert "plain.csv: it has no angle_rad" in err and len(err.strip().splitlines()) == 1
+
+
+def test_a_file_twice_or_none_is_refused(parts: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = run(capsys, "fit", parts[0], parts[0])
+    assert code == 2 and "named twice" in err
+    assert run(capsys, "fit")[0] == 2
+
+
+def test_a_copy_or_a_link_is_no_second_recording(
+    parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy, link = tmp_path / "copy.csv", tmp_path / "link.csv"
+    copy.write_bytes(parts[0].read_bytes())
+    link.symlink_to(parts[0])
+    for again in (copy, link, parts[0].parent / ".." / parts[0].parent.name / parts[0].name):
+        code, _, err = run(capsys, "fit", parts[0], again)
+        assert code == 2 and "measured in another" in err and again.name in err, err
+
+
+def test_what_cannot_be_joined_names_its_file(
+    parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = tmp_path / "short.csv"
+    short.write_text("\n".join(parts[0].read_text().splitlines()[:6]))
+    code, _, err = run(capsys, "fit", parts[0], short)
+    assert code == 2 and "short.csv" in err and len(err.strip().splitlines()) == 1, err
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The model of a first session, and the record of a second one without the effect."""
+    folder = tmp_path_factory.mktemp("carry")
+    model, data = folder / "MODEL.json", folder / "second.csv"
+    earlier = identify.fit(
+        hidden_muscles.record("electromechanical_delay", seed=7), effects=["electromechanical_delay"]
+    )
+    model.write_text(earlier.to_json())
+    write_joined(hidden_muscles.record("", seed=8), data)
+    return model, data
+
+
+def test_words_and_json_say_what_is_no_longer_needed(
+    files: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, data = files
+    out = tmp_path / "new.json"
+    assert main.run(["fit", str(data), "--carry", str(model), "-o", str(out)]) == 0
+    words = capsys.readouterr().out
+    assert "offered: the plain structure" in words and "no longer needed: electromechanical_delay." in words
+    assert main.run(["fit", str(data), "--carry", str(model), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["effects"] == [] and found["extra"]["carried"]["no_longer_needed"] == ["electromechanical_delay"]
+    assert json.loads(out.read_text())["extra"]["carried"]["offered"] == "plain"
+
+
+def test_options_of_another_structure_are_one_line(
+    files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, data = files
+    assert main.run(["fit", str(data), "--carry", str(model), "--effects", "fatigue"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "Leave out --method, --effects and --fit-on." in err
+
+
+# ---- From a record with something hidden in it to a better model's prediction, through the command line alone
+
+
+def stimrig(*words: object) -> str:
+    """Standard output of a verb that must succeed; of three effects it finds what is missing."""
+    out, err = io.StringIO(), io.StringIO()
+    few = few_effects.only("fatigue", "output_saturation", "potentiation")
+    with few, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main.run(list(map(str, words)))
+    assert code == 0, err.getvalue()
+    return out.getvalue()
+
+
+@pytest.fixture(scope="module")
+def tired(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A record of a muscle that tires, and what `improve` makes of it."""
+    folder = tmp_path_factory.mktemp("tired")
+    record = hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100, design="short")
+    data = folder / "record.csv"
+    hidden_records.write_csv(record, data)
+    made = ("-o", folder / "better.json", "--html", folder / "report.html")
+    (folder / "improved.json").write_text(stimrig("improve", data, *made, "--json"))
+    return folder
+
+
+def test_improve_writes_a_model_that_predicts_better(tired: Path, tmp_path: Path) -> None:
+    data, base, better = tired / "record.csv", tmp_path / "base.json", tired / "better.json"
+    stimrig("fit", data, "-o", base)
+    found = json.loads((tired / "improved.json").read_text())
+    assert [step["added"] for step in found["steps"]][:2] == [None, "fatigue"]
+    assert found["steps"][1]["rms_nm"] < found["steps"][0]["rms_nm"]
+    assert (tired / "report.html").stat().st_size > 1000
+
+    def rms_nm(model: Path) -> float:
+        out = tmp_path / f"{model.stem}.csv"
+        stimrig("predict", model, data, "-o", out)
+        with out.open(newline="") as lines:
+            rows = list(csv.DictReader(lines))
+        assert list(rows[0]) == ["time_s", "torque_nm", "predicted_torque_nm"]
+        gap = [float(row["torque_nm"]) - float(row["predicted_torque_nm"]) for row in rows]
+        return float(np.sqrt(np.mean(np.square(gap))))
+
+    assert rms_nm(better) < 0.5 * rms_nm(base)
+
+
+def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds(tired: Path, tmp_path: Path) -> None:
+    data, held = tired / "record.csv", tmp_path / "held.json"
+    fitted = json.loads(stimrig("fit", data, "--effects", "auto", "-o", held, "--json"))
+    improved = json.loads((tired / "improved.json").read_text())
+    added = [step["added"] for step in improved["steps"][1:]]
+    assert [effect["id"] for effect in fitted["effects"]] == added and "fatigue" in added
+    forms = [f"{effect['id']} ({effect['form']})" for effect in fitted["effects"]]
+    assert f"structure      {', '.join(forms)}\n" in stimrig("diagnose", data, "--model", held)
+    own = verbs.diagnosis(str(data), lambda *_: None, held.read_text())
+    assert [name.partition(":")[0] for name in own["structure"]] == added
+    assert own["verdict"] == "nothing_missing" and own["missing"] == []
+    tried = {row["effect"] for rows in own["candidates"] for row in rows}
+    assert tried and not tried & set(added)
+    assert own["base"]["rms_nm"] == pytest.approx(fitted["fit"]["rms_nm"], rel=0.02)
+    report = tmp_path / "report.html"
+    further = json.loads(stimrig("improve", data, "--model", held, "--html", report, "--json"))
+    assert [name.partition(":")[0] for name in further["structure"]] == added
+    assert [step["added"] for step in further["steps"]] == [None] and further["verdict"] == "nothing_missing"
+    assert further["steps"][0]["rms_nm"] == pytest.approx(fitted["fit"]["rms_nm"], rel=0.02)
+    assert "fatigue" in report.read_text().lower()
+
+
+def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:
+    record = hidden_records.generate("output_saturation", "middle", seed=42, rate_hz=100, design="short")
+    data = tmp_path / "record.csv"
+    hidden_records.write_csv(record, data)
+    model = json.loads(stimrig("fit", data, "--effects", "output_saturation", "--json"))
+    assert [effect["id"] for effect in model["effects"]] == ["output_saturation"]
+    assert {"linear", "recruitment", "valid_for", "uncertainty", "residual_tests", "data", "software"} <= set(model)
+    assert {"b", "a", "delay_samples"} <= set(model["linear"])
+    b, a = np.array(model["linear"]["b"]), np.array(model["linear"]["a"])
+    assert b.sum() / a.sum() == pytest.approx(1.0, abs=1e-6)

@@ -11,7 +11,7 @@ import pytest
 
 from stimrig.api.store.tables import Model
 from tests.api.conftest import QUICK_SPEED, Service, let_go, run_test, wait_done
-from tests.api.test_access import signed_in
+from tests.api.test_people import signed_in
 from tests.api.test_problems import problem
 
 ASKED = {"participant": "P017"}

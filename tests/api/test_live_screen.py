@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import re
 import time
+from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
+from stimrig.api.charts import figure as fig
+from stimrig.api.charts import model_charts
 from stimrig.api.store.tables import Test
 from stimrig.api.web.pages.views import limits_of
+from stimrig.api.workers.curves import recorded
 from stimrig.rig.messages import Bound, Status
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service, soon
+from tests.api.test_people import signed_in
+from tests.api.test_stop_right import stops_noted
 
-pytestmark = pytest.mark.browser
 SIZES = (1366, 768), (820, 1180)
 """A laptop and a tablet."""
 
 
-service = shared_service(speed=0.7)
+service = shared_service(speed=0.5)
 
 
 @pytest.fixture
@@ -36,6 +43,7 @@ OUTSIDE = """(names) => { scrollTo(0, 0); return names.filter((name) => {
   return box.top < 0 || box.bottom > innerHeight; }); }"""
 
 
+@pytest.mark.browser
 def test_everything_is_on_one_screen(running: Any) -> None:
     names = ["segment", "left", "torque", "width", "current", "dose", "age", "torque-chart", "width-chart", "tone"]
     for width, height in SIZES:
@@ -55,6 +63,7 @@ LIMIT_PIXELS = """(id) => { const c = document.getElementById(id), pen = c.getCo
   return n; }"""
 
 
+@pytest.mark.browser
 def test_what_flows_is_told_in_numbers_and_a_clinicians_words(running: Any, service: Service) -> None:
     running.locator("#segment", has_text="Random pulses").wait_for(timeout=30_000)
     assert running.locator("#segment").get_attribute("title") == "prbs"
@@ -77,6 +86,7 @@ def test_the_tightest_torque_limit_is_the_one_shown() -> None:
     assert limits_of(row, rig)["torque_nm"] == limits_of(row, None)["torque_nm"] == 12.0
 
 
+@pytest.mark.browser
 @pytest.mark.parametrize(("key", "focus"), [("Escape", "#tone"), (" ", ""), (" ", "#stop"), (" ", "#tone")])
 def test_esc_and_space_stop_once_wherever_the_focus_is(running: Any, service: Service, key: str, focus: str) -> None:
     if focus:
@@ -89,6 +99,7 @@ def test_esc_and_space_stop_once_wherever_the_focus_is(running: Any, service: Se
     assert service.rig.stopped_by is not None
 
 
+@pytest.mark.browser
 def test_a_space_in_a_note_is_a_space_and_esc_stops_there_too(running: Any, service: Service) -> None:
     running.evaluate(
         "document.querySelector('#live').insertAdjacentHTML('afterend', '<textarea id=remark></textarea>')"
@@ -100,6 +111,7 @@ def test_a_space_in_a_note_is_a_space_and_esc_stops_there_too(running: Any, serv
     running.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
 
+@pytest.mark.browser
 def test_the_tone_is_off_until_it_is_wished_and_kept(running: Any) -> None:
     assert not running.locator("#tone").is_checked()
     running.locator("#tone").click()
@@ -113,6 +125,7 @@ def test_the_tone_is_off_until_it_is_wished_and_kept(running: Any) -> None:
     assert not running.locator("#tone").is_checked()
 
 
+@pytest.mark.browser
 def test_a_page_that_was_signed_out_says_so_and_stops_all_the_same(running: Any, service: Service) -> None:
     expected(running.locator("#stale")).to_be_hidden()
     (cookie,) = running.context.cookies()
@@ -120,3 +133,93 @@ def test_a_page_that_was_signed_out_says_so_and_stops_all_the_same(running: Any,
     running.locator("#stale", has_text="You are signed out").wait_for(timeout=15_000)
     running.get_by_role("button", name="Stop stimulation").click()
     running.get_by_text("The rig confirms that stimulation is off.").wait_for()
+
+
+# ---- A stopped test's page shows what was recorded, who stopped it and when; loading a stop's page again stops nothing
+
+
+def stops(service: Service) -> int:
+    with service.client() as http:
+        return len(stops_noted(http))
+
+
+@pytest.mark.browser
+def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service) -> None:
+    participant(tab, service, f"W{time.time_ns() % 10**9}")
+    start(tab)
+    tab.locator("#segment", has_text="Random pulses").wait_for(timeout=60_000)
+    test_page = tab.url
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_role("heading", name=re.compile(r"Stopped at \d\d:\d\d:\d\d")).wait_for()
+    expected(tab.get_by_text("Ada: stop pressed on the page")).to_be_visible()
+    assert "/stopped/" in tab.url
+    before = stops(service)
+    with tab.expect_request(lambda request: request.is_navigation_request()) as asked:
+        tab.reload()
+    assert asked.value.method == "GET"
+    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    assert stops(service) == before, "loading the page again stops nothing again"
+    tab.get_by_role("link", name="See what was recorded").click()
+    tab.wait_for_url(test_page)
+    tab.locator("#recorded svg.still").wait_for()
+    tab.locator("#rig-state", has_text="Stopped").wait_for()
+    shown = tab.locator("#recorded").inner_text()
+    for words in ("torque, measured", "pulse width, sent", "planned, not played", "stopped at"):
+        assert words in shown, words
+    reason = tab.locator("#reason").inner_text()
+    assert re.search(r"Stopped at \d\d:\d\d:\d\d, after \d+\.\d s\..*by Ada", reason), reason
+    tab.locator("#rig-state", has_text="needs re-arm").wait_for()
+    tab.get_by_role("button", name="I have checked: re-arm").click()
+    tab.locator("#rig-state", has_text="ready").wait_for()
+    assert tab.url == test_page and service.rig.state == "ready", "on the spot"
+    assert tab.locator("canvas").count() == 0 and tab.get_by_text("What was planned", exact=True).count() == 0
+
+
+def test_an_unconfirmed_stop_keeps_its_warning_when_loaded_again(service: Service) -> None:
+    service.rig.confirms_stop = False
+    with service.client() as http:
+        answer = http.post("/v1/stop")
+    assert (answer.status_code, answer.json()["title"]) == (503, "The stop is not confirmed")
+    assert "emergency switch" in answer.json()["detail"]
+    with signed_in(service) as browser:
+        led = browser.post("/v1/stop", data={})
+        assert led.status_code == 303
+        for _ in range(2):
+            told = browser.get(led.headers["location"])
+            assert told.status_code == 503 and "emergency switch" in told.text
+            assert "<h1>The stop is not confirmed" in told.text and "confirms" not in told.text
+        unknown = browser.get("/stopped/none")  # as after a restart of the service
+        assert unknown.status_code == 404 and "The bar above shows what the rig does now" in unknown.text
+        assert 'id="rig-state"' in unknown.text and 'action="/v1/stop"' in unknown.text
+    service.rig.confirms_stop = True
+    with service.client() as http:
+        http.post("/v1/rearm")
+
+
+def made_up(path: Path, sent_us: list[float], seconds: float) -> Path:
+    time_s = np.arange(int(400 * seconds)) / 400
+    with h5py.File(path, "w") as file:
+        file["torque/time_s"], file["torque/torque_nm"] = time_s, np.where(np.arange(time_s.size) == 777, 9.0, 1.0)
+        file["pulses/planned_time_s"], file["pulses/sent_pulse_width_us"] = np.arange(len(sent_us)) / 40, sent_us
+        file.create_dataset("segments/name", data=["prbs"], dtype=h5py.string_dtype())
+        file["segments/start_s"], file["segments/end_s"] = [0.0], [len(sent_us) / 40]
+        file.attrs["pulse_rate_hz"] = 40.0
+    return path
+
+
+def test_no_peak_is_lost_and_a_dropped_pulse_is_a_gap(tmp_path: Path) -> None:
+    found = recorded(str(made_up(tmp_path / "r.h5", [100.0, 100.0, np.nan, 200.0], 30.0)), lambda *_: None)
+    assert max(found["torque_nm"]) == 9.0 and len(found["time_s"]) <= 2000
+    assert found["sent_pulse_width_us"] == [100.0, 100.0, None, 200.0, 200.0], "the first level reaches to the gap"
+    assert found["pulses_end_s"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("sent_us", [[], [0.0], [100.0] * 40])
+def test_what_was_not_played_begins_where_the_pulses_end(tmp_path: Path, sent_us: list[float]) -> None:
+    found = recorded(str(made_up(tmp_path / "r.h5", sent_us, 1.2 if sent_us else 0.0)), lambda *_: None)
+    plan_us = [100.0] * 400
+    figure = model_charts.recorded(found, plan_us, 40.0, "stopped")
+    (faint,) = [trace for trace in figure["data"] if trace["name"] == "planned, not played"]
+    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == fig.FAINT
+    whole = model_charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
+    assert not [trace for trace in whole["data"] if trace["name"] == "planned, not played"]

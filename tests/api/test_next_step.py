@@ -12,7 +12,7 @@ import pytest
 from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.next_view import Situation, Today, next_step
 from tests.api.conftest import Service, run_test, wait_done
-from tests.api.test_access import csrf, signed_in
+from tests.api.test_people import csrf, signed_in
 
 READY, DONE, POOR = Today("M1", "usable"), Today("M1", "usable", decided=True), Today("M1", "not usable")
 TABLE: list[tuple[dict[str, Any], str, str, str]] = [

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any
 
+import h5py
+import httpx
 import numpy as np
 import pytest
 
 from stimrig import identify
 from stimrig.api.models.tracking import Limits
+from stimrig.api.store.tables import Recording
 from stimrig.api.workers import tracking_verbs
+from stimrig.api.workers.pool import WORKER
 from stimrig.identify import tracking
 from stimrig.rig import messages as m
+from tests.api.conftest import Service, run_service, run_test, soon, wait_done
 from tests.api.fake_rig import PATIENT, write_recording
+from tests.api.test_tracked import play, say
 from tests.harness.sessions import Planned, record
 
 RATE_HZ = 400
@@ -149,3 +157,118 @@ def test_warming_follows_a_trial_of_its_own(model_json: str, monkeypatch: pytest
     monkeypatch.setattr(tracking, "follow", noted)
     assert tracking_verbs.warm(silent, model_json) == {}
     assert len(followed) == 1 and followed[0] > 1.0
+
+
+# ---- What the muscle did between two trials: the service passes it on, the worker carries its effects through it
+
+
+def passed_on(service: Service, approval_id: int) -> list[list[str]]:
+    """For each trial that was followed, the recordings that the worker was given beside its own."""
+    store = service.app.state.context.store
+    names = {row.path: row.id for row in store.all(Recording)}
+    rows = service.app.state.context.tracked.rows(approval_id)
+    return [[names[path] for path in row.step["state"]["between"]] for row in rows if row.step is not None]
+
+
+def test_the_worker_is_given_what_was_played_since(service: Service, client: httpx.Client, participant: str) -> None:
+    tested = run_test(client, participant)
+    plain = tested["model_id"]
+    assert client.post(f"/v1/models/{plain}/approve").status_code == 200
+    first = play(client)
+    soon(lambda: passed_on(service, 1) == [[]])  # a model without effects
+    added = client.post(f"/v1/models/{plain}/effects", json={"effects": ["fatigue"]}).json()["id"]
+    assert client.post(f"/v1/models/{added}/approve").status_code == 200
+    play(client)
+    say(service, reason="It cannot be read.")
+    missed = play(client)
+    client.put(f"/v1/participants/{participant}/profile", json={"current_ma": 15.0})
+    play(client)  # at another current: nobody knows how much it tires
+    client.put(f"/v1/participants/{participant}/profile", json={"current_ma": 20.0})
+    play(client)
+    play(client)
+    expected = [[tested["recording_id"], first["recording_id"]], [missed["recording_id"]], []]
+    soon(lambda: passed_on(service, 2) == expected)
+
+
+def at(path: str, unix_s: float) -> str:
+    """The recording, begun then."""
+    with h5py.File(path, "a") as file:
+        file.attrs["created_utc"] = datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tiring_json() -> str:
+    """A model with the effect fatigue."""
+    document = identify.fit(record(Planned(PATIENT, 0.0), 3)).to_dict()
+    values = {"depth": 0.6, "onset_s": 30.0, "recovery_s": 60.0}
+    settings = {"scale_nm": PATIENT.gain}
+    document["effects"] = [{"id": "fatigue", "form": "fitness", "parameters": values, "settings": settings}]
+    return json.dumps(document)
+
+
+def states(data: str, model_json: str, **more: Any) -> dict[str, float]:
+    found = follow(data, model_json, **more)
+    told = found["step"]["effects"]["fatigue"]
+    assert json.loads(found["model"])["effects"][0]["state"] == pytest.approx(told["coming"])
+    return told
+
+
+def test_the_worker_carries_the_states_through_it(tiring_json: str, tmp_path: Path) -> None:
+    test, trial = at(recorded(tmp_path, 1.0), 1e9), at(recorded(tmp_path, 0.9), 1e9 + 32.0)
+    alone = states(trial, tiring_json)
+    after = states(trial, tiring_json, between=[test])
+    broken = tmp_path / "R-broken.h5"
+    broken.write_bytes(b"nothing of the kind" * 100)
+    assert after["now"] > alone["now"] + 0.05 and 0.0 < after["coming"] < after["now"]
+    assert states(trial, tiring_json, between=[test, str(broken), str(tmp_path / "R-gone.h5")]) == after
+    assert states(at(trial, 1e9 + 9e4), tiring_json, between=[test])["now"] == pytest.approx(alone["now"], abs=1e-6)
+
+
+def test_a_model_without_such_effects_reads_no_further_recording(
+    tiring_json: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = json.dumps(json.loads(tiring_json) | {"effects": []})
+    test, trial = recorded(tmp_path, 1.0), recorded(tmp_path, 0.9)
+    read: list[Path] = []
+    dated = tracking_verbs.dated
+    monkeypatch.setattr(tracking_verbs, "dated", lambda path: (read.append(path), dated(path))[1])
+    assert follow(trial, plain, between=[test])["step"]["effects"] == {}
+    assert read == [Path(trial)]
+
+
+# ---- from a trial to the tracked model that is served; nothing is stubbed but the rig ----------------------------
+
+PERSON = "/v1/participants/P1"
+TRIAL_US = np.r_[np.zeros(40), np.linspace(0, 160, 100), np.full(60, 160.0), np.linspace(160, 0, 100), np.zeros(40)]
+TRIAL = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": TRIAL_US.round().tolist()}}]
+BODY = {"participant": "P1", "kind": "sequence", "segments": TRIAL}
+
+
+def test_a_muscle_that_stays_is_followed_through_the_service(tmp_path: Path, short_dir: Path) -> None:
+    for service in run_service(tmp_path, short_dir, WORKER):
+        with service.client() as client:
+            client.timeout = 300
+            client.post("/v1/participants", json={"code": "P1"})
+            test = run_test(client, "P1", 300)
+            assert client.post(f"/v1/models/{test['model_id']}/approve").status_code == 200
+            for number in (1, 2):
+                wait_done(client, client.post("/v1/tests", json=BODY).json()["id"], 300)
+                served = client.get(f"{PERSON}/model", params={"tracked": True})
+                for _ in range(60):  # a fetch waits two seconds at most, and the first trial may wait for the worker
+                    if served.json().get("tracking", {}).get("trial") == number:
+                        break
+                    served = client.get(f"{PERSON}/model", params={"tracked": True})
+            document, plain = served.json(), client.get(f"{PERSON}/model").json()
+            told = document["tracking"]
+            (one, two) = client.get(f"{PERSON}/tracking").json()["trials"]
+            assert told["trial"] == 2 and told["ask"] is None and two["outcome"] == "followed", (one, two)
+            gain = told["now"]["gain"]
+            assert gain["low"] < 1.0 < gain["high"] and gain["high"] - gain["low"] < 0.2
+            moved, approved = (np.array(d["recruitment"]["torque_nm"]) for d in (document, plain))
+            assert moved[-1] / approved[-1] == pytest.approx(told["coming"]["gain"]["value"], abs=0.02)
+            assert parsedate_to_datetime(served.headers["last-modified"]).isoformat()[:19] == two["at_utc"][:19]
+            wanted = {"reference_torque_nm": np.r_[np.zeros(20), np.full(60, 1.0)].tolist()}
+            widths = client.post(f"/v1/models/{document['model_id']}/widths", json=wanted)
+            assert widths.status_code == 200, widths.text
+            assert widths.json()["predicted_torque_nm"][-1] == pytest.approx(1.0, abs=0.1)

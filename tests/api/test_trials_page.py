@@ -13,7 +13,7 @@ from stimrig.api.models.tracking import OUTCOMES, sentences
 from stimrig.api.web.pages.decision_view import tracking_words
 from stimrig.api.web.responses.models import TrialOut
 from tests.api.conftest import Service
-from tests.api.test_access import csrf, signed_in
+from tests.api.test_people import csrf, signed_in
 from tests.api.test_tracked import play, say, tracked
 
 PAGE = "/participants/P017"

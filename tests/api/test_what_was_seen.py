@@ -22,9 +22,9 @@ from stimrig.rig import messages as m
 from stimrig.rig.requests import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
 from tests.api.fake_arm import still
-from tests.api.test_access import csrf, signed_in
 from tests.api.test_forms import fields
 from tests.api.test_overtaken import TRIAL, key_of
+from tests.api.test_people import csrf, signed_in
 
 HTML = {"Accept": "text/html"}
 QUIET: Any = None

@@ -15,7 +15,7 @@ import pytest
 from stimrig.api.models import explanation
 from stimrig.hardware_sim import hidden_records
 from tests.api.conftest import Service, run_test, soon, wait_done
-from tests.api.test_access import csrf, signed_in
+from tests.api.test_people import csrf, signed_in
 from tests.harness import few_effects
 
 

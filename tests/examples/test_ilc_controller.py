@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import io
-import sys
+import warnings
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
+from examples import ilc_controller as ilc
+from stimrig.identify.fitting import fit
+from stimrig.identify.model import Model
+from stimrig.identify.tracking import QUANTITIES, State, follow, model_for_next
+from tests.harness.changing import Changing
 from tests.harness.muscle import Patient
+from tests.harness.patients import make_record
 
 PATH = Path(__file__).parents[2] / "examples" / "ilc_controller.py"
-
-
-@pytest.fixture(scope="module")
-def ilc() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("ilc_controller", PATH)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["ilc_controller"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def patient_of(period_s: float, damping: float, plateau_nm: float, middle_us: float) -> Patient:
@@ -90,7 +86,7 @@ def test_imports_nothing_of_ours_but_the_client() -> None:
     assert {"stimrig", "numpy", "h5py"} <= names
 
 
-def test_pulse_response_has_unit_gain(ilc: ModuleType) -> None:
+def test_pulse_response_has_unit_gain() -> None:
     response = ilc.Plant(model_of(*MODEL), 400).response
     assert response.sum() == pytest.approx(1.0, abs=0.01)
     assert response[0] < response[5]
@@ -99,7 +95,7 @@ def test_pulse_response_has_unit_gain(ilc: ModuleType) -> None:
 @pytest.mark.parametrize(
     ("law", "static"), [("norm-optimal", False), ("norm-optimal", True), ("phase-lead", False), ("phase-lead", True)]
 )
-def test_error_falls_below_five_percent_in_five_trials(ilc: ModuleType, law: str, static: bool) -> None:
+def test_error_falls_below_five_percent_in_five_trials(law: str, static: bool) -> None:
     """On a muscle unlike its model: below 5 % by the fifth trial, falling from the first until noise is reached."""
     reference = ilc.Reference.reach(4.0)
     trials = ilc.learn(Muscle(), model_of(*MODEL), reference, law, 10, static)
@@ -111,7 +107,7 @@ def test_error_falls_below_five_percent_in_five_trials(ilc: ModuleType, law: str
     assert errors[-1] < floor, errors
 
 
-def test_noise_is_not_played_back(ilc: ModuleType) -> None:
+def test_noise_is_not_played_back() -> None:
     """At the noise's floor a full correction gives the last trial's noise back (error √2 of it, less what G takes)."""
     reference, noise_nm, last = ilc.Reference.reach(4.0), 0.2, []
     for seed in range(6):
@@ -128,7 +124,7 @@ def test_noise_is_not_played_back(ilc: ModuleType) -> None:
     assert np.mean(last) < 1.13 * floor, (np.mean(last), floor)
 
 
-def test_dropped_pulses_are_not_learnt_from(ilc: ModuleType) -> None:
+def test_dropped_pulses_are_not_learnt_from() -> None:
     reference = ilc.Reference.reach(4.0)
     trials = ilc.learn(Muscle(drops=True), model_of(*MODEL), reference, "norm-optimal", 6)
     assert all(trial.lost_pulses for trial in trials)
@@ -136,13 +132,13 @@ def test_dropped_pulses_are_not_learnt_from(ilc: ModuleType) -> None:
     assert 100 * np.sqrt(np.mean((clean - reference.torque_nm) ** 2)) / reference.rms_nm < 3
 
 
-def test_reference_asks_for_what_a_muscle_can_give(ilc: ModuleType) -> None:
+def test_reference_asks_for_what_a_muscle_can_give() -> None:
     reference = ilc.Reference.reach(3.0)
     assert reference.torque_nm.max() == pytest.approx(3.0) and reference.torque_nm.min() == 0.0
     assert reference.torque_nm.size == 400
 
 
-def test_trial_that_did_not_end_well_halts_the_controller(ilc: ModuleType) -> None:
+def test_trial_that_did_not_end_well_halts_the_controller() -> None:
     file = io.BytesIO()
     with h5py.File(file, "w") as recording:
         recording.attrs["outcome"], recording.attrs["reason"] = "fault", "the load cell fell silent"
@@ -150,7 +146,7 @@ def test_trial_that_did_not_end_well_halts_the_controller(ilc: ModuleType) -> No
         ilc.measured(file.getvalue(), 400)
 
 
-def test_a_share_that_was_halved_grows_again(ilc: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_share_that_was_halved_grows_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second trial is disturbed; what is learnt after it is learnt faster than with the half share."""
 
     class Disturbed(Muscle):
@@ -215,7 +211,7 @@ class Tiring(Muscle):
         return document_of(self.at(self.trials - 1), self.at(self.trials))
 
 
-def test_plant_now_is_the_plant_of_the_levels_now(ilc: ModuleType) -> None:
+def test_plant_now_is_the_plant_of_the_levels_now() -> None:
     now, coming = (0.8, 6.0, 1.1), (0.7, 9.0, 1.2)
     document = document_of(now, coming)
     plant, wanted, widths = ilc.Plant(document, 400).now(), ilc.Plant(model_of(*moved(*now)), 400), np.arange(0, 290.0)
@@ -226,7 +222,7 @@ def test_plant_now_is_the_plant_of_the_levels_now(ilc: ModuleType) -> None:
 @pytest.mark.parametrize(
     "changes", [{"rises_us": 0.0, "slows": 0.0}, {"falls": 0.0, "slows": 0.0}, {"falls": 0.0, "rises_us": 0.0}, {}]
 )
-def test_a_muscle_that_tires_is_followed(ilc: ModuleType, changes: dict[str, float]) -> None:
+def test_a_muscle_that_tires_is_followed(changes: dict[str, float]) -> None:
     """A well-followed model leaves nearly the error of a muscle that does not change; without it, far more is left."""
     reference, last = ilc.Reference.reach(3.0), {}
     for name, muscle, tracked in (
@@ -240,7 +236,7 @@ def test_a_muscle_that_tires_is_followed(ilc: ModuleType, changes: dict[str, flo
     assert last["untracked"] > 2 * last["tracked"], last
 
 
-def test_what_a_person_holds_is_learnt_as_without_following(ilc: ModuleType) -> None:
+def test_what_a_person_holds_is_learnt_as_without_following() -> None:
     reference, last = ilc.Reference.reach(3.0), {}
     for tracked in (False, True):
         muscle = Tiring(rises_us=0.0, slows=0.0)
@@ -250,7 +246,7 @@ def test_what_a_person_holds_is_learnt_as_without_following(ilc: ModuleType) -> 
     assert last[True] < 1.2 * last[False], last
 
 
-def test_a_model_that_is_never_moved_is_played_as_untracked(ilc: ModuleType) -> None:
+def test_a_model_that_is_never_moved_is_played_as_untracked() -> None:
     reference, still = ilc.Reference.reach(3.0), {"falls": 0.0, "rises_us": 0.0, "slows": 0.0}
     document, runs = model_of(*moved(1.1, 4.0, 1.1)), []  # with something to learn
     for tracked in (False, True):
@@ -264,7 +260,7 @@ def test_a_model_that_is_never_moved_is_played_as_untracked(ilc: ModuleType) -> 
         assert other.error_percent == pytest.approx(one.error_percent, rel=0.1)
 
 
-def test_what_a_muscle_did_of_its_own_is_not_learnt(ilc: ModuleType) -> None:
+def test_what_a_muscle_did_of_its_own_is_not_learnt() -> None:
     """A spasm in the third trial: told of it, the controller plays the fourth as if it had not been."""
     reference, after = ilc.Reference.reach(3.0), []
     for told in (True, False):
@@ -288,7 +284,7 @@ def test_what_a_muscle_did_of_its_own_is_not_learnt(ilc: ModuleType) -> None:
     assert after[0] < 1.3 and after[1] > 5, after
 
 
-def test_a_followed_model_is_waited_for(ilc: ModuleType) -> None:
+def test_a_followed_model_is_waited_for() -> None:
     class Slow:
         asked = 0
 
@@ -300,9 +296,104 @@ def test_a_followed_model_is_waited_for(ilc: ModuleType) -> None:
     assert ilc.Service(Slow(), "P").fetch_followed() == {"number": 3}
 
 
-def test_it_stops_where_a_person_has_to_be_asked(ilc: ModuleType) -> None:
+def test_it_stops_where_a_person_has_to_be_asked() -> None:
     asks = SimpleNamespace(document={"tracking": {"ask": "A new test is needed."}}, changed=True)
     client = SimpleNamespace(approved_model=lambda *_, **__: asks)
     for fetch in (ilc.Service.fetch_followed, ilc.Service.fetch):
         with pytest.raises(ilc.HaltedError, match="A new test is needed"):
             fetch(ilc.Service(client, "P"))
+
+
+# ---- The controller with the filter in its loop, on simulated muscles that change or stay; no service between them
+
+
+PEOPLE = {
+    55001: Patient.with_rise(45.0, 120.0, gain=8.0, time_constant_s=0.25, damping=0.9),
+    55002: Patient.with_rise(70.0, 90.0, gain=4.0, time_constant_s=0.16, damping=0.7),
+    55003: Patient.with_rise(60.0, 150.0, gain=11.0, time_constant_s=0.35, damping=1.0),
+}
+TRIALS = 10
+REST = 40
+"""Pulse periods before and after a trial."""
+
+
+class Loop:
+    """Stands where the service stands: a trial is recorded, followed, and the moved model served."""
+
+    wanted_nm: np.ndarray | None = None
+
+    def __init__(self, model: Model, muscle: Changing, seed: int) -> None:
+        self.model, self.muscle, self.rng = model, muscle, np.random.default_rng(seed)
+        self.state: State | None = None
+        self.trials = 0
+        self.moved: list[float] = []
+
+    def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rests = np.zeros(REST)
+        self.record = self.muscle.play(np.r_[rests, widths_us, rests], self.trials, self.rng)
+        self.trials += 1
+        torque_nm = self.record.torque_nm.reshape(widths_us.size + 2 * REST, -1)
+        return torque_nm[REST : REST + widths_us.size].mean(axis=1) - torque_nm[12:REST].mean(), widths_us
+
+    def fetch_followed(self) -> dict[str, Any]:
+        step = follow(self.model, self.state, self.record)
+        if self.state is not None:
+            bands = 1.96 * np.sqrt(np.diag(self.state.covariance)[: len(QUANTITIES)])
+            self.moved.append(float(np.max(np.abs(step.coming.mean - self.state.mean)[: len(QUANTITIES)] / bands)))
+        self.state = step.coming
+        tracking = step.to_dict() | {"moved": list(QUANTITIES)}
+        return model_for_next(self.model, step).to_dict() | {"tracking": tracking}
+
+
+@pytest.fixture(scope="module")
+def models() -> dict[int, Model]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return {seed: fit(make_record(one, np.random.default_rng(seed))[0]) for seed, one in PEOPLE.items()}
+
+
+def errors(model: Model, muscle: Changing, seed: int, tracked: bool = True) -> tuple[np.ndarray, list[float]]:
+    document, loop = model.to_dict(), Loop(model, muscle, seed)
+    reference = ilc.Reference.reach(0.4 * float(document["recruitment"]["inverse"]["torque_nm"][-1]))
+    done = ilc.learn(loop, document, reference, "norm-optimal", TRIALS, tracked=tracked)  # pyright: ignore
+    return np.array([trial.error_percent for trial in done]), loop.moved
+
+
+@pytest.fixture(scope="module")
+def still(models: dict[int, Model]) -> dict[int, tuple[np.ndarray, list[float]]]:
+    """Followed, where nothing changes."""
+    return {seed: errors(models[seed], Changing(patient), seed) for seed, patient in PEOPLE.items()}
+
+
+def test_where_nothing_changes_following_costs_nothing_and_moves_nothing(
+    models: dict[int, Model], still: dict[int, tuple[np.ndarray, list[float]]]
+) -> None:
+    without = [errors(models[seed], Changing(patient), seed, tracked=False)[0] for seed, patient in PEOPLE.items()]
+    last = [np.mean([found[-3:] for found in runs]) for runs in ([found for found, _ in still.values()], without)]
+    moved = [far for _, each in still.values() for far in each]
+    assert last[0] < 1.05 * last[1], last
+    assert len(moved) == 3 * (TRIALS - 1) and max(moved) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "most"),
+    [
+        ({"gain": lambda n: 1 - 0.04 * n}, 1.3),
+        ({"gain": lambda n: 1 + 0.25 * (1 - np.exp(-n / 3))}, 1.5),
+        ({"shift_us": lambda n: 1.5 * n}, 1.5),
+        ({"time_scale": lambda n: 1 + 0.03 * n}, 1.5),
+    ],
+    ids=["fatigue of 40 %", "potentiation", "threshold drift", "slower"],
+)
+def test_a_muscle_that_changes_is_followed(
+    models: dict[int, Model],
+    still: dict[int, tuple[np.ndarray, list[float]]],
+    change: dict[str, Callable[[float], float]],
+    most: float,
+) -> None:
+    ratios = []
+    for seed, patient in PEOPLE.items():
+        found, _ = errors(models[seed], Changing(patient, **change), seed)
+        ratios.append(np.mean(found[-2:]) / np.mean(still[seed][0][-2:]))
+    assert np.median(ratios) <= most, ratios
+    assert max(ratios) <= 1.5 * most, ratios

@@ -11,7 +11,7 @@ from _pytest.mark.expression import Expression
 PROCESSORS = os.cpu_count() or 1
 TOGETHER = ("--dist", "worksteal", "-n")
 FAST = "not wire and not browser and not service and not slow"
-ON_POSTGRESQL = ("access", "archive", "controller_keys", "idle_lock", "people", "session", "tracked")
+ON_POSTGRESQL = ("controller_keys", "idle_lock", "participants", "people", "session", "tracked")
 
 
 @dataclass(frozen=True)

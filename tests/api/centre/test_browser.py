@@ -10,8 +10,7 @@ import httpx
 import pytest
 
 from tests.api.browser import close, there, watched
-from tests.api.centre.conftest import Centre
-from tests.api.centre.told import AT, Teller
+from tests.api.centre.conftest import AT, Centre, Teller
 from tests.api.conftest import TOKEN
 from tests.api.test_axe import fits, violations
 

@@ -19,8 +19,7 @@ from stimrig.api.centre import check
 from stimrig.api.centre.bucket import Bucket, BucketError
 from stimrig.api.centre.spool import MOST_PARTS, MOST_PIECE_BYTES
 from stimrig.api.store.centre_tables import CentreFile, CentreItem, CentreModel, CentreWanted
-from tests.api.centre.conftest import Centre, run_centre
-from tests.api.centre.told import Teller, sha256
+from tests.api.centre.conftest import Centre, Teller, run_centre, sha256
 from tests.api.conftest import PATIENCE_S, soon
 
 

@@ -14,8 +14,7 @@ from sqlalchemy import update
 
 from stimrig.api.centre import warnings
 from stimrig.api.store.centre_tables import CentreItem, CentreRecording, CentreWarning
-from tests.api.centre.conftest import Centre, run_centre
-from tests.api.centre.told import AT, ZEROS, Teller, canonical, sha256
+from tests.api.centre.conftest import AT, ZEROS, Centre, Teller, canonical, run_centre, sha256
 
 
 def counts(centre: Centre) -> tuple[int, int]:

@@ -17,8 +17,7 @@ from stimrig.api.centre import app as centre_app
 from stimrig.api.centre.pages import doubts
 from stimrig.api.store.centre_tables import CentreRig
 from stimrig.rig.messages import RigState
-from tests.api.centre.conftest import Centre, run_centre
-from tests.api.centre.told import Teller
+from tests.api.centre.conftest import Centre, Teller, run_centre
 from tests.api.conftest import TOKEN
 
 HOLDERS = ("nobody", "reader", "rig", "administrator")

@@ -23,7 +23,7 @@ from stimrig.api.store import audit
 from stimrig.api.store.audit import entry_hash
 from stimrig.api.store.tables import AuditEntry, OutboxItem
 from tests.api.centre.conftest import Centre
-from tests.api.outbox.rigs import Rig
+from tests.api.outbox.conftest import Rig
 
 
 class Trail:

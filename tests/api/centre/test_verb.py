@@ -18,8 +18,7 @@ import pytest
 
 from stimrig.api import schemas
 from stimrig.api.cli.main import run
-from tests.api.centre.conftest import Centre
-from tests.api.centre.told import Teller, sha256
+from tests.api.centre.conftest import Centre, Teller, sha256
 
 ROOT = Path(__file__).parents[3]
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from stimrig.api.cohort import figures
-from stimrig.api.cohort.statistics import read_statistics, wilson
-from stimrig.api.cohort.tasks import CohortError
-from tests.api.cohort.test_changed import failed, row, written
+from stimrig.api.cli.commands.cohort import changed_lines
+from stimrig.api.cohort import changed, figures
+from stimrig.api.cohort.changed import compared
+from stimrig.api.cohort.results import Results
+from stimrig.api.cohort.statistics import read_statistics, repeatability, wilson
+from stimrig.api.cohort.tasks import CohortError, Task
 
 
 def session(who: int, week: int, tired: bool = False, **more: Any) -> dict[str, Any]:
@@ -111,3 +115,172 @@ def test_no_results_are_one_line(tmp_path: Path) -> None:
         read_statistics(tmp_path / "nowhere.parquet")
     with pytest.raises(CohortError, match="no record"):
         read_statistics(written(tmp_path / "r.parquet"))
+
+
+# ---- Two runs compared: what changed is named with its reason, noise is not, and who is in one only is told
+
+
+def row(name: str, **more: Any) -> dict[str, Any]:
+    found = {
+        "address": f"/d/{name}", "name": name, "record_id": name, "stamp": name, "status": "ok",
+        "sha256": hashlib.sha256(name.encode()).hexdigest(), "participant": "P001", "day": "2026-01-05",
+        "verdict": "effect_missing", "probability": 0.9, "held_out_rms_nm": 0.2,
+        "effects": [{"effect": "fatigue", "probability": 0.9}],
+        "parameters": [
+            {"of": "fatigue", "name": "depth", "value": 0.5, "sd": 0.1, "unit": "1"},
+            {"of": "fatigue", "name": "onset_s", "value": 90.0, "sd": None, "unit": "s"},
+        ],
+    }  # fmt: skip
+    return deepcopy({**found, **more})
+
+
+def failed(name: str, kind: str = "timeout", **more: Any) -> dict[str, Any]:
+    found = row(name, status="error", error_kind=kind, error=f"it was {kind}", **more)
+    return {**found, "verdict": None, "effects": None, "parameters": None, "probability": None, "held_out_rms_nm": None}
+
+
+def written(path: Path, *rows: dict[str, Any], verb: str = "diagnose", software: str = "1.0") -> Path:
+    with Results(path, Task(verb, software=software)) as results:
+        for one in rows:
+            results.add(one)
+        results.join()
+    return path
+
+
+def of(tmp_path: Path, old: dict[str, Any], new: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """Kinds and reasons of one record."""
+    before = written(tmp_path / "old.parquet", old)
+    after = written(tmp_path / "new.parquet", new, software="2.0")
+    found = compared(before, after).to_dict()
+    assert found["compared"] == 1
+    return (found["records"][0]["kinds"], found["records"][0]["why"]) if found["records"] else ([], [])
+
+
+def with_parameter(number: int, **more: Any) -> dict[str, Any]:
+    found = row("a")
+    found["parameters"][number] |= more
+    return found
+
+
+@pytest.mark.parametrize(
+    ("new", "kind", "why"),
+    [
+        (row("a", verdict="nothing_missing", effects=[], parameters=[]), "verdict",
+         "effect missing → nothing missing"),
+        (row("a", effects=[]), "effect lost", "fatigue lost (probability 0.9)"),
+        (row("a", effects=[{"effect": "fatigue", "probability": 0.9}, {"effect": "tremor", "probability": 0.7}]),
+         "effect gained", "tremor gained (probability 0.7)"),
+        (row("a", effects=[{"effect": "fatigue", "probability": 0.8}]), "probability", "fatigue 0.9 → 0.8"),
+        (row("a", probability=0.5), "probability", "of the verdict 0.9 → 0.5"),
+        (with_parameter(0, value=0.61), "parameter", "fatigue depth 0.5 → 0.61 (sd 0.1)"),
+        (with_parameter(1, value=95.0), "parameter", "fatigue onset_s 90 → 95 s"),
+        (row("a", held_out_rms_nm=0.3), "held-out error", "0.2 → 0.3 N·m"),
+        (failed("a"), "ok to error", "now timeout: it was timeout"),
+    ],
+)  # fmt: skip
+def test_a_change_is_named(tmp_path: Path, new: dict[str, Any], kind: str, why: str) -> None:
+    kinds, reasons = of(tmp_path, row("a"), new)
+    assert kinds[0] == kind
+    assert any(why in reason for reason in reasons), reasons
+
+
+@pytest.mark.parametrize(
+    "new",
+    [
+        row("a"),
+        row("a", probability=0.9 + 1e-9, held_out_rms_nm=0.2000001),
+        row("a", effects=[{"effect": "fatigue", "probability": 0.94}]),
+        with_parameter(0, value=0.59),
+        with_parameter(1, value=90.5),
+        with_parameter(0, value=0.7, sd=0.25),
+        row("a", address="/elsewhere/a", took_s=99.0),
+    ],
+)
+def test_noise_is_no_change(tmp_path: Path, new: dict[str, Any]) -> None:
+    assert of(tmp_path, row("a"), new) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("new", "kinds"),
+    [(row("a"), ["error to ok"]), (failed("a", "bad record"), ["other error"]),
+     ({**failed("a"), "error": "in other words"}, [])],
+)  # fmt: skip
+def test_errors_are_compared_by_their_kind(tmp_path: Path, new: dict[str, Any], kinds: list[str]) -> None:
+    assert of(tmp_path, failed("a"), new)[0] == kinds
+
+
+@pytest.mark.parametrize("shares", [1, 3])
+def test_counts_and_who_is_in_one_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shares: int) -> None:
+    monkeypatch.setattr(changed, "ROWS_AT_ONCE", 100 if shares == 1 else 3)
+    unread = failed("far", "unreadable", sha256=None)
+    old = written(tmp_path / "old.parquet", *(row(name) for name in "abcd"), unread, failed("x", sha256=None),
+                  failed("y", sha256=None))  # fmt: skip
+    new = written(
+        tmp_path / "new.parquet", row("a"), row("b", probability=0.1), row("c", verdict="nothing_missing"), row("e"),
+        row("far"), failed("x", sha256=None), failed("z", sha256=None), software="2.0",
+    )  # fmt: skip
+    found = compared(old, new).to_dict()
+    assert (found["compared"], found["unchanged"], found["changed"]) == (5, 2, 3)
+    assert found["counts"] == {"error to ok": 1, "verdict": 1, "probability": 1}
+    assert [one["record"] for one in found["records"]] == ["far", "c", "b"]
+    assert (found["only_in_old"], found["only_in_new"]) == (["d", "y"], ["e", "z"])
+    assert (found["old"]["software"], found["new"]["software"]) == ("1.0", "2.0")
+    assert found["other_options"] == ""
+
+
+def test_other_options_are_told(tmp_path: Path) -> None:
+    """What changed need not be the new version's doing."""
+    old, new = written(tmp_path / "o.parquet", row("a")), tmp_path / "n.parquet"
+    with Results(new, Task("diagnose", method="ridge", effects=("auto",), software="2.0")) as results:
+        results.add(row("a"))
+        results.join()
+    found = compared(old, new).to_dict()
+    assert found["other_options"] == "method maximum-likelihood, now ridge, effects none, now auto"
+    assert f"made with other options: {found['other_options']}" in changed_lines(found)
+
+
+def test_results_of_two_verbs_are_refused(tmp_path: Path) -> None:
+    old, new = written(tmp_path / "o.parquet", row("a")), written(tmp_path / "n.parquet", row("a"), verb="fit")
+    with pytest.raises(CohortError, match="of one verb"):
+        compared(old, new)
+    with pytest.raises(CohortError, match="no such file"):
+        compared(old, tmp_path / "nowhere.parquet")
+    (tmp_path / "x.parquet").write_bytes(b"x")
+    with pytest.raises(CohortError, match="no table of results"):
+        compared(tmp_path / "x.parquet", new)
+
+
+# ---- Figures with known answers
+
+
+def test_the_interval_of_a_share() -> None:
+    """Newcombe 1998, Statistics in Medicine 17:857, table I, method 3."""
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    assert wilson(15, 148) == pytest.approx((0.0624, 0.1605), abs=5e-5)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
+    assert wilson(1, 29) == pytest.approx((0.0061, 0.1718), abs=5e-5)
+    assert wilson(0, 0) == (0.0, 1.0)
+    assert wilson(5, 5)[1] == 1.0
+
+
+def test_repeatability_of_a_known_table() -> None:
+    """Shrout and Fleiss 1979, Psychological Bulletin 86:420: ICC(1,1) of their table 2 is 0.17."""
+    rows = [(9, 2, 5, 8), (6, 1, 3, 2), (8, 4, 6, 8), (7, 1, 2, 6), (10, 5, 6, 9), (6, 2, 4, 7)]
+    found = repeatability([[float(value) for value in row] for row in rows])
+    assert found is not None
+    assert found.icc == pytest.approx(0.166, abs=5e-4)
+    assert found.within_sd**2 == pytest.approx(6.264, abs=5e-4)
+    assert (found.participants, found.sessions) == (6, 24)
+
+
+def test_too_few_say_less() -> None:
+    assert repeatability([]) is None
+    assert repeatability([[1.0], [2.0]]) is None
+    one = repeatability([[1.0, 3.0], [7.0]])
+    assert one is not None
+    assert (one.participants, one.sessions, one.between_sd, one.icc) == (1, 2, None, None)
+    assert one.within_sd == pytest.approx(2**0.5)
+    both_signs = repeatability([[-1.0, 1.0], [0.5, -0.5]])
+    assert both_signs is not None and both_signs.cv_percent is None
+    same = repeatability([[2.0, 2.0], [2.0, 2.0]])
+    assert same is not None and same.icc is None and same.within_sd == 0.0

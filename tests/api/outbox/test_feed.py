@@ -14,7 +14,7 @@ from stimrig.api.outbox import chain, feed
 from stimrig.api.outbox.feed import Feed
 from stimrig.api.store import audit, uploads
 from stimrig.api.store.tables import Approval, Model, Note, OutboxItem, Participant, Recording, Test
-from tests.api.outbox.rigs import Rig, assert_chain, sha256
+from tests.api.outbox.conftest import Rig, assert_chain, sha256
 
 
 def as_items(rig: Rig) -> list[dict[str, Any]]:

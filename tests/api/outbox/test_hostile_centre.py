@@ -7,7 +7,7 @@ import itertools
 import httpx
 
 from stimrig.api.outbox import files
-from tests.api.outbox.rigs import Rig, run
+from tests.api.outbox.conftest import Rig, run
 from tests.harness.fake_centre import KEY, FakeCentre, answer, problem
 
 DAY_S = 86400.0

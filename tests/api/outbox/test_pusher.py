@@ -24,7 +24,7 @@ from stimrig.api.outbox.files import CHUNK
 from stimrig.api.outbox.pusher import HELLO_S, REVOKED_S
 from stimrig.api.store import audit
 from stimrig.api.store.tables import AuditEntry, Participant, Recording
-from tests.api.outbox.rigs import Rig, assert_chain, assert_told, run, sha256
+from tests.api.outbox.conftest import Rig, assert_chain, assert_told, run, sha256
 from tests.harness.fake_centre import KEY, RUBBISH, BadLine, FakeCentre
 
 

@@ -1,0 +1,323 @@
+"""The list of participants, the archive, side and muscle, and who ran a test."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+from sqlalchemy import event
+
+from stimrig.api import language
+from stimrig.api.models.stored_model import followed
+from stimrig.api.store.tables import Participant
+from tests.api.conftest import Service, run_test, shared_service, soon, wait_done
+from tests.api.test_people import csrf, signed_in
+
+service = shared_service()
+
+
+@pytest.fixture
+def http(service: Service) -> Iterator[httpx.Client]:
+    with service.client() as client:
+        yield client
+
+
+def make(http: httpx.Client, code: str, **more: Any) -> None:
+    assert http.post("/v1/participants", json={"code": code, **more}).status_code == 201
+
+
+def test_an_archived_participant_is_left_alone_until_it_is_taken_out(http: httpx.Client) -> None:
+    make(http, "A1")
+    assert http.post("/v1/participants/A1/archive").json()["archived_utc"]
+    for path, body in (("/v1/tests", {"participant": "A1"}), ("/v1/participants/A1/calibration", {})):
+        refused = http.post(path, json=body)
+        assert refused.status_code == 409 and refused.json()["type"] == "/problems/archived", refused.text
+        assert "unarchive" in refused.json()["detail"]
+    assert "A1" not in [row["code"] for row in http.get("/v1/participants", params={"archived": False}).json()]
+    assert [row["code"] for row in http.get("/v1/participants", params={"archived": True}).json()] == ["A1"]
+    assert http.post("/v1/participants/A1/unarchive").json()["archived_utc"] is None
+    assert run_test(http, "A1")["state"] == "completed"
+    trail = [entry["action"] for entry in http.get("/v1/audit").json()["entries"] if entry["subject"] == "A1"]
+    assert trail == ["create participant", "archive", "unarchive"]
+    seen = {"If-Match": http.get("/v1/participants/A1").headers["etag"]}
+    refused = http.post("/v1/participants/nobody/archive", headers=seen)
+    assert refused.status_code == 409 and "no version of /v1/participants/nobody" in refused.json()["detail"]
+
+
+def test_nobody_is_archived_in_the_middle_of_a_test(service: Service, http: httpx.Client) -> None:
+    make(http, "A2", side="left")
+    service.rig.speed = 2.0
+    test = http.post("/v1/tests", json={"participant": "A2"}).json()
+    for refused in (
+        http.post("/v1/participants/A2/archive"),
+        http.put("/v1/participants/A2/muscle", json={"side": "right"}),
+    ):
+        assert refused.status_code == 409 and refused.json()["type"] == "/problems/participant-busy"
+    service.rig.speed = 60.0
+    assert wait_done(http, test["id"])["side"] == "left"
+    assert http.post("/v1/participants/A2/archive").status_code == 200
+
+
+def test_the_list_is_searched_and_most_recent_first(http: httpx.Client) -> None:
+    for code in ("S_1", "S_2", "Sx2"):
+        make(http, code)
+    run_test(http, "S_1")
+    assert [row["code"] for row in http.get("/v1/participants", params={"q": "s_"}).json()] == ["S_1", "S_2"]
+    assert http.get("/v1/participants", params={"q": "%"}).json() == []
+    assert http.get("/v1/participants", params={"q": "x" * 81}).status_code == 422
+
+
+def test_a_test_keeps_the_side_it_was_begun_with_and_says_who_ran_it(http: httpx.Client) -> None:
+    make(http, "M1", side="left", muscle="biceps brachii")
+    test = http.post("/v1/tests", json={"participant": "M1", "ran_by": "Jörg  Müller"}).json()
+    wait_done(http, test["id"])
+    assert http.put("/v1/participants/M1/muscle", json={"side": "right", "muscle": "biceps brachii"}).status_code == 200
+    kept = http.get(f"/v1/tests/{test['id']}").json()
+    assert (kept["side"], kept["muscle"]) == ("left", "biceps brachii")
+    assert (kept["requested_by"], kept["ran_by"]) == ("administrator", "Jörg Müller")
+    again = run_test(http, "M1")
+    assert (again["side"], again["ran_by"]) == ("right", "administrator")
+
+
+@pytest.mark.parametrize("body", [{"side": "both"}, {"muscle": ""}, {"muscle": "x" * 61}, {"muscle": "a\nb"}])
+def test_what_is_no_side_or_muscle_is_refused(http: httpx.Client, body: dict[str, Any]) -> None:
+    assert http.put("/v1/participants/M1/muscle", json=body).status_code == 422
+    assert http.post("/v1/participants", json={"code": "M9", **body}).status_code == 422
+
+
+def test_thresholds_of_one_arm_do_not_hold_for_the_other(service: Service, http: httpx.Client) -> None:
+    make(http, "M2")
+    http.put("/v1/participants/M2/muscle", json={"side": "left"})
+    store = service.app.state.context.store
+    with store.write() as session:
+        row = session.get(Participant, "M2")
+        row.profile = {**row.profile, "motor_pulse_width_us": 80.0, "set_at_utc": "2026-03-01T10:00:00.000Z"}
+    refused = http.put("/v1/participants/M2/muscle", json={"side": "right"})
+    assert refused.status_code == 409 and "left" in refused.json()["detail"]
+    assert http.get("/v1/participants/M2").json()["side"] == "left"
+    done = http.put("/v1/participants/M2/muscle?void_calibration=true", json={"side": "right"}).json()
+    assert done["side"] == "right" and done["profile"]["motor_pulse_width_us"] is None
+
+
+def test_the_first_page_asks_as_much_of_the_database_for_many_as_for_few(service: Service, http: httpx.Client) -> None:
+    store = service.app.state.context.store
+    asked: list[str] = []
+    event.listen(store.engine, "before_cursor_execute", lambda *given: asked.append(given[2]))
+
+    def once(path: str, html: bool) -> int:
+        asked.clear()
+        answer = http.get(path, headers={"Accept": "text/html"} if html else {})
+        assert answer.status_code == 200
+        return len(asked)
+
+    def count(path: str, html: bool = False) -> int:
+        """The fewest of some tries: what the service does by itself asks the database meanwhile, too."""
+        return min(once(path, html) for _ in range(5))
+
+    few = count("/v1/participants"), count("/?all=1", html=True)
+    now = service.app.state.context.clock.utc()
+    with store.write() as session:
+        for number in range(500):
+            session.add(
+                Participant(code=f"Z{number:03d}", profile={"current_ma": 20.0}, created_utc=now, created_by="t")
+            )
+    assert (count("/v1/participants"), count("/?all=1", html=True)) == few
+    assert len(http.get("/v1/participants", params={"q": "Z"}).json()) == 500
+
+
+def test_the_page_of_an_archived_participant_offers_the_way_out_and_no_test(
+    service: Service, http: httpx.Client
+) -> None:
+    make(http, "A3")
+    http.post("/v1/participants/A3/archive")
+    with signed_in(service) as browser:
+        page = browser.get("/participants/A3").text
+        assert 'data-next="archived"' in page and "In the archive since" in page
+        assert "Start the pre-session test" not in page and "A3/calibration" not in page
+        assert page.count('action="/participants/A3/unarchive"') == 2, "in the line that says what is next, and below"
+        out = browser.post("/participants/A3/unarchive", data={"csrf": csrf(browser)})
+        assert out.status_code == 303
+        assert "Start the pre-session test" in browser.get("/participants/A3").text
+
+
+def test_side_and_muscle_are_asked_for_on_the_page(service: Service, http: httpx.Client) -> None:
+    with signed_in(service) as browser:
+        assert '<option value="right"' in browser.get("/").text and 'name="muscle"' in browser.get("/").text
+        form = {"csrf": csrf(browser), "code": "A4", "side": "right", "muscle": "triceps brachii"}
+        assert browser.post("/participants", data=form).headers["location"] == "/participants/A4"
+    made = http.get("/v1/participants/A4").json()
+    assert (made["side"], made["muscle"]) == ("right", "triceps brachii")
+
+
+# ---- Notes: on a session, on a test, at a time in it; struck and never deleted; and what may not stand in one
+
+
+@pytest.fixture(scope="module")
+def made(service: Service) -> Iterator[tuple[httpx.Client, dict[str, Any]]]:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "N1"})
+        yield http, run_test(http, "N1")
+
+
+def test_a_note_is_kept_struck_and_never_deleted(made: tuple[httpx.Client, dict[str, Any]]) -> None:
+    http, _test = made
+    http.post("/v1/participants", json={"code": "N2"})
+    written = http.post("/v1/participants/N2/notes", json={"kind": "posture", "text": "  sat up straight "})
+    assert written.status_code == 201 and written.json()["text"] == "sat up straight"
+    note = written.json()
+    for _ in range(2):
+        struck = http.post(f"/v1/participants/N2/notes/{note['id']}/strike")
+        assert struck.status_code == 200 and struck.json()["struck_by"] == "administrator"
+    (kept,) = http.get("/v1/participants/N2/notes").json()
+    assert kept == {**note, "struck_by": "administrator", "struck_utc": struck.json()["struck_utc"]}
+    trail = [entry for entry in http.get("/v1/audit").json()["entries"] if entry["subject"] == "N2"]
+    assert [entry["action"] for entry in trail] == ["create participant", "note", "strike note"]
+
+
+def test_a_time_lies_in_the_test_of_this_participant(made: tuple[httpx.Client, dict[str, Any]]) -> None:
+    http, test = made
+    last_s = test["summary"]["duration_s"]
+
+    def note(code: str = "N1", **fields: Any) -> httpx.Response:
+        return http.post(f"/v1/participants/{code}/notes", json={"kind": "spasm", "test_id": test["id"], **fields})
+
+    assert note(at_s=last_s / 2).json()["at_s"] == last_s / 2
+    assert note().json()["at_s"] is None
+    assert note(at_s=last_s + 1).status_code == 422
+    assert note(at_s=-1).status_code == 422
+    assert note(now=True).status_code == 409, "it is over"
+    assert note(at_s=1, now=True).status_code == 422
+    http.post("/v1/participants", json={"code": "N3"})
+    assert note("N3").status_code == 404
+    assert note("nobody").status_code == 404
+    assert http.post("/v1/participants/N1/notes", json={"kind": "spasm", "at_s": 1}).status_code == 422
+
+
+def test_now_is_where_the_running_test_stands(service: Service) -> None:
+    service.rig.speed = 2.0
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "N4"})
+        test = http.post("/v1/tests", json={"participant": "N4"}).json()
+        elapsed_s = soon(lambda: http.get(f"/v1/tests/{test['id']}").json()["elapsed_s"])
+        body = {"kind": "spasm", "test_id": test["id"], "now": True}
+        note = http.post("/v1/participants/N4/notes", json=body).json()
+        service.rig.speed = 60.0
+        after = wait_done(http, test["id"])
+        assert elapsed_s - 0.01 <= note["at_s"] <= after["summary"]["duration_s"]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"kind": "other"},
+        {"kind": "other", "text": " "},
+        {"kind": "nonsense"},
+        {"kind": "spasm", "text": "x" * 501},
+        {"kind": "spasm", "text": "x" * 100_000},
+        {"kind": "spasm", "text": "two\nlines"},
+        {"kind": "spasm", "text": "a\u202eb"},
+        {"kind": "spasm", "text": "a\u200bb"},
+        {"kind": "spasm", "text": "a\x00b"},
+        {"kind": "spasm", "text": 3},
+        {"kind": "spasm", "more": 1},
+    ],
+    ids=lambda fields: repr(fields)[:40],
+)
+def test_what_is_no_note_is_refused(made: tuple[httpx.Client, dict[str, Any]], fields: dict[str, Any]) -> None:
+    http, _test = made
+    before = len(http.get("/v1/participants/N1/notes").json())
+    answer = http.post("/v1/participants/N1/notes", json=fields)
+    assert answer.status_code == 422 and len(answer.text) < 2000, answer.text[:500]
+    assert len(http.get("/v1/participants/N1/notes").json()) == before
+
+
+def test_letters_are_composed(made: tuple[httpx.Client, dict[str, Any]]) -> None:
+    http, _test = made
+    answer = http.post("/v1/participants/N1/notes", json={"kind": "other", "text": "Mu\u0308de <b>"})
+    assert answer.json()["text"] == "Müde <b>"
+
+
+# ---- Folds stay as a person left them, a note's kind is chosen, an estimate says so, a day ends at 23:59
+
+
+@pytest.fixture(scope="module")
+def model(service: Service) -> str:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "L1"})
+        model: str = run_test(http, "L1")["model_id"]
+        http.get(f"/v1/models/{model}/diagnosis")
+    return model
+
+
+def test_the_kind_of_a_note_is_chosen(service: Service, model: str) -> None:
+    with signed_in(service) as browser:
+        page = browser.get("/participants/L1").text
+        assert 'name="kind" required><option value="">Choose…</option>' in page
+        form = {"csrf": csrf(browser), "text": "electrode 2 moved", "kind": ""}
+        refused = browser.post("/participants/L1/notes", data=form, headers={"Accept": "text/html"})
+        assert refused.status_code == 422 and "Choose what the note is about" in refused.text
+        assert browser.post("/participants/L1/notes", data={**form, "kind": "electrodes"}).status_code == 303
+        assert [note["kind"] for note in browser.get("/v1/participants/L1/notes").json()] == ["electrodes"]
+
+
+def test_what_an_effect_would_leave_is_called_an_estimate(service: Service, model: str) -> None:
+    with signed_in(service) as browser:
+        page = browser.get(f"/models/{model}").text
+    assert "0.200 → about <b>0.042 N·m</b>" in page and "it is estimated: adding it fits the model anew" in page
+    assert "with it (estimated)" in page
+
+
+def test_a_day_ends_at_its_last_minute_everywhere(service: Service, model: str) -> None:
+    with service.client() as http:
+        ends = http.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"}).json()
+    end = language.until(ends["expires_utc"])
+    assert end.endswith("23:59") and language.when(ends["expires_utc"]).endswith("00:00")
+    with signed_in(service) as browser:
+        assert f"until {end}" in browser.get(f"/models/{model}").text
+        assert f"until {end}" in browser.get(f"/models/{model}/report").text
+    assert language.until("2026-01-02T09:30:00.000Z") == language.when("2026-01-02T09:30:00.000Z")
+
+
+@pytest.mark.browser
+def test_a_fold_stays_as_it_was_left(tab: Any, service: Service, model: str) -> None:
+    tab.goto(f"{service.url}/models/{model}")
+    fold = tab.locator("#curves")
+    assert fold.get_attribute("open") is None
+    fold.locator("summary").click()
+    tab.locator("#figures summary").first.click()
+    tab.locator("#figures summary").first.click()
+    tab.wait_for_function(
+        "sessionStorage.length === 1 && 'figures' in JSON.parse(sessionStorage.getItem(sessionStorage.key(0)))"
+    )
+    tab.reload()
+    assert fold.get_attribute("open") is not None
+    fold.locator("[data-figure=recruitment] .main-svg").first.wait_for()
+    assert tab.locator("#figures").get_attribute("open") is None
+    assert tab.errors == []
+
+
+def test_new_pulses_come_first() -> None:
+    both = {"fit_percent": 98.5, "ceiling_percent": 99.0, "held_out_fit_percent": 97.9}
+    assert (followed(both).percent, followed(both).where) == (97.9, "On pulses not used for fitting")
+    crossed = {**both, "held_out_by": "cross-validation"}
+    assert followed(crossed).where == "On parts of the recording that were left out in turn"
+    alone = followed({**both, "held_out_fit_percent": None})
+    assert (alone.percent, alone.ceiling_percent, alone.where) == (98.5, 99.0, "On the pulses that it was fitted to")
+
+
+def test_every_page_shows_the_same_fit(service: Service) -> None:
+    with service.client() as http:
+        http.post("/v1/participants", json={"code": "F1"})
+        first, second = (run_test(http, "F1")["model_id"] for _ in range(2))
+    pages = ("/", "/participants/F1", "/participants/F1/trend", f"/compare?model={first}&model={second}",
+             f"/models/{first}", f"/models/{first}/report")  # fmt: skip
+    with signed_in(service) as browser:
+        for place in pages:
+            page = browser.get(place).text
+            assert "97.9" in page and 'title="On pulses not used for fitting"' in page, place
+            page = re.sub(r"<(script|svg)\b.*?</\1>", "", page, flags=re.DOTALL)
+            others = page.count("98.5")  # on the pulses that it was fitted to; said so where it is shown
+            assert others == page.count("On fitted pulses</span><b>98.5"), place
