@@ -20,6 +20,7 @@ import pytest
 import uvicorn
 from argon2 import PasswordHasher
 from sqlalchemy import text
+from websockets.sync.client import ClientConnection, connect
 
 from stimrig.api.centre.postgres import programs
 from stimrig.api.clock import Clock
@@ -192,6 +193,27 @@ class Service:
     def rig(self) -> FakeRig:
         return self.rig_thread.rig
 
+    @property
+    def context(self) -> Any:
+        return self.app.state.context
+
+    def run(self, work: Any) -> Any:
+        """What a coroutine of the service gives, on the service's own loop."""
+        return asyncio.run_coroutine_threadsafe(work, self.context.rig._task.get_loop()).result(30)
+
+    def live(self, test_id: str, token: str | None = TOKEN, **headers: str) -> ClientConnection:
+        """A test's live channel."""
+        head = headers | ({"Authorization": f"Bearer {token}"} if token else {})
+        url = self.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
+        return connect(url, additional_headers=head, open_timeout=60)
+
+    def change(self, table: Any, key: Any, **fields: Any) -> None:
+        """Done to a row behind the service's back: new values, or functions of the old ones."""
+        with self.context.store.write() as session:
+            row = session.get(table, key)
+            for name, value in fields.items():
+                setattr(row, name, value(getattr(row, name)) if callable(value) else value)
+
     def client(self, token: str | None = TOKEN, **more: Any) -> httpx.Client:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         headers |= more.pop("headers", {})
@@ -202,7 +224,7 @@ class Service:
 
     def sql(self, statement: str) -> Any:
         """Done to the database behind the service's back; what it answers."""
-        with self.app.state.context.store.write() as session:
+        with self.context.store.write() as session:
             done = session.execute(text(statement))
             return done.all() if done.returns_rows else []
 

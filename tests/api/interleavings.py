@@ -183,13 +183,13 @@ def lock(service: Service, random: Random) -> None:
     """Have the database alone for a while, again and again."""
     for _ in range(random.randint(2, 5)):
         time.sleep(random.random() * 0.2)
-        with service.app.state.context.store.write():
+        with service.context.store.write():
             time.sleep(random.random() ** 2 * 0.3)
 
 
 def judge(service: Service, run: Run) -> None:
     """Hold every decision of the trail, and every trial of the rig, against what came before it."""
-    store = service.app.state.context.store
+    store = service.context.store
     entries = [row.as_dict() for row in store.all(AuditEntry, order=AuditEntry.seq)]
     models = {row.id for row in store.all(Model)}
     for entry in entries:

@@ -55,7 +55,7 @@ def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service:
     laid = [row for row in told["decisions"] if "sample_to_plan_ms" in row]
     assert [row["kind"] for row in laid][-1] == "enough" and laid[0]["kind"] == "next"
     assert document["summary"]["duration_s"] < 38.7
-    with service.app.state.context.store.read() as session:
+    with service.context.store.read() as session:
         from stimrig.api.store.tables import Test
 
         plan = session.get(Test, document["id"]).plan
@@ -69,7 +69,7 @@ def test_only_new_samples_are_sent_and_none_is_lost(
     """The adviser is busy at first: a record without its beginning would mislead. And a recording in a folder that the
     pool learns meanwhile starts the pool's workers anew, not the one that keeps the test."""
     asked: list[dict[str, Any]] = []
-    context = service.app.state.context
+    context = service.context
     adviser = context.runner.adaptive.adviser
     ask = adviser.ask
 
@@ -104,7 +104,7 @@ def test_a_start_that_took_long_is_not_played_and_is_quick_when_asked_again(
 def test_another_start_does_not_wait_until_it_is_known_what_a_test_can_reach(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    context = service.app.state.context
+    context = service.context
     looked: list[int] = []
     planned = context.runner._planned
 
@@ -122,7 +122,7 @@ def test_another_start_does_not_wait_until_it_is_known_what_a_test_can_reach(
 def test_previews_of_others_do_not_disturb_a_test_that_starts(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    context = service.app.state.context
+    context = service.context
     previewed = context.runner._previewed
 
     async def crowded(plan: Any) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
     """Whether the rig laid it is not known; a record with the wrong widths would mislead."""
-    rig = service.app.state.context.rig
+    rig = service.context.rig
     ask = rig.ask
 
     async def deaf(message: Any, *more: Any, **how: Any) -> dict[str, Any]:

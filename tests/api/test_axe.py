@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.api.browser import PASSWORD, PHONE, WIDE, open_tab, participant, sign_in_with_token, start
@@ -127,11 +128,10 @@ def test_a_test_and_its_ends(tab: Any, service: Service) -> None:
     service.rig.speed = 8.0
 
 
-def test_a_model_and_what_is_made_of_it(tab: Any, service: Service) -> None:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "X3"})
-        first = run_test(http, "X3")
-        second = run_test(http, "X3")
+def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: httpx.Client) -> None:
+    client.post("/v1/participants", json={"code": "X3"})
+    first = run_test(client, "X3")
+    second = run_test(client, "X3")
 
     def drawn() -> None:
         tab.get_by_role("link", name="Fatigue").wait_for()
@@ -155,23 +155,21 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service) -> None:
     visit(tab, service, "/participants/X3")
 
 
-def test_trials_of_a_controller(tab: Any, service: Service) -> None:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "X7"})
-        model = run_test(http, "X7")["model_id"]
-        http.post(f"/v1/models/{model}/approve")
-        (service.data / "recordings" / "track.json").write_text(json.dumps({"values": {"gain": 0.5}}))
-        trial = http.post("/v1/tests", json={"participant": "X7", "kind": "sequence"}).json()
-        wait_done(http, trial["id"])
-        assert http.get("/v1/participants/X7/model?tracked=true").json()["tracking"]["ask"]
+def test_trials_of_a_controller(tab: Any, service: Service, client: httpx.Client) -> None:
+    client.post("/v1/participants", json={"code": "X7"})
+    model = run_test(client, "X7")["model_id"]
+    client.post(f"/v1/models/{model}/approve")
+    (service.data / "recordings" / "track.json").write_text(json.dumps({"values": {"gain": 0.5}}))
+    trial = client.post("/v1/tests", json={"participant": "X7", "kind": "sequence"}).json()
+    wait_done(client, trial["id"])
+    assert client.get("/v1/participants/X7/model?tracked=true").json()["tracking"]["ask"]
     visit(tab, service, "/participants/X7", tab.get_by_text("All trials as a table").click)
 
 
-def test_in_the_dark(browser: Any, service: Service) -> None:
+def test_in_the_dark(browser: Any, service: Service, client: httpx.Client) -> None:
     """The main pages, their notices and their states, where the system is dark."""
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "X5"})
-        done = run_test(http, "X5")
+    client.post("/v1/participants", json={"code": "X5"})
+    done = run_test(client, "X5")
     model = f"/models/{done['model_id']}"
 
     def opened() -> None:
@@ -199,11 +197,10 @@ def test_in_the_dark(browser: Any, service: Service) -> None:
         service.rig.speed = 8.0
 
 
-def test_in_german(tab: Any, service: Service) -> None:
+def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:
     """The longest pages in the language with the longer words."""
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "X6"})
-        done = run_test(http, "X6")
+    client.post("/v1/participants", json={"code": "X6"})
+    done = run_test(client, "X6")
 
     def opened() -> None:
         tab.get_by_role("link", name="Ermüdung").wait_for()

@@ -46,8 +46,8 @@ def rows(page: str) -> dict[str, str]:
 
 def status_heard(service: Service) -> m.Status:
     """The service knows what the rig says now."""
-    context = service.app.state.context
-    return asyncio.run_coroutine_threadsafe(context.rig.fresh_status(), context.rig._task.get_loop()).result(10)
+    context = service.context
+    return service.run(context.rig.fresh_status())
 
 
 def test_start_shows_who_and_how_much_and_plays_nothing(
@@ -63,7 +63,7 @@ def test_start_shows_who_and_how_much_and_plays_nothing(
     assert told["Calibration"] == "not calibrated"
     assert (told["Side and muscle"], told["Run by"]) == ("right, triceps brachii", "administrator")
     assert re.search(r'class="stimulate big" data-needs-ready[^>]*>Start now: 20 mA, 300 µs<', page)
-    assert service.rig.starts == 0 and service.app.state.context.runner.current is None
+    assert service.rig.starts == 0 and service.context.runner.current is None
 
 
 def test_who_calibrated_and_until_when_is_told(tab: httpx.Client, client: httpx.Client) -> None:
@@ -90,7 +90,7 @@ def test_yes_starts_once_however_often_it_is_said(tab: httpx.Client, client: htt
 def test_a_question_is_open_for_five_minutes_by_either_clock(
     tab: httpx.Client, service: Service, unix_s: float, monotonic_s: float
 ) -> None:
-    clock = service.app.state.context.questions.clock = SetClock()
+    clock = service.context.questions.clock = SetClock()
     question = ask(tab)
     clock.unix, clock.now_s = clock.unix + unix_s, clock.now_s + monotonic_s
     for answer in (tab.get(question), yes(tab, question)):
@@ -128,7 +128,7 @@ def test_limits_changed_meanwhile_are_not_played(
     refused = yes(tab, question)
     assert refused.status_code == 409
     assert re.search(f"<td>{words[0]}(<br>.*)?</td><td><b>{words[1]}</b></td>", refused.text)
-    assert service.rig.starts == 0 and service.app.state.context.runner.current is None
+    assert service.rig.starts == 0 and service.context.runner.current is None
 
 
 def test_a_rig_set_up_anew_meanwhile_is_asked_about_again(
@@ -139,7 +139,7 @@ def test_a_rig_set_up_anew_meanwhile_is_asked_about_again(
     monkeypatch.setattr(service.rig, "_widths", lambda _plan: ([*widths, 300.0], segments))
     refused = yes(tab, question)
     assert refused.status_code == 409 and "would now play something else" in refused.text
-    assert service.rig.starts == 0 and service.app.state.context.runner.current is None
+    assert service.rig.starts == 0 and service.context.runner.current is None
 
 
 def test_a_rig_that_asks_for_a_calibration_offers_that_first(
@@ -163,7 +163,7 @@ def test_a_rig_that_asks_for_a_calibration_offers_that_first(
 
 def test_a_calibration_of_yesterday_starts_nothing(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
     calibrate(client)
-    with service.app.state.context.store.write() as session:
+    with service.context.store.write() as session:
         from stimrig.api.store.tables import Participant
 
         row = session.get(Participant, "P017")

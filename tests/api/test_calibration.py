@@ -275,9 +275,9 @@ def trains(service: Service) -> int:
 
 def at_once(service: Service, press: Any, count: int = 2) -> list[httpx.Response]:
     """Press so often; all requests stand at the turn before the first of them gets it."""
-    context = service.app.state.context
+    context = service.context
     turn, loop = context.holds._turns[LIMITS_TURN], context.rig._task.get_loop()
-    asyncio.run_coroutine_threadsafe(turn.acquire(), loop).result(10)
+    service.run(turn.acquire())
     answers: list[httpx.Response] = []
     pressing = [threading.Thread(target=lambda: answers.append(press())) for _ in range(count)]
     for thread in pressing:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.api.browser import expected, open_tab
@@ -49,7 +50,7 @@ def press(page: Any, key: str, trains: int) -> None:
     settled(page, trains)
 
 
-def test_a_whole_calibration_by_keys(page: Any, service: Service) -> None:
+def test_a_whole_calibration_by_keys(page: Any, service: Service, client: httpx.Client) -> None:
     for count, key in enumerate(["ArrowUp", "ArrowUp", "ArrowDown", "r", "ArrowRight"], 1):
         press(page, key, count)
     assert widths(service) == [10, 20, 10, 10, 15]
@@ -63,8 +64,7 @@ def test_a_whole_calibration_by_keys(page: Any, service: Service) -> None:
     page.locator("#finish.primary").wait_for()
     page.keyboard.press("Enter")
     page.wait_for_url("**/participants/K1")
-    with service.client() as http:
-        profile = http.get("/v1/participants/K1").json()["profile"]
+    profile = client.get("/v1/participants/K1").json()["profile"]
     assert [profile[f"{name}_pulse_width_us"] for name in ("sensory", "motor", "max")] == [15, 25, 35]
     assert not page.errors
 
@@ -124,9 +124,8 @@ def test_esc_and_space_stop_once_wherever_the_focus_is(page: Any, service: Servi
     assert [url.rsplit("/", 1)[1] for url in sent] == ["stop"] and service.rig.state == "latched"
 
 
-def test_a_stale_page_sends_nothing_and_says_so_in_place(page: Any, service: Service) -> None:
-    with service.client() as http:
-        http.post("/v1/participants/K1/calibration/step", json={"direction": "up"})
+def test_a_stale_page_sends_nothing_and_says_so_in_place(page: Any, service: Service, client: httpx.Client) -> None:
+    client.post("/v1/participants/K1/calibration/step", json={"direction": "up"})
     page.keyboard.press("ArrowUp")
     page.get_by_text("This page is out of date").wait_for()
     assert widths(service) == [10] and page.url.endswith("/calibration")
@@ -142,7 +141,7 @@ def test_another_width_than_the_one_on_the_button_is_not_sent(page: Any, service
     assert widths(service) == []
 
 
-def test_what_the_rig_refuses_is_said_in_place(page: Any, service: Service) -> None:
+def test_what_the_rig_refuses_is_said_in_place(page: Any, service: Service, client: httpx.Client) -> None:
     press(page, "ArrowUp", 1)
     page.keyboard.press("Enter")
     page.locator("#mark-motor.primary").wait_for()
@@ -152,8 +151,7 @@ def test_what_the_rig_refuses_is_said_in_place(page: Any, service: Service) -> N
     page.keyboard.press("ArrowUp")
     page.wait_for_timeout(300)
     assert widths(service) == [10, 20, 30, 40]
-    with service.client() as http:
-        http.post("/v1/participants/K1/calibration/finish", json={"discard": True})
+    client.post("/v1/participants/K1/calibration/finish", json={"discard": True})
     page.keyboard.press("r")
     page.get_by_role("button", name="Begin the calibration").wait_for()
 
@@ -219,11 +217,10 @@ def test_last_times_marks_stand_beside_todays(page: Any, service: Service) -> No
     assert service.rig.asked.large_steps and service.rig.asked.last.sensory_pulse_width_us == 10
 
 
-def test_an_end_that_is_refused_says_why(page: Any, service: Service) -> None:
+def test_an_end_that_is_refused_says_why(page: Any, client: httpx.Client) -> None:
     """A colleague ended it, and nothing says so but the answer."""
     press(page, "ArrowUp", 1)
-    with service.client() as http:
-        assert http.post("/v1/participants/K1/calibration/finish", json={"discard": True}).status_code == 200
+    assert client.post("/v1/participants/K1/calibration/finish", json={"discard": True}).status_code == 200
     page.locator("#discard").click()
     page.get_by_text("No calibration of K1 is open").wait_for()
     assert page.url.endswith("/participants/K1/calibration"), "loaded again it sends nothing"

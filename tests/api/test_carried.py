@@ -72,7 +72,7 @@ def test_nothing_is_carried_without_an_approval_or_from_a_rejected_model(
 def test_approval_whose_day_is_over_still_lends_its_structure(
     client: httpx.Client, service: Service, participant: str, approved: dict[str, Any]
 ) -> None:
-    store = service.app.state.context.store
+    store = service.context.store
     with store.write() as session:
         for row in session.query(Approval):
             row.expires_utc = "2020-01-01T00:00:00Z"
@@ -105,7 +105,7 @@ def test_plain_structure_carries_over_as_one_version(client: httpx.Client, parti
 def test_plain_model_is_there_and_offered_whatever_becomes_of_the_carried_one(
     how: str, client: httpx.Client, service: Service, participant: str, approved: dict[str, Any]
 ) -> None:
-    folder = service.app.state.context.settings.recordings_dir
+    folder = service.context.settings.recordings_dir
     told = "The earlier model holds my_effect, which is not installed here."
     (folder / ("does-not-carry" if how == "refused" else "carrying-slowly")).write_text(told)
     started = client.post("/v1/tests", json={"participant": participant}).json()["id"]
@@ -117,7 +117,7 @@ def test_plain_model_is_there_and_offered_whatever_becomes_of_the_carried_one(
     if how == "cancelled":
         assert client.post(f"/v1/tests/{started}/keep-plain").status_code == 200
     if how == "died":
-        for worker in service.app.state.context.pool.workers:
+        for worker in service.context.pool.workers:
             if worker.call is not None and worker.call.verb == "carry":
                 worker.kill()
     test = wait_done(client, started)
@@ -145,9 +145,9 @@ def test_restart_goes_on_after_the_plain_version(
     """What the restarted service finds: an open test that names its first version."""
     test = run_test(client, participant)
     plain, _ = versions(client, participant, test)
-    context = service.app.state.context
+    context = service.context
     context.runner.lifecycle.update(test["id"], state="identifying", model_id=plain["id"], followed_by="dead")
-    asyncio.run_coroutine_threadsafe(context.runner.resume(), context.rig._task.get_loop()).result(30)
+    service.run(context.runner.resume())
     test = wait_done(client, test["id"])
     rows = versions(client, participant, test)
     assert [row["effects"] for row in rows].count([]) == 1 and test["fit"]["effects"] == ["fatigue"]
@@ -197,7 +197,7 @@ def test_a_damaged_approved_model_leaves_the_plain_one(document: bytes) -> None:
 def test_the_page_offers_to_keep_the_plain_model_while_the_other_is_fitted(
     client: httpx.Client, service: Service, participant: str, approved: dict[str, Any]
 ) -> None:
-    (service.app.state.context.settings.recordings_dir / "carrying-slowly").touch()
+    (service.context.settings.recordings_dir / "carrying-slowly").touch()
     started = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     plain = until_carrying(client, started)["model_id"]
     with signed_in(service) as browser:
@@ -228,7 +228,7 @@ def test_settings_name_effects_separated_by_commas(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 def test_models_have_the_sites_structure_until_one_is_approved(site: Service) -> None:
-    settings = site.app.state.context.settings
+    settings = site.context.settings
     with site.client() as client:
         client.post("/v1/participants", json={"code": "P1"})
         first = client.get(f"/v1/models/{run_test(client, 'P1')['model_id']}").json()
@@ -254,7 +254,7 @@ def test_models_have_the_sites_structure_until_one_is_approved(site: Service) ->
 @pytest.mark.slow
 def test_structure_that_the_recording_does_not_bear_is_left_out_and_said(site: Service) -> None:
     """A person went through the test: it gives a model all the same."""
-    site.app.state.context.settings.structure = ("bad",)
+    site.context.settings.structure = ("bad",)
     with site.client() as client:
         client.post("/v1/participants", json={"code": "P1"})
         test = run_test(client, "P1")
@@ -268,7 +268,7 @@ def test_structure_that_the_recording_does_not_bear_is_left_out_and_said(site: S
 @pytest.mark.slow
 def test_an_uploads_model_page_says_what_was_left_out_of_its_structure(site: Service) -> None:
     """The page, the REST answer and the report say the same, also when they are loaded again."""
-    site.app.state.context.settings.structure = ("bad",)
+    site.context.settings.structure = ("bad",)
     csv = "time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n"
     with site.client() as client, signed_in(site) as browser:
         for code in ("P1", "P2"):

@@ -403,14 +403,13 @@ def opened(page: Any, service: Service, model: str) -> None:
         page.locator(f"[data-figure={name}] .modebar-btn").first.wait_for()
 
 
-def test_reports_have_them_and_pages_of_other_models_do_not(service: Service, models: tuple[str, str]) -> None:
+def test_reports_have_them_and_pages_of_other_models_do_not(client: httpx.Client, models: tuple[str, str]) -> None:
     at_rest, moving = models
-    with service.client() as http:
-        for path, count in ((f"/models/{moving}", 2), (f"/models/{at_rest}", 0)):
-            page = http.get(path).text
-            assert page.count('data-figure="joint_') == count and ('"joint_g"' in page) == bool(count)
-        assert http.get(f"/models/{moving}/report").text.count("<svg") == 5
-        assert http.get(f"/models/{at_rest}/report").text.count("<svg") == 3
+    for path, count in ((f"/models/{moving}", 2), (f"/models/{at_rest}", 0)):
+        page = client.get(path).text
+        assert page.count('data-figure="joint_') == count and ('"joint_g"' in page) == bool(count)
+    assert client.get(f"/models/{moving}/report").text.count("<svg") == 5
+    assert client.get(f"/models/{at_rest}/report").text.count("<svg") == 3
 
 
 @pytest.mark.browser

@@ -63,7 +63,7 @@ def started(service: Service, client: httpx.Client, participant: str) -> Iterato
 def test_a_stop_is_answered_while_every_thread_waits_for_the_database(
     service: Service, client: httpx.Client, started: None
 ):
-    store, codes = service.app.state.context.store, []
+    store, codes = service.context.store, []
 
     def add(number: int) -> None:
         with service.client() as other:
@@ -144,7 +144,7 @@ def test_too_many_previews_at_once_are_refused_before_they_are_read(
         await asyncio.to_thread(go_on.wait, 120)
         return {"duration_s": 1.0}
 
-    monkeypatch.setattr(service.app.state.context.runner, "preview", slow)
+    monkeypatch.setattr(service.context.runner, "preview", slow)
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(client.post, "/v1/preview", json={"participant": participant})
         assert asked.wait(60)
@@ -229,42 +229,41 @@ def test_fifty_starts_at_once_give_one_test_and_forty_nine_refusals(service: Ser
 
 
 @pytest.mark.parametrize("path", ["/v1/participants/P017/recordings", "/v1/participants", "/v1/stop"])
-def test_a_body_without_an_end_is_not_taken_in(service: Service, path: str) -> None:
+def test_a_body_without_an_end_is_not_taken_in(service: Service, client: httpx.Client, path: str) -> None:
     """A client that never stops sending is cut off; the service answers others meanwhile."""
-    service.app.state.context.settings.max_upload_mb = 1.0
-    with service.client() as client:
-        client.post("/v1/participants", json={"code": "P017"})
-        seen = client.get("/v1/participants/P017").headers["etag"]
-        host, port = service.url.removeprefix("http://").split(":")
-        with socket.create_connection((host, int(port)), timeout=10) as line:
-            head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {TOKEN}\r\n"
-            head += f"If-Match: {seen}\r\n"
-            line.sendall(f"{head}Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n".encode())
-            chunk = b"10000\r\n" + b"x" * 65536 + b"\r\n"
-            sent, end = 0, time.monotonic() + 8
-            answer = b""
-            line.settimeout(0.01)
-            while time.monotonic() < end and not answer and sent < 40 * 65536:
-                try:
-                    line.sendall(chunk)
-                    sent += 65536
-                    answer = line.recv(4096)
-                except TimeoutError:
-                    continue
-                except OSError:
-                    break
-            line.settimeout(5)
-            if not answer:
-                try:
-                    answer = line.recv(4096)
-                except OSError:
-                    answer = b""
-        if path == "/v1/stop":
-            assert answer.startswith(b"HTTP/1.1 200") and service.rig.stopped_by, "a stop is a stop"
-        else:
-            assert answer.startswith(b"HTTP/1.1 413") and b"application/problem+json" in answer, answer[:200]
-        assert client.get("/health").status_code == 200
-        assert not list((service.data / "recordings").rglob("upload-*"))
+    service.context.settings.max_upload_mb = 1.0
+    client.post("/v1/participants", json={"code": "P017"})
+    seen = client.get("/v1/participants/P017").headers["etag"]
+    host, port = service.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as line:
+        head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {TOKEN}\r\n"
+        head += f"If-Match: {seen}\r\n"
+        line.sendall(f"{head}Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n".encode())
+        chunk = b"10000\r\n" + b"x" * 65536 + b"\r\n"
+        sent, end = 0, time.monotonic() + 8
+        answer = b""
+        line.settimeout(0.01)
+        while time.monotonic() < end and not answer and sent < 40 * 65536:
+            try:
+                line.sendall(chunk)
+                sent += 65536
+                answer = line.recv(4096)
+            except TimeoutError:
+                continue
+            except OSError:
+                break
+        line.settimeout(5)
+        if not answer:
+            try:
+                answer = line.recv(4096)
+            except OSError:
+                answer = b""
+    if path == "/v1/stop":
+        assert answer.startswith(b"HTTP/1.1 200") and service.rig.stopped_by, "a stop is a stop"
+    else:
+        assert answer.startswith(b"HTTP/1.1 413") and b"application/problem+json" in answer, answer[:200]
+    assert client.get("/health").status_code == 200
+    assert not list((service.data / "recordings").rglob("upload-*"))
 
 
 def test_a_token_that_is_read_while_it_is_revoked_is_not_valid_afterwards(
@@ -315,7 +314,7 @@ def test_a_stop_whose_answer_is_no_answer_names_the_emergency_switch(client: htt
         writer.close()
 
     door = service.rig.path.with_name(service.rig.path.name + ".stop")
-    context = service.app.state.context
+    context = service.context
     path = context.rig.path
 
     async def serve() -> asyncio.Server:
@@ -336,7 +335,7 @@ def test_a_stop_whose_answer_is_no_answer_names_the_emergency_switch(client: htt
 def test_a_start_that_cannot_be_written_down_plays_nothing_on(
     service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lifecycle = service.app.state.context.runner.lifecycle
+    lifecycle = service.context.runner.lifecycle
     update = lifecycle.update
 
     def broken(test_id: str, **fields: Any) -> Any:

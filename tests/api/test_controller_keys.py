@@ -165,7 +165,7 @@ def test_a_trial_is_played_with_the_plans_limits_and_watched(shared: Service, ke
     assert {"history", "test"} <= kinds
     test = wait_done(key, test_id)
     assert test["state"] == "completed" and key.get(f"/v1/recordings/{test['recording_id']}").status_code == 200
-    row = shared.app.state.context.store.get(Test, test_id)
+    row = shared.context.store.get(Test, test_id)
     assert row.plan["profile"]["current_ma"] == 15.0 and row.plan["max_pulse_width_us"] == 200.0
     assert row.requested_by.startswith("ilc (")
 
@@ -218,13 +218,13 @@ def test_limits_that_were_narrowed_after_the_key_was_made_hold(
         test_id = key.post("/v1/tests", json=TRIAL).json()["id"]
         wait_done(key, test_id)
         admin.put("/v1/participants/P1/profile", json={"current_ma": before["current_ma"]})
-    assert shared.app.state.context.store.get(Test, test_id).plan["profile"]["current_ma"] == 9.0
+    assert shared.context.store.get(Test, test_id).plan["profile"]["current_ma"] == 9.0
 
 
 def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(
     shared: Service, admin: httpx.Client, done: dict[str, Any]
 ) -> None:
-    context, text = shared.app.state.context, made(admin)
+    context, text = shared.context, made(admin)
     row = context.store.get(Token, digest(text))
     assert row.expires_utc == context.clock.end_of_day_utc() and row.participant == "P1"
     with shared.client(text) as key:
@@ -264,7 +264,7 @@ def test_a_live_channel_tells_a_key_nothing_of_another_participants_test(
     shared: Service, key: httpx.Client, admin: httpx.Client, done: dict[str, Any]
 ) -> None:
     """While its own test is identified, the rig may play another one."""
-    context, own = shared.app.state.context, done["P1"]["id"]
+    context, own = shared.context, done["P1"]["id"]
     put(context, own, "identifying")
     said = []
     try:
@@ -303,7 +303,7 @@ def test_after_a_rejection_it_plays_nothing_and_plans_nothing(
     shared: Service, key: httpx.Client, admin: httpx.Client, done: dict[str, Any]
 ) -> None:
     model, before = done["P1"]["model_id"], shared.rig.starts
-    approval = shared.app.state.context.versions.approved("P1")
+    approval = shared.context.versions.approved("P1")
     asked = {"widths": {"reference_torque_nm": [0, 1]}, "prediction": {"pulse_width_us": [0, 100]}}
     head = {"If-Match": key.get("/v1/participants/P1/model").headers["etag"]}
     assert admin.post(f"/v1/models/{model}/reject", json={"reason": "wrong"}).status_code == 200
@@ -365,7 +365,7 @@ def test_a_key_gives_no_scope_that_its_maker_lacks(shared: Service, admin: httpx
 def test_it_falls_with_the_token_of_its_maker_and_still_stops(
     shared: Service, admin: httpx.Client, done: dict[str, Any], how: str
 ) -> None:
-    context = shared.app.state.context
+    context = shared.context
     text = shared.token(f"maker {how}", "approve-model", "run-test", "read-live", "read-model")
     with shared.client(text) as maker:
         made_key = made(maker)
@@ -400,7 +400,7 @@ def test_it_falls_with_a_person_who_is_removed(shared: Service, admin: httpx.Cli
 
 def test_key_and_trials_are_in_the_trail(shared: Service, admin: httpx.Client) -> None:
     text = made(admin, name="audited")
-    entries = shared.app.state.context.store.all(AuditEntry, order=AuditEntry.seq)
+    entries = shared.context.store.all(AuditEntry, order=AuditEntry.seq)
     (entry,) = [one for one in entries if one.subject.startswith("audited (")]
     assert entry.action == "issue token" and entry.detail["participant"] == "P1" and entry.detail["plan"]["trials"] == 3
     assert entry.detail["until"] and text not in json.dumps(entry.detail)

@@ -41,7 +41,7 @@ def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterato
             body = made_up_csv(folder / "record.csv").read_bytes()
             model = admin.post("/v1/participants/P017/recordings", content=body).json()["model"]["id"]
             assert admin.post(f"/v1/models/{model}/approve", json={"reason": "for the page's test"}).status_code == 200
-        text, _ = controllers.make_key(service.app.state.context.auth, "page", "P017", PLAN, "test")
+        text, _ = controllers.make_key(service.context.auth, "page", "P017", PLAN, "test")
         yield service, text
 
 

@@ -39,7 +39,7 @@ DAMAGE = {
 
 
 def damage(service: Service, model_id: str, how: str, sound: bytes | None = None) -> None:
-    context = service.app.state.context
+    context = service.context
     with context.store.write() as session:
         row = session.get(Model, model_id)
         spoilt = DAMAGE[how](sound or row.document)
@@ -51,7 +51,7 @@ def damage(service: Service, model_id: str, how: str, sound: bytes | None = None
 def test_a_test_is_previewed_and_started_without_the_estimate(
     client: httpx.Client, service: Service, approved: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    sound = service.app.state.context.store.get(Model, approved).document
+    sound = service.context.store.get(Model, approved).document
     service.rig.speed = QUICK_SPEED
     with caplog.at_level(logging.WARNING, logger="stimrig.models"):
         for how in DAMAGE:
@@ -72,7 +72,7 @@ def test_everything_that_is_not_read_off_it_is_there(
     client: httpx.Client, service: Service, approved: str, how: str
 ) -> None:
     test_id = client.get("/v1/tests").json()[0]["id"]
-    with service.app.state.context.store.write() as session:  # one from before verdict and figures were kept beside it
+    with service.context.store.write() as session:  # one from before verdict and figures were kept beside it
         row = session.get(Model, approved)
         row.fit = {key: value for key, value in row.fit.items() if key not in ("verdict", "figures")}
     damage(service, approved, how)

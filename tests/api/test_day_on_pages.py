@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.api.browser import PASSWORD, expected, participant, start
@@ -128,10 +129,9 @@ def test_the_page_comes_back_as_it_was_and_both_tabs_with_it(tab: Any, service: 
     other.close()
 
 
-def test_what_was_typed_is_not_shown_to_the_next_person(tab: Any, service: Service) -> None:
+def test_what_was_typed_is_not_shown_to_the_next_person(tab: Any, service: Service, client: httpx.Client) -> None:
     make(service, "V2")
-    with service.client() as http:
-        http.post("/v1/users", json={"name": "Eve Two", "password": PASSWORD})
+    client.post("/v1/users", json={"name": "Eve Two", "password": PASSWORD})
     tab.goto(service.url + "/participants/V2")
     tab.locator("#notes").get_by_label("Note", exact=True).fill("half a sentence")
     lock(tab)
@@ -158,15 +158,14 @@ def test_a_persons_hand_is_told_and_a_scripts_is_not(tab: Any, service: Service)
         tab.clock.run_for(30_000)
 
 
-def test_the_report_names_the_session_and_has_a_place_to_sign(tab: Any, service: Service) -> None:
+def test_the_report_names_the_session_and_has_a_place_to_sign(tab: Any, service: Service, client: httpx.Client) -> None:
     make(service, "U1", side="left", muscle="biceps brachii")
-    with service.client() as http:
-        done = run_test(http, "U1")
-        for number in range(14):
-            note = {"kind": "spasm", "text": f"note {number}", "test_id": done["id"], "at_s": number}
-            struck = http.post("/v1/participants/U1/notes", json=note).json()
-        http.post(f"/v1/participants/U1/notes/{struck['id']}/strike")
-        http.post(f"/v1/models/{done['model_id']}/approve", json={"reason": "follows the ramp"})
+    done = run_test(client, "U1")
+    for number in range(14):
+        note = {"kind": "spasm", "text": f"note {number}", "test_id": done["id"], "at_s": number}
+        struck = client.post("/v1/participants/U1/notes", json=note).json()
+    client.post(f"/v1/participants/U1/notes/{struck['id']}/strike")
+    client.post(f"/v1/models/{done['model_id']}/approve", json={"reason": "follows the ramp"})
     tab.goto(f"{service.url}/models/{done['model_id']}/report")
     text = tab.locator("main").inner_text()
     for words in ("left, biceps brachii", "20.0 mA", "30.0 N·m", "administrator", "follows the ramp", "not calibrated"):

@@ -92,11 +92,10 @@ def test_folder_open_to_all_is_said(tmp_path: Path) -> None:
     assert finding("data folder", data_dir=tmp_path).verdict == "ok"
 
 
-def test_rig_that_is_not_there_or_stands_still(service: Service, tmp_path: Path) -> None:
+def test_rig_that_is_not_there_or_stands_still(service: Service, client: httpx.Client, tmp_path: Path) -> None:
     assert finding("rig", data_dir=tmp_path, rig_socket=tmp_path / "none.sock").verdict == "fails"
     assert finding("rig", data_dir=tmp_path, rig_socket=service.rig.path).verdict == "ok"
-    with service.client() as client:
-        client.post("/v1/stop")
+    client.post("/v1/stop")
     found = finding("rig", data_dir=tmp_path, rig_socket=service.rig.path)
     assert found.verdict == "fails" and "latched" in found.says and "re-arm" in found.fix
 

@@ -6,6 +6,7 @@ import json
 import re
 import time
 
+import httpx
 from websockets.sync.client import connect
 
 from stimrig.api import language
@@ -71,14 +72,13 @@ def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
             assert explanation.card(rival, known)["rivals"] == ["Drift der Rekrutierungsschwelle"]
 
 
-def test_no_page_shows_an_id(service: Service) -> None:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "E1"})
-        other, plain = (run_test(http, "E1")["model_id"] for _ in range(2))
-        body = {"effects": ["threshold_drift"], "force": True, "reason": "seen last week"}
-        added = http.post(f"/v1/models/{plain}/effects", json=body)
-        assert added.status_code == 201, added.text
-        better = added.json()["id"]
+def test_no_page_shows_an_id(service: Service, client: httpx.Client) -> None:
+    client.post("/v1/participants", json={"code": "E1"})
+    other, plain = (run_test(client, "E1")["model_id"] for _ in range(2))
+    body = {"effects": ["threshold_drift"], "force": True, "reason": "seen last week"}
+    added = client.post(f"/v1/models/{plain}/effects", json=body)
+    assert added.status_code == 201, added.text
+    better = added.json()["id"]
     pages = ("/participants/E1", "/participants/E1/trend", f"/compare?model={better}&model={other}",
              f"/models/{better}", f"/models/{better}/report")  # fmt: skip
     with signed_in(service) as browser:
@@ -95,7 +95,7 @@ GERMAN = {"Accept-Language": "de"}
 
 
 def test_a_page_that_waits_reads_its_own_language(service: Service) -> None:
-    slow = service.app.state.context.settings.recordings_dir / "slow"
+    slow = service.context.settings.recordings_dir / "slow"
     slow.parent.mkdir(parents=True, exist_ok=True)
     slow.write_text("0.4")
     with service.client() as http, signed_in(service) as browser:
@@ -111,21 +111,20 @@ def test_a_page_that_waits_reads_its_own_language(service: Service) -> None:
         assert http.delete(f"/v1/jobs/{job}").is_success  # it would stand still for a minute
 
 
-def test_the_live_page_hears_its_own_language(service: Service) -> None:
-    carrying = service.app.state.context.settings.recordings_dir / "carrying-slowly"
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "G2"})
-        first = run_test(http, "G2")["model_id"]
-        added = http.post(f"/v1/models/{first}/effects", json={"effects": ["tremor"], "force": True, "reason": "seen"})
-        http.post(f"/v1/models/{added.json()['id']}/approve", json={"reason": "follows the measurement well"})
-        carrying.touch()
-        test = http.post("/v1/tests", json={"participant": "G2"}).json()["id"]
-        address = service.url.replace("http", "ws") + f"/v1/tests/{test}/live"
-        with connect(address, additional_headers={"Authorization": f"Bearer {TOKEN}", **GERMAN}) as socket:
-            heard = {}
-            for message in map(json.loads, socket):
-                if message["type"] == "test":
-                    heard[(message["test"]["identification"] or {}).get("text")] = message["words"]["work"]
-                if "fitting last session's structure" in heard:
-                    carrying.unlink(missing_ok=True)
+def test_the_live_page_hears_its_own_language(service: Service, client: httpx.Client) -> None:
+    carrying = service.context.settings.recordings_dir / "carrying-slowly"
+    client.post("/v1/participants", json={"code": "G2"})
+    first = run_test(client, "G2")["model_id"]
+    added = client.post(f"/v1/models/{first}/effects", json={"effects": ["tremor"], "force": True, "reason": "seen"})
+    client.post(f"/v1/models/{added.json()['id']}/approve", json={"reason": "follows the measurement well"})
+    carrying.touch()
+    test = client.post("/v1/tests", json={"participant": "G2"}).json()["id"]
+    address = service.url.replace("http", "ws") + f"/v1/tests/{test}/live"
+    with connect(address, additional_headers={"Authorization": f"Bearer {TOKEN}", **GERMAN}) as socket:
+        heard = {}
+        for message in map(json.loads, socket):
+            if message["type"] == "test":
+                heard[(message["test"]["identification"] or {}).get("text")] = message["words"]["work"]
+            if "fitting last session's structure" in heard:
+                carrying.unlink(missing_ok=True)
     assert heard["fitting last session's structure"] == "Anpassen der Struktur der letzten Sitzung"

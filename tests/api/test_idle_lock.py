@@ -44,7 +44,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 @pytest.fixture
 def clock(service: Service) -> SetClock:
     found = SetClock()
-    service.app.state.context.auth.idle.clock = found
+    service.context.auth.idle.clock = found
     return found
 
 
@@ -116,7 +116,7 @@ def test_an_action_on_any_tab_keeps_all_of_them_open(service: Service, clock: Se
 
 
 def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(
-    service: Service, clock: SetClock
+    service: Service, client: httpx.Client, clock: SetClock
 ) -> None:
     with signed_in(service) as http:
         clock.ahead_s = 900.0
@@ -136,12 +136,11 @@ def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(
             http.get("/locked", params={"next": target}, headers=HTML)
             back = http.post("/unlock", data={"secret": PASSWORD, "csrf": csrf, "next": target}, headers=HTML)
             assert back.status_code == 303 and back.headers["location"] == "/", target
-    with service.client() as admin:
-        assert admin.get("/v1/participants/L9").status_code == 404
+    assert client.get("/v1/participants/L9").status_code == 404
 
 
 def test_guesses_at_the_lock_are_held_to_a_pace(service: Service, clock: SetClock) -> None:
-    for pace in vars(service.app.state.context.people.guesses).values():
+    for pace in vars(service.context.people.guesses).values():
         if isinstance(pace, Pace):
             pace.clock = type("Still", (Clock,), {"monotonic_s": lambda _self: 1000.0})()
     with signed_in(service, "Jörg Müller") as http:
@@ -215,7 +214,7 @@ def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
 
 
 def test_actions_are_written_down_once_and_what_comes_meanwhile_is_kept(service: Service) -> None:
-    context = service.app.state.context
+    context = service.context
     clock = SetClock()
     idle = IdleLock(context.store, clock, 10)
     with signed_in(service) as http:

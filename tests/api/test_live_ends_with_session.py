@@ -34,10 +34,9 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 
 
 @pytest.fixture(scope="module")
-def test_id(service: Service) -> str:
+def test_id(client: httpx.Client) -> str:
     """A test that outlasts this module."""
-    with service.client() as admin:
-        return admin.post("/v1/tests", json={"participant": "P017"}).json()["id"]
+    return client.post("/v1/tests", json={"participant": "P017"}).json()["id"]
 
 
 @contextmanager
@@ -93,7 +92,7 @@ def removed(_http: httpx.Client, service: Service) -> None:
 
 
 def run_out(http: httpx.Client, service: Service) -> None:
-    with service.app.state.context.store.write() as session:
+    with service.context.store.write() as session:
         session.get(PageSession, digest(next(iter(http.cookies.values())))).expires_unix_s = 1.0
 
 
@@ -121,7 +120,7 @@ def test_it_closes_with_its_session_and_with_no_other(
 @pytest.mark.parametrize("how", ["revoked", "expired", "scope"])
 def test_it_closes_with_its_token_and_with_no_other(service: Service, test_id: str, how: str) -> None:
     text, other = service.token("bench", "read-live"), service.token("bench", "read-live")
-    context = service.app.state.context
+    context = service.context
     with (
         watching(service, test_id, {"Authorization": f"Bearer {text}"}) as socket,
         watching(service, test_id, {"Authorization": f"Bearer {other}"}) as others,

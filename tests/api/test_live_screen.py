@@ -129,7 +129,7 @@ def test_the_tone_is_off_until_it_is_wished_and_kept(running: Any) -> None:
 def test_a_page_that_was_signed_out_says_so_and_stops_all_the_same(running: Any, service: Service) -> None:
     expected(running.locator("#stale")).to_be_hidden()
     (cookie,) = running.context.cookies()
-    service.app.state.context.auth.sign_out(cookie["value"])  # in another tab
+    service.context.auth.sign_out(cookie["value"])  # in another tab
     running.locator("#stale", has_text="You are signed out").wait_for(timeout=15_000)
     running.get_by_role("button", name="Stop stimulation").click()
     running.get_by_text("The rig confirms that stimulation is off.").wait_for()

@@ -205,7 +205,7 @@ def test_the_page_that_refuses_a_re_arm_is_read_first(tab: Any, service: Service
     tab.get_by_role("button", name="I have checked: re-arm").wait_for()
     tab.route("**/rig/*", lambda route: route.abort())  # it does not hear of the second one
     service.rig_thread.become("latched", "two")
-    soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
+    soon(lambda: service.context.rig.status.latch == service.rig.latch)
     tab.route("**/rig.js*", lambda route: route.abort())  # the style alone
     tab.get_by_role("button", name="I have checked: re-arm").click()
     tab.get_by_text("This was changed since you saw it").wait_for()
@@ -229,7 +229,7 @@ def test_a_third_stop_on_the_page_that_refuses_is_read_first_too(tab: Any, servi
         if stop == "two":
             tab.route("**/rig/*", lambda route: route.abort())
         service.rig_thread.become("latched", stop)
-        soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
+        soon(lambda: service.context.rig.status.latch == service.rig.latch)
         if stop == "one":
             button.wait_for()
     button.click()
@@ -258,7 +258,7 @@ def test_the_page_that_refuses_a_re_arm_is_read_first_also_without_its_style(tab
     tab.route("**/rig/*", lambda route: route.abort())
     tab.route("**/page.css*", lambda route: route.abort())
     service.rig_thread.become("latched", "two")
-    soon(lambda: service.app.state.context.rig.status.latch == service.rig.latch)
+    soon(lambda: service.context.rig.status.latch == service.rig.latch)
     tab.get_by_role("button", name="I have checked: re-arm").click()
     tab.get_by_text("This was changed since you saw it").wait_for()
     tab.wait_for_load_state("load")

@@ -40,7 +40,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 @pytest.fixture
 def http(service: Service) -> Iterator[httpx.Client]:
     """What other tests guessed in vain counts no more: they may come in any order."""
-    guesses = service.app.state.context.people.guesses
+    guesses = service.context.people.guesses
     vars(guesses).update(vars(Guesses(Clock())))
     with service.client() as client:
         yield client

@@ -115,7 +115,7 @@ def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Ser
     from stimrig.api.store.tables import Model, Test
 
     document = run_test(client, participant)
-    with service.app.state.context.store.write() as session:
+    with service.context.store.write() as session:
         session.get(Model, document["model_id"]).created_utc = "2026-01-02T10:00:00.000Z"
         session.get(Test, document["id"]).requested_utc = "2026-01-02T09:00:00.000Z"
     assert shown(service)[0] == "calibrate may"
@@ -129,7 +129,7 @@ def test_of_two_versions_of_a_test_the_offered_one_is_next(
     plain = run_test(client, participant)["model_id"]
     carried = client.post(f"/v1/models/{plain}/effects", json={"effects": ["fatigue"]}).json()["id"]
     for offered, expected in (("plain", plain), ("carried", carried)):
-        with service.app.state.context.store.write() as session:
+        with service.context.store.write() as session:
             row = session.get(Model, carried)
             row.carried_from_id, row.carried = (
                 plain,

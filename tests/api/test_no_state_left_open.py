@@ -33,11 +33,11 @@ def fails(*_args: Any, **_more: Any) -> Any:
 
 def reopened(service: Service, ended: dict[str, Any], **fields: Any) -> Any:
     """What a restarted service finds: the test is open; gives the function that takes it up."""
-    context = service.app.state.context
+    context = service.context
     context.runner.lifecycle.update(ended["id"], state="identifying", model_id=None, followed_by="dead", **fields)
 
     def resume() -> None:
-        asyncio.run_coroutine_threadsafe(context.runner.resume(), context.rig._task.get_loop()).result(30)
+        service.run(context.runner.resume())
 
     return resume
 
@@ -51,7 +51,7 @@ def test_a_test_taken_up_after_a_restart_ends_whatever_fails(
     caplog: pytest.LogCaptureFixture,
     with_recording: bool,
 ) -> None:
-    context = service.app.state.context
+    context = service.context
     ended = run_test(client, participant)
     resume = reopened(service, ended, **({} if with_recording else {"recording_id": None}))
     broken = (context.versions, "add") if with_recording else (context.runner.lifecycle, "missed_end")
@@ -88,7 +88,7 @@ def test_a_start_between_a_tests_end_and_the_rig_let_go_waits(
     client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The database says that a test is done a moment before the rig is let go: on a busy machine clients met a 409."""
-    lifecycle, written_down = service.app.state.context.runner.lifecycle, threading.Event()
+    lifecycle, written_down = service.context.runner.lifecycle, threading.Event()
     fail = lifecycle.fail
 
     def fails_slowly(test_id: str, error: Exception) -> None:
@@ -109,7 +109,7 @@ def test_what_has_ended_is_not_called_failed_by_what_goes_wrong_later(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
     ended = run_test(client, participant)
-    service.app.state.context.runner.lifecycle.fail(ended["id"], RuntimeError("late"))
+    service.context.runner.lifecycle.fail(ended["id"], RuntimeError("late"))
     now = client.get(f"/v1/tests/{ended['id']}").json()
     assert (now["state"], now["reason"]) == ("completed", ended["reason"])
 
@@ -117,7 +117,7 @@ def test_what_has_ended_is_not_called_failed_by_what_goes_wrong_later(
 def test_a_start_that_fails_unexpectedly_is_stopped_and_leaves_nothing_open(
     service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = service.app.state.context.rig
+    rig = service.context.rig
     ask = rig.ask
 
     async def broken(message: Any, timeout_s: float | None = None) -> Any:
@@ -208,7 +208,7 @@ def test_a_failing_listener_costs_nobody_else_the_news(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
     """The first events come while the start is under way: a link that broke there made the start a 503."""
-    rig, told = service.app.state.context.rig, []
+    rig, told = service.context.rig, []
 
     def always(event: Any) -> None:
         told.append(type(event).__name__)
@@ -226,7 +226,7 @@ def test_a_message_that_cannot_be_taken_costs_one_connection_at_most(
     client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An unexpected error outside a listener; a service that never connects again hears of no test's end."""
-    rig, failures = service.app.state.context.rig, []
+    rig, failures = service.context.rig, []
 
     def once(message: dict[str, Any], subscription_id: int) -> None:
         if not failures:
@@ -240,7 +240,7 @@ def test_a_message_that_cannot_be_taken_costs_one_connection_at_most(
 
 
 def test_a_failure_in_a_poll_does_not_end_the_polling(client: httpx.Client, service: Service) -> None:
-    rig, calls = service.app.state.context.rig, []
+    rig, calls = service.context.rig, []
 
     def always(_status: Any) -> None:
         calls.append(time.monotonic())

@@ -89,10 +89,9 @@ def test_every_operation_says_who_may_and_every_error_is_a_problem(document: dic
 
 
 def test_the_answer_to_a_guess_is_as_the_document_says_and_the_cookie_has_its_name(
-    service: Service, document: dict[str, Any]
+    service: Service, client: httpx.Client, document: dict[str, Any]
 ) -> None:
-    with service.client() as admin:
-        admin.post("/v1/users", json={"name": "Grace", "password": "long enough"}).raise_for_status()
+    client.post("/v1/users", json={"name": "Grace", "password": "long enough"}).raise_for_status()
     with service.client(token=None) as browser:
         browser.post("/v1/sessions", json={"name": "Grace", "password": "long enough"}).raise_for_status()
         assert list(browser.cookies) == [document["components"]["securitySchemes"]["session"]["name"]]
@@ -102,27 +101,26 @@ def test_the_answer_to_a_guess_is_as_the_document_says_and_the_cookie_has_its_na
         assert held.status_code == 429 and int(held.headers["Retry-After"]) >= 1
 
 
-def test_real_answers_hold_to_the_document(service: Service, document: dict[str, Any]) -> None:
-    with service.client() as client:
-        client.post("/v1/participants", json={"code": "P017"}).raise_for_status()
-        test = run_test(client, "P017")
-        ids = {"code": "P017", "test_id": test["id"], "model_id": test["model_id"], "name": "model"}
-        client.post(f"/v1/models/{test['model_id']}/approve", json={"reason": "good"}).raise_for_status()
-        client.post("/v1/users", json={"name": "Ada", "password": "long enough"}).raise_for_status()
-        tried = 0
-        for path, method, operation in operations(document):
-            kinds = operation["responses"].get("200", {}).get("content", {})
-            if method != "get" or not any("json" in kind for kind in kinds) or "{job_id}" in path:
-                continue
-            if path.endswith(("/calibration", "/model", "/file")) or path == "/v1/models/{model_id}":
-                continue  # none is open; and MODEL.json of a stub is none: tests/api/test_schemas.py has a real one
-            answer = client.get(path.format(**ids))
-            assert answer.status_code == 200, (path, answer.text)
-            (media,) = kinds.values()
-            schema = {**media["schema"], "components": document["components"]}
-            errors = [error.message for error in jsonschema_rs.Draft202012Validator(schema).iter_errors(answer.json())]
-            assert errors == [], path
-            tried += 1
+def test_real_answers_hold_to_the_document(client: httpx.Client, document: dict[str, Any]) -> None:
+    client.post("/v1/participants", json={"code": "P017"}).raise_for_status()
+    test = run_test(client, "P017")
+    ids = {"code": "P017", "test_id": test["id"], "model_id": test["model_id"], "name": "model"}
+    client.post(f"/v1/models/{test['model_id']}/approve", json={"reason": "good"}).raise_for_status()
+    client.post("/v1/users", json={"name": "Ada", "password": "long enough"}).raise_for_status()
+    tried = 0
+    for path, method, operation in operations(document):
+        kinds = operation["responses"].get("200", {}).get("content", {})
+        if method != "get" or not any("json" in kind for kind in kinds) or "{job_id}" in path:
+            continue
+        if path.endswith(("/calibration", "/model", "/file")) or path == "/v1/models/{model_id}":
+            continue  # none is open; and MODEL.json of a stub is none: tests/api/test_schemas.py has a real one
+        answer = client.get(path.format(**ids))
+        assert answer.status_code == 200, (path, answer.text)
+        (media,) = kinds.values()
+        schema = {**media["schema"], "components": document["components"]}
+        errors = [error.message for error in jsonschema_rs.Draft202012Validator(schema).iter_errors(answer.json())]
+        assert errors == [], path
+        tried += 1
     assert tried > 12
 
 

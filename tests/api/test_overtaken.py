@@ -24,7 +24,7 @@ class Held:
 
     def __init__(self, service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
         self.reached, self.free = threading.Event(), threading.Event()
-        target = service.app.state.context.runner
+        target = service.context.runner
         write = target._write_intent
 
         def slowly(*arguments: Any) -> Any:
@@ -191,7 +191,7 @@ def test_another_service_that_changes_something_is_heard_within_the_bound(
     key, controller = key_of(service, client, participant)
     service.rig.speed = 0.1
     assert controller.post("/v1/tests", json={"participant": participant, **TRIAL}).status_code == 202
-    assert service.app.state.context.auth.revoke(key, "somebody elsewhere")
+    assert service.context.auth.revoke(key, "somebody elsewhere")
     soon(lambda: service.rig.withdrawn)
     assert playing.LOOK_AGAIN_S <= 0.25
 
@@ -203,12 +203,12 @@ def test_a_trial_that_outlives_its_service_ends_with_the_right_that_was_revoked_
     key, controller = key_of(service, client, participant)
     service.rig.speed = 0.1
     test = controller.post("/v1/tests", json={"participant": participant, **TRIAL}).json()
-    context = service.app.state.context
+    context = service.context
     soon(lambda: context.rig.status.test_id == test["id"])
     context.runner.current = None
     context.runner.lifecycle.update(test["id"], followed_by="dead")
     assert context.auth.revoke(key, "somebody elsewhere")
-    asyncio.run_coroutine_threadsafe(context.runner.resume(), context.rig._task.get_loop()).result(30)
+    service.run(context.runner.resume())
     told = soon(lambda: service.rig.withdrawn)
     assert (told[0].test_id, told[0].begun) == (test["id"], True)
 
@@ -217,7 +217,7 @@ def test_a_rearm_that_a_stop_overtakes_is_not_done(service: Service, client: htt
     """The re-arm waits while the database is busy; a stop is pressed and confirmed; then the re-arm arrives."""
     assert client.post("/v1/stop", json={"reason": "first"}).is_success
     seen = client.get("/v1/rig").headers["etag"]
-    store = service.app.state.context.store
+    store = service.context.store
     with ThreadPoolExecutor(1) as pool:
         with store.write():
             asked = pool.submit(client.post, "/v1/rearm", headers={"If-Match": seen}, timeout=30)

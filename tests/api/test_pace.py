@@ -179,7 +179,7 @@ def test_guesses_of_tokens_are_slowed_down_and_keep_no_controller_out(
 def test_a_known_place_is_remembered_over_a_restart_and_forgotten_with_the_password(
     service: Service, client: httpx.Client
 ) -> None:
-    people = service.app.state.context.people
+    people = service.context.people
     client.post("/v1/users", json={"name": "Ada", "password": PASSWORD})
     assert people._look_up("Ada", OWN)[1] is False
     for number in range(25):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 
 from stimrig.api.web import pages
@@ -41,7 +42,7 @@ pytestmark = pytest.mark.browser
 service = shared_service(speed=8.0)
 
 
-def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
+def test_a_clinicians_whole_way(tab: Any, service: Service, client: httpx.Client) -> None:
     service.rig.speed = 4.0
     participant(tab, service, "P100")
     expected(tab.get_by_text("No model yet.")).to_be_visible()
@@ -67,8 +68,7 @@ def test_a_clinicians_whole_way(tab: Any, service: Service) -> None:
     assert tab.locator(".who").inner_text().split() == ["Signed", "in:", "Ada", "clinician"]
     tab.get_by_role("link", name="P100").click()
     tab.get_by_text("in use", exact=True).wait_for()
-    with service.client() as http:
-        assert http.get("/v1/participants/P100/model").status_code == 200
+    assert client.get("/v1/participants/P100/model").status_code == 200
     assert {urlsplit(url).netloc for url in tab.requests if url.startswith("http")} == {urlsplit(service.url).netloc}
     assert tab.errors == []
     service.rig.speed = 8.0
@@ -220,13 +220,12 @@ def test_approval_wants_the_password_a_rejection_a_reason_and_says_what_is_wrong
     assert (NAME, "approve", "") in deeds and (NAME, "reject", "electrode slipped") in deeds
 
 
-def test_a_form_without_a_reason_decides_nothing(service: Service) -> None:
+def test_a_form_without_a_reason_decides_nothing(service: Service, client: httpx.Client) -> None:
     model = a_model(service, "C2")["model_id"]
     with signed_in(service) as browser:
         refused = browser.post(f"/models/{model}/reject", data={"csrf": csrf(browser), "reason": "  "})
     assert refused.status_code == 422 and "needs a reason" in refused.text
-    with service.client() as http:
-        assert http.get(f"/v1/models/{model}").json()["decision"] is None
+    assert client.get(f"/v1/models/{model}").json()["decision"] is None
 
 
 def test_every_export_of_a_model_and_a_test_is_there(tab: Any, service: Service) -> None:
@@ -269,11 +268,10 @@ def test_stop_during_a_fit_is_confirmed_and_the_model_still_comes(tab: Any, serv
     assert test["state"] == "completed" and test["model_id"]
 
 
-def test_a_reader_sees_no_deeds_and_may_stop(service: Service) -> None:
+def test_a_reader_sees_no_deeds_and_may_stop(service: Service, client: httpx.Client) -> None:
     model = a_model(service, "C4")["model_id"]
-    with service.client() as http:
-        body = {"name": "Rosa", "password": PASSWORD, "scopes": ["read-live", "read-model"]}
-        assert http.post("/v1/users", json=body).status_code in (201, 409)
+    body = {"name": "Rosa", "password": PASSWORD, "scopes": ["read-live", "read-model"]}
+    assert client.post("/v1/users", json=body).status_code in (201, 409)
     with service.client(token=None, headers=HTML, follow_redirects=True) as page:
         home = page.post("/sign-in", data={"name": "Rosa", "password": PASSWORD}).text
         assert "You may not see this list" in home and "C4" not in without_values(home)
@@ -319,10 +317,9 @@ def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, ser
     assert blank.get_by_role("link", name="Administration").count() == 0
 
 
-def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service) -> None:
+def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service, client: httpx.Client) -> None:
     """Sign in, make a participant, start, stop, re-arm: only keys."""
-    with service.client() as http:
-        http.post("/v1/users", json={"name": NAME, "password": PASSWORD})
+    client.post("/v1/users", json={"name": NAME, "password": PASSWORD})
     service.rig.speed = 1.5
     blank.goto(service.url)
     keys = blank.keyboard

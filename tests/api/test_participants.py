@@ -91,7 +91,7 @@ def test_what_is_no_side_or_muscle_is_refused(http: httpx.Client, body: dict[str
 def test_thresholds_of_one_arm_do_not_hold_for_the_other(service: Service, http: httpx.Client) -> None:
     make(http, "M2")
     http.put("/v1/participants/M2/muscle", json={"side": "left"})
-    store = service.app.state.context.store
+    store = service.context.store
     with store.write() as session:
         row = session.get(Participant, "M2")
         row.profile = {**row.profile, "motor_pulse_width_us": 80.0, "set_at_utc": "2026-03-01T10:00:00.000Z"}
@@ -103,7 +103,7 @@ def test_thresholds_of_one_arm_do_not_hold_for_the_other(service: Service, http:
 
 
 def test_the_first_page_asks_as_much_of_the_database_for_many_as_for_few(service: Service, http: httpx.Client) -> None:
-    store = service.app.state.context.store
+    store = service.context.store
     asked: list[str] = []
     event.listen(store.engine, "before_cursor_execute", lambda *given: asked.append(given[2]))
 
@@ -118,7 +118,7 @@ def test_the_first_page_asks_as_much_of_the_database_for_many_as_for_few(service
         return min(once(path, html) for _ in range(5))
 
     few = count("/v1/participants"), count("/?all=1", html=True)
-    now = service.app.state.context.clock.utc()
+    now = service.context.clock.utc()
     with store.write() as session:
         for number in range(500):
             session.add(
@@ -196,17 +196,16 @@ def test_a_time_lies_in_the_test_of_this_participant(made: tuple[httpx.Client, d
     assert http.post("/v1/participants/N1/notes", json={"kind": "spasm", "at_s": 1}).status_code == 422
 
 
-def test_now_is_where_the_running_test_stands(service: Service) -> None:
+def test_now_is_where_the_running_test_stands(service: Service, client: httpx.Client) -> None:
     service.rig.speed = 2.0
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "N4"})
-        test = http.post("/v1/tests", json={"participant": "N4"}).json()
-        elapsed_s = soon(lambda: http.get(f"/v1/tests/{test['id']}").json()["elapsed_s"])
-        body = {"kind": "spasm", "test_id": test["id"], "now": True}
-        note = http.post("/v1/participants/N4/notes", json=body).json()
-        service.rig.speed = 60.0
-        after = wait_done(http, test["id"])
-        assert elapsed_s - 0.01 <= note["at_s"] <= after["summary"]["duration_s"]
+    client.post("/v1/participants", json={"code": "N4"})
+    test = client.post("/v1/tests", json={"participant": "N4"}).json()
+    elapsed_s = soon(lambda: client.get(f"/v1/tests/{test['id']}").json()["elapsed_s"])
+    body = {"kind": "spasm", "test_id": test["id"], "now": True}
+    note = client.post("/v1/participants/N4/notes", json=body).json()
+    service.rig.speed = 60.0
+    after = wait_done(client, test["id"])
+    assert elapsed_s - 0.01 <= note["at_s"] <= after["summary"]["duration_s"]
 
 
 @pytest.mark.parametrize(
@@ -270,9 +269,8 @@ def test_what_an_effect_would_leave_is_called_an_estimate(service: Service, mode
     assert "with it (estimated)" in page
 
 
-def test_a_day_ends_at_its_last_minute_everywhere(service: Service, model: str) -> None:
-    with service.client() as http:
-        ends = http.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"}).json()
+def test_a_day_ends_at_its_last_minute_everywhere(service: Service, client: httpx.Client, model: str) -> None:
+    ends = client.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"}).json()
     end = language.until(ends["expires_utc"])
     assert end.endswith("23:59") and language.when(ends["expires_utc"]).endswith("00:00")
     with signed_in(service) as browser:
@@ -308,10 +306,9 @@ def test_new_pulses_come_first() -> None:
     assert (alone.percent, alone.ceiling_percent, alone.where) == (98.5, 99.0, "On the pulses that it was fitted to")
 
 
-def test_every_page_shows_the_same_fit(service: Service) -> None:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "F1"})
-        first, second = (run_test(http, "F1")["model_id"] for _ in range(2))
+def test_every_page_shows_the_same_fit(service: Service, client: httpx.Client) -> None:
+    client.post("/v1/participants", json={"code": "F1"})
+    first, second = (run_test(client, "F1")["model_id"] for _ in range(2))
     pages = ("/", "/participants/F1", "/participants/F1/trend", f"/compare?model={first}&model={second}",
              f"/models/{first}", f"/models/{first}/report")  # fmt: skip
     with signed_in(service) as browser:

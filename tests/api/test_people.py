@@ -32,7 +32,7 @@ PASSWORD = "correct horse battery"
 def standing_still(service: Service) -> SetClock:
     """The clock of the paces: on a busy machine a wait would be over before the next try."""
     clock = SetClock()
-    for pace in vars(service.app.state.context.people.guesses).values():
+    for pace in vars(service.context.people.guesses).values():
         if isinstance(pace, Pace):
             pace.clock = clock
     return clock
@@ -60,7 +60,7 @@ def test_password_is_kept_as_argon2id_only(service: Service, clinician: httpx.Cl
     assert clinician.get("/v1/rig").status_code == 200
     ((kept,),) = service.sql("SELECT password_hash FROM users")
     assert kept.startswith("$argon2id$")
-    tables = inspect(service.app.state.context.store.engine).get_table_names()
+    tables = inspect(service.context.store.engine).get_table_names()
     assert not any(PASSWORD in str(service.sql(f"SELECT * FROM {table}")) for table in tables)
 
 
@@ -330,7 +330,7 @@ def test_stop_by_plain_form_works_without_csrf_and_after_the_session_ran_out(
     with signed_in(service) as browser:
         with service.client() as client:
             client.post("/v1/tests", json={"participant": participant})
-        with service.app.state.context.store.write() as session:
+        with service.context.store.write() as session:
             session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
         assert browser.get("/v1/rig").status_code in (303, 401)
         page = browser.post("/v1/stop", data={"reason": "stop pressed on the page"}, follow_redirects=True)
@@ -361,7 +361,7 @@ def test_approval_ends_with_its_day(client: httpx.Client, service: Service, part
     approved = client.post(f"{document['model_url']}/approve").json()
     fetch = f"/v1/participants/{participant}/model"
     assert client.get(fetch).status_code == 200
-    clock = service.app.state.context.clock
+    clock = service.context.clock
     now = clock.unix_s()
     assert clock.utc() < approved["expires_utc"] <= utc_label(now + 25 * 3600)
     clock.unix_s = lambda: now + 25 * 3600

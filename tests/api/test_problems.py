@@ -167,7 +167,7 @@ def test_upload_of_a_table_with_a_wrong_name_is_one_line(
 
 
 def test_upload_too_large_or_empty(client: httpx.Client, service: Service, participant: str) -> None:
-    service.app.state.context.settings.max_upload_mb = 0.001
+    service.context.settings.max_upload_mb = 0.001
     problem(client.post(f"/v1/participants/{participant}/recordings", content=b"x" * 2000), 413)
     problem(client.post(f"/v1/participants/{participant}/recordings", content=b""), 422)
     assert list((service.data / "recordings").rglob("upload-*")) == []
@@ -184,6 +184,6 @@ def test_unforeseen_error_is_a_problem_too(
     def broken(*_: object) -> None:
         raise RuntimeError("secret detail")
 
-    monkeypatch.setattr(service.app.state.context.versions, "get", broken)
+    monkeypatch.setattr(service.context.versions, "get", broken)
     found = problem(client.get("/v1/models/M1"), 500)
     assert "secret detail" not in str(found)

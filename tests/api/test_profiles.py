@@ -183,7 +183,7 @@ def test_a_calibration_takes_the_participants_own_limits(
     client: httpx.Client, service: Service, tight: dict[str, float]
 ) -> None:
     """Not 20 mA and 30 N·m because nothing was said; and what it doesn't look for is kept."""
-    context = service.app.state.context
+    context = service.context
     with context.store.write() as session:
         from stimrig.api.store.tables import Participant
 

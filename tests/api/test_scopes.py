@@ -282,7 +282,7 @@ def test_what_goes_wrong_has_the_same_head(
     def broken() -> None:
         raise RuntimeError("unexpected")
 
-    monkeypatch.setattr(service.app.state.context.people, "documents", broken)
+    monkeypatch.setattr(service.context.people, "documents", broken)
     model = run_test(client, participant)
     client.post(f"{model['model_url']}/approve")
     for answer, status in (

@@ -125,7 +125,7 @@ def test_comparison_and_diagnosis_are_made_once_and_kept(
     diagnosis = client.get(f"{model}/diagnosis").json()  # begun with the test's end: nothing else is made after it
     assert diagnosis["verdict"] == "effect_missing"
     comparison = client.get(f"{model}/comparison").json()
-    pool = service.app.state.context.pool
+    pool = service.context.pool
     come_to_rest(pool)  # a worker that still warms up, or ends the diagnosis begun ahead, counts too
     done = pool.done_count
     assert client.get(f"{model}/comparison").json() == comparison
@@ -198,7 +198,7 @@ def test_version_with_other_contents_is_refused_and_the_old_one_stays(
     before = client.get(path)
     model = json.loads(before.content)
     model["recruitment"]["torque_nm"][-1] += 1.0
-    versions = service.app.state.context.versions
+    versions = service.context.versions
     with pytest.raises(ApiError, match="cannot be changed"):
         versions.add(json.dumps(model), participant, document["recording_id"], "somebody")
     same = versions.add(before.content.decode(), participant, document["recording_id"], "somebody")

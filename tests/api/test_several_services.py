@@ -87,7 +87,7 @@ def test_a_rejection_and_a_revoked_token_count_everywhere_at_once(
 
 def test_a_right_to_stop_of_one_page_is_good_at_the_other(tmp_path: Path, short_dir: Path, address: str) -> None:
     with two(tmp_path, short_dir, address) as (a, b):
-        right = a.app.state.context.stop_rights.give("Ada", None)
+        right = a.context.stop_rights.give("Ada", None)
         assert httpx.post(f"{b.url}/v1/stop", headers={"X-Stop-Right": right}, timeout=60).status_code == 200
 
 
@@ -107,7 +107,7 @@ def test_one_rig_is_held_by_one_test_whoever_asks(tmp_path: Path, short_dir: Pat
             assert refused.status_code == 409 and refused.json()["holder"]["test_id"] == begun["id"], refused.text
         for client in (clients[0], clients[-1]):
             assert wait_done(client, begun["id"])["state"] == "completed"
-        store = services[0].app.state.context.store
+        store = services[0].context.store
         assert len(store.all(Test, Test.state == "completed")) == len(store.all(Model)) == 1
         entries = store.all(AuditEntry, order=AuditEntry.seq)
         assert audit.first_broken(entries) is None
@@ -138,7 +138,7 @@ def test_what_a_killed_service_leaves_is_taken_up_by_the_other(
         process.wait(20)
         told = wait_done(at_b, test_id)
         assert told["state"] == "completed" and told["model_id"], told
-        assert len(b.app.state.context.store.all(Model)) == 1
+        assert len(b.context.store.all(Model)) == 1
         assert at_b.get("/v1/audit").json()["whole"]
 
 
@@ -152,7 +152,7 @@ def test_what_a_living_service_follows_is_left_to_it(tmp_path: Path, short_dir: 
         at_a.post("/v1/participants", json={"code": "P1"})
         test_id = at_a.post("/v1/tests", json={"participant": "P1"}).json()["id"]
         one(stack, tmp_path / "b", address, rig)
-        context = a.app.state.context
+        context = a.context
         assert wait_done(at_a, test_id)["state"] == "completed"
         assert context.store.get(Test, test_id).followed_by == context.holds.me
 

@@ -72,9 +72,9 @@ def test_a_key_stops_what_the_service_has_not_yet_heard_of(
     words: list[str] = []
 
     async def last_known() -> Any:
-        return service.app.state.context.rig.status
+        return service.context.rig.status
 
-    monkeypatch.setattr(service.app.state.context.rig, "fresh_status", last_known)
+    monkeypatch.setattr(service.context.rig, "fresh_status", last_known)
     monkeypatch.setattr(service.rig, "_send", lambda _event: None)
     with StopKey(at_service(service.url, TOKEN), words.append, program):
         started(client, service, participant)

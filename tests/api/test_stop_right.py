@@ -37,7 +37,7 @@ def person(service: Service, name: str = "Ada") -> httpx.Client:
 
 
 def cookie_name(service: Service) -> str:
-    return service.app.state.context.auth.cookie_name
+    return service.context.auth.cookie_name
 
 
 def right_on(page: str) -> str:
@@ -68,7 +68,7 @@ def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) ->
 
 
 def run_out(_browser: httpx.Client, _client: httpx.Client, service: Service) -> None:
-    with service.app.state.context.store.write() as session:
+    with service.context.store.write() as session:
         session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
 
 
@@ -104,7 +104,7 @@ def test_a_page_has_its_stop_button_while_the_database_does_not_answer(
     browser, stranger = person(service), service.client(token=None, headers=HTML)
     browser.get("/")
     running(service, participant)
-    monkeypatch.setattr(service.app.state.context.auth, "ask", database)
+    monkeypatch.setattr(service.context.auth, "ask", database)
     shown = browser.get("/nowhere")
     assert shown.status_code == 404
     assert CONFIRMED in press(service, right_on(shown.text)).text
@@ -122,7 +122,7 @@ def test_no_page_gives_a_right_to_a_key_or_to_who_was_told_no_since(
     assert removed.get("/").status_code == 200
     remove(removed, client, service)
     assert 'action="/v1/stop"' not in removed.get("/nowhere").text
-    monkeypatch.setattr(service.app.state.context.auth, "ask", gone)
+    monkeypatch.setattr(service.context.auth, "ask", gone)
     for stranger in (by_key, as_cookie, removed):
         assert 'action="/v1/stop"' not in stranger.get("/nowhere").text
 
@@ -149,7 +149,7 @@ def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
 def test_a_stop_waits_for_no_database(service: Service, participant: str, monkeypatch: pytest.MonkeyPatch) -> None:
     right = right_on(person(service).get("/").text)
     running(service, participant)
-    store = service.app.state.context.store
+    store = service.context.store
 
     def gone(*_: Any) -> Any:
         raise OperationalError("SELECT", {}, Exception("disk I/O error"))
@@ -174,7 +174,7 @@ def test_the_answer_to_a_stop_that_is_not_confirmed_has_the_button_still(service
 
 
 def test_nobody_makes_a_right(service: Service) -> None:
-    rights: StopRights = service.app.state.context.stop_rights
+    rights: StopRights = service.context.stop_rights
     real = rights.give("Ada", None)
     words, _, mark = real.partition(".")
     other = StopRights(b"k" * 32, Clock()).give("Eve", None)
@@ -193,7 +193,7 @@ OPEN = ("/v1/stop", "/v1/sessions", "/v1/schemas", "/v1/schemas/{name}")
 
 
 def test_a_right_opens_nothing_but_stop(service: Service) -> None:
-    right = service.app.state.context.stop_rights.give("Ada", None)
+    right = service.context.stop_rights.give("Ada", None)
     with service.client(token=None, headers={"X-Stop-Right": right}) as http:
         for path, methods in http.get("/openapi.json").json()["paths"].items():
             for method in methods:
@@ -217,7 +217,7 @@ def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
 
 
 def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Service) -> None:
-    context = service.app.state.context
+    context = service.context
     right, gone = context.stop_rights.give("Ada", None), service.data / "stop-right.key"
     assert StopRights(holds.shared_secret(context.store, "stop-right", gone), Clock()).holder(right) == "Ada"
 
@@ -232,22 +232,21 @@ def test_the_upgrade_keeps_them_too(tmp_path: Path) -> None:
     store.close()
 
 
-def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Service) -> None:
+def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Service, client: httpx.Client) -> None:
     """The configured token, after a restart, while a client with an old token tries on at the same address."""
-    pace = service.app.state.context.auth.guesses._tokens
+    pace = service.context.auth.guesses._tokens
     for _ in range(20):
         pace.count("127.0.0.1")
-    with service.client() as program:
-        assert program.get("/v1/rig").status_code == 429
-        assert program.post("/v1/stop").status_code == 200
-        assert program.get("/v1/rig").status_code == 429, "a stop opens nothing else"
+    assert client.get("/v1/rig").status_code == 429
+    assert client.post("/v1/stop").status_code == 200
+    assert client.get("/v1/rig").status_code == 429, "a stop opens nothing else"
     assert service.client("guess").post("/v1/stop").status_code == 429
 
 
 def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stimrig.api.web.guards.PATIENCE_S", 0.01)
     monkeypatch.setattr("stimrig.api.web.guards.LONGEST_PATIENCE_S", 60.0, raising=False)
-    right = service.app.state.context.stop_rights.give("Ada", None)
+    right = service.context.stop_rights.give("Ada", None)
     with slow_form(service, f"right={right}", f"Cookie: {cookie_name(service)}=ended\r\n") as connection:
         connection.sendall(right[-1:].encode())
         assert connection.recv(12) == b"HTTP/1.1 200"

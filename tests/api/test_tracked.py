@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
 import re
@@ -256,7 +255,7 @@ def test_a_trial_that_cannot_be_followed_is_noted_and_nothing_is_lost(
     play(client)
     document = tracked(client).json()
     assert document["tracking"]["trial"] == 3 and gain(document, client.get(MODEL).json()) == pytest.approx(0.98**2)
-    state = service.app.state.context.tracked.rows(1)[-1].step["state"]
+    state = service.context.tracked.rows(1)[-1].step["state"]
     assert state["missed"] == 1, "what is known has become less certain by the trial in between"
 
 
@@ -269,7 +268,7 @@ def test_a_trial_at_another_current_moves_nothing(service: Service, client: http
 
 def test_rates_are_learnt_from_the_same_place(service: Service, client: httpx.Client, approved: str) -> None:
     def sessions() -> int:
-        tracked = service.app.state.context.tracked
+        tracked = service.context.tracked
         return len(tracked.earlier(tracked.allowing("P017")))
 
     play(client)
@@ -283,22 +282,21 @@ def test_rates_are_learnt_from_the_same_place(service: Service, client: httpx.Cl
 
 
 def test_a_damaged_model_is_not_followed(service: Service, client: httpx.Client, approved: str) -> None:
-    with service.app.state.context.store.write() as session:
+    with service.context.store.write() as session:
         row = session.get(Model, approved)
         row.document = row.document.replace(b"1", b"2", 1)
     play(client)
-    (row,) = soon(lambda: service.app.state.context.tracked.rows(1))
+    (row,) = soon(lambda: service.context.tracked.rows(1))
     assert row.outcome == "not-followed" and "no longer what was stored" in row.reason
     assert tracked(client).status_code == 500
 
 
 def test_a_trial_that_is_told_twice_moves_nothing_twice(service: Service, client: httpx.Client, approved: str) -> None:
     test = play(client)
-    before, context = tracked(client), service.app.state.context
+    before, context = tracked(client), service.context
     event = FinishedEvent(test_id=test["id"], outcome="completed", last_sample_unix_s=None)
-    loop = context.rig._task.get_loop()
     for again in (context.runner._finish(event), context.runner.trials.follow(test["id"])):
-        asyncio.run_coroutine_threadsafe(again, loop).result(30)
+        service.run(again)
     assert tracked(client).content == before.content and len(trials(client)) == 1
 
 
@@ -318,7 +316,7 @@ def test_a_restart_goes_on_where_it_was(tmp_path: Path, short_dir: Path) -> None
             client.post(f"/v1/models/{run_test(client, 'P017')['model_id']}/approve")
             play(client)
             before = tracked(client)
-            store = service.app.state.context.store
+            store = service.context.store
             open_one = play(client)["id"]
             assert tracked(client).json()["tracking"]["trial"] == 2
             with store.write() as session:  # as if the service had been killed before it was followed

@@ -164,9 +164,9 @@ def test_warming_follows_a_trial_of_its_own(model_json: str, monkeypatch: pytest
 
 def passed_on(service: Service, approval_id: int) -> list[list[str]]:
     """For each trial that was followed, the recordings that the worker was given beside its own."""
-    store = service.app.state.context.store
+    store = service.context.store
     names = {row.path: row.id for row in store.all(Recording)}
-    rows = service.app.state.context.tracked.rows(approval_id)
+    rows = service.context.tracked.rows(approval_id)
     return [[names[path] for path in row.step["state"]["between"]] for row in rows if row.step is not None]
 
 

@@ -35,7 +35,7 @@ service = shared_service()
 
 
 def made(service: Service, code: str, planned: list[Planned]) -> list[str]:
-    context = service.app.state.context
+    context = service.context
     return sessions.make(context.store, context.settings.recordings_dir, code, planned)
 
 
@@ -75,7 +75,7 @@ def test_deviations_are_those_of_repeated_records() -> None:
 
 def test_one_point_a_session_approved_first_and_the_newest_version_else(service: Service, client: httpx.Client) -> None:
     ids = made(service, "ONE", three())
-    context = service.app.state.context
+    context = service.context
     row = context.versions.get(ids[2])
     later = {**json.loads(row.document), "model_id": "a-second-version"}
     context.versions.add(json.dumps(later), "ONE", row.recording_id, "Ada", parent_id=row.id)
@@ -131,7 +131,7 @@ def test_models_from_before_the_figures_are_read_once(tmp_path: Path, short_dir:
 def _read_once(service: Service, client: httpx.Client) -> None:
     ids = made(service, "P017", three())
     stored = trend(client, "P017")["sessions"]
-    store = service.app.state.context.store
+    store = service.context.store
     with store.write() as session:
         for identity in ids:
             row = session.get(Model, identity)

@@ -146,7 +146,7 @@ SOME = ["only the delay is used today", "Nur die Verzögerung wird heute gebrauc
 
 def make_poor(service: Service, model: str) -> str:
     """A version of the same recording that identify would call not usable."""
-    context = service.app.state.context
+    context = service.context
     row = context.versions.get(model)
     document = json.loads(row.document) | {"model_id": f"M-poor{time.time_ns()}"}
     says = "stimulation hardly changes the torque: check electrodes, current and load cell"

@@ -68,7 +68,7 @@ def test_a_withdrawal_that_the_rig_does_not_take_is_repeated_and_stops_meanwhile
     service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     key = playing(service, client, participant)
-    rig, failed = service.app.state.context.rig, list[int]()
+    rig, failed = service.context.rig, list[int]()
     ask = rig.ask
 
     async def fails_once(message: Any, timeout_s: float | None = None) -> Any:
@@ -88,8 +88,8 @@ def test_a_token_that_came_back_starts_tests(
     service: Service, client: httpx.Client, participant: str, same_text: bool
 ) -> None:
     """Its revocation stays in the trail, newer than what was read of the participant."""
-    text, auth = service.token("lab", "run-test", "read-live"), service.app.state.context.auth
-    (known,) = [row for row in service.app.state.context.store.all(Token) if row.name == "lab"]
+    text, auth = service.token("lab", "run-test", "read-live"), service.context.auth
+    (known,) = [row for row in service.context.store.all(Token) if row.name == "lab"]
     assert auth.revoke(known.hash[:16], "somebody")
     again = auth.issue("lab", [Scope.RUN_TEST, Scope.READ_LIVE], "somebody", text=text if same_text else None)
     assert service.client(again).post("/v1/tests", json={"participant": participant}).status_code == 202
@@ -111,7 +111,7 @@ def test_a_form_that_comes_back_for_want_of_something_is_as_old_as_it_was(
 def test_a_question_ends_with_its_day(service: Service, client: httpx.Client, participant: str) -> None:
     with signed_in(service) as tab:
         asked = tab.post(f"{PAGE}/tests", data=fields(tab))
-        questions = service.app.state.context.questions
+        questions = service.context.questions
         (question,) = questions._all.values()
         question.seen = replace(question.seen, day="2020-01-01")
         answer = tab.post(asked.headers["location"], data={"csrf": csrf(tab)})
@@ -236,7 +236,7 @@ def test_a_pose_whose_answer_was_lost_is_a_change(
     service.rig.arm.way = still(0.2)
     old = client.get("/v1/rig/angle").headers["etag"]
     with monkeypatch.context() as patch:
-        patch.setattr(service.app.state.context.rig, "patience_s", 0.0)
+        patch.setattr(service.context.rig, "patience_s", 0.0)
         lost = client.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}, headers={"If-Match": old})
         assert lost.status_code == 503, lost.text
     assert [one["action"] for one in client.get("/v1/audit").json()["entries"]][-1] == "pose not taken"
@@ -268,7 +268,7 @@ def test_a_trial_that_plays_ends_with(
 ) -> None:
     """With the day of its key, its right, or what another service does to the participant."""
     playing(service, client, participant)
-    context = service.app.state.context
+    context = service.context
 
     def gone(_: object) -> list[Any]:
         raise OSError("the disk is gone")
@@ -300,13 +300,13 @@ def test_a_key_that_ends_between_its_intent_and_its_command_plays_nothing(
 ) -> None:
     """It is told to the rig at once; and the start that follows is refused here, whatever the rig remembers."""
     _key, controller = key_of(service, client, participant)
-    runner = service.app.state.context.runner
+    runner = service.context.runner
     write = runner._write_intent
 
     def then_it_is_tomorrow(*given: Any) -> Any:
         row = write(*given)
         runner.clock = Tomorrow(runner.clock)
-        asyncio.run_coroutine_threadsafe(runner.look_again(), runner.rig._task.get_loop()).result(20)
+        service.run(runner.look_again())
         return row
 
     monkeypatch.setattr(runner, "_write_intent", then_it_is_tomorrow)
@@ -321,7 +321,7 @@ def test_a_key_that_is_revoked_before_its_intent_plays_nothing(
 ) -> None:
     """It was good at the door; another service revokes it while the plan is looked at."""
     key, controller = key_of(service, client, participant)
-    context, starts = service.app.state.context, service.rig.starts
+    context, starts = service.context, service.rig.starts
     look = context.runner._previewed
 
     async def meanwhile(plan: Any) -> Any:
@@ -339,7 +339,7 @@ def test_a_key_that_is_revoked_before_its_intent_plays_nothing(
 def test_a_trial_ends_with_its_makers_token_and_a_programs_test_does_not(
     service: Service, client: httpx.Client, participant: str, approved: str, by_key: bool
 ) -> None:
-    context, starts = service.app.state.context, service.rig.starts
+    context, starts = service.context, service.rig.starts
     maker = service.client(service.token("clin", "approve-model", "run-test", "read-live", "read-model"))
     if by_key:
         playing(service, maker_and(client, maker), participant)
@@ -355,7 +355,7 @@ def test_a_trial_ends_with_its_makers_token_and_a_programs_test_does_not(
         soon(lambda: service.rig.withdrawn)
     told = len(service.rig.withdrawn)
     for _ in range(2):
-        asyncio.run_coroutine_threadsafe(context.runner.look_again(), context.rig._task.get_loop()).result(20)
+        service.run(context.runner.look_again())
     assert len(service.rig.withdrawn) == told == by_key, "once, and not again"
     assert service.rig.starts == starts + 1 and approved
 
@@ -426,7 +426,7 @@ def test_a_key_is_made_on_what_was_seen_also_when_its_check_is_overtaken(
     page, old = client.get(PAGE, headers=HTML).text, client.get(HOME).headers["etag"]
     version = re.findall(r'name="seen" value="([^"]+)"', page)[-1]
     assert client.put(f"{HOME}/profile", json={"max_torque_nm": 12}).is_success
-    store = service.app.state.context.store
+    store = service.context.store
     monkeypatch.setattr(store, "refuse_changed", lambda *_about: None)
     key = {"name": "ilc", "current_ma": "8", "max_pulse_width_us": "200", "max_duration_s": "60", "trials": "3"}
     refused = client.post(f"{PAGE}/keys", data={**key, "seen": version}, headers=HTML, auth=None)

@@ -41,7 +41,7 @@ def test_new_test_ends_the_diagnosis_in_the_background(
 ) -> None:
     make_slow(service)
     model = run_test(client, participant)["model_id"]
-    analyses = service.app.state.context.analyses
+    analyses = service.context.analyses
     job = soon(lambda: analyses.running.get((model, "diagnosis")))
     soon(lambda: job.state == "running")
     assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
@@ -52,14 +52,14 @@ def test_new_test_ends_the_diagnosis_in_the_background(
 def test_who_asks_does_not_wait_for_low_priority(client: httpx.Client, service: Service, participant: str) -> None:
     marker = make_slow(service, 0.2)
     model = run_test(client, participant)["model_id"]
-    analyses = service.app.state.context.analyses
+    analyses = service.context.analyses
     soon(lambda: (job := analyses.running.get((model, "diagnosis"))) and job.background and job.progress > 0.1)
     marker.unlink()
     assert client.get(f"/v1/models/{model}/diagnosis").json()["verdict"] == "effect_missing"
 
 
 def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, service: Service, model: str) -> None:
-    soon(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
+    soon(lambda: service.context.analyses.known(model, "diagnosis"))
     body = {"effects": ["slow"], "force": True, "reason": "x"}
     begun, again = (client.post(f"/v1/models/{model}/effects?wait=false", json=body) for _ in range(2))
     url = begun.headers["location"]
@@ -148,7 +148,7 @@ def test_improving_a_version_adds_to_what_it_holds(client: httpx.Client, model: 
 
 def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client, service: Service, model: str) -> None:
     """It was made of the plain structure, and kept with the first version."""
-    context = service.app.state.context
+    context = service.context
     kept = soon(lambda: context.analyses.known(model, "diagnosis"))
     old = {key: value for key, value in kept.items() if key != "structure"} | {"noise_sd_nm": 0.123}
     context.analyses._keep(model, "diagnosis", old)
@@ -280,7 +280,7 @@ def test_place_is_named_without_repeating_its_share() -> None:
 
 
 def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Service, model: str) -> None:
-    soon(lambda: service.app.state.context.analyses.known(model, "diagnosis"))
+    soon(lambda: service.context.analyses.known(model, "diagnosis"))
     with signed_in(service) as browser:
         text = browser.get(f"/models/{model}").text
         for words in ("What is missing", "Fatigue", "93 %", "This recording cannot tell it apart from", "Run it now",

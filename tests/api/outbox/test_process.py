@@ -236,9 +236,9 @@ def test_page_metrics_and_doctor_say_how_it_goes(tmp_path: Path, short_dir: Path
             assert "stimrig_outbox_items_waiting 1234.0" in figures and "stimrig_outbox_files_waiting 56.0" in figures
             assert "stimrig_outbox_contact_age_seconds " in figures
             assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201
-        kinds = [item.kind for item in service.app.state.context.store.all(OutboxItem)]
+        kinds = [item.kind for item in service.context.store.all(OutboxItem)]
         assert "participant" in kinds and "audit" in kinds
-        finding = next(check_centre(service.app.state.context.settings))
+        finding = next(check_centre(service.context.settings))
         assert finding.verdict == "care" and "1234 items and 56 files wait" in finding.says
 
 
@@ -248,8 +248,8 @@ def test_without_a_centre_nothing_is_shown_and_nothing_grows(tmp_path: Path, sho
             http.post("/v1/participants", json={"code": "P1"})
             assert 'id="centre"' not in http.get("/administration").text
             assert "stimrig_outbox" not in http.get("/metrics").text
-        assert service.app.state.context.store.all(OutboxItem) == []
-        assert list(check_centre(service.app.state.context.settings)) == []
+        assert service.context.store.all(OutboxItem) == []
+        assert list(check_centre(service.context.settings)) == []
 
 
 # ---- What talks to a centre has no way to the rig: nothing that a centre answers can move current
