@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import shutil
 import ssl
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -37,6 +39,7 @@ from tests.harness.looks_first import LooksFirst
 from tests.harness.postgres import Cluster, running
 
 TOKEN = "administrator-token-of-the-tests"
+HTML = {"Accept": "text/html,application/xhtml+xml"}
 PATIENCE_S = 60.0
 """For each answer: a busy machine is slow, and a test says so where an answer has to be quick."""
 QUICK_SPEED = 600.0
@@ -421,6 +424,27 @@ def approved(client: httpx.Client, participant: str) -> str:
     model: str = run_test(client, participant)["model_id"]
     assert client.post(f"/v1/models/{model}/approve").status_code == 200
     return model
+
+
+@contextmanager
+def signed_in(service: Service, token: str = TOKEN) -> Iterator[httpx.Client]:
+    with service.client(token=None, headers=HTML, follow_redirects=False) as browser:
+        answer = browser.post("/sign-in", data={"token": token, "next": "/"})
+        assert answer.status_code == 303, answer.text
+        cookie = answer.headers["set-cookie"]
+        assert "HttpOnly" in cookie and "SameSite=strict" in cookie
+        yield browser
+
+
+def csrf(browser: httpx.Client) -> str:
+    return re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+
+
+@pytest.fixture
+def pages(service: Service) -> Iterator[httpx.Client]:
+    """The administrator's browser, signed in."""
+    with signed_in(service) as browser:
+        yield browser
 
 
 def soon(found: Callable[[], Any], limit_s: float = 60.0) -> Any:

@@ -7,10 +7,9 @@ from typing import Any
 import pytest
 
 from tests.api.browser import expected, open_tab, participant
-from tests.api.conftest import Service, own_service, wait_done
+from tests.api.conftest import Service, csrf, own_service, signed_in, wait_done
 from tests.api.test_axe import examined
 from tests.api.test_forms import fields
-from tests.api.test_people import csrf, signed_in
 
 service = own_service(speed=0.25)
 """Slow enough to look at a running test from all sides."""

@@ -14,9 +14,8 @@ import pytest
 from stimrig.api.people.auth import Principal
 from stimrig.api.sessions.questions import LIFE_S, MOST, Question, Questions
 from stimrig.rig import messages as m
-from tests.api.conftest import Service, SetClock, run_test, wait_done
+from tests.api.conftest import Service, SetClock, csrf, run_test, signed_in, wait_done
 from tests.api.test_forms import fields
-from tests.api.test_people import csrf, signed_in
 from tests.api.test_profiles import calibrate
 
 PAGE = "/participants/P017"

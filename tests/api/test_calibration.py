@@ -13,8 +13,7 @@ import httpx
 import pytest
 
 from stimrig.api.store.holds import LIMITS_TURN
-from tests.api.conftest import Service, soon, wait_done
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import Service, csrf, signed_in, soon, wait_done
 from tests.api.test_problems import problem
 
 WHERE = "/v1/participants/P017/calibration"
@@ -90,25 +89,24 @@ def sight(service: Service, token: dict[str, str]) -> dict[str, str]:
     return {**token, "calibration": f"{found.calibration_id}.{len(found.trains)}.{marks:08x}"}
 
 
-def test_whole_calibration_by_plain_forms(service: Service, participant: str) -> None:
+def test_whole_calibration_by_plain_forms(service: Service, pages: httpx.Client, participant: str) -> None:
     page = "/participants/P017/calibration"
-    with signed_in(service) as browser:
-        token = {"csrf": csrf(browser)}
-        assert "Begin the calibration" in browser.get(page).text
-        assert browser.post(page, data={**token, "current_ma": "x", "step_us": "10"}).status_code == 422
-        assert browser.post(page, data={**token, "current_ma": "20", "step_us": "10"}).status_code == 303
-        (wider,) = re.findall(r'<button[^>]*id="step-up"[^>]*>', browser.get(page).text)
-        assert "disabled" not in wider, "it works without scripts"
-        for threshold in ("sensory", "motor", "comfort"):
-            browser.post(f"{page}/step/up", data=sight(service, token))
-            browser.post(f"{page}/mark/{threshold}", data=sight(service, token))
-        assert "Still to be marked" not in browser.get(page).text
-        assert browser.post(f"{page}/step/sideways", data=sight(service, token)).status_code == 422
-        for what in ("step/up", "mark/comfort", "finish", "discard"):
-            assert browser.post(f"{page}/{what}", data=token, auth=None).status_code == 428, "it shows no calibration"
-        led = browser.post(f"{page}/finish", data=sight(service, token))
-        assert led.headers["location"] == "/participants/P017"
-        assert "felt at 10 µs, moves at 20 µs" in browser.get("/participants/P017").text
+    token = {"csrf": csrf(pages)}
+    assert "Begin the calibration" in pages.get(page).text
+    assert pages.post(page, data={**token, "current_ma": "x", "step_us": "10"}).status_code == 422
+    assert pages.post(page, data={**token, "current_ma": "20", "step_us": "10"}).status_code == 303
+    (wider,) = re.findall(r'<button[^>]*id="step-up"[^>]*>', pages.get(page).text)
+    assert "disabled" not in wider, "it works without scripts"
+    for threshold in ("sensory", "motor", "comfort"):
+        pages.post(f"{page}/step/up", data=sight(service, token))
+        pages.post(f"{page}/mark/{threshold}", data=sight(service, token))
+    assert "Still to be marked" not in pages.get(page).text
+    assert pages.post(f"{page}/step/sideways", data=sight(service, token)).status_code == 422
+    for what in ("step/up", "mark/comfort", "finish", "discard"):
+        assert pages.post(f"{page}/{what}", data=token, auth=None).status_code == 428, "it shows no calibration"
+    led = pages.post(f"{page}/finish", data=sight(service, token))
+    assert led.headers["location"] == "/participants/P017"
+    assert "felt at 10 µs, moves at 20 µs" in pages.get("/participants/P017").text
 
 
 # ---- limits that change while one is open -------------------------------------------------------------------
@@ -230,26 +228,24 @@ def test_the_page_says_that_it_goes_no_further(client: httpx.Client, service: Se
 
 
 def test_a_question_about_a_calibration_is_bound_to_the_limits_it_showed(
-    client: httpx.Client, service: Service, participant: str
+    client: httpx.Client, service: Service, pages: httpx.Client, participant: str
 ) -> None:
-    with signed_in(service) as browser:
-        token = {"csrf": csrf(browser)}
-        asked = browser.post("/participants/P017/calibration", data={**token, "current_ma": "26", "step_us": "10"})
-        assert "/confirm/" in asked.headers["location"]
-        assert client.put(PROFILE, json=LOWER).status_code == 200
-        assert browser.post(asked.headers["location"], data=token).status_code == 409
-        assert service.rig.calibration is None
+    token = {"csrf": csrf(pages)}
+    asked = pages.post("/participants/P017/calibration", data={**token, "current_ma": "26", "step_us": "10"})
+    assert "/confirm/" in asked.headers["location"]
+    assert client.put(PROFILE, json=LOWER).status_code == 200
+    assert pages.post(asked.headers["location"], data=token).status_code == 409
+    assert service.rig.calibration is None
 
 
 def test_lowered_during_a_test_says_that_it_holds_from_the_next_one(
-    client: httpx.Client, service: Service, participant: str
+    client: httpx.Client, service: Service, pages: httpx.Client, participant: str
 ) -> None:
     service.rig.speed = 2.0
     started = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     words = "hold from the next test on"
     assert words in client.put(PROFILE, json=LOWER).json()["meanwhile"]
-    with signed_in(service) as browser:
-        assert words in browser.get("/participants/P017").text
+    assert words in pages.get("/participants/P017").text
     client.post("/v1/stop")
     wait_done(client, started)
     assert client.put(PROFILE, json=LOWER).json()["meanwhile"] == ""

@@ -19,9 +19,8 @@ from stimrig.api.cli.terminal import carried_lines
 from stimrig.api.models.carried_structure import CarriedStructure
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Approval
-from tests.api.conftest import STUB, Service, run_service, run_test, soon, wait_done
+from tests.api.conftest import STUB, Service, csrf, run_service, run_test, signed_in, soon, wait_done
 from tests.api.test_one_service import command
-from tests.api.test_people import csrf, signed_in
 
 CSV = "time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n"
 
@@ -161,21 +160,20 @@ def test_upload_takes_the_structure_over_too(client: httpx.Client, participant: 
 
 
 def test_model_page_says_what_carries_over(
-    client: httpx.Client, service: Service, participant: str, approved: dict[str, Any]
+    client: httpx.Client, pages: httpx.Client, participant: str, approved: dict[str, Any]
 ) -> None:
     test = run_test(client, participant)
     plain, child = versions(client, participant, test)
     client.get(f"/v1/models/{child['id']}/diagnosis")
-    with signed_in(service) as browser:
-        page = browser.get(f"/models/{child['id']}").text
-        section = page[page.index('id="carried"') :].partition("</section>")[0]
-        assert "has the structure of the last approved model" in section
-        assert "<b>Fatigue</b>" in section and "still needed" in section
-        assert "<b>Threshold_drift</b>" in section and "asked for again" in section  # by the stub's diagnosis
-        assert f"/models/{plain['id']}" in section
-        other = browser.get(f"/models/{plain['id']}").text
-        assert "is better" in other and f"/models/{child['id']}" in other
-        assert 'id="carried"' not in browser.get(f"/models/{approved['id']}").text
+    page = pages.get(f"/models/{child['id']}").text
+    section = page[page.index('id="carried"') :].partition("</section>")[0]
+    assert "has the structure of the last approved model" in section
+    assert "<b>Fatigue</b>" in section and "still needed" in section
+    assert "<b>Threshold_drift</b>" in section and "asked for again" in section  # by the stub's diagnosis
+    assert f"/models/{plain['id']}" in section
+    other = pages.get(f"/models/{plain['id']}").text
+    assert "is better" in other and f"/models/{child['id']}" in other
+    assert 'id="carried"' not in pages.get(f"/models/{approved['id']}").text
 
 
 @pytest.mark.parametrize("document", [b"\xff\xfe", b'{"sample_rate_hz": 41.0}'], ids=["no text", "another digit"])
@@ -195,20 +193,19 @@ def test_a_damaged_approved_model_leaves_the_plain_one(document: bytes) -> None:
 
 
 def test_the_page_offers_to_keep_the_plain_model_while_the_other_is_fitted(
-    client: httpx.Client, service: Service, participant: str, approved: dict[str, Any]
+    client: httpx.Client, service: Service, pages: httpx.Client, participant: str, approved: dict[str, Any]
 ) -> None:
     (service.context.settings.recordings_dir / "carrying-slowly").touch()
     started = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     plain = until_carrying(client, started)["model_id"]
-    with signed_in(service) as browser:
-        form = re.search(r'<form[^>]*id="keep-plain"[^>]*>', browser.get(f"/tests/{started}").text)
-        assert form and "hidden" not in form[0]
-        kept = browser.post(f"/tests/{started}/keep-plain", data={"csrf": csrf(browser)})
-        assert (kept.status_code, kept.headers["location"]) == (303, f"/models/{plain}")
-        assert wait_done(client, started)["model_id"] == plain
-        late = browser.post(f"/tests/{started}/keep-plain", data={"csrf": csrf(browser)})
-        assert (late.status_code, late.headers["location"]) == (303, f"/tests/{started}")
-        assert 'id="keep-plain"' not in browser.get(f"/tests/{started}").text
+    form = re.search(r'<form[^>]*id="keep-plain"[^>]*>', pages.get(f"/tests/{started}").text)
+    assert form and "hidden" not in form[0]
+    kept = pages.post(f"/tests/{started}/keep-plain", data={"csrf": csrf(pages)})
+    assert (kept.status_code, kept.headers["location"]) == (303, f"/models/{plain}")
+    assert wait_done(client, started)["model_id"] == plain
+    late = pages.post(f"/tests/{started}/keep-plain", data={"csrf": csrf(pages)})
+    assert (late.status_code, late.headers["location"]) == (303, f"/tests/{started}")
+    assert 'id="keep-plain"' not in pages.get(f"/tests/{started}").text
 
 
 # ---- The structure that a site's new participants start with: taken by the fit after a test, kept, shown, refused

@@ -19,10 +19,9 @@ from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import AuditEntry, Test, Token
 from stimrig.api.web.guards import OPEN
 from tests.api.browser import without_values
-from tests.api.conftest import STUB, TOKEN, Service, run_service, run_test, wait_done
+from tests.api.conftest import HTML, STUB, TOKEN, Service, run_service, run_test, wait_done
 from tests.api.test_scopes import ROWS
 
-HTML = {"Accept": "text/html"}
 PLAN = {"name": "ilc", "current_ma": "15", "max_pulse_width_us": "200", "max_duration_s": "60", "trials": "3"}
 SEGMENTS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [0, 100, 150] * 20}}]
 TRIAL = {"participant": "P1", "kind": "sequence", "segments": SEGMENTS}

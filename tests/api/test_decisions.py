@@ -18,12 +18,11 @@ from stimrig.api.centre.app import ROUTERS
 from stimrig.api.decisions import DECISIONS
 from stimrig.api.web import pages, routes
 from stimrig.api.web.app import routers
-from tests.api.conftest import Service, run_test, shared_service, soon
+from tests.api.conftest import HTML, Service, run_test, shared_service, soon
 from tests.api.fake_arm import still
 
 ROOT = Path(__file__).parents[2]
 TABLE = tomllib.loads((ROOT / "docs" / "safety" / "decisions.toml").read_text("utf-8"))
-HTML = {"Accept": "text/html"}
 LIMITS = {"current_ma": 21.0, "max_pulse_width_us": 250.0, "max_torque_nm": 20.0}
 KEY = {"name": "ilc", "current_ma": "8", "max_pulse_width_us": "200", "max_duration_s": "60", "trials": "3"}
 

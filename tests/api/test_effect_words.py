@@ -14,8 +14,7 @@ from stimrig.api.effect_words import effects_words, library, parameter_words
 from stimrig.api.language import translated
 from stimrig.api.models import changes, explanation, stored_model
 from stimrig.identify import effects
-from tests.api.conftest import TOKEN, Service, run_test, shared_service
-from tests.api.test_people import signed_in
+from tests.api.conftest import TOKEN, Service, run_test, shared_service, signed_in
 
 PLAIN = {
     "sample_rate_hz": 40.0,

@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig.api.web.pages import typed
-from tests.api.conftest import Service
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import Service, csrf, signed_in
 from tests.api.test_profiles import calibrate, limits
 
 PAGE = "/participants/P017"

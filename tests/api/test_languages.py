@@ -21,8 +21,7 @@ from stimrig.api import language
 from stimrig.api.language import extract, translated, words
 from stimrig.api.language.translated import PERSON, of
 from stimrig.api.language.words import best
-from tests.api.conftest import STUB, Service, run_service, run_test
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import STUB, Service, csrf, run_service, run_test, signed_in
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
 LANGUAGES = [code for code in language.CODES if code != language.DEFAULT]

@@ -18,8 +18,7 @@ from stimrig.api.web.pages.views import limits_of
 from stimrig.api.workers.curves import recorded
 from stimrig.rig.messages import Bound, Status
 from tests.api.browser import expected, participant, start
-from tests.api.conftest import Service, shared_service, soon
-from tests.api.test_people import signed_in
+from tests.api.conftest import Service, shared_service, signed_in, soon
 from tests.api.test_stop_right import stops_noted
 
 SIZES = (1366, 768), (820, 1180)

@@ -11,8 +11,7 @@ import pytest
 
 from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.next_view import Situation, Today, next_step
-from tests.api.conftest import Service, run_test, wait_done
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import Service, csrf, run_test, signed_in, wait_done
 
 READY, DONE, POOR = Today("M1", "usable"), Today("M1", "usable", decided=True), Today("M1", "not usable")
 TABLE: list[tuple[dict[str, Any], str, str, str]] = [
@@ -149,17 +148,16 @@ def test_a_stopped_test_says_so_until_the_next_one(client: httpx.Client, service
     assert shown(service)[1].startswith("The last test was stopped.")
 
 
-def test_the_start_in_the_line_sets_what_was_typed(client: httpx.Client, service: Service, participant: str) -> None:
+def test_the_start_in_the_line_sets_what_was_typed(client: httpx.Client, pages: httpx.Client, participant: str) -> None:
     """It is a button of the limits' form: one click sets them and asks."""
     run_test(client, participant)
-    with signed_in(service) as browser:
-        seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
-        form = {
-            "csrf": csrf(browser),
-            "seen": seen,
-            "current_ma": "19",
-            "max_pulse_width_us": "300",
-            "max_torque_nm": "30",
-        }
-        page = browser.get(browser.post("/participants/P017/tests", data=form).headers["location"]).text
+    seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
+    form = {
+        "csrf": csrf(pages),
+        "seen": seen,
+        "current_ma": "19",
+        "max_pulse_width_us": "300",
+        "max_torque_nm": "30",
+    }
+    page = pages.get(pages.post("/participants/P017/tests", data=form).headers["location"]).text
     assert "19 mA" in page and "Start now" in page

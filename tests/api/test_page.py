@@ -33,8 +33,7 @@ from tests.api.browser import (
     there,
     without_values,
 )
-from tests.api.conftest import Service, run_test, shared_service, wait_done
-from tests.api.test_people import HTML, csrf, signed_in
+from tests.api.conftest import HTML, Service, csrf, run_test, shared_service, wait_done
 
 pytestmark = pytest.mark.browser
 
@@ -220,10 +219,9 @@ def test_approval_wants_the_password_a_rejection_a_reason_and_says_what_is_wrong
     assert (NAME, "approve", "") in deeds and (NAME, "reject", "electrode slipped") in deeds
 
 
-def test_a_form_without_a_reason_decides_nothing(service: Service, client: httpx.Client) -> None:
+def test_a_form_without_a_reason_decides_nothing(service: Service, pages: httpx.Client, client: httpx.Client) -> None:
     model = a_model(service, "C2")["model_id"]
-    with signed_in(service) as browser:
-        refused = browser.post(f"/models/{model}/reject", data={"csrf": csrf(browser), "reason": "  "})
+    refused = pages.post(f"/models/{model}/reject", data={"csrf": csrf(pages), "reason": "  "})
     assert refused.status_code == 422 and "needs a reason" in refused.text
     assert client.get(f"/v1/models/{model}").json()["decision"] is None
 

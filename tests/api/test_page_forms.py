@@ -10,9 +10,8 @@ from fastapi.routing import APIRoute
 
 from stimrig.api.web import pages
 from stimrig.api.web.app import routers
-from tests.api.conftest import TOKEN, Service, run_test, shared_service
+from tests.api.conftest import HTML, TOKEN, Service, run_test, shared_service
 
-HTML = {"Accept": "text/html"}
 NAMES = (
     "csrf", "code", "file", "reason", "effect", "force", "back", "name", "password", "token", "next", "role", "days",
     "current_ma", "step_us", "max_pulse_width_us", "max_torque_nm", "placement", "of", "seen", "latch",

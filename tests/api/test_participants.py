@@ -13,8 +13,7 @@ from sqlalchemy import event
 from stimrig.api import language
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
-from tests.api.conftest import Service, run_test, shared_service, soon, wait_done
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import Service, csrf, run_test, shared_service, signed_in, soon, wait_done
 
 service = shared_service()
 
@@ -129,25 +128,23 @@ def test_the_first_page_asks_as_much_of_the_database_for_many_as_for_few(service
 
 
 def test_the_page_of_an_archived_participant_offers_the_way_out_and_no_test(
-    service: Service, http: httpx.Client
+    pages: httpx.Client, http: httpx.Client
 ) -> None:
     make(http, "A3")
     http.post("/v1/participants/A3/archive")
-    with signed_in(service) as browser:
-        page = browser.get("/participants/A3").text
-        assert 'data-next="archived"' in page and "In the archive since" in page
-        assert "Start the pre-session test" not in page and "A3/calibration" not in page
-        assert page.count('action="/participants/A3/unarchive"') == 2, "in the line that says what is next, and below"
-        out = browser.post("/participants/A3/unarchive", data={"csrf": csrf(browser)})
-        assert out.status_code == 303
-        assert "Start the pre-session test" in browser.get("/participants/A3").text
+    page = pages.get("/participants/A3").text
+    assert 'data-next="archived"' in page and "In the archive since" in page
+    assert "Start the pre-session test" not in page and "A3/calibration" not in page
+    assert page.count('action="/participants/A3/unarchive"') == 2, "in the line that says what is next, and below"
+    out = pages.post("/participants/A3/unarchive", data={"csrf": csrf(pages)})
+    assert out.status_code == 303
+    assert "Start the pre-session test" in pages.get("/participants/A3").text
 
 
-def test_side_and_muscle_are_asked_for_on_the_page(service: Service, http: httpx.Client) -> None:
-    with signed_in(service) as browser:
-        assert '<option value="right"' in browser.get("/").text and 'name="muscle"' in browser.get("/").text
-        form = {"csrf": csrf(browser), "code": "A4", "side": "right", "muscle": "triceps brachii"}
-        assert browser.post("/participants", data=form).headers["location"] == "/participants/A4"
+def test_side_and_muscle_are_asked_for_on_the_page(pages: httpx.Client, http: httpx.Client) -> None:
+    assert '<option value="right"' in pages.get("/").text and 'name="muscle"' in pages.get("/").text
+    form = {"csrf": csrf(pages), "code": "A4", "side": "right", "muscle": "triceps brachii"}
+    assert pages.post("/participants", data=form).headers["location"] == "/participants/A4"
     made = http.get("/v1/participants/A4").json()
     assert (made["side"], made["muscle"]) == ("right", "triceps brachii")
 
@@ -251,31 +248,28 @@ def model(service: Service) -> str:
     return model
 
 
-def test_the_kind_of_a_note_is_chosen(service: Service, model: str) -> None:
-    with signed_in(service) as browser:
-        page = browser.get("/participants/L1").text
-        assert 'name="kind" required><option value="">Choose…</option>' in page
-        form = {"csrf": csrf(browser), "text": "electrode 2 moved", "kind": ""}
-        refused = browser.post("/participants/L1/notes", data=form, headers={"Accept": "text/html"})
-        assert refused.status_code == 422 and "Choose what the note is about" in refused.text
-        assert browser.post("/participants/L1/notes", data={**form, "kind": "electrodes"}).status_code == 303
-        assert [note["kind"] for note in browser.get("/v1/participants/L1/notes").json()] == ["electrodes"]
+def test_the_kind_of_a_note_is_chosen(pages: httpx.Client, model: str) -> None:
+    page = pages.get("/participants/L1").text
+    assert 'name="kind" required><option value="">Choose…</option>' in page
+    form = {"csrf": csrf(pages), "text": "electrode 2 moved", "kind": ""}
+    refused = pages.post("/participants/L1/notes", data=form, headers={"Accept": "text/html"})
+    assert refused.status_code == 422 and "Choose what the note is about" in refused.text
+    assert pages.post("/participants/L1/notes", data={**form, "kind": "electrodes"}).status_code == 303
+    assert [note["kind"] for note in pages.get("/v1/participants/L1/notes").json()] == ["electrodes"]
 
 
-def test_what_an_effect_would_leave_is_called_an_estimate(service: Service, model: str) -> None:
-    with signed_in(service) as browser:
-        page = browser.get(f"/models/{model}").text
+def test_what_an_effect_would_leave_is_called_an_estimate(pages: httpx.Client, model: str) -> None:
+    page = pages.get(f"/models/{model}").text
     assert "0.200 → about <b>0.042 N·m</b>" in page and "it is estimated: adding it fits the model anew" in page
     assert "with it (estimated)" in page
 
 
-def test_a_day_ends_at_its_last_minute_everywhere(service: Service, client: httpx.Client, model: str) -> None:
+def test_a_day_ends_at_its_last_minute_everywhere(pages: httpx.Client, client: httpx.Client, model: str) -> None:
     ends = client.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"}).json()
     end = language.until(ends["expires_utc"])
     assert end.endswith("23:59") and language.when(ends["expires_utc"]).endswith("00:00")
-    with signed_in(service) as browser:
-        assert f"until {end}" in browser.get(f"/models/{model}").text
-        assert f"until {end}" in browser.get(f"/models/{model}/report").text
+    assert f"until {end}" in pages.get(f"/models/{model}").text
+    assert f"until {end}" in pages.get(f"/models/{model}/report").text
     assert language.until("2026-01-02T09:30:00.000Z") == language.when("2026-01-02T09:30:00.000Z")
 
 

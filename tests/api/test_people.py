@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,19 @@ from stimrig.api.people.pace import Pace
 from stimrig.api.settings import Settings
 from stimrig.api.web.server import configuration, loopback, refuse_open_door
 from tests.api.centre.conftest import run_centre
-from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Service, SetClock, run_service, run_test, wait_done
+from tests.api.conftest import (
+    HTML,
+    PATIENCE_S,
+    STUB,
+    TOKEN,
+    Service,
+    SetClock,
+    csrf,
+    run_service,
+    run_test,
+    signed_in,
+    wait_done,
+)
 
 PASSWORD = "correct horse battery"
 
@@ -207,23 +217,6 @@ def test_an_audit_of_no_database_is_told(tmp_path: Path) -> None:
 # ---- Who may do what: tokens, scopes, sessions, forms
 
 
-HTML = {"Accept": "text/html,application/xhtml+xml"}
-
-
-@contextmanager
-def signed_in(service: Service, token: str = TOKEN) -> Iterator[httpx.Client]:
-    with service.client(token=None, headers=HTML, follow_redirects=False) as browser:
-        answer = browser.post("/sign-in", data={"token": token, "next": "/"})
-        assert answer.status_code == 303, answer.text
-        cookie = answer.headers["set-cookie"]
-        assert "HttpOnly" in cookie and "SameSite=strict" in cookie
-        yield browser
-
-
-def csrf(browser: httpx.Client) -> str:
-    return re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
-
-
 def test_wrong_revoked_and_expired_tokens_are_refused(client: httpx.Client, service: Service) -> None:
     assert service.client("wrong").get("/v1/rig").status_code == 401
     assert service.client(None).get("/v1/rig", headers={"Authorization": "Basic eDp5"}).status_code == 401
@@ -285,12 +278,11 @@ def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
         later.auth.bearer("first-one")
 
 
-def test_signing_out_ends_the_session(service: Service) -> None:
-    with signed_in(service) as browser:
-        cookie = dict(browser.cookies)
-        browser.post("/sign-out", data={"csrf": csrf(browser)})
-        answer = service.client(None, cookies=cookie).get("/v1/rig")
-        assert answer.status_code == 401
+def test_signing_out_ends_the_session(service: Service, pages: httpx.Client) -> None:
+    cookie = dict(pages.cookies)
+    pages.post("/sign-out", data={"csrf": csrf(pages)})
+    answer = service.client(None, cookies=cookie).get("/v1/rig")
+    assert answer.status_code == 401
 
 
 def test_sign_in_leads_nowhere_else(service: Service) -> None:
@@ -324,18 +316,17 @@ def test_stop_is_open_to_anyone_signed_in_and_to_nobody_else(service: Service) -
 
 
 def test_stop_by_plain_form_works_without_csrf_and_after_the_session_ran_out(
-    service: Service, participant: str
+    service: Service, pages: httpx.Client, participant: str
 ) -> None:
     service.rig.speed = 0.5
-    with signed_in(service) as browser:
-        with service.client() as client:
-            client.post("/v1/tests", json={"participant": participant})
-        with service.context.store.write() as session:
-            session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
-        assert browser.get("/v1/rig").status_code in (303, 401)
-        page = browser.post("/v1/stop", data={"reason": "stop pressed on the page"}, follow_redirects=True)
-        assert page.status_code == 200
-        assert "The rig confirms that stimulation is off" in page.text
+    with service.client() as client:
+        client.post("/v1/tests", json={"participant": participant})
+    with service.context.store.write() as session:
+        session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
+    assert pages.get("/v1/rig").status_code in (303, 401)
+    page = pages.post("/v1/stop", data={"reason": "stop pressed on the page"}, follow_redirects=True)
+    assert page.status_code == 200
+    assert "The rig confirms that stimulation is off" in page.text
     assert service.rig.stopped_by == "administrator"
 
 

@@ -19,10 +19,10 @@ from stimrig.api.clock import Clock
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.stops import RIGHT_S, StopRights
 from stimrig.api.store import Store, holds
-from tests.api.conftest import TOKEN, Service, SetClock, soon
+from tests.api.conftest import HTML, TOKEN, Service, SetClock, soon
+from tests.api.conftest import csrf as csrf_of
 from tests.api.test_people import standing_still
 
-HTML = {"Accept": "text/html,application/xhtml+xml"}
 PASSWORD = "correct horse battery"
 CONFIRMED = "The rig confirms that stimulation is off"
 
@@ -63,7 +63,7 @@ def stops_noted(client: httpx.Client) -> list[dict[str, Any]]:
 
 
 def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) -> None:
-    csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+    csrf = csrf_of(browser)
     assert browser.post("/sign-out", data={"csrf": csrf}).status_code == 303
 
 
@@ -287,7 +287,7 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         assert refused.status_code == 403 and "rearm" in refused.json()["detail"]
         assert program.post("/rearm").status_code == 403
         page.post("/sign-in", data={"token": token})
-        csrf = re.findall(r'name="csrf" value="([^"]+)"', page.get("/").text)[0]
+        csrf = csrf_of(page)
         assert page.post("/rearm", data={"csrf": csrf}).status_code == 403, "a token that signs in is no person"
         assert "I have checked" not in page.get("/").text
         assert program.post("/v1/tests", json=start).status_code == 409
@@ -297,7 +297,7 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         assert program.post(f"{calibration}/step", json={}, headers=seen).status_code == 404
         assert program.get("/v1/rig").json()["state"] == "latched" and service.rig.starts == 0
         assert "I have checked" in browser.get("/").text
-        csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+        csrf = csrf_of(browser)
         assert browser.post("/rearm", data={"csrf": csrf}).status_code == 303
         assert program.post("/v1/tests", json=start).status_code == 202
 
@@ -305,5 +305,5 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
 def test_a_person_who_runs_no_tests_does_not_rearm(service: Service, client: httpx.Client) -> None:
     client.post("/v1/users", json={"name": "Eve", "password": PASSWORD, "scopes": ["read-live", "read-model"]})
     browser = person(service, "Eve")
-    csrf = re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+    csrf = csrf_of(browser)
     assert browser.post("/rearm", data={"csrf": csrf}).status_code == 403

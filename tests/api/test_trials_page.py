@@ -12,8 +12,7 @@ from stimrig.api import language
 from stimrig.api.models.tracking import OUTCOMES, sentences
 from stimrig.api.web.pages.decision_view import tracking_words
 from stimrig.api.web.responses.models import TrialOut
-from tests.api.conftest import Service
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import Service, csrf
 from tests.api.test_tracked import play, say, tracked
 
 PAGE = "/participants/P017"
@@ -111,36 +110,34 @@ def test_the_card_tells_the_trials_without_scripts_and_in_german(
 
 
 def test_what_is_asked_leads_to_the_shortest_test_in_one_click(
-    service: Service, client: httpx.Client, approved: str
+    service: Service, pages: httpx.Client, client: httpx.Client, approved: str
 ) -> None:
     say(service, values={"gain": 0.7})
     play(client)
-    with signed_in(service) as browser:
-        page = browser.get(PAGE).text
-        assert "The trials say that a new test is needed." in page
-        notice = re.search(r'<div class="notice bad" role="alert">.*?</div>', page, re.S)
-        assert notice and "After trial 1 the gain is expected to be 70.0 %" in notice[0]
-        fields = dict(re.findall(r'name="(\w+)" value="([^"]*)"', notice[0]))
-        asked = browser.post(f"{PAGE}/tests", data=fields)
-        assert asked.status_code == 303 and "/confirm/" in asked.headers["location"]
-        assert "Stops once known within" in browser.get(asked.headers["location"]).text
+    page = pages.get(PAGE).text
+    assert "The trials say that a new test is needed." in page
+    notice = re.search(r'<div class="notice bad" role="alert">.*?</div>', page, re.S)
+    assert notice and "After trial 1 the gain is expected to be 70.0 %" in notice[0]
+    fields = dict(re.findall(r'name="(\w+)" value="([^"]*)"', notice[0]))
+    asked = pages.post(f"{PAGE}/tests", data=fields)
+    assert asked.status_code == 303 and "/confirm/" in asked.headers["location"]
+    assert "Stops once known within" in pages.get(asked.headers["location"]).text
 
 
-def test_a_person_sets_the_limits_with_the_approval(service: Service, client: httpx.Client, approved: str) -> None:
-    with signed_in(service) as browser:
-        client.post(f"/v1/models/{approved}/reject", json={"reason": "once more"})
-        page = browser.get(f"/models/{approved}").text
-        assert re.search(r'name="gain_percent"[^>]*value="20"', page)
-        summary = re.search(r'<details class="more tracking"><summary>(.*?)</summary>', page, re.S)
-        assert summary and "gain ±20\u00a0%, threshold ±20\u00a0% (±" in summary[1], "it is read before it is approved"
-        form = {"csrf": csrf(browser), "password": "correct horse battery"}
-        for wrong in ("61", "-1", "", "1e1", "nan"):
-            refused = browser.post(f"/models/{approved}/approve", data={**form, "gain_percent": wrong})
-            assert refused.status_code == 422, wrong
-        assert tracked(client).status_code == 404
-        sent = {**form, "gain_percent": "12,5", "threshold_percent": "0", "time_scale_percent": "60"}
-        assert browser.post(f"/models/{approved}/approve", data=sent).status_code == 303
-        shown = browser.get(f"/models/{approved}").text
+def test_a_person_sets_the_limits_with_the_approval(pages: httpx.Client, client: httpx.Client, approved: str) -> None:
+    client.post(f"/v1/models/{approved}/reject", json={"reason": "once more"})
+    page = pages.get(f"/models/{approved}").text
+    assert re.search(r'name="gain_percent"[^>]*value="20"', page)
+    summary = re.search(r'<details class="more tracking"><summary>(.*?)</summary>', page, re.S)
+    assert summary and "gain ±20\u00a0%, threshold ±20\u00a0% (±" in summary[1], "it is read before it is approved"
+    form = {"csrf": csrf(pages), "password": "correct horse battery"}
+    for wrong in ("61", "-1", "", "1e1", "nan"):
+        refused = pages.post(f"/models/{approved}/approve", data={**form, "gain_percent": wrong})
+        assert refused.status_code == 422, wrong
+    assert tracked(client).status_code == 404
+    sent = {**form, "gain_percent": "12,5", "threshold_percent": "0", "time_scale_percent": "60"}
+    assert pages.post(f"/models/{approved}/approve", data=sent).status_code == 303
+    shown = pages.get(f"/models/{approved}").text
     assert "gain ±12.5\u00a0%, threshold as approved, time scale ±60\u00a0%" in shown
     limits = client.get("/v1/participants/P017/tracking").json()["limits"]
     assert limits == {"gain_percent": 12.5, "threshold_percent": 0.0, "time_scale_percent": 60.0}

@@ -25,8 +25,7 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.identify.estimation import quality
-from tests.api.conftest import REAL, Service, run_service, run_test
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import REAL, Service, csrf, run_service, run_test, signed_in
 from tests.harness import few_effects
 from tests.harness.patients import Patient, make_record
 from tests.identify import hidden_muscles

@@ -20,13 +20,11 @@ from stimrig.api.store.tables import Token
 from stimrig.api.web import guards
 from stimrig.rig import messages as m
 from stimrig.rig.requests import WithdrawRequest
-from tests.api.conftest import Service, run_test, soon
+from tests.api.conftest import HTML, Service, csrf, run_test, signed_in, soon
 from tests.api.fake_arm import still
 from tests.api.test_forms import fields
 from tests.api.test_overtaken import TRIAL, key_of
-from tests.api.test_people import csrf, signed_in
 
-HTML = {"Accept": "text/html"}
 QUIET: Any = None
 """A client that says no version by itself."""
 HOME = "/v1/participants/P017"
@@ -96,16 +94,15 @@ def test_a_token_that_came_back_starts_tests(
 
 
 def test_a_form_that_comes_back_for_want_of_something_is_as_old_as_it_was(
-    service: Service, client: httpx.Client, participant: str
+    pages: httpx.Client, client: httpx.Client, participant: str
 ) -> None:
-    with signed_in(service) as tab:
-        form = {**fields(tab), "csrf": csrf(tab)}
-        client.put(f"{HOME}/profile", json={"max_torque_nm": 12})
-        back = tab.post(f"{PAGE}/profile", data={**form, "current_ma": "x"})
-        assert back.status_code == 422
-        (kept,) = set(re.findall(r'name="seen" value="([^"]+)"', back.text))
-        assert kept == form["seen"]
-        assert tab.post(f"{PAGE}/profile", data={**form, "seen": kept, "current_ma": "19"}).status_code == 409
+    form = {**fields(pages), "csrf": csrf(pages)}
+    client.put(f"{HOME}/profile", json={"max_torque_nm": 12})
+    back = pages.post(f"{PAGE}/profile", data={**form, "current_ma": "x"})
+    assert back.status_code == 422
+    (kept,) = set(re.findall(r'name="seen" value="([^"]+)"', back.text))
+    assert kept == form["seen"]
+    assert pages.post(f"{PAGE}/profile", data={**form, "seen": kept, "current_ma": "19"}).status_code == 409
 
 
 def test_a_question_ends_with_its_day(service: Service, client: httpx.Client, participant: str) -> None:
@@ -119,13 +116,12 @@ def test_a_question_ends_with_its_day(service: Service, client: httpx.Client, pa
     assert service.rig.starts == 0
 
 
-def test_a_page_of_another_day_offers_nothing(service: Service, client: httpx.Client, participant: str) -> None:
-    with signed_in(service) as tab:
-        form = {**fields(tab), "csrf": csrf(tab), "current_ma": "19"}
-        form["seen"] = re.sub(r"\.\d{4}-", ".2020-", form["seen"])
-        refused = tab.post(f"{PAGE}/profile", data=form)
-        assert refused.status_code == 409 and "This page is of 2020-" in refused.text
-        assert "all the same" not in refused.text
+def test_a_page_of_another_day_offers_nothing(pages: httpx.Client, client: httpx.Client, participant: str) -> None:
+    form = {**fields(pages), "csrf": csrf(pages), "current_ma": "19"}
+    form["seen"] = re.sub(r"\.\d{4}-", ".2020-", form["seen"])
+    refused = pages.post(f"{PAGE}/profile", data=form)
+    assert refused.status_code == 409 and "This page is of 2020-" in refused.text
+    assert "all the same" not in refused.text
 
 
 def test_a_waiting_result_is_let_go_by_who_saw_it(service: Service, client: httpx.Client, participant: str) -> None:
@@ -437,28 +433,27 @@ def test_a_key_is_made_on_what_was_seen_also_when_its_check_is_overtaken(
     assert begun.status_code == 409 and service.rig.starts == 1, "in the intent's own transaction, too"
 
 
-def test_the_page_says_what_is_pressed_once_more(service: Service, client: httpx.Client, participant: str) -> None:
+def test_the_page_says_what_is_pressed_once_more(pages: httpx.Client, client: httpx.Client, participant: str) -> None:
     model = run_test(client, participant)["model_id"]
-    with signed_in(service) as tab:
-        form = {**fields(tab), "csrf": csrf(tab)}
-        client.put(f"{HOME}/muscle", json={"side": "right", "muscle": "triceps brachii"})
-        site = tab.post(f"{PAGE}/muscle", data={**form, "side": "left", "muscle": "biceps brachii", "placement": "B"})
-        assert "You wanted: left, biceps brachii, B" in site.text
-        assert "Set this side and muscle all the same" in site.text
-        client.post(f"{HOME}/archive")
-        again = tab.post(f"{PAGE}/archive", data=form).text
-        assert re.search(r"not in the archive.*<b>in the archive</b>", again, re.DOTALL)
-        client.post(f"{HOME}/unarchive")
-        client.put(f"{HOME}/muscle", json={})
-        version = re.findall(r'name="seen" value="([^"]+)"', tab.get(f"/models/{model}").text)[-1]
-        client.post(f"/v1/models/{model}/reject", json={"reason": "wrong arm"})
-        data = {"csrf": form["csrf"], "seen": version, "reason": "good enough"}
-        refused = tab.post(f"/models/{model}/approve", data=data).text
-        assert f'<a href="/models/{model}">Model {model[:8]}</a>' in refused and "wrong arm" in refused
+    form = {**fields(pages), "csrf": csrf(pages)}
+    client.put(f"{HOME}/muscle", json={"side": "right", "muscle": "triceps brachii"})
+    site = pages.post(f"{PAGE}/muscle", data={**form, "side": "left", "muscle": "biceps brachii", "placement": "B"})
+    assert "You wanted: left, biceps brachii, B" in site.text
+    assert "Set this side and muscle all the same" in site.text
+    client.post(f"{HOME}/archive")
+    again = pages.post(f"{PAGE}/archive", data=form).text
+    assert re.search(r"not in the archive.*<b>in the archive</b>", again, re.DOTALL)
+    client.post(f"{HOME}/unarchive")
+    client.put(f"{HOME}/muscle", json={})
+    version = re.findall(r'name="seen" value="([^"]+)"', pages.get(f"/models/{model}").text)[-1]
+    client.post(f"/v1/models/{model}/reject", json={"reason": "wrong arm"})
+    data = {"csrf": form["csrf"], "seen": version, "reason": "good enough"}
+    refused = pages.post(f"/models/{model}/approve", data=data).text
+    assert f'<a href="/models/{model}">Model {model[:8]}</a>' in refused and "wrong arm" in refused
 
 
 def test_a_result_of_other_limits_is_not_offered_once_more(
-    service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
+    service: Service, pages: httpx.Client, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at = f"{HOME}/calibration"
     client.post(at, json={})
@@ -466,7 +461,6 @@ def test_a_result_of_other_limits_is_not_offered_once_more(
     service.rig.calibrated = finished(service).model_copy(update={"result": found_limits()})
     version = client.get(at).headers["etag"].strip('"')
     client.put(f"{HOME}/profile", json={"max_torque_nm": 12})
-    with signed_in(service) as tab:
-        refused = tab.post(f"{PAGE}/calibration/finish", data={"csrf": csrf(tab), "calibration": version})
-        assert refused.status_code == 409 and "12 N·m" in refused.text
-        assert "all the same" not in refused.text
+    refused = pages.post(f"{PAGE}/calibration/finish", data={"csrf": csrf(pages), "calibration": version})
+    assert refused.status_code == 409 and "12 N·m" in refused.text
+    assert "all the same" not in refused.text

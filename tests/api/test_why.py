@@ -14,8 +14,7 @@ import pytest
 
 from stimrig.api.models import explanation
 from stimrig.hardware_sim import hidden_records
-from tests.api.conftest import Service, run_test, soon, wait_done
-from tests.api.test_people import csrf, signed_in
+from tests.api.conftest import Service, csrf, run_test, signed_in, soon, wait_done
 from tests.harness import few_effects
 
 
@@ -125,16 +124,15 @@ def with_fatigue(client: httpx.Client, model: str) -> str:
     return client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
 
 
-def test_version_with_effects_is_criticised_with_them(client: httpx.Client, service: Service, model: str) -> None:
+def test_version_with_effects_is_criticised_with_them(client: httpx.Client, pages: httpx.Client, model: str) -> None:
     better = with_fatigue(client, model)
     plain, own = (client.get(f"/v1/models/{name}/diagnosis").json() for name in (model, better))
     assert (plain["structure"], [entry["effect"] for entry in plain["missing"]]) == ([], ["fatigue"])
     assert (own["structure"], [entry["effect"] for entry in own["missing"]]) == (["fatigue"], ["threshold_drift"])
-    with signed_in(service) as browser:
-        page = browser.get(f"/models/{better}").text
-        assert "Structure of the model: fatigue" in page and 'id="effect-threshold_drift"' in page
-        assert 'id="effect-fatigue"' not in page
-        assert "Structure of the model: plain" in browser.get(f"/models/{model}").text
+    page = pages.get(f"/models/{better}").text
+    assert "Structure of the model: fatigue" in page and 'id="effect-threshold_drift"' in page
+    assert 'id="effect-fatigue"' not in page
+    assert "Structure of the model: plain" in pages.get(f"/models/{model}").text
     added = client.post(f"/v1/models/{better}/effects", json={"effects": ["threshold_drift"]})
     assert added.status_code == 201 and added.json()["effects"] == ["fatigue", "threshold_drift"]
 
@@ -299,12 +297,11 @@ def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Ser
         assert undone.headers["location"] == f"/models/{model}#versions"
 
 
-def test_forcing_on_the_page_wants_a_reason_and_refusals_are_pages(service: Service, model: str) -> None:
-    with signed_in(service) as browser:
-        led = browser.post(f"/models/{model}/effects", data={"csrf": csrf(browser), "effect": "tremor"})
-        page = soon(lambda: (found := browser.get(led.headers["location"])).status_code != 200 and found)
-        assert page.status_code == 409
-        assert "gives no evidence for this effect" in page.text and "Back to the model" in page.text
+def test_forcing_on_the_page_wants_a_reason_and_refusals_are_pages(pages: httpx.Client, model: str) -> None:
+    led = pages.post(f"/models/{model}/effects", data={"csrf": csrf(pages), "effect": "tremor"})
+    page = soon(lambda: (found := pages.get(led.headers["location"])).status_code != 200 and found)
+    assert page.status_code == 409
+    assert "gives no evidence for this effect" in page.text and "Back to the model" in page.text
 
 
 def test_cancelled_diagnosis_offers_to_begin_anew(client: httpx.Client, service: Service, participant: str) -> None:
@@ -317,10 +314,9 @@ def test_cancelled_diagnosis_offers_to_begin_anew(client: httpx.Client, service:
         assert "data-job" not in page
 
 
-def test_a_model_on_another_recording(client: httpx.Client, service: Service, model: str, participant: str) -> None:
+def test_a_model_on_another_recording(client: httpx.Client, pages: httpx.Client, model: str, participant: str) -> None:
     other = run_test(client, participant)["model_id"]
-    with signed_in(service) as browser:
-        assert "On the other recording" in browser.get("/compare", params={"model": [model, other]}).text
+    assert "On the other recording" in pages.get("/compare", params={"model": [model, other]}).text
     recording = client.get(f"/v1/models/{other}").json()["recording_id"]
     for name, status in ((recording, 200), ("none", 404)):
         assert client.get(f"/v1/models/{model}/comparison", params={"recording": name}).status_code == status

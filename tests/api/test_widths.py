@@ -17,11 +17,10 @@ import pytest
 from stimrig import Client
 from stimrig.api.cli import main
 from stimrig.rig.messages import Bound
-from tests.api.conftest import PATIENCE_S, REAL, TOKEN, Service, run_service
+from tests.api.conftest import HTML, PATIENCE_S, REAL, TOKEN, Service, run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_worker import made_up_csv
 
-HTML = {"Accept": "text/html"}
 TIME_S = np.arange(0, 6, 0.01)
 WANTED_NM = 1.5 * np.sin(np.pi * TIME_S / 6) ** 2
 

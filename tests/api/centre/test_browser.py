@@ -37,7 +37,7 @@ def looked_at(page: Any, what: str) -> None:
         assert violations(page) == [], (what, width)
 
 
-def test_from_no_rig_to_a_download(page: Any, centre: Centre) -> None:
+def test_from_no_rig_to_a_download(page: Any, centre: Centre, told: Teller) -> None:
     looked_at(page, "no rig")
     for path in ("/participants", "/warnings", "/administration"):
         page.goto(centre.url + path)
@@ -48,7 +48,6 @@ def test_from_no_rig_to_a_download(page: Any, centre: Centre) -> None:
     shown = page.locator("pre.secret").inner_text()
     looked_at(page, "the key")
     key = re.findall(r"STIMRIG_CENTRE_KEY=(\S+)", shown)[0]
-    told = Teller()
     for week in range(5):
         data = told.session(day=f"2026-02-0{1 + week}", number=week)
     with centre.client(key) as rig:

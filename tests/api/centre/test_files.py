@@ -66,8 +66,7 @@ def put(rig: httpx.Client, name: str, offset: int, data: bytes) -> httpx.Respons
     return rig.put(f"/v1/rig/files/{name}?offset={offset}", content=data)
 
 
-def test_a_file_is_cut_off_and_goes_on_where_it_was(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_a_file_is_cut_off_and_goes_on_where_it_was(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     data = os.urandom(100_000)
     name = told.add("recording", "r1", {"participant": "P1"}, data)["file"]
     rig.post("/v1/rig/items", json=told.batch())
@@ -82,8 +81,7 @@ def test_a_file_is_cut_off_and_goes_on_where_it_was(centre: Centre, rig: httpx.C
     assert put(rig, name, 0, data).json() == {"have_bytes": 100_000, "whole": True}, "once more: it is there"
 
 
-def test_a_forged_file_is_thrown_away(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_a_forged_file_is_thrown_away(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     name = told.add("recording", "r1", {"participant": "P1"}, b"what was sealed")["file"]
     rig.post("/v1/rig/items", json=told.batch())
     for forged in (b"what was forged", b"what was sealed, and more"):
@@ -98,8 +96,7 @@ def test_a_forged_file_is_thrown_away(centre: Centre, rig: httpx.Client) -> None
     assert put(rig, name, 0, b"what was sealed").json()["whole"] is True
 
 
-def test_an_empty_file_is_a_file(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_an_empty_file_is_a_file(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     name = told.add("recording", "r1", {"participant": "P1"}, b"")["file"]
     told.push(rig)
     assert whole_files(centre) == {name}
@@ -127,8 +124,7 @@ def test_the_same_file_of_two_rigs_is_kept_once_and_no_rig_spoils_anothers(
     assert list(centre.data.glob("spool/*/*.part")) == [], "what nobody waits for is thrown away"
 
 
-def test_so_many_parts_of_a_rig_and_no_more(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_so_many_parts_of_a_rig_and_no_more(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     names = [told.add("recording", f"r{n}", {"participant": "P1"}, b"%03d" % n)["file"] for n in range(MOST_PARTS + 4)]
     rig.post("/v1/rig/items", json=told.batch())
     for number, name in enumerate(names):
@@ -139,11 +135,10 @@ def test_so_many_parts_of_a_rig_and_no_more(centre: Centre, rig: httpx.Client) -
 
 
 def test_so_many_bytes_of_a_rigs_parts_and_no_more(
-    centre: Centre, rig: httpx.Client, monkeypatch: pytest.MonkeyPatch
+    centre: Centre, rig: httpx.Client, monkeypatch: pytest.MonkeyPatch, told: Teller
 ) -> None:
     """A rig that begins one large file after the other fills no disk of the centre."""
     monkeypatch.setattr("stimrig.api.centre.spool.MOST_BYTES", 50)
-    told = Teller()
     data = [b"%03d" % n * 10 for n in range(6)]
     names = [told.add("recording", f"r{n}", {"participant": "P1"}, one)["file"] for n, one in enumerate(data)]
     rig.post("/v1/rig/items", json=told.batch())
@@ -155,8 +150,7 @@ def test_so_many_bytes_of_a_rigs_parts_and_no_more(
 
 
 @pytest.mark.parametrize("trouble", [errno.ENOSPC, errno.EIO])
-def test_a_bucket_that_is_full_or_gone_loses_nothing(troubled: Centre, trouble: int) -> None:
-    told = Teller()
+def test_a_bucket_that_is_full_or_gone_loses_nothing(troubled: Centre, trouble: int, told: Teller) -> None:
     data = told.session()
     with troubled.client(troubled.key()) as rig, troubled.client() as http:
         rig.post("/v1/rig/items", json=told.batch())
@@ -184,8 +178,7 @@ def test_a_bucket_that_is_full_or_gone_loses_nothing(troubled: Centre, trouble: 
         assert http.get(recording["url"]).status_code == 503
 
 
-def test_a_rig_goes_on_with_a_file_that_only_waits_for_the_bucket(troubled: Centre) -> None:
-    told = Teller()
+def test_a_rig_goes_on_with_a_file_that_only_waits_for_the_bucket(troubled: Centre, told: Teller) -> None:
     data = told.session()
     with troubled.client(troubled.key()) as rig:
         rig.post("/v1/rig/items", json=told.batch())
@@ -197,8 +190,7 @@ def test_a_rig_goes_on_with_a_file_that_only_waits_for_the_bucket(troubled: Cent
         assert put(rig, sha256(data), len(data), b"").json() == {"have_bytes": len(data), "whole": True}
 
 
-def test_a_folder_that_is_not_mounted_any_more_takes_nothing(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_a_folder_that_is_not_mounted_any_more_takes_nothing(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     data = told.session()
     rig.post("/v1/rig/items", json=told.batch())
     bucket = centre.data / "files"
@@ -257,8 +249,7 @@ def test_a_file_that_was_changed_is_refused_told_and_asked_for_again(
         assert told_of and all(one["ended_utc"] for one in told_of), "and the warning says so"
 
 
-def test_check_reads_every_file_and_goes_on_where_it_was_cut(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_check_reads_every_file_and_goes_on_where_it_was_cut(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     for number in range(6):
         told.session(number=number)
     told.push(rig)

@@ -40,8 +40,7 @@ def test_a_day_arrives_whole_and_is_handed_out_as_it_was(centre: Centre, rig: ht
     assert centre.warnings() == []
 
 
-def test_what_comes_twice_is_there_once(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_what_comes_twice_is_there_once(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     told.session()
     for _ in range(3):
         told.push(rig)
@@ -52,8 +51,7 @@ def test_what_comes_twice_is_there_once(centre: Centre, rig: httpx.Client) -> No
     assert centre.row().recordings == 2
 
 
-def test_a_gap_is_refused_and_the_place_to_go_on_from_is_told(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_a_gap_is_refused_and_the_place_to_go_on_from_is_told(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     told.session()
     assert rig.post("/v1/rig/items", json=told.batch(1, 2)).json()["seq"] == 2
     for items in (told.items[3:], told.items[2:3] + told.items[4:], told.items[2:4][::-1]):
@@ -64,8 +62,7 @@ def test_a_gap_is_refused_and_the_place_to_go_on_from_is_told(centre: Centre, ri
 
 
 @pytest.mark.parametrize("field", ["body", "key", "kind", "at_utc", "file", "file_bytes", "sha256", "hash"])
-def test_a_forged_item_is_refused_with_its_batch(centre: Centre, rig: httpx.Client, field: str) -> None:
-    told = Teller()
+def test_a_forged_item_is_refused_with_its_batch(centre: Centre, rig: httpx.Client, field: str, told: Teller) -> None:
     told.session()
     batch = copy.deepcopy(told.batch())
     forged = {
@@ -78,8 +75,7 @@ def test_a_forged_item_is_refused_with_its_batch(centre: Centre, rig: httpx.Clie
     assert counts(centre) == (0, 0)
 
 
-def test_a_chain_that_does_not_follow_is_forked(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_a_chain_that_does_not_follow_is_forked(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     told.session()
     told.push(rig)
     other = Teller()
@@ -123,8 +119,7 @@ def test_a_body_that_is_cut_too_long_or_no_sense_is_refused_in_one_line(
     assert "\n" not in refused.json()["detail"] and counts(centre) == (0, 0)
 
 
-def test_at_most_500_items_are_taken_at_once(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_at_most_500_items_are_taken_at_once(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     for number in range(500):
         told.add("participant", f"P{number}", {"code": f"P{number}"})
     assert rig.post("/v1/rig/items", json=told.batch()).status_code == 422
@@ -132,8 +127,7 @@ def test_at_most_500_items_are_taken_at_once(centre: Centre, rig: httpx.Client) 
     assert rig.post("/v1/rig/items", json=told.batch(501)).json()["seq"] == 501
 
 
-def test_a_key_opens_its_own_rig_alone(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_a_key_opens_its_own_rig_alone(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     told.session()
     told.push(rig)
     with centre.client(centre.key("Ward 2")) as other:
@@ -180,9 +174,8 @@ def test_the_key_is_looked_at_again_within_the_batchs_transaction(centre: Centre
 
 
 def test_a_rig_restored_from_its_backup_is_told_and_nothing_doubles(
-    centre: Centre, rig: httpx.Client, http: httpx.Client
+    centre: Centre, rig: httpx.Client, http: httpx.Client, told: Teller
 ) -> None:
-    told = Teller()
     told.session()
     old = copy.deepcopy(told)  # the backup
     told.session(number=1)
@@ -217,9 +210,8 @@ def test_a_rig_that_wrote_on_after_its_restore_to_the_same_place_is_told(centre:
 
 
 def test_a_greeting_warns_of_clock_disk_and_damage_until_it_is_over(
-    centre: Centre, rig: httpx.Client, http: httpx.Client
+    centre: Centre, rig: httpx.Client, http: httpx.Client, told: Teller
 ) -> None:
-    told = Teller()
     bad = {"disk_free_bytes": 10**9, "damaged": ["recordings/a.h5"], "state": "latched", "reason": "stop pressed"}
     rig.post("/v1/rig/hello", json=told.hello(AT, **bad))
     kinds = {"clock", "disk", "damaged-at-rig"}
@@ -251,8 +243,7 @@ def test_a_rig_that_is_not_seen_for_a_day_is_told_once(centre: Centre, rig: http
     assert [one["ended_utc"] is not None for one in centre.client().get("/v1/warnings").json()] == [True]
 
 
-def test_kinds_of_a_newer_rig_are_kept_and_shown_nowhere(centre: Centre, rig: httpx.Client) -> None:
-    told = Teller()
+def test_kinds_of_a_newer_rig_are_kept_and_shown_nowhere(centre: Centre, rig: httpx.Client, told: Teller) -> None:
     told.add("posture", "x", {"what": "a newer version tells"})
     told.push(rig)
     assert counts(centre) == (2, 0) and centre.warnings() == []

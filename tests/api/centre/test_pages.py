@@ -340,9 +340,8 @@ def test_a_rig_at_work_is_no_rig_to_look_at() -> None:
 
 @pytest.mark.parametrize("label", ["9999-12-31T23:59:59Z", "9999-12-30T00:00:00.000Z"])
 def test_a_day_after_which_there_is_none_is_no_day(
-    centre: Centre, rig: httpx.Client, http: httpx.Client, label: str
+    centre: Centre, rig: httpx.Client, http: httpx.Client, label: str, told: Teller
 ) -> None:
-    told = Teller()
     told.add("recording", "r1", {"participant": "P1", "created_utc": label})
     told.add("test", "t1", {"participant": "P1", "requested_utc": label, "finished_utc": label, "plan": {}})
     assert rig.post("/v1/rig/items", json=told.batch()).status_code == 200

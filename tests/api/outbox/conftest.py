@@ -1,4 +1,4 @@
-"""A rig of its own for each test."""
+"""A rig's store with a feed and a pusher on a virtual clock, and days of work to be told."""
 
 from __future__ import annotations
 
@@ -21,17 +21,6 @@ from stimrig.api.store import Store, audit
 from stimrig.api.store.tables import Approval, Model, OutboxItem, Participant, Recording, Test, Tracked
 from tests.api.conftest import put_database
 from tests.harness.fake_centre import KEY, FakeCentre, canonical, sha256
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path)
-    yield made
-    made.close()
-
-
-# ---- A rig's store with a feed and a pusher on a virtual clock, and days of work to be told
-
 
 URL = "https://centre.example.org"
 ZEROS = "0" * 64
@@ -87,7 +76,13 @@ class Rig:
         self.add(row, action="create participant", subject=code)
         return row
 
+    def known(self, code: str) -> None:
+        """The participant is there."""
+        if self.store.get(Participant, code) is None:
+            self.participant(code)
+
     def begin_test(self, code: str) -> str:
+        self.known(code)
         self.number += 1
         plan = {"kind": "identification", "preview": {"duration_s": 30.0, "pulse_width_us": [1.0] * 1000}}
         row = Test(id=f"T{self.number}", participant=code, kind="identification", state="requested", plan=plan)
@@ -96,6 +91,7 @@ class Rig:
         return row.id
 
     def recording(self, code: str, test_id: str | None = None, size: int = 1000) -> Recording:
+        self.known(code)
         self.number += 1
         data = self.chance.randbytes(size)
         path = self.folder / "recordings" / f"R{self.number}.h5"
@@ -190,3 +186,10 @@ def assert_told(rig: Rig, centre: FakeCentre) -> None:
     named = {item.file for item in own if item.file is not None}
     assert named == set(centre.files)
     assert all(sha256(data) == digest for digest, data in centre.files.items())
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path)
+    yield made
+    made.close()

@@ -26,7 +26,6 @@ def body_of(rig: Rig, kind: str) -> dict[str, Any]:
 
 
 def test_a_session_is_told_in_order_with_its_files(rig: Rig) -> None:
-    rig.participant("P1")
     model = rig.session("P1")
     rig.tracked(model)
     kinds = [kind for kind, _ in rig.told()]
@@ -44,7 +43,6 @@ def test_a_session_is_told_in_order_with_its_files(rig: Rig) -> None:
 
 
 def test_nothing_that_a_person_typed_freely_and_no_path_is_told(rig: Rig) -> None:
-    rig.participant("P1")
     rig.session("P1")
     note = Note(id="N1", participant="P1", kind="pain", text="Mr Miller said it hurt", by="Ada", at_utc=rig.now)
     rig.add(note, action="add note", subject="N1")
@@ -56,7 +54,6 @@ def test_nothing_that_a_person_typed_freely_and_no_path_is_told(rig: Rig) -> Non
 
 
 def test_a_test_is_told_once_it_is_closed_and_without_its_pulses(rig: Rig) -> None:
-    rig.participant("P1")
     test_id = rig.begin_test("P1")
     for state in ("running", "sealing", "identifying"):
         with rig.store.write() as session:

@@ -40,7 +40,6 @@ def test_a_chain_begins_anew_less_and_less_often(rig: Rig) -> None:
 
 
 def test_files_that_nobody_named_fill_no_memory_and_are_looked_for_with_rests(rig: Rig) -> None:
-    rig.participant("P1")
     rig.session("P1")
     centre, drawn = FakeCentre(), itertools.count()
 
@@ -62,7 +61,6 @@ def test_files_that_nobody_named_fill_no_memory_and_are_looked_for_with_rests(ri
 
 
 def test_a_file_that_is_asked_for_again_and_again_is_not_read_without_rest(rig: Rig) -> None:
-    rig.participant("P1")
     for _ in range(3):
         rig.recording("P1", size=5000)
     centre = FakeCentre()
@@ -84,7 +82,6 @@ def test_a_file_that_is_asked_for_again_and_again_is_not_read_without_rest(rig: 
 
 
 def test_no_cookie_is_kept_or_sent_back(rig: Rig) -> None:
-    rig.participant("P1")
     rig.session("P1")
     centre, drawn, sent = FakeCentre(), itertools.count(), []
 

@@ -40,7 +40,6 @@ def state_of(rig: Rig) -> status.Status:
 
 
 def test_everything_comes_over_and_what_is_new_within_two_seconds(rig: Rig, centre: FakeCentre) -> None:
-    rig.participant("P1")
     rig.tracked(rig.session("P1"))
     pusher = rig.pusher(centre.handle)
     run(pusher, 3)
@@ -71,7 +70,6 @@ def test_an_empty_rig_says_hello(rig: Rig, centre: FakeCentre) -> None:
 
 def test_what_came_about_without_a_centre_is_told(tmp_path: Path, centre: FakeCentre) -> None:
     rig = Rig(tmp_path, feed=False)
-    rig.participant("P1")
     for _ in range(3):
         rig.session("P1")
     run(rig.pusher(centre.handle), 5)
@@ -87,7 +85,6 @@ def test_whatever_the_line_does_all_comes_over(tmp_path: Path, seed: int, rubbis
     """Answers dropped, bodies cut, answered twice, restored from an older state, rubbish: at the end all is there."""
     rig, line = Rig(tmp_path, seed=seed), BadLine(FakeCentre(), random.Random(seed), 0.6, rubbish)
     pusher = rig.pusher(line, seed)
-    rig.participant("P1")
     for _ in range(12):
         rig.session("P1", size=rig.chance.randrange(5_000))
         run(pusher, rig.chance.choice((1.0, 10.0, 600.0)))
@@ -138,7 +135,6 @@ def test_in_any_order_of_work_failures_and_restarts(
 
 
 def test_a_large_recording_goes_over_in_chunks_and_each_byte_once(rig: Rig, centre: FakeCentre) -> None:
-    rig.participant("P1")
     row = rig.recording("P1", size=2 * CHUNK + 12345)
     sizes: list[int] = []
 
@@ -183,7 +179,6 @@ def test_memory_is_bounded_whatever_a_recording_is_long(rig: Rig, centre: FakeCe
 
 
 def test_a_damaged_or_missing_recording_is_told_and_the_others_go_on(rig: Rig, centre: FakeCentre) -> None:
-    rig.participant("P1")
     rows = [rig.recording("P1") for _ in range(4)]
     changed, gone = Path(rows[0].path), Path(rows[2].path)
     whole = changed.read_bytes()
@@ -209,7 +204,6 @@ def test_more_damaged_files_than_a_centre_lists_at_once_keep_none_back(rig: Rig,
 
 
 def test_a_file_that_changes_while_it_is_sent_is_not_believed(rig: Rig, centre: FakeCentre) -> None:
-    rig.participant("P1")
     row = rig.recording("P1", size=CHUNK + 1000)
     path = Path(row.path)
 
@@ -225,7 +219,6 @@ def test_a_file_that_changes_while_it_is_sent_is_not_believed(rig: Rig, centre: 
 
 
 def test_what_arrived_damaged_is_sent_again(rig: Rig, centre: FakeCentre) -> None:
-    rig.participant("P1")
     row = rig.recording("P1", size=1000)
     centre.parts[row.file_sha256] = b"not what was sent"
     run(rig.pusher(centre.handle), 60)
@@ -234,7 +227,6 @@ def test_what_arrived_damaged_is_sent_again(rig: Rig, centre: FakeCentre) -> Non
 
 def test_a_bucket_that_is_full_keeps_no_item_back(rig: Rig, centre: FakeCentre) -> None:
     centre.bucket_full = True
-    rig.participant("P1")
     rig.session("P1")
     pusher = rig.pusher(centre.handle)
     run(pusher, 10)
@@ -292,7 +284,6 @@ def test_a_wrong_answer_is_one_line_and_changes_nothing(rig: Rig, centre: FakeCe
 @pytest.mark.parametrize("path", ["items", "files"])
 def test_rubbish_for_some_requests_only(rig: Rig, centre: FakeCentre, number: int, path: str) -> None:
     """The centre answers hello as it should, but one thing never: nothing is lost, and it is not asked without end."""
-    rig.participant("P1")
     rig.session("P1")
     chains = {item.chain for item in rig.items()}
     requests, broken = 0, True
@@ -378,7 +369,6 @@ def test_a_restored_rig_begins_anew_and_tells_everything_again(
 ) -> None:
     if rig.store.engine.dialect.name != "sqlite":
         pytest.skip("the backup is SQLite's")
-    rig.participant("P1")
     rig.session("P1")
     run(rig.pusher(centre.handle), 5)
     with contextlib.closing(sqlite3.connect(rig.folder / "stimrig.db")) as connection:
@@ -459,7 +449,6 @@ def test_a_database_that_fails_is_said_and_tried_again(
 
 
 def test_a_centre_that_was_restored_gets_again_what_it_lost(rig: Rig, centre: FakeCentre) -> None:
-    rig.participant("P1")
     rig.session("P1")
     pusher = rig.pusher(centre.handle)
     run(pusher, 5)
