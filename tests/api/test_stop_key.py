@@ -28,19 +28,30 @@ from tests.harness.looks_first import LooksFirst
 ROOT = Path(__file__).parents[2]
 
 
+class Terminal:
+    """A terminal: the keyboard's end, the program's end, and what was said on it."""
+
+    def __init__(self) -> None:
+        self.keyboard, self.program = pty.openpty()
+        self.words: list[str] = []
+
+    def watch(self, stop: Any) -> StopKey:
+        return StopKey(stop, self.words.append, self.program)
+
+    def press(self, key: bytes = b"x") -> str:
+        """What is said of a key."""
+        count = len(self.words)
+        os.write(self.keyboard, key)
+        return soon(lambda: self.words[count:], 15)[0]
+
+
 @pytest.fixture
-def terminal() -> Iterator[tuple[int, int]]:
-    """The keyboard's end and the program's end."""
-    keyboard, program = pty.openpty()
-    yield keyboard, program
-    for descriptor in (keyboard, program):
+def terminal() -> Iterator[Terminal]:
+    made = Terminal()
+    yield made
+    for descriptor in (made.keyboard, made.program):
         with contextlib.suppress(OSError):
             os.close(descriptor)
-
-
-def told(words: list[str], count: int = 1) -> list[str]:
-    soon(lambda: len(words) >= count, 15)
-    return words
 
 
 def started(client: httpx.Client, service: Service, participant: str) -> str:
@@ -50,81 +61,65 @@ def started(client: httpx.Client, service: Service, participant: str) -> str:
 
 @pytest.mark.parametrize("way", ["rig", "service"])
 def test_any_key_stops_a_running_test(
-    client: httpx.Client, service: Service, participant: str, terminal: tuple[int, int], way: str
+    client: httpx.Client, service: Service, participant: str, terminal: Terminal, way: str
 ) -> None:
-    keyboard, program = terminal
-    before, words = termios.tcgetattr(program), []
+    before = termios.tcgetattr(terminal.program)
     stop = at_rig(service.rig.path) if way == "rig" else at_service(service.url, TOKEN)
-    with StopKey(stop, words.append, program) as key:
+    with terminal.watch(stop) as key:
         assert key.watched
         test_id = started(client, service, participant)
-        os.write(keyboard, b"x")
-        assert told(words) == [stop_key.CONFIRMED]
+        assert terminal.press() == stop_key.CONFIRMED
         ended = wait_done(client, test_id)
     assert ended["state"] == "stopped" and service.rig.stopped_by == (stop_key.BY if way == "rig" else "administrator")
-    assert termios.tcgetattr(program) == before, "the terminal is as it was"
+    assert termios.tcgetattr(terminal.program) == before, "the terminal is as it was"
 
 
 def test_a_key_stops_what_the_service_has_not_yet_heard_of(
-    client: httpx.Client, service: Service, participant: str, terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+    client: httpx.Client, service: Service, participant: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keyboard, program = terminal
-    words: list[str] = []
 
     async def last_known() -> Any:
         return service.context.rig.status
 
     monkeypatch.setattr(service.context.rig, "fresh_status", last_known)
     monkeypatch.setattr(service.rig, "_send", lambda _event: None)
-    with StopKey(at_service(service.url, TOKEN), words.append, program):
+    with terminal.watch(at_service(service.url, TOKEN)):
         started(client, service, participant)
         assert client.get("/v1/rig").json()["state"] == "ready" and service.rig.state == "running"
-        os.write(keyboard, b"x")
-        assert told(words) == [stop_key.CONFIRMED]
+        assert terminal.press() == stop_key.CONFIRMED
     assert service.rig.stopped_by == "administrator"
 
 
-def test_a_key_is_no_stray_one_where_the_service_does_not_hear_its_rig(
-    service: Service, terminal: tuple[int, int]
-) -> None:
-    keyboard, program = terminal
-    words: list[str] = []
-    with service.client() as http, StopKey(at_service(service.url, TOKEN), words.append, program):
+def test_a_key_is_no_stray_one_where_the_service_does_not_hear_its_rig(service: Service, terminal: Terminal) -> None:
+    with service.client() as http, terminal.watch(at_service(service.url, TOKEN)):
         service.rig_thread.__exit__(None, None, None)
         soon(lambda: not http.get("/v1/rig").json()["connected"], 20)
-        os.write(keyboard, b"x")
-        assert "emergency switch" in told(words)[0]
+        assert "emergency switch" in terminal.press()
 
 
-def test_a_key_while_nothing_runs_does_not_latch(service: Service, terminal: tuple[int, int]) -> None:
-    keyboard, program = terminal
-    words: list[str] = []
-    with StopKey(at_rig(service.rig.path), words.append, program):
-        os.write(keyboard, b"\n")
-        assert told(words) == [stop_key.NOTHING]
+def test_a_key_while_nothing_runs_does_not_latch(service: Service, terminal: Terminal) -> None:
+    with terminal.watch(at_rig(service.rig.path)):
+        assert terminal.press(b"\n") == stop_key.NOTHING
         with service.client() as http:
             assert http.get("/v1/rig").json()["state"] == "ready"
             http.post("/v1/stop")
-        os.write(keyboard, b" ")
-        assert told(words, 2)[1] == stop_key.NOTHING
+        assert terminal.press(b" ") == stop_key.NOTHING
 
 
 def test_what_is_not_confirmed_says_what_to_do(
-    client: httpx.Client, service: Service, participant: str, terminal: tuple[int, int], tmp_path: Path
+    client: httpx.Client, service: Service, participant: str, terminal: Terminal, tmp_path: Path
 ) -> None:
-    keyboard, program = terminal
-    words: list[str] = []
     service.rig.confirms_stop = False
-    with StopKey(at_rig(service.rig.path), words.append, program):
+    with terminal.watch(at_rig(service.rig.path)):
         started(client, service, participant)
-        os.write(keyboard, b"x")
-        assert "emergency switch" in told(words)[0] and "No ack." in words[0]
-    with StopKey(at_rig(tmp_path / "none.sock"), words.append, program):
-        os.write(keyboard, b"x")
-        assert "emergency switch" in told(words, 2)[1] and "cannot be reached" in words[1]
-    with StopKey(lambda: [][0], words.append, program):
-        os.write(keyboard, b"x")
-        assert "emergency switch" in told(words, 3)[2] and "IndexError" in words[2]
+        said = terminal.press()
+        assert "emergency switch" in said and "No ack." in said
+    with terminal.watch(at_rig(tmp_path / "none.sock")):
+        said = terminal.press()
+        assert "emergency switch" in said and "cannot be reached" in said
+    with terminal.watch(lambda: [][0]):
+        said = terminal.press()
+        assert "emergency switch" in said and "IndexError" in said
 
 
 def test_without_a_terminal_nothing_listens(tmp_path: Path) -> None:
@@ -139,22 +134,20 @@ def test_without_a_terminal_nothing_listens(tmp_path: Path) -> None:
     os.close(writing)
 
 
-def test_a_terminal_that_closes_ends_the_listening(terminal: tuple[int, int]) -> None:
-    keyboard, program = terminal
-    with StopKey(lambda: "never", print, program) as key:
-        os.close(keyboard)
+def test_a_terminal_that_closes_ends_the_listening(terminal: Terminal) -> None:
+    with StopKey(lambda: "never", print, terminal.program) as key:
+        os.close(terminal.keyboard)
         assert key._thread is not None
         key._thread.join(5)
         assert not key._thread.is_alive()
 
 
 def test_stimrig_test_stops_on_a_key(
-    service: Service, terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    service: Service, terminal: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    keyboard, program = terminal
     service.rig.speed = 1.0
     monkeypatch.setenv("STIMRIG_TOKEN", TOKEN)
-    monkeypatch.setattr(stop_key, "standard_input", lambda: program)
+    monkeypatch.setattr(stop_key, "standard_input", lambda: terminal.program)
     real = test_verb.run_test
 
     def watched(client: httpx.Client, participant: str, watch: Any, over: Any, **more: Any) -> dict[str, Any]:
@@ -162,7 +155,7 @@ def test_stimrig_test_stops_on_a_key(
 
         def look() -> list[str]:
             if service.rig.state == "running" and not pressed:
-                pressed.append(os.write(keyboard, b"q"))
+                pressed.append(os.write(terminal.keyboard, b"q"))
             return []
 
         return real(client, participant, look, over, **more)
@@ -175,15 +168,14 @@ def test_stimrig_test_stops_on_a_key(
 
 
 def test_a_key_before_the_rig_plays_keeps_the_test_from_beginning(
-    service: Service, terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    service: Service, terminal: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    keyboard, program = terminal
     monkeypatch.setenv("STIMRIG_TOKEN", TOKEN)
-    monkeypatch.setattr(stop_key, "standard_input", lambda: program)
+    monkeypatch.setattr(stop_key, "standard_input", lambda: terminal.program)
     real = test_verb.run_test
 
     def asked(*given: Any, **more: Any) -> dict[str, Any]:
-        os.write(keyboard, b"q")
+        os.write(terminal.keyboard, b"q")
         soon(lambda: service.rig.state == "latched", 20)
         return real(*given, **more)
 
@@ -230,9 +222,8 @@ def test_no_rig_at_the_socket_is_one_line(tmp_path: Path, capsys: pytest.Capture
 
 @pytest.mark.slow
 def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
-    short_dir: Path, tmp_path: Path, terminal: tuple[int, int]
+    short_dir: Path, tmp_path: Path, terminal: Terminal
 ) -> None:
-    keyboard, program = terminal
     socket = short_dir / f"attached-{time.time_ns()}.sock"
     command = [
         sys.executable,
@@ -249,7 +240,7 @@ def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
     environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": str(ROOT)}
     with RigThread(socket, tmp_path / "data" / "recordings", speed=1.0) as thread:
         served = subprocess.Popen(
-            command, cwd=tmp_path, env=environment, stdin=program, stdout=subprocess.PIPE, text=True
+            command, cwd=tmp_path, env=environment, stdin=terminal.program, stdout=subprocess.PIPE, text=True
         )
         assert served.stdout is not None
         try:
@@ -261,7 +252,7 @@ def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
             with httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=60) as http:
                 http.post("/v1/participants", json={"code": "A1"})
                 test_id = http.post("/v1/tests", json={"participant": "A1"}).json()["id"]
-                os.write(keyboard, b"s")
+                os.write(terminal.keyboard, b"s")
                 assert served.stdout.readline().strip() == stop_key.CONFIRMED
                 ended = wait_done(http, test_id)
             assert ended["state"] == "stopped" and stop_key.BY in ended["reason"]

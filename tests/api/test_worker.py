@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,73 +29,69 @@ def with_pool(work: Any, workers: int = 1, command: tuple[str, ...] = COMMAND) -
     return asyncio.run(run())
 
 
-def test_a_call_is_cancelled_at_once_after_it_was_handed_to_a_worker() -> None:
+def pooled(**how: Any) -> Callable[[Callable[[Pool], Any]], Callable[[], None]]:
+    """A test that is given a pool of stubs, and has its loop."""
+
+    def decorated(test: Callable[[Pool], Any]) -> Callable[[], None]:
+        return lambda: with_pool(test, **how)
+
+    return decorated
+
+
+@pooled()
+async def test_a_call_is_cancelled_at_once_after_it_was_handed_to_a_worker(pool: Pool) -> None:
     """Before its process has been started, and while the process of the call before waits for work."""
-
-    async def work(pool: Pool) -> None:
-        for _ in range(2):
-            call = pool.submit("fit", data="x", effects=["slow"])
-            pool.cancel(call)
-            with pytest.raises(ApiError, match="cancelled"):
-                await call.result
-            assert call.state == "cancelled"
-            assert (await pool.submit("effects").result)["effects"], "the worker does the next call"
-
-    with_pool(work)
-
-
-def test_cancelled_job_frees_its_worker() -> None:
-    async def work(pool: Pool) -> None:
-        slow = pool.submit("fit", data="x", effects=["slow"])
-        while slow.progress < 0.5:
-            await asyncio.sleep(0.01)
-        pool.cancel(slow)
+    for _ in range(2):
+        call = pool.submit("fit", data="x", effects=["slow"])
+        pool.cancel(call)
         with pytest.raises(ApiError, match="cancelled"):
-            await slow.result
-        assert slow.state == "cancelled"
-        assert (await pool.submit("fit", data="x").result)["model"]["method"] == "maximum-likelihood"
-
-    with_pool(work)
+            await call.result
+        assert call.state == "cancelled"
+        assert (await pool.submit("effects").result)["effects"], "the worker does the next call"
 
 
-def test_queued_job_can_be_cancelled() -> None:
-    async def work(pool: Pool) -> None:
-        slow, queued = pool.submit("fit", data="x", effects=["slow"]), pool.submit("fit", data="x")
-        await asyncio.sleep(0.05)
-        pool.cancel(queued)
-        with pytest.raises(ApiError, match="cancelled"):
-            await queued.result
-        assert slow.state == "running"
-
-    with_pool(work)
-
-
-def test_dead_worker_is_a_problem_and_the_next_job_gets_a_new_one() -> None:
-    async def work(pool: Pool) -> None:
-        with pytest.raises(ApiError, match="died"):
-            await pool.submit("fit", data="x", effects=["die"]).result
-        await pool.submit("fit", data="x").result
-
-    with_pool(work)
+@pooled()
+async def test_cancelled_job_frees_its_worker(pool: Pool) -> None:
+    slow = pool.submit("fit", data="x", effects=["slow"])
+    while slow.progress < 0.5:
+        await asyncio.sleep(0.01)
+    pool.cancel(slow)
+    with pytest.raises(ApiError, match="cancelled"):
+        await slow.result
+    assert slow.state == "cancelled"
+    assert (await pool.submit("fit", data="x").result)["model"]["method"] == "maximum-likelihood"
 
 
-def test_fit_after_a_test_goes_first_and_has_a_worker_kept_free() -> None:
-    async def work(pool: Pool) -> None:
-        blocking = [pool.submit("fit", data="x", effects=["slow"]) for _ in range(3)]
-        urgent = await asyncio.wait_for(pool.submit("fit", urgent=True, data="x").result, 20)
-        assert urgent["model"]
-        assert sum(call.state == "running" for call in blocking) == 1
+@pooled()
+async def test_queued_job_can_be_cancelled(pool: Pool) -> None:
+    slow, queued = pool.submit("fit", data="x", effects=["slow"]), pool.submit("fit", data="x")
+    await asyncio.sleep(0.05)
+    pool.cancel(queued)
+    with pytest.raises(ApiError, match="cancelled"):
+        await queued.result
+    assert slow.state == "running"
 
-    with_pool(work, workers=2)
+
+@pooled()
+async def test_dead_worker_is_a_problem_and_the_next_job_gets_a_new_one(pool: Pool) -> None:
+    with pytest.raises(ApiError, match="died"):
+        await pool.submit("fit", data="x", effects=["die"]).result
+    await pool.submit("fit", data="x").result
 
 
-def test_expected_error_names_the_place() -> None:
-    async def work(pool: Pool) -> None:
-        with pytest.raises(ApiError) as caught:
-            await pool.submit("fit", data="x", effects=["bad"]).result
-        assert caught.value.status == 422 and caught.value.extra["place"] == "effects"
+@pooled(workers=2)
+async def test_fit_after_a_test_goes_first_and_has_a_worker_kept_free(pool: Pool) -> None:
+    blocking = [pool.submit("fit", data="x", effects=["slow"]) for _ in range(3)]
+    urgent = await asyncio.wait_for(pool.submit("fit", urgent=True, data="x").result, 20)
+    assert urgent["model"]
+    assert sum(call.state == "running" for call in blocking) == 1
 
-    with_pool(work)
+
+@pooled()
+async def test_expected_error_names_the_place(pool: Pool) -> None:
+    with pytest.raises(ApiError) as caught:
+        await pool.submit("fit", data="x", effects=["bad"]).result
+    assert caught.value.status == 422 and caught.value.extra["place"] == "effects"
 
 
 def made_up_csv(path: Path) -> Path:

@@ -46,11 +46,23 @@ def output(tmp_path: Path) -> Path:
     return tmp_path / "results.parquet"
 
 
+def run(output: Path, *rows: dict[str, Any], join: bool = True, **more: Any) -> list[str]:
+    """A run that adds these rows; what each of them was."""
+    with Results(output, TASK, **more) as results:
+        kinds = [results.add(row) for row in rows]
+        if join:
+            results.join()
+    return kinds
+
+
+def refused(output: Path, match: str, task: Task = TASK) -> None:
+    with pytest.raises(CohortError, match=match), Results(output, task):
+        pass
+
+
 def test_a_run_that_was_cut_off_goes_on(output: Path) -> None:
-    with Results(output, TASK) as results:
-        results.add(made("a"))
-        results.add(made("b", status="error", error_kind="bad record"))
-        results.add(made("c", status=LEFT_OUT))
+    bad = made("b", status="error", error_kind="bad record")
+    run(output, made("a"), bad, made("c", status=LEFT_OUT), join=False)
     assert not output.exists()
     with Results(output, TASK) as results:
         assert all(results.done.has_place(entry(name)) for name in "abc")
@@ -63,11 +75,8 @@ def test_a_run_that_was_cut_off_goes_on(output: Path) -> None:
 
 
 def test_finished_results_take_in_what_is_new(output: Path) -> None:
-    for names in ("ab", "c"):
-        with Results(output, TASK) as results:
-            for name in names:
-                results.add(made(name))
-            results.join()
+    run(output, made("a"), made("b"))
+    run(output, made("c"))
     assert told(output) == ["a ok", "b ok", "c ok"]
 
 
@@ -83,57 +92,40 @@ def test_a_part_that_was_half_written_counts_for_nothing(output: Path) -> None:
     with Results(output, TASK) as results:
         results.add(made("a"))
     (results.folder / "00000001.parquet.new").write_bytes(b"PAR1half")
-    with Results(output, TASK) as results:
-        results.add(made("b"))
-        results.join()
+    run(output, made("b"))
     assert told(output) == ["a ok", "b ok"]
 
 
 def test_killed_between_the_join_and_the_tidying(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Results(output, TASK) as results, monkeypatch.context() as patch:
-        results.add(made("a"))
+    with monkeypatch.context() as patch:
         patch.setattr(parts.shutil, "rmtree", lambda *_, **__: None)
-        results.join()
-    assert results.folder.exists()
-    with Results(output, TASK) as results:
-        results.join()
+        run(output, made("a"))
+    assert Path(f"{output}.parts").exists()
+    run(output)
     assert told(output) == ["a ok"]
 
 
 def test_a_content_counts_once_wherever_it_lies(output: Path) -> None:
     with Results(output, TASK) as results:
-        assert results.add(made("a", "x")) == "ok"
-        assert results.add(made("b", "x")) == COPY
+        assert [results.add(made(name, "x")) for name in "ab"] == ["ok", COPY]
         assert results.join()["copies"] == 1
     assert told(output) == ["a ok"]
 
 
 def test_a_file_that_was_replaced_takes_its_old_row_with_it(output: Path) -> None:
-    with Results(output, TASK) as results:
-        results.add(made("a", "old"))
-        results.add(made("b", "moved"))
-        results.join()
-    with Results(output, TASK) as results:
-        results.add(made("a", "new"))
-        results.add(made("b", "other"))
-        assert results.add(made("c", "moved")) == COPY
-        results.join()
-    contents = {row["stamp"] for row in read(output)}
-    assert contents == {"s-new", "s-other", "s-moved"}
+    run(output, made("a", "old"), made("b", "moved"))
+    assert run(output, made("a", "new"), made("b", "other"), made("c", "moved"))[-1] == COPY
+    assert {row["stamp"] for row in read(output)} == {"s-new", "s-other", "s-moved"}
 
 
 def test_what_failed_is_done_again_if_asked(output: Path) -> None:
-    with Results(output, TASK) as results:
-        results.add(made("slow", status="error", error_kind="timeout"))
-        results.add(made("far", "", status="error", error_kind="unreadable"))
-        results.add(made("bad", status="error", error_kind="bad record"))
-        results.join()
+    failures = (("slow", None, "timeout"), ("far", "", "unreadable"), ("bad", None, "bad record"))
+    run(output, *(made(name, content, "error", error_kind=kind) for name, content, kind in failures))
     with Results(output, TASK) as results:
         assert results.done.has_place(entry("slow"))
     with Results(output, TASK, again=True) as results:
         assert not results.done.has_place(entry("slow")) and results.done.has_place(entry("bad"))
-        assert results.add(made("slow")) == "ok"
-        assert results.add(made("far")) == "ok"
+        assert [results.add(made(name)) for name in ("slow", "far")] == ["ok", "ok"]
         results.join()
     assert told(output) == ["bad error", "far ok", "slow ok"]
 
@@ -149,37 +141,28 @@ def test_what_failed_is_done_again_if_asked(output: Path) -> None:
 )
 @pytest.mark.parametrize("joined", [False, True])
 def test_other_options_are_refused(output: Path, other: Task, named: str, joined: bool) -> None:
-    with Results(output, TASK) as results:
-        results.add(made("a"))
-        if joined:
-            results.join()
-    with pytest.raises(CohortError, match=named), Results(output, other):
-        pass
+    run(output, made("a"), join=joined)
+    refused(output, named, other)
     with Results(output, TASK) as results:
         assert results.done.has_place(entry("a"))
 
 
 def test_two_runs_never_write_one_output(output: Path) -> None:
-    with Results(output, TASK), pytest.raises(CohortError, match="another run"), Results(output, TASK):
-        pass
     with Results(output, TASK):
-        pass
+        refused(output, "another run")
+    run(output)
 
 
 def test_what_is_no_table_of_results_is_not_written_over(output: Path, tmp_path: Path) -> None:
     output.write_bytes(b"somebody's letter")
-    with pytest.raises(CohortError, match="no table of results"), Results(output, TASK):
-        pass
+    refused(output, "no table of results")
     pq.write_table(pa.table({"a": [1]}), output)
-    with pytest.raises(CohortError, match="no results of a cohort"), Results(output, TASK):
-        pass
+    refused(output, "no results of a cohort")
     assert pq.read_table(output).num_rows == 1
-    with pytest.raises(CohortError, match="a folder"), Results(tmp_path, TASK):
-        pass
+    refused(tmp_path, "a folder")
     assert [path.name for path in tmp_path.iterdir()] == [output.name]
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(CohortError, match="can be written"), Results(tmp_path / "file" / "x.parquet", TASK):
-        pass
+    refused(tmp_path / "file" / "x.parquet", "can be written")
 
 
 def test_damaged_parts_are_one_line(output: Path) -> None:
@@ -187,21 +170,16 @@ def test_damaged_parts_are_one_line(output: Path) -> None:
         results.add(made("a"))
     part = next(results.folder.glob("*.parquet"))
     part.write_bytes(part.read_bytes()[:-20])
-    with pytest.raises(CohortError, match="cannot be read"), Results(output, TASK):
-        pass
+    refused(output, "cannot be read")
     (results.folder / "run.json").write_bytes(b"{")
-    with pytest.raises(CohortError, match="Remove the folder"), Results(output, TASK):
-        pass
+    refused(output, "Remove the folder")
 
 
 def test_many_rows_pass_in_groups(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "ROWS_A_PART", 7)
     monkeypatch.setattr(read_tables, "ROWS_A_GROUP", 10)
     monkeypatch.setattr(read_tables, "ROWS_AT_ONCE", 4)
-    with Results(output, TASK) as results:
-        for number in range(60):
-            results.add(made(str(number % 50), status="ok" if number % 3 else LEFT_OUT))
-        results.join()
+    run(output, *(made(str(number % 50), status="ok" if number % 3 else LEFT_OUT) for number in range(60)))
     assert told(output) == sorted({f"{number % 50} ok" for number in range(60) if number % 3})
     assert pq.read_metadata(output).num_row_groups > 2
 
