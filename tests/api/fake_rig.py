@@ -187,18 +187,18 @@ class FakeRig:
 
     async def _answer(self, request: Any, writer: asyncio.StreamWriter) -> m.Reply:
         try:
-            body = await getattr(self, f"_on_{request.kind}".replace("-", "_"))(request, writer)
-            return m.Reply(id=request.id, ok=True, body=body)
+            found = await getattr(self, f"_on_{request.kind}".replace("-", "_"))(request, writer)
+            found = self.status() if found is None else found
+            return m.Reply(id=request.id, ok=True, body=found if isinstance(found, dict) else found.model_dump())
         except m_refusal as error:
             code, title, detail = error.args
             return m.Reply(id=request.id, ok=False, problem=m.Problem(code=code, title=title, detail=detail))
 
-    async def _on_status(self, request: Any, writer: Any) -> dict[str, Any]:
-        return self.status().model_dump()
+    async def _on_status(self, request: Any, writer: Any) -> m.Status:
+        return self.status()
 
-    async def _on_subscribe(self, request: Any, writer: asyncio.StreamWriter) -> dict[str, Any]:
+    async def _on_subscribe(self, request: Any, writer: asyncio.StreamWriter) -> Any:
         self._writers[writer] = request.samples
-        return self.status().model_dump()
 
     def _widths(self, plan: m.TestPlan) -> tuple[list[float], list[dict[str, Any]]]:
         for segment in plan.segments or []:
@@ -214,23 +214,23 @@ class FakeRig:
         score.go_on(1e9)
         return score.widths, [{key: s[key] for key in ("name", "start_s", "end_s")} for s in score.segments]
 
-    async def _on_preview(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_preview(self, request: Any, writer: Any) -> Any:
         widths, segments = self._widths(request.plan)
         charge = sum(widths) * request.plan.profile.current_ma / 1000
         return m.Preview(
             duration_s=len(widths) / PULSE_RATE_HZ, charge_uc=charge, torque_time_nms=None, pulse_width_us=widths,
             segments=segments,
-        ).model_dump()  # fmt: skip
+        )  # fmt: skip
 
-    async def _on_sequences(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_sequences(self, request: Any, writer: Any) -> Any:
         rest = m.SequenceInfo(
             id="rest", description="No pulses.",
             settings={"type": "object", "properties": {"duration_s": {"type": "number", "maximum": 600}}},
         )  # fmt: skip
         default = [m.SegmentPlan(name="rest", sequence="rest", settings={"duration_s": 1.0})]
-        return m.Sequences(sequences=[rest], default=default).model_dump()
+        return m.Sequences(sequences=[rest], default=default)
 
-    async def _on_start(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_start(self, request: Any, writer: Any) -> Any:
         if self.state == "running":
             raise m_refusal("busy", "A test is running", "Wait or stop it.")
         if self.state != "ready":
@@ -243,7 +243,6 @@ class FakeRig:
         self.plan, self.state, self.reason, self.key = request.plan, "running", "", request.key
         self._stop.clear()
         self._play = asyncio.create_task(self._run(request.plan))
-        return self.status().model_dump()
 
     def _running(self, request: Any) -> FakeScore:
         if self.score is None or self.plan is None or self.plan.test_id != request.test_id:
@@ -252,7 +251,7 @@ class FakeRig:
             raise m_refusal("bad-plan", "Not adaptive", f"test {request.test_id} has a fixed plan")
         return self.score
 
-    async def _on_extend(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_extend(self, request: Any, writer: Any) -> Any:
         score = self._running(request)
         if request.key != self.key:
             raise m_refusal("bad-plan", "Wrong key", "extend.key: not the key")
@@ -260,13 +259,13 @@ class FakeRig:
             raise m_refusal(code, "Not laid", f"extend: {code}")
         return score.told(request.test_id)
 
-    async def _on_enough(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_enough(self, request: Any, writer: Any) -> Any:
         score = self._running(request)
         if not score.ended_by:
             score.end("enough", self.elapsed_s if request.at_once else None)
         return score.told(request.test_id)
 
-    async def _on_calibrate_start(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_calibrate_start(self, request: Any, writer: Any) -> Any:
         if self.state != "ready":
             raise m_refusal("busy" if self.state == "running" else self.state, "Not now", f"the rig is {self.state}")
         self.state, self.asked = "calibrating", request
@@ -276,9 +275,8 @@ class FakeRig:
             max_torque_nm=request.max_torque_nm, pulse_width_us=0.0, ceiling_us=45.0, ceiling_owner="hard limit",
             missing=["sensory", "motor", "comfort"],
         )  # fmt: skip
-        return self.status().model_dump()
 
-    async def _on_calibrate_step(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_calibrate_step(self, request: Any, writer: Any) -> Any:
         known = self.calibration
         assert known is not None
         steps = {"up": 1, "fine": 0.5, "down": -1, "repeat": 0}
@@ -289,9 +287,8 @@ class FakeRig:
             raise m_refusal("refused", "Above a limit", f"{width_us:g} µs is above the hard limit of 45 µs by 5 µs")
         train = m.CalibrationTrain(number=len(known.trains) + 1, pulse_width_us=width_us, pulses=40, torque_rise_nm=0.1)
         self.calibration = known.model_copy(update={"pulse_width_us": width_us, "trains": [*known.trains, train]})
-        return self.status().model_dump()
 
-    async def _on_calibrate_mark(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_calibrate_mark(self, request: Any, writer: Any) -> Any:
         known = self.calibration
         assert known is not None
         if not known.trains:
@@ -299,20 +296,19 @@ class FakeRig:
         marks = {**known.marks_us, request.threshold: known.pulse_width_us}
         missing = [name for name in known.missing if name not in marks]
         self.calibration = known.model_copy(update={"marks_us": marks, "missing": missing})
-        return self.status().model_dump()
 
-    async def _on_calibrate_finish(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_calibrate_finish(self, request: Any, writer: Any) -> Any:
         known, kept = self.calibration, self.calibrated
         if kept is not None and request.calibration_id == kept.calibration_id:
             if request.discard:
                 self.calibrated = None
-            return (m.CalibrationResult() if request.discard else kept.result).model_dump()
+            return m.CalibrationResult() if request.discard else kept.result
         assert known is not None
         if known.missing and not request.discard:
             raise m_refusal("bad-plan", "Not marked yet", f"not marked yet: {', '.join(known.missing)}")
         self.state, self.calibration = "ready", None
         if request.discard:
-            return m.CalibrationResult().model_dump()
+            return m.CalibrationResult()
         marks = known.marks_us
         profile = m.Profile(
             current_ma=known.current_ma, max_pulse_width_us=marks["comfort"], max_torque_nm=known.max_torque_nm,
@@ -323,27 +319,25 @@ class FakeRig:
         self.calibrated = m.Calibrated(
             calibration_id=known.calibration_id, participant=known.participant, by=known.by, result=result
         )
-        return result.model_dump()
+        return result
 
-    async def _on_calibrate_stored(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_calibrate_stored(self, request: Any, writer: Any) -> Any:
         self.calibrated = None
-        return self.status().model_dump()
 
-    async def _on_withdraw(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_withdraw(self, request: Any, writer: Any) -> Any:
         self.withdrawn.append(request)
         plays = self.state == "running" and self.plan is not None and self.plan.test_id == request.test_id
         if plays and request.begun:
             self._stop.set()
         return {"withdrawn": plays and request.begun}
 
-    async def _on_angle_pose(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_angle_pose(self, request: Any, writer: Any) -> Any:
         if self.state != "ready":
             raise m_refusal("busy", "Not now", f"the rig is {self.state}")
         if why := self.arm.pose(request.angle_rad, request.by, time.monotonic(), request.first):
             raise m_refusal("bad-plan", "Not taken", why)
-        return self.status().model_dump()
 
-    async def _on_stop(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_stop(self, request: Any, writer: Any) -> Any:
         self.stopped_by = request.by
         self.stops += 1
         self._stop.set()
@@ -351,11 +345,9 @@ class FakeRig:
             self.state, self.reason = "latched", f"stopped by {request.by}"
             self._send(m.StateEvent(status=self.status()))
         words = "No pulse since the stop command." if self.confirms_stop else "No ack."
-        return m.StopEvidence(
-            confirmed=self.confirms_stop, detail=words, last_pulse_age_s=0.06, device_state="stopped"
-        ).model_dump()
+        return m.StopEvidence(confirmed=self.confirms_stop, detail=words, last_pulse_age_s=0.06, device_state="stopped")
 
-    async def _on_rearm(self, request: Any, writer: Any) -> dict[str, Any]:
+    async def _on_rearm(self, request: Any, writer: Any) -> Any:
         if self.state == "running":  # as the rig does until its recording is sealed, also after a stop
             raise m_refusal("busy", "Not now", "a test is running; nothing to re-arm")
         if request.latch != self.latch:
@@ -367,7 +359,6 @@ class FakeRig:
                 "load cell: connected, but no torque arrives; check its cable and start frames",
             )
         self.become("ready")
-        return self.status().model_dump()
 
     def _send(self, event: Any) -> None:
         full = event.model_dump_json().encode() + b"\n"
