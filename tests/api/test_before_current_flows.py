@@ -13,6 +13,7 @@ import pytest
 
 from stimrig.api.people.auth import Principal
 from stimrig.api.sessions.questions import LIFE_S, MOST, Question, Questions
+from stimrig.api.store.tables import Participant
 from stimrig.rig import messages as m
 from tests.api.conftest import Service, SetClock, csrf, run_test, signed_in, wait_done
 from tests.api.test_forms import fields
@@ -162,11 +163,7 @@ def test_a_rig_that_asks_for_a_calibration_offers_that_first(
 
 def test_a_calibration_of_yesterday_starts_nothing(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
     calibrate(client)
-    with service.context.store.write() as session:
-        from stimrig.api.store.tables import Participant
-
-        row = session.get(Participant, "P017")
-        row.profile = {**row.profile, "expires_at_utc": "2026-01-02T00:00:00Z"}
+    service.change(Participant, "P017", profile=lambda old: old | {"expires_at_utc": "2026-01-02T00:00:00Z"})
     assert "Calibrate first" in tab.get(PAGE).text and "expired" in tab.get(PAGE).text
     assert tab.post(f"{PAGE}/tests", data=fields(tab)).status_code == 409
 

@@ -15,6 +15,7 @@ import pytest
 from stimrig.api.store.holds import LIMITS_TURN
 from tests.api.conftest import Service, csrf, signed_in, soon, wait_done
 from tests.api.test_problems import problem
+from tests.api.test_profiles import mark_all
 
 WHERE = "/v1/participants/P017/calibration"
 
@@ -129,9 +130,7 @@ def test_lowered_limits_end_an_open_calibration_and_stay(
         assert up(client).status_code == 409, asked
         client.post(f"{WHERE}/finish", json={"discard": True})
     client.post(WHERE, json={"current_ma": 19})
-    for threshold in ("sensory", "motor", "comfort"):
-        assert up(client).status_code == 202
-        client.post(f"{WHERE}/mark", json={"threshold": threshold})
+    mark_all(client)
     lowered = client.put(PROFILE, json=LOWER)
     assert lowered.status_code == 200 and "sends no further train" in lowered.json()["meanwhile"]
     assert service.rig.calibration is not None

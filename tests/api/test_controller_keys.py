@@ -13,7 +13,6 @@ import httpx
 import pytest
 from sqlalchemy import select
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import AuditEntry, Test, Token
@@ -158,8 +157,7 @@ def test_a_trial_is_played_with_the_plans_limits_and_watched(shared: Service, ke
     begun = key.post("/v1/tests", json=TRIAL)
     assert begun.status_code == 202, begun.text
     test_id = begun.json()["id"]
-    url = shared.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
-    with connect(url, additional_headers={"Authorization": key.headers["authorization"]}) as socket:
+    with shared.live(test_id, None, Authorization=key.headers["authorization"]) as socket:
         kinds = {json.loads(message)["type"] for message in socket}
     assert {"history", "test"} <= kinds
     test = wait_done(key, test_id)
@@ -227,8 +225,7 @@ def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(
     row = context.store.get(Token, digest(text))
     assert row.expires_utc == context.clock.end_of_day_utc() and row.participant == "P1"
     with shared.client(text) as key:
-        with context.store.write() as session:
-            session.get(Token, digest(text)).expires_utc = context.clock.utc()
+        shared.change(Token, digest(text), expires_utc=context.clock.utc())
         assert key.get("/v1/participants/P1/model").status_code == 401
         assert key.post("/v1/stop").status_code == 200
     text = made(admin)
@@ -251,8 +248,7 @@ def test_it_ends_with_its_day_and_where_it_is_revoked_and_still_stops(
 def test_a_live_channel_is_its_own_participants(shared: Service, admin: httpx.Client, done: dict[str, Any]) -> None:
     text = made(admin)
     for test_id in (done["P2"]["id"], "nothing"):
-        url = shared.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
-        with connect(url, additional_headers={"Authorization": f"Bearer {text}"}) as socket:
+        with shared.live(test_id, text) as socket:
             said = json.loads(socket.recv())
             assert said["problem"]["type"] == "/problems/outside-key"
             with pytest.raises(ConnectionClosed):
@@ -264,11 +260,10 @@ def test_a_live_channel_tells_a_key_nothing_of_another_participants_test(
 ) -> None:
     """While its own test is identified, the rig may play another one."""
     context, own = shared.context, done["P1"]["id"]
-    put(context, own, "identifying")
+    shared.change(Test, own, state="identifying")
     said = []
     try:
-        url = shared.url.replace("http", "ws") + f"/v1/tests/{own}/live"
-        with connect(url, additional_headers={"Authorization": key.headers["authorization"]}) as socket:
+        with shared.live(own, None, Authorization=key.headers["authorization"]) as socket:
             assert json.loads(socket.recv())["type"] == "test"
             other = run_test(admin, "P2")
             context.runner.hub.send({"type": "state", "rig": {"test_id": own, "state": "sealing"}})
@@ -276,14 +271,9 @@ def test_a_live_channel_tells_a_key_nothing_of_another_participants_test(
             while not said or json.loads(said[-1])["type"] != "link":
                 said.append(str(socket.recv()))
     finally:
-        put(context, own, "completed")
+        shared.change(Test, own, state="completed")
     assert not [message for message in said if "P2" in message or other["id"] in message]
     assert [json.loads(message)["type"] for message in said] == ["state", "link"]
-
-
-def put(context: Any, test_id: str, state: str) -> None:
-    with context.store.write() as session:
-        session.get(Test, test_id).state = state
 
 
 def test_a_stopped_rig_tells_a_key_nothing_of_another_participant(
@@ -373,8 +363,7 @@ def test_it_falls_with_the_token_of_its_maker_and_still_stops(
         if how == "revoked":
             assert admin.delete(f"/v1/tokens/{digest(text)[:16]}").status_code == 204
         else:
-            with context.store.write() as session:
-                session.get(Token, digest(text)).expires_utc = context.clock.utc()
+            shared.change(Token, digest(text), expires_utc=context.clock.utc())
         for answer in (key.get("/v1/participants/P1/model"), key.post("/v1/tests", json=TRIAL)):
             assert answer.status_code == 401 and "Who made this key" in answer.text
         assert key.post("/v1/stop").status_code == 200

@@ -38,13 +38,11 @@ DAMAGE = {
 
 
 def damage(service: Service, model_id: str, how: str, sound: bytes | None = None) -> None:
-    context = service.context
-    with context.store.write() as session:
-        row = session.get(Model, model_id)
-        spoilt = DAMAGE[how](sound or row.document)
-        assert spoilt != row.document
-        row.document = spoilt
-    context.versions._served.clear()
+    was = service.context.store.get(Model, model_id).document
+    spoilt = DAMAGE[how](sound or was)
+    assert spoilt != was
+    service.change(Model, model_id, document=spoilt)
+    service.context.versions._served.clear()
 
 
 def test_a_test_is_previewed_and_started_without_the_estimate(

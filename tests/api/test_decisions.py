@@ -20,6 +20,7 @@ from stimrig.api.web import pages, routes
 from stimrig.api.web.app import routers
 from tests.api.conftest import HTML, Service, run_test, shared_service, soon
 from tests.api.fake_arm import still
+from tests.api.test_profiles import mark_all
 
 ROOT = Path(__file__).parents[2]
 TABLE = tomllib.loads((ROOT / "docs" / "safety" / "decisions.toml").read_text("utf-8"))
@@ -99,10 +100,8 @@ class World:
         assert self.me.post(f"/v1/participants/{self.code}/calibration/step", json={"direction": "up"}).is_success
 
     def marked(self) -> None:
-        self.calibration()
-        for threshold in ("sensory", "motor", "comfort"):
-            answer = self.me.post(f"/v1/participants/{self.code}/calibration/mark", json={"threshold": threshold})
-            assert answer.is_success, answer.text
+        assert self.me.post(f"/v1/participants/{self.code}/calibration", json={}).is_success
+        mark_all(self.me, self.code)
 
     def lower(self) -> httpx.Response:
         return self.colleague.put(f"/v1/participants/{self.code}/profile", json={"current_ma": 9.0})

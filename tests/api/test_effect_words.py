@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-import time
 
 import httpx
-from websockets.sync.client import connect
 
 from stimrig.api import language
 from stimrig.api.effect_words import effects_words, library, parameter_words
 from stimrig.api.language import translated
 from stimrig.api.models import changes, explanation, stored_model
 from stimrig.identify import effects
-from tests.api.conftest import TOKEN, Service, run_test, shared_service, signed_in
+from tests.api.conftest import Service, run_test, shared_service, signed_in, soon
 
 PLAIN = {
     "sample_rate_hz": 40.0,
@@ -101,9 +99,7 @@ def test_a_page_that_waits_reads_its_own_language(service: Service) -> None:
         http.post("/v1/participants", json={"code": "G1"})
         model = run_test(http, "G1")["model_id"]
         job = http.get(f"/v1/models/{model}/diagnosis", params={"wait": False}).json()["id"]
-        end = time.monotonic() + 30
-        while not (now := browser.get(f"/jobs/now/{job}", headers=GERMAN).json())["text"]:
-            assert time.monotonic() < end
+        now = soon(lambda: (told := browser.get(f"/jobs/now/{job}", headers=GERMAN).json())["text"] and told)
         assert now == {"progress": 0.4, "text": "geprüft: Ermüdung", "time_left_s": now["time_left_s"], "done": False}
         assert http.get(f"/v1/jobs/{job}", headers=GERMAN).json()["text"] == "tried fatigue", "REST speaks English"
         slow.unlink()
@@ -118,8 +114,7 @@ def test_the_live_page_hears_its_own_language(service: Service, client: httpx.Cl
     client.post(f"/v1/models/{added.json()['id']}/approve", json={"reason": "follows the measurement well"})
     carrying.touch()
     test = client.post("/v1/tests", json={"participant": "G2"}).json()["id"]
-    address = service.url.replace("http", "ws") + f"/v1/tests/{test}/live"
-    with connect(address, additional_headers={"Authorization": f"Bearer {TOKEN}", **GERMAN}) as socket:
+    with service.live(test, **GERMAN) as socket:
         heard = {}
         for message in map(json.loads, socket):
             if message["type"] == "test":

@@ -8,9 +8,8 @@ from typing import Any
 
 import httpx
 import pytest
-from websockets.sync.client import connect
 
-from tests.api.conftest import TOKEN, Service, own_service, run_test, soon, wait_done
+from tests.api.conftest import Service, own_service, run_test, soon, wait_done
 from tests.api.fake_arm import back_and_forth, still
 from tests.api.test_controller_keys import made
 
@@ -133,9 +132,8 @@ def test_while_it_runs_it_says_angle_and_what_is_missing(service: Service, clien
     service.rig.arm.way = back_and_forth(RANGE[0] + 0.01, RANGE[1] - 0.01, (0.4,))  # never fast
     service.rig.speed = 4.0
     begun = begin(client, ready, "passive", max_duration_s=20)
-    address = f"{service.url.replace('http', 'ws')}/v1/tests/{begun.json()['id']}/live"
     kinds, joint, lives = set(), {}, []
-    with connect(address, additional_headers={"Authorization": f"Bearer {TOKEN}"}) as socket:
+    with service.live(begun.json()["id"]) as socket:
         for line in socket:
             message = json.loads(line)
             kinds.add(message["type"])

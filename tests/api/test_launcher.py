@@ -17,7 +17,7 @@ from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.launcher import Services
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
-from tests.api.conftest import TOKEN, soon
+from tests.api.conftest import TOKEN, soon, wait_done
 from tests.harness.looks_first import LooksFirst
 
 pytestmark = pytest.mark.wire
@@ -69,10 +69,7 @@ def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path)
         services.rig.process.wait()
         soon(lambda: not http.get("/v1/rig").json()["connected"], 5.0)
         assert any("rig had ended" in event for event in services.watch())
-        end = time.monotonic() + 60
-        while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
-            assert time.monotonic() < end, document
-            time.sleep(0.1)
+        document = wait_done(http, test_id, 60)
         assert document["state"] == "fault"
         assert document["recording_id"], "the journal of the killed rig was sealed and adopted"
         rig = http.get("/v1/rig").json()
@@ -91,10 +88,7 @@ def test_killed_service_comes_back_at_the_same_place_with_everything(tmp_path: P
         services.api.process.kill()
         services.api.process.wait()
         assert any("api had ended" in event for event in services.watch())
-        end = time.monotonic() + 800
-        while not (document := http.get(f"/v1/tests/{test_id}").json())["done"]:
-            assert time.monotonic() < end, document
-            time.sleep(0.1)
+        document = wait_done(http, test_id, 800)
         assert document["state"] == "completed", document["reason"]
         assert document["model_id"]
 

@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import pytest
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import ClientConnection
 
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import PageSession, Token
@@ -34,15 +34,15 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 
 
 @pytest.fixture(scope="module")
-def test_id(client: httpx.Client) -> str:
+def test_id(service: Service) -> str:
     """A test that outlasts this module."""
-    return client.post("/v1/tests", json={"participant": "P017"}).json()["id"]
+    with service.client() as admin:
+        return admin.post("/v1/tests", json={"participant": "P017"}).json()["id"]
 
 
 @contextmanager
 def watching(service: Service, test_id: str, headers: dict[str, str]) -> Iterator[ClientConnection]:
-    url = service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
-    with connect(url, additional_headers=headers, open_timeout=60) as socket:
+    with service.live(test_id, None, **headers) as socket:
         assert json.loads(socket.recv(20))["type"] == "history"
         yield socket
 
@@ -92,8 +92,7 @@ def removed(_http: httpx.Client, service: Service) -> None:
 
 
 def run_out(http: httpx.Client, service: Service) -> None:
-    with service.context.store.write() as session:
-        session.get(PageSession, digest(next(iter(http.cookies.values())))).expires_unix_s = 1.0
+    service.change(PageSession, digest(next(iter(http.cookies.values()))), expires_unix_s=1.0)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +119,6 @@ def test_it_closes_with_its_session_and_with_no_other(
 @pytest.mark.parametrize("how", ["revoked", "expired", "scope"])
 def test_it_closes_with_its_token_and_with_no_other(service: Service, test_id: str, how: str) -> None:
     text, other = service.token("bench", "read-live"), service.token("bench", "read-live")
-    context = service.context
     with (
         watching(service, test_id, {"Authorization": f"Bearer {text}"}) as socket,
         watching(service, test_id, {"Authorization": f"Bearer {other}"}) as others,
@@ -129,12 +127,8 @@ def test_it_closes_with_its_token_and_with_no_other(service: Service, test_id: s
             with service.client() as admin:
                 assert admin.delete(f"/v1/tokens/{digest(text)[:16]}").status_code == 204
         else:
-            with context.store.write() as session:
-                row = session.get(Token, digest(text))
-                if how == "expired":
-                    row.expires_utc = "2020-01-01T00:00:00Z"
-                else:
-                    row.scopes = ["read-model"]
+            changed = {"expires_utc": "2020-01-01T00:00:00Z"} if how == "expired" else {"scopes": ["read-model"]}
+            service.change(Token, digest(text), **changed)
         said = last(socket)
         assert said["problem"]["status"] == (403 if how == "scope" else 401)
         goes_on(others)

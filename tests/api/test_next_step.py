@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from stimrig.api.store.tables import Model, Test
 from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.next_view import Situation, Today, next_step
 from tests.api.conftest import Service, csrf, run_test, signed_in, wait_done
@@ -111,29 +112,20 @@ def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service,
 
 
 def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Service, participant: str) -> None:
-    from stimrig.api.store.tables import Model, Test
-
     document = run_test(client, participant)
-    with service.context.store.write() as session:
-        session.get(Model, document["model_id"]).created_utc = "2026-01-02T10:00:00.000Z"
-        session.get(Test, document["id"]).requested_utc = "2026-01-02T09:00:00.000Z"
+    service.change(Model, document["model_id"], created_utc="2026-01-02T10:00:00.000Z")
+    service.change(Test, document["id"], requested_utc="2026-01-02T09:00:00.000Z")
     assert shown(service)[0] == "calibrate may"
 
 
 def test_of_two_versions_of_a_test_the_offered_one_is_next(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    from stimrig.api.store.tables import Model
-
     plain = run_test(client, participant)["model_id"]
     carried = client.post(f"/v1/models/{plain}/effects", json={"effects": ["fatigue"]}).json()["id"]
     for offered, expected in (("plain", plain), ("carried", carried)):
-        with service.context.store.write() as session:
-            row = session.get(Model, carried)
-            row.carried_from_id, row.carried = (
-                plain,
-                {"offered": offered, "why": "plain-before", "from_model_id": plain},
-            )
+        told = {"offered": offered, "why": "plain-before", "from_model_id": plain}
+        service.change(Model, carried, carried_from_id=plain, carried=told)
         assert shown(service)[0] == f"look {expected}"
 
 

@@ -17,6 +17,7 @@ from sqlalchemy.exc import OperationalError
 from stimrig.api.sessions import playing, runner
 from stimrig.api.web.routes import calibration
 from tests.api.conftest import Service, run_test, soon
+from tests.api.test_profiles import mark_all
 
 
 class Held:
@@ -283,9 +284,7 @@ def test_a_calibration_that_could_not_be_stored_is_stored_by_finishing_again(
 ) -> None:
     at = f"/v1/participants/{participant}/calibration"
     client.post(at, json={})
-    client.post(f"{at}/step", json={"direction": "up"})
-    for threshold in ("sensory", "motor", "comfort"):
-        assert client.post(f"{at}/mark", json={"threshold": threshold}).is_success
+    mark_all(client)
     store = calibration._store
 
     def busy(*_arguments: Any) -> Any:

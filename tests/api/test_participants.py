@@ -90,10 +90,8 @@ def test_what_is_no_side_or_muscle_is_refused(http: httpx.Client, body: dict[str
 def test_thresholds_of_one_arm_do_not_hold_for_the_other(service: Service, http: httpx.Client) -> None:
     make(http, "M2")
     http.put("/v1/participants/M2/muscle", json={"side": "left"})
-    store = service.context.store
-    with store.write() as session:
-        row = session.get(Participant, "M2")
-        row.profile = {**row.profile, "motor_pulse_width_us": 80.0, "set_at_utc": "2026-03-01T10:00:00.000Z"}
+    found = {"motor_pulse_width_us": 80.0, "set_at_utc": "2026-03-01T10:00:00.000Z"}
+    service.change(Participant, "M2", profile=lambda old: old | found)
     refused = http.put("/v1/participants/M2/muscle", json={"side": "right"})
     assert refused.status_code == 409 and "left" in refused.json()["detail"]
     assert http.get("/v1/participants/M2").json()["side"] == "left"

@@ -321,8 +321,7 @@ def test_stop_by_plain_form_works_without_csrf_and_after_the_session_ran_out(
     service.rig.speed = 0.5
     with service.client() as client:
         client.post("/v1/tests", json={"participant": participant})
-    with service.context.store.write() as session:
-        session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
+    service.sql("UPDATE page_sessions SET expires_unix_s = 0")
     assert pages.get("/v1/rig").status_code in (303, 401)
     page = pages.post("/v1/stop", data={"reason": "stop pressed on the page"}, follow_redirects=True)
     assert page.status_code == 200

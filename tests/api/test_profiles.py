@@ -13,6 +13,7 @@ import pytest
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.requests import ProfileIn, TestIn, limits_of
+from stimrig.api.store.tables import Participant
 from tests.api.conftest import Service, wait_done
 from tests.api.test_problems import problem
 
@@ -31,12 +32,18 @@ def limits(client: httpx.Client) -> dict[str, Any]:
     return {name: profile[name] for name in profiles.LIMITS}
 
 
+def mark_all(client: httpx.Client, code: str = "P017") -> None:
+    """The three thresholds of the open calibration, a step each."""
+    for threshold in ("sensory", "motor", "comfort"):
+        for what, body in (("step", {"direction": "up"}), ("mark", {"threshold": threshold})):
+            answer = client.post(f"/v1/participants/{code}/calibration/{what}", json=body)
+            assert answer.is_success, answer.text
+
+
 def calibrate(client: httpx.Client, **asked: Any) -> dict[str, Any]:
     """Sensory at 10 µs, motor at 20, comfort at 30."""
     assert client.post(f"{P}/calibration", json=asked).status_code == 201
-    for threshold in ("sensory", "motor", "comfort"):
-        client.post(f"{P}/calibration/step", json={"direction": "up"})
-        client.post(f"{P}/calibration/mark", json={"threshold": threshold})
+    mark_all(client)
     return client.post(f"{P}/calibration/finish").json()["profile"]
 
 
@@ -183,12 +190,7 @@ def test_a_calibration_takes_the_participants_own_limits(
     client: httpx.Client, service: Service, tight: dict[str, float]
 ) -> None:
     """Not 20 mA and 30 N·m because nothing was said; and what it doesn't look for is kept."""
-    context = service.context
-    with context.store.write() as session:
-        from stimrig.api.store.tables import Participant
-
-        row = session.get(Participant, "P017")
-        row.profile = {**row.profile, "rest_between_tests_s": 60.0}
+    service.change(Participant, "P017", profile=lambda old: old | {"rest_between_tests_s": 60.0})
     found = calibrate(client)
     assert (found["current_ma"], found["max_torque_nm"], found["rest_between_tests_s"]) == (12, 20, 60)
     assert client.get(P).json()["profile"] == found

@@ -8,11 +8,10 @@ from typing import Any
 
 import httpx
 import pytest
-from websockets.sync.client import connect
 
 from stimrig.api.errors import ApiError
 from stimrig.api.store import Store, database
-from tests.api.conftest import DURABLE, TOKEN, Service, run_test, soon, wait_done
+from tests.api.conftest import DURABLE, Service, run_test, soon, wait_done
 
 
 def test_whole_path_to_the_controller(client: httpx.Client, service: Service, participant: str) -> None:
@@ -79,8 +78,7 @@ def test_live_channel_tells_history_frames_and_the_end(
     service.rig.speed = 1.0
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] >= 0.5, 20)
-    url = service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live"
-    with connect(url, additional_headers={"Authorization": f"Bearer {TOKEN}"}, open_timeout=60) as socket:
+    with service.live(test_id) as socket:
         messages = []
         for text in socket:
             messages.append(json.loads(text))
@@ -98,7 +96,7 @@ def test_live_channel_tells_history_frames_and_the_end(
 
 def test_live_channel_wants_a_token(client: httpx.Client, service: Service, participant: str) -> None:
     test_id = run_test(client, participant)["id"]
-    with connect(service.url.replace("http", "ws") + f"/v1/tests/{test_id}/live", open_timeout=60) as socket:
+    with service.live(test_id, None) as socket:
         message = json.loads(socket.recv())
     assert message["type"] == "problem" and message["problem"]["status"] == 401
 

@@ -68,8 +68,7 @@ def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) ->
 
 
 def run_out(_browser: httpx.Client, _client: httpx.Client, service: Service) -> None:
-    with service.context.store.write() as session:
-        session.connection().exec_driver_sql("UPDATE page_sessions SET expires_unix_s = 0")
+    service.sql("UPDATE page_sessions SET expires_unix_s = 0")
 
 
 def new_password(_browser: httpx.Client, client: httpx.Client, _service: Service) -> None:

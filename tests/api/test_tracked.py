@@ -282,9 +282,7 @@ def test_rates_are_learnt_from_the_same_place(service: Service, client: httpx.Cl
 
 
 def test_a_damaged_model_is_not_followed(service: Service, client: httpx.Client, approved: str) -> None:
-    with service.context.store.write() as session:
-        row = session.get(Model, approved)
-        row.document = row.document.replace(b"1", b"2", 1)
+    service.change(Model, approved, document=lambda old: old.replace(b"1", b"2", 1))
     play(client)
     (row,) = soon(lambda: service.context.tracked.rows(1))
     assert row.outcome == "not-followed" and "no longer what was stored" in row.reason

@@ -24,6 +24,7 @@ from tests.api.conftest import HTML, Service, csrf, run_test, signed_in, soon
 from tests.api.fake_arm import still
 from tests.api.test_forms import fields
 from tests.api.test_overtaken import TRIAL, key_of
+from tests.api.test_profiles import mark_all
 
 QUIET: Any = None
 """A client that says no version by itself."""
@@ -127,9 +128,7 @@ def test_a_page_of_another_day_offers_nothing(pages: httpx.Client, client: httpx
 def test_a_waiting_result_is_let_go_by_who_saw_it(service: Service, client: httpx.Client, participant: str) -> None:
     at = f"{HOME}/calibration"
     client.post(at, json={})
-    client.post(f"{at}/step", json={"direction": "up"})
-    for threshold in ("sensory", "motor", "comfort"):
-        client.post(f"{at}/mark", json={"threshold": threshold})
+    mark_all(client)
     found = client.get(at).json()
     service.rig.calibrated = finished(service)
     missing = client.get(at)
