@@ -69,12 +69,6 @@ def test_fit_reports_and_writes_a_model(capsys: pytest.CaptureFixture[str], reco
     assert json.loads(model.read_text())["recruitment"]["pulse_width_us"]
 
 
-def test_fit_json_is_one_object_and_nothing_else(capsys: pytest.CaptureFixture[str], record: Path) -> None:
-    code, out, err = run(capsys, "fit", str(record), "--json")
-    assert code == 0 and err == "" and out.count("\n") == 1
-    assert json.loads(out)["linear"]["b"]
-
-
 def test_predict_writes_the_three_columns(
     capsys: pytest.CaptureFixture[str], record: Path, model: Path, tmp_path: Path
 ) -> None:
@@ -262,11 +256,6 @@ def test_every_verb_of_the_contract_is_there_and_helps() -> None:
     done = subprocess.run([sys.executable, "-m", "stimrig", "--help"], capture_output=True, text=True, check=True)
     for verb in ("serve", "emulate", "test", "fit", "predict", "compare", "diagnose", "improve", "effects", "table1"):
         assert f"\n  {verb}" in done.stdout
-
-
-def test_bad_input_as_a_process() -> None:
-    done = subprocess.run([sys.executable, "-m", "stimrig", "fit", "nowhere.csv"], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
 
 
 def test_emulate_hands_everything_on() -> None:

@@ -8,13 +8,14 @@ import signal
 import subprocess
 import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.harness.c_program import compiled
+from tests.harness.http_double import answering
 
 CODE, ODD_CODE = "P017", "P 1/../P2?x"
 PLANNED = {"pulse_rate_hz": 50.0, "segments": [{"name": "trial"}], "unreachable": []}
@@ -36,31 +37,17 @@ class Service:
             "GET /R1": (200, "file"),
             "POST /stop": (200, {"stopped": True}),
         }
-        outer = self
+        self.url = ""
 
-        class Handler(BaseHTTPRequestHandler):
-            def answer(self) -> None:
-                size = int(self.headers.get("content-length") or 0)
-                body = json.loads(self.rfile.read(size) or "null")
-                outer.heard.append((f"{self.command} {self.path}", body))
-                status, document = outer.answers[f"{self.command} /{self.path.rsplit('/', 1)[1]}"]
-                if self.path.endswith("/T1"):
-                    outer.polled.set()
-                if not status:
-                    self.close_connection = True
-                    return
-                text = json.dumps(document).encode()
-                self.send_response(status)
-                self.send_header("content-length", str(len(text)))
-                self.end_headers()
-                self.wfile.write(text)
-
-            do_GET = do_POST = answer  # noqa: N815
-
-            def log_message(self, *_: Any) -> None: ...
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        path = request.url.raw_path.decode()
+        self.heard.append((f"{request.method} {path}", json.loads(request.read() or "null")))
+        if path.endswith("/T1"):
+            self.polled.set()
+        status, document = self.answers[f"{request.method} /{path.rsplit('/', 1)[1]}"]
+        if not status:
+            raise httpx.ReadError("closed")
+        return httpx.Response(status, json=document)
 
     @property
     def stops(self) -> int:
@@ -75,14 +62,12 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def service() -> Iterator[Service]:
     found = Service()
-    yield found
-    found.server.shutdown()
-    found.server.server_close()
+    with answering(found) as found.url:
+        yield found
 
 
 def begun(program: Path, service: Service, folder: Path, code: str = CODE) -> subprocess.Popen[str]:
-    url = f"http://127.0.0.1:{service.server.server_port}"
-    words = [str(program), url, code, str(folder / "trial.h5")]
+    words = [str(program), service.url, code, str(folder / "trial.h5")]
     return subprocess.Popen(words, env={**os.environ, "STIMRIG_TOKEN": "key"}, stderr=subprocess.PIPE, text=True)
 
 

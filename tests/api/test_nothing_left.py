@@ -174,7 +174,11 @@ def test_nothing_is_left_whenever_it_is_told_to_end(tmp_path: Path) -> None:
 def test_a_running_test_is_sealed_although_the_launcher_is_killed(tmp_path: Path) -> None:
     """It says nothing to the rig any more: the kernel does."""
     served = Started(tmp_path, "served", "-m", "stimrig", *SERVE, "--data", str(tmp_path / "served"))
-    with httpx.Client(base_url=served.url(), auth=LooksFirst(TOKEN), timeout=LIMIT_S) as http:
+    url, said = served.url(), served.process.stdout
+    assert said is not None and said.readline()
+    control = said.readline().partition("the emulator's control line: ")[2].strip()
+    assert Path(control).is_socket()
+    with httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=LIMIT_S) as http:
         http.post("/v1/participants", json={"code": "P1"})
         http.post("/v1/tests", json={"participant": "P1"})
         while not (found := list(served.folder.glob("journals/*"))):

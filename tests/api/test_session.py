@@ -94,13 +94,6 @@ def test_live_channel_tells_history_frames_and_the_end(
     assert "identifying" in states
 
 
-def test_live_channel_wants_a_token(client: httpx.Client, service: Service, participant: str) -> None:
-    test_id = run_test(client, participant)["id"]
-    with service.live(test_id, None) as socket:
-        message = json.loads(socket.recv())
-    assert message["type"] == "problem" and message["problem"]["status"] == 401
-
-
 def test_recording_comes_back_byte_for_byte(client: httpx.Client, service: Service, participant: str) -> None:
     document = run_test(client, participant)
     answer = client.get(document["recording_url"])

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import pickle
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
+import httpx
 import pytest
 
 from stimrig.api.cohort.select import FIELDS, Selection
 from stimrig.api.cohort.sources import Bucket, Centre, Entry, Folder, Source, SourceError, sources_of
 from stimrig.api.cohort.tasks import CohortError
+from tests.harness.http_double import answering
 
 MOST = 1000
 
@@ -166,67 +164,57 @@ def test_a_bucket_that_is_not_there_is_refused_in_one_line(bucket: Any) -> None:
 # ---- a centre
 
 
-class CentreDouble(BaseHTTPRequestHandler):
+CONTENTS = (b"one", b"two", b"three", b"four", b"five")
+
+
+class CentreDouble:
     """`GET /v1/recordings` in pages of two, and `GET /v1/recordings/{id}`, as a centre answers them."""
 
-    files: tuple[bytes, ...] = (b"one", b"two", b"three", b"four", b"five")
-    asked: list[dict[str, list[str]]]
+    def __init__(self) -> None:
+        self.asked: list[dict[str, str]] = []
+        self.url = ""
 
-    def do_GET(self) -> None:
-        url = urlsplit(self.path)
-        if self.headers["Authorization"] != "Bearer right":
-            self.answer(401, json.dumps({"type": "/problems/unauthorized", "title": "Not signed in", "status": 401}))
-        elif url.path == "/v1/recordings":
-            asked = parse_qs(url.query)
-            type(self).asked.append(asked)
-            begin = int(asked.get("after", ["0"])[0])
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        number = request.url.path.rpartition("/")[2]
+        if request.headers.get("Authorization") != "Bearer right":
+            return problem(401, "unauthorized", "Not signed in")
+        if number == "recordings":
+            self.asked.append(dict(request.url.params))
+            begin = int(request.url.params.get("after", 0))
             rows = [self.row(number) for number in range(begin, min(begin + 2, 5))]
             after = str(begin + 2) if begin + 2 < 5 else None
-            self.answer(200, json.dumps({"recordings": rows, "after": after}))
-        elif (number := url.path.rpartition("/")[2]).isdecimal() and int(number) < 4:
-            self.answer(200, self.files[int(number)])
-        else:
-            self.answer(404, json.dumps({"type": "/problems/not-found", "title": "No such recording", "status": 404}))
+            return httpx.Response(200, json={"recordings": rows, "after": after})
+        if number.isdecimal() and int(number) < 4:
+            return httpx.Response(200, content=CONTENTS[int(number)])
+        return problem(404, "not-found", "No such recording")
 
     def row(self, number: int) -> dict[str, Any]:
-        content = self.files[number]
         return {
             "id": number, "rig": "R1", "recording_id": f"rec-{number}", "participant": f"P{number}", "test_id": None,
             "origin": None, "created_utc": f"2026-01-0{number + 1}T10:00:00.000Z", "url": f"/v1/recordings/{number}",
-            "file": hashlib.sha256(content).hexdigest(), "file_bytes": len(content),
+            "file": hashlib.sha256(CONTENTS[number]).hexdigest(), "file_bytes": len(CONTENTS[number]),
         }  # fmt: skip
 
-    def answer(self, status: int, body: str | bytes) -> None:
-        body = body.encode() if isinstance(body, str) else body
-        self.send_response(status)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
 
-    def log_message(self, format: str, *args: object) -> None:
-        pass
+def problem(status: int, code: str, title: str) -> httpx.Response:
+    return httpx.Response(status, json={"type": f"/problems/{code}", "title": title, "status": status})
 
 
 @pytest.fixture
-def centre() -> Iterator[str]:
-    CentreDouble.asked = []
-    server = ThreadingHTTPServer(("127.0.0.1", 0), CentreDouble)
-    thread = Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}"
-    server.shutdown()
-    server.server_close()
-    thread.join()
+def centre() -> Iterator[CentreDouble]:
+    made = CentreDouble()
+    with answering(made) as made.url:
+        yield made
 
 
-def test_a_centre_is_read_page_by_page(centre: str) -> None:
-    source = Centre(centre, "right")
+def test_a_centre_is_read_page_by_page(centre: CentreDouble) -> None:
+    source = Centre(centre.url, "right")
     found = listed(source)
     assert [entry.name for entry in found] == [f"rec-{number}" for number in range(5)]
-    assert [asked.get("after") for asked in CentreDouble.asked] == [None, ["2"], ["4"]]
+    assert [asked.get("after") for asked in centre.asked] == [None, "2", "4"]
     assert found[1].known == {
-        "name": "rec-1", "origin": centre, "record_id": "rec-1", "participant": "P1", "rig": "R1", "day": "2026-01-02",
-        "begun_utc": "2026-01-02T10:00:00.000Z", "bytes": 3,
+        "name": "rec-1", "origin": centre.url, "record_id": "rec-1", "participant": "P1", "rig": "R1",
+        "day": "2026-01-02", "begun_utc": "2026-01-02T10:00:00.000Z", "bytes": 3,
     }  # fmt: skip
     assert found[1].sha256 == hashlib.sha256(b"two").hexdigest()
     assert source.open(found[1], MOST) == b"two"
@@ -235,14 +223,14 @@ def test_a_centre_is_read_page_by_page(centre: str) -> None:
         source.open(found[4], MOST)
 
 
-def test_a_centre_is_asked_for_what_the_selection_says(centre: str) -> None:
-    listed(Centre(centre, "right"), 'participant == "P1" and day >= "2026-01-02" and "x" in name')
-    assert CentreDouble.asked[0] == {"participant": ["P1"], "from": ["2026-01-02"]}
+def test_a_centre_is_asked_for_what_the_selection_says(centre: CentreDouble) -> None:
+    listed(Centre(centre.url, "right"), 'participant == "P1" and day >= "2026-01-02" and "x" in name')
+    assert centre.asked[0] == {"participant": "P1", "from": "2026-01-02"}
 
 
-def test_a_wrong_token_or_what_is_no_centre_is_one_line(centre: str) -> None:
-    assert "Not signed in" in refused(centre, token="wrong")
-    assert "Is it a centre?" in refused(f"{centre}/v1/recordings/1?", token="right")
+def test_a_wrong_token_or_what_is_no_centre_is_one_line(centre: CentreDouble) -> None:
+    assert "Not signed in" in refused(centre.url, token="wrong")
+    assert "Is it a centre?" in refused(f"{centre.url}/v1/recordings/1?", token="right")
 
 
 def test_a_token_is_not_shown() -> None:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import random
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-import httpx
 import pytest
 
 from stimrig.api.cli import launcher
@@ -29,49 +24,9 @@ from stimrig.api.store.tables import OutboxItem
 from tests.api.conftest import PATIENCE_S, STUB, run_service
 from tests.api.outbox.conftest import Rig, assert_told
 from tests.harness.fake_centre import KEY, BadLine, FakeCentre
+from tests.harness.http_double import answering
 
 ROOT = Path(__file__).parents[3]
-
-
-@contextlib.contextmanager
-def serving(line: BadLine) -> Iterator[str]:
-    """A centre on a real port."""
-    turn = threading.Lock()
-
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
-        def answer(self) -> None:
-            length = int(self.headers.get("Content-Length", 0))
-            body = self.rfile.read(length)
-            if len(body) < length:
-                return  # whoever sent it was killed
-            request = httpx.Request(self.command, f"http://centre{self.path}", headers=dict(self.headers), content=body)
-            try:
-                with turn:
-                    given = line(request)
-            except httpx.TransportError:
-                self.close_connection = True
-                return
-            self.send_response(given.status_code)
-            self.send_header("Content-Length", str(len(given.content)))
-            self.end_headers()
-            self.wfile.write(given.content)
-
-        do_GET = do_POST = do_PUT = answer  # noqa: N815
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
 
 
 def start(folder: Path, url: str) -> subprocess.Popen[bytes]:
@@ -94,7 +49,7 @@ def test_killed_at_random_it_loses_and_doubles_nothing(tmp_path: Path, seed: int
     rig, chance = Rig(tmp_path, seed=seed), random.Random(seed)
     line = BadLine(FakeCentre(), chance, 0.25)
     rig.participant("P1")
-    with serving(line) as url:
+    with answering(line) as url:
         for _ in range(3):
             rig.session("P1", size=chance.choice((1000, 9_000_000)))
             seen = line.requests
@@ -273,7 +228,7 @@ def test_whatever_a_centre_answers_nobody_comes_to_the_rigs_socket(tmp_path: Pat
     rig, line = Rig(tmp_path), BadLine(FakeCentre(), random.Random(1), 0.5, rubbish=True)
     rig.participant("P1")
     place = short_dir / f"rig-{time.time_ns()}.sock"
-    with socket.socket(socket.AF_UNIX) as listener, serving(line) as url:
+    with socket.socket(socket.AF_UNIX) as listener, answering(line) as url:
         listener.bind(str(place))
         listener.listen()
         listener.setblocking(False)
