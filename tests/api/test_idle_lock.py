@@ -63,20 +63,21 @@ def locked(http: httpx.Client) -> bool:
     return said["locked"]
 
 
-def test_it_locks_after_ten_minutes_and_not_before(pages: httpx.Client, clock: SetClock) -> None:
-    clock.ahead_s = 599
-    assert not locked(pages)
-    clock.ahead_s = 900
-    assert locked(pages)
-    refused = pages.get("/v1/rig")
-    assert refused.status_code == 401
-    assert refused.json()["type"] == "/problems/locked"
-    assert "participant" not in pages.get("/rig/now").text, "nothing about a participant"
-    page = pages.get("/participants/L1?x=1", headers=HTML)
-    assert page.status_code == 303
-    assert parse_qs(urlsplit(page.headers["location"]).query) == {"next": ["/participants/L1?x=1"]}
-    assert pages.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 204
-    assert pages.get("/v1/rig").status_code == 200
+def test_it_locks_after_ten_minutes_and_not_before(service: Service, clock: SetClock) -> None:
+    with signed_in(service) as http:
+        clock.ahead_s = 599
+        assert not locked(http)
+        clock.ahead_s = 900
+        assert locked(http)
+        refused = http.get("/v1/rig")
+        assert refused.status_code == 401
+        assert refused.json()["type"] == "/problems/locked"
+        assert "participant" not in http.get("/rig/now").text, "nothing about a participant"
+        page = http.get("/participants/L1?x=1", headers=HTML)
+        assert page.status_code == 303
+        assert parse_qs(urlsplit(page.headers["location"]).query) == {"next": ["/participants/L1?x=1"]}
+        assert http.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 204
+        assert http.get("/v1/rig").status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -91,12 +92,13 @@ def test_it_locks_after_ten_minutes_and_not_before(pages: httpx.Client, clock: S
     ],
 )
 def test_what_scripts_read_by_themselves_keeps_no_session_open(
-    pages: httpx.Client, clock: SetClock, path: str, headers: dict[str, str]
+    service: Service, clock: SetClock, path: str, headers: dict[str, str]
 ) -> None:
-    for clock.ahead_s in (300.0, 590.0):
-        pages.get(path, headers=headers)
-    clock.ahead_s = 900.0
-    assert locked(pages)
+    with signed_in(service) as http:
+        for clock.ahead_s in (300.0, 590.0):
+            http.get(path, headers=headers)
+        clock.ahead_s = 900.0
+        assert locked(http)
 
 
 def test_an_action_on_any_tab_keeps_all_of_them_open(service: Service, clock: SetClock) -> None:
@@ -113,26 +115,28 @@ def test_an_action_on_any_tab_keeps_all_of_them_open(service: Service, clock: Se
 
 
 def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(
-    pages: httpx.Client, client: httpx.Client, clock: SetClock
+    service: Service, clock: SetClock
 ) -> None:
-    clock.ahead_s = 900.0
-    assert pages.post("/v1/participants", json={"code": "L9"}).status_code == 401
-    csrf = pages.headers.pop("X-CSRF-Token")
-    assert pages.post("/unlock", data={"secret": PASSWORD}, headers=HTML).status_code == 403
-    assert pages.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 403
-    wrong = pages.post("/unlock", data={"secret": "no", "csrf": csrf}, headers=HTML)
-    assert wrong.status_code == 401 and "Ada" in wrong.text and locked(pages)
-    for target in (
-        "https://evil.example/",
-        "//evil.example",
-        "/\\evil.example",
-        "/\t/evil.example",
-        "javascript:x",
-    ):
-        pages.get("/locked", params={"next": target}, headers=HTML)
-        back = pages.post("/unlock", data={"secret": PASSWORD, "csrf": csrf, "next": target}, headers=HTML)
-        assert back.status_code == 303 and back.headers["location"] == "/", target
-    assert client.get("/v1/participants/L9").status_code == 404
+    with signed_in(service) as http:
+        clock.ahead_s = 900.0
+        assert http.post("/v1/participants", json={"code": "L9"}).status_code == 401
+        csrf = http.headers.pop("X-CSRF-Token")
+        assert http.post("/unlock", data={"secret": PASSWORD}, headers=HTML).status_code == 403
+        assert http.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 403
+        wrong = http.post("/unlock", data={"secret": "no", "csrf": csrf}, headers=HTML)
+        assert wrong.status_code == 401 and "Ada" in wrong.text and locked(http)
+        for target in (
+            "https://evil.example/",
+            "//evil.example",
+            "/\\evil.example",
+            "/\t/evil.example",
+            "javascript:x",
+        ):
+            http.get("/locked", params={"next": target}, headers=HTML)
+            back = http.post("/unlock", data={"secret": PASSWORD, "csrf": csrf, "next": target}, headers=HTML)
+            assert back.status_code == 303 and back.headers["location"] == "/", target
+    with service.client() as admin:
+        assert admin.get("/v1/participants/L9").status_code == 404
 
 
 def test_guesses_at_the_lock_are_held_to_a_pace(service: Service, clock: SetClock) -> None:
@@ -150,23 +154,24 @@ def test_guesses_at_the_lock_are_held_to_a_pace(service: Service, clock: SetCloc
             assert other.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 204, "others wait not"
 
 
-def test_the_red_button_works_on_a_locked_page(service: Service, pages: httpx.Client, clock: SetClock) -> None:
+def test_the_red_button_works_on_a_locked_page(service: Service, clock: SetClock) -> None:
     service.rig.speed = 1.0
-    test = pages.post("/v1/tests", json={"participant": "L1"}).json()
-    pages.post("/v1/sessions/lock")
-    page = pages.get("/locked", headers=HTML).text
-    assert 'id="stop"' in page and "L1" not in without_values(page) and "Ada" in page
-    assert service.rig.state == "running", "the test is not touched"
-    right = page.split('name="right" value="')[1].split('"')[0]
-    with service.client(token=None) as nobody:
-        assert nobody.post("/v1/stop", data={"right": right}).status_code == 200
-    told = pages.post("/v1/stop", data={"right": right}, headers=HTML, follow_redirects=True).text
-    assert "The rig confirms" in told and "See what was recorded" not in told, "nothing about the test"
-    assert locked(pages)
-    with service.client() as admin:
-        assert wait_done(admin, test["id"])["state"] == "stopped"
-        admin.post("/v1/rearm")
-    assert pages.post("/v1/stop").status_code == 200, "and by the session itself"
+    with signed_in(service) as http:
+        test = http.post("/v1/tests", json={"participant": "L1"}).json()
+        http.post("/v1/sessions/lock")
+        page = http.get("/locked", headers=HTML).text
+        assert 'id="stop"' in page and "L1" not in without_values(page) and "Ada" in page
+        assert service.rig.state == "running", "the test is not touched"
+        right = page.split('name="right" value="')[1].split('"')[0]
+        with service.client(token=None) as nobody:
+            assert nobody.post("/v1/stop", data={"right": right}).status_code == 200
+        told = http.post("/v1/stop", data={"right": right}, headers=HTML, follow_redirects=True).text
+        assert "The rig confirms" in told and "See what was recorded" not in told, "nothing about the test"
+        assert locked(http)
+        with service.client() as admin:
+            assert wait_done(admin, test["id"])["state"] == "stopped"
+            admin.post("/v1/rearm")
+        assert http.post("/v1/stop").status_code == 200, "and by the session itself"
     with service.client() as admin:
         admin.post("/v1/rearm")
 
@@ -188,10 +193,11 @@ def csrf_of(http: httpx.Client) -> str:
     return http.get("/", headers=HTML).text.split('name="csrf" value="')[1].split('"')[0]
 
 
-def test_somebody_else_may_leave_for_the_one_who_is_gone(pages: httpx.Client, clock: SetClock) -> None:
-    pages.post("/v1/sessions/lock")
-    assert pages.post("/sign-out", data={"csrf": pages.headers["X-CSRF-Token"]}, headers=HTML).status_code == 303
-    assert pages.get("/v1/rig").json()["type"] == "/problems/unauthorized"
+def test_somebody_else_may_leave_for_the_one_who_is_gone(service: Service, clock: SetClock) -> None:
+    with signed_in(service) as http:
+        http.post("/v1/sessions/lock")
+        assert http.post("/sign-out", data={"csrf": http.headers["X-CSRF-Token"]}, headers=HTML).status_code == 303
+        assert http.get("/v1/rig").json()["type"] == "/problems/unauthorized"
 
 
 def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
@@ -207,17 +213,18 @@ def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
             assert locked(http)
 
 
-def test_actions_are_written_down_once_and_what_comes_meanwhile_is_kept(service: Service, pages: httpx.Client) -> None:
+def test_actions_are_written_down_once_and_what_comes_meanwhile_is_kept(service: Service) -> None:
     context = service.context
     clock = SetClock()
     idle = IdleLock(context.store, clock, 10)
-    row = context.auth.cookie(pages.cookies[context.auth.cookie_name]).page_session
-    clock.ahead_s = 500.0
-    idle.acted(row.hash)
-    idle.flush()
-    clock.ahead_s = 1000.0
-    again = IdleLock(context.store, clock, 10)  # as after a restart
-    assert not again.locked(context.store.get(type(row), row.hash))
-    clock.ahead_s = 1200.0
-    assert again.locked(context.store.get(type(row), row.hash))
-    assert not IdleLock(context.store, clock, 0).locked(context.store.get(type(row), row.hash)), "0: never"
+    with signed_in(service) as http:
+        row = context.auth.cookie(http.cookies[context.auth.cookie_name]).page_session
+        clock.ahead_s = 500.0
+        idle.acted(row.hash)
+        idle.flush()
+        clock.ahead_s = 1000.0
+        again = IdleLock(context.store, clock, 10)  # as after a restart
+        assert not again.locked(context.store.get(type(row), row.hash))
+        clock.ahead_s = 1200.0
+        assert again.locked(context.store.get(type(row), row.hash))
+        assert not IdleLock(context.store, clock, 0).locked(context.store.get(type(row), row.hash)), "0: never"

@@ -20,6 +20,7 @@ import pytest
 
 from tests.api.conftest import TOKEN
 from tests.harness.looks_first import LooksFirst
+from tests.harness.pauses import stat
 
 pytestmark = [pytest.mark.wire, pytest.mark.realtime, pytest.mark.slow]
 LIMIT_S = 90.0
@@ -200,16 +201,8 @@ def test_no_end_is_lost_between_fork_and_exec(tmp_path: Path, when: str, killed:
     if killed == "child":
         os.kill(child, TERM)
         (tmp_path / "go").touch()
-        while state(child) not in "Z":
+        while (stat(child) or "Z")[0] != "Z":
             assert time.monotonic() < end_s, "it became a program that nobody told"
             time.sleep(0.01)
     parent.tell(KILL)
     assert parent.ended() == {}
-
-
-def state(pid: int) -> str:
-    """Of a process: Z where it has ended; empty where it is gone."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return ""

@@ -23,6 +23,7 @@ from stimrig.api.cli import main
 from stimrig.api.cohort import cluster
 from stimrig.api.cohort.select import FIELDS
 from tests.harness.cohort_records import cohort
+from tests.harness.pauses import below, stat
 
 PATIENCE_S = 240.0
 SESSIONS = 30
@@ -151,23 +152,6 @@ def started(folder: Path, output: Path) -> subprocess.Popen[str]:
     )  # fmt: skip
 
 
-def below(pid: int) -> list[int]:
-    """Every process below one."""
-    parents: dict[int, list[int]] = {}
-    for place in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = place.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        parents.setdefault(int(fields[1]), []).append(int(place.parent.name))
-    found, waiting = [], [pid]
-    while waiting:
-        children = parents.get(waiting.pop(), [])
-        found += children
-        waiting += children
-    return found
-
-
 def until(reached: Callable[[], Any], what: str, run: subprocess.Popen[str] | None = None) -> None:
     ends_s = time.monotonic() + PATIENCE_S
     while not reached():
@@ -182,10 +166,7 @@ def rows_in(parts: Path) -> int:
 
 
 def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    return (stat(pid) or "Z")[0] != "Z"
 
 
 @pytest.mark.slow
