@@ -331,6 +331,14 @@ def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.
             yield Service(url, app, rig, tmp_path)
 
 
+@contextmanager
+def serving(*given: Any, **more: Any) -> Iterator[tuple[Service, httpx.Client]]:
+    """A service, and the administrator's client of it."""
+    for service in run_service(*given, **more):
+        with service.client() as client:
+            yield service, client
+
+
 def shared_service(worker: Any = STUB, **more: Any) -> Any:
     """A fixture of a module: one service for all its tests."""
 

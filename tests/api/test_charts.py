@@ -26,7 +26,7 @@ from stimrig.api.workers.curves import curves
 from stimrig.api.workers.pool import WORKER
 from tests.api import made_up_joint
 from tests.api.browser import open_tab
-from tests.api.conftest import Service, run_service, run_test, shared_service
+from tests.api.conftest import Service, run_test, serving, shared_service
 from tests.api.fake_rig import default_widths, muscle
 from tests.api.test_axe import examined
 from tests.api.test_chart_boxes import COVERED, LAPTOP
@@ -38,11 +38,10 @@ Done = tuple[httpx.Client, dict[str, Any], Path]
 def done(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Done]:
     """A test's recording and model, by real workers."""
     folder = tmp_path_factory.mktemp("export")
-    for service in run_service(folder, short_dir, WORKER):
-        with service.client() as client:
-            client.timeout = 120
-            client.post("/v1/participants", json={"code": "P1"})
-            yield client, run_test(client, "P1", 120.0), folder
+    with serving(folder, short_dir, WORKER) as (_, client):
+        client.timeout = 120
+        client.post("/v1/participants", json={"code": "P1"})
+        yield client, run_test(client, "P1", 120.0), folder
 
 
 def test_csv_of_a_recording_is_the_recording(done: Done, tmp_path: Path) -> None:

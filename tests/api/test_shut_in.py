@@ -23,7 +23,7 @@ from stimrig.api.record_files import find_recording
 from stimrig.api.workers import confinement
 from stimrig.api.workers.pool import WORKER, Pool
 from stimrig.api.workers.process import Places
-from tests.api.conftest import STUB, Service, run_service, soon
+from tests.api.conftest import STUB, Service, run_service, serving, soon
 from tests.api.test_problems import problem
 from tests.api.test_worker import made_up_csv, with_pool
 from tests.harness import hostile_files, hostile_shapes
@@ -210,35 +210,31 @@ def test_a_start_with_another_database_deletes_no_upload(
 ) -> None:
     """A mistyped STIMRIG_DATABASE_URL, or an older database put back, names none of the files that are there."""
     kept = ""
-    for service in run_service(tmp_path, short_dir, STUB):
-        with service.client() as client:
-            client.post("/v1/participants", json={"code": "P017"})
-            kept = client.post("/v1/participants/P017/recordings", content=b"a,b\n").json()["recording_id"]
+    with serving(tmp_path, short_dir, STUB) as (_, client):
+        client.post("/v1/participants", json={"code": "P017"})
+        kept = client.post("/v1/participants/P017/recordings", content=b"a,b\n").json()["recording_id"]
     folder = tmp_path / "recordings"
     names = {f"{kept}.csv", "upload-00ff.h5", "joined-00ff.csv", "20260101T000000Z_T-1.h5", "upload-notes.txt"}
     for name in names - {f"{kept}.csv"}:
         (folder / name).write_bytes(b"x")
     for _ in run_service(tmp_path, short_dir, STUB, database_url=f"sqlite:///{tmp_path}/fresh.db"):
         assert f"{kept}.csv" in caplog.text and "Is it the right database?" in caplog.text
-    for service in run_service(tmp_path, short_dir, STUB):
-        with service.client() as client:
-            assert client.get(f"/v1/recordings/{kept}").text == "a,b\n"
+    with serving(tmp_path, short_dir, STUB) as (_, client):
+        assert client.get(f"/v1/recordings/{kept}").text == "a,b\n"
     assert {path.name for path in folder.iterdir() if path.is_file()} == names
 
 
 def test_what_an_ended_service_had_begun_to_take_in_is_settled_at_the_start(tmp_path: Path, short_dir: Path) -> None:
     kept = ""
-    for service in run_service(tmp_path, short_dir, STUB):
-        with service.client() as client:
-            client.post("/v1/participants", json={"code": "P017"})
-            kept = client.post("/v1/participants/P017/recordings", content=b"a,b\n").json()["recording_id"]
+    with serving(tmp_path, short_dir, STUB) as (_, client):
+        client.post("/v1/participants", json={"code": "P017"})
+        kept = client.post("/v1/participants/P017/recordings", content=b"a,b\n").json()["recording_id"]
     folder, parts = tmp_path / "recordings", tmp_path / "recordings" / "parts"
     (folder / f"{kept}.csv").replace(parts / f"{kept}.csv")  # it ended right after it had written the row
     for name in ("upload-00ff.csv", "upload-00ff.h5", "joined-00ff.csv"):
         (parts / name).write_bytes(b"x")
-    for service in run_service(tmp_path, short_dir, STUB):
-        with service.client() as client:
-            assert client.get(f"/v1/recordings/{kept}").text == "a,b\n"
+    with serving(tmp_path, short_dir, STUB) as (_, client):
+        assert client.get(f"/v1/recordings/{kept}").text == "a,b\n"
     assert not list(parts.iterdir())
 
 

@@ -17,7 +17,7 @@ from stimrig.api.models import tracking
 from stimrig.api.models.tracking import NEW_TEST, Limits
 from stimrig.api.store.tables import Model, Test, Tracked
 from stimrig.rig.messages import FinishedEvent
-from tests.api.conftest import STUB, Service, run_service, run_test, soon, wait_done
+from tests.api.conftest import STUB, Service, run_test, serving, soon, wait_done
 
 WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 40}}]
 MODEL, TRACKING = "/v1/participants/P017/model", "/v1/participants/P017/tracking"
@@ -308,27 +308,25 @@ def test_a_slow_worker_keeps_no_test_waiting(service: Service, client: httpx.Cli
 
 
 def test_a_restart_goes_on_where_it_was(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, STUB):
-        with service.client() as client:
-            client.post("/v1/participants", json={"code": "P017"})
-            client.post(f"/v1/models/{run_test(client, 'P017')['model_id']}/approve")
-            play(client)
-            before = tracked(client)
-            store = service.context.store
-            open_one = play(client)["id"]
-            assert tracked(client).json()["tracking"]["trial"] == 2
-            with store.write() as session:  # as if the service had been killed before it was followed
-                session.delete(session.get(Tracked, open_one))
-            assert store.get(Test, open_one).state == "completed"
-    for service in run_service(tmp_path, short_dir, STUB):
-        with service.client() as client:
-            soon(lambda: len(trials(client)) == 2)
-            document = tracked(client).json()
-            assert document["tracking"]["test_id"] == open_one
-            assert gain(document, client.get(MODEL).json()) == pytest.approx(0.98**2)
-            assert gain(before.json(), client.get(MODEL).json()) == pytest.approx(0.98)
-            play(client)
-            assert tracked(client).json()["tracking"]["trial"] == 3
+    with serving(tmp_path, short_dir, STUB) as (service, client):
+        client.post("/v1/participants", json={"code": "P017"})
+        client.post(f"/v1/models/{run_test(client, 'P017')['model_id']}/approve")
+        play(client)
+        before = tracked(client)
+        store = service.context.store
+        open_one = play(client)["id"]
+        assert tracked(client).json()["tracking"]["trial"] == 2
+        with store.write() as session:  # as if the service had been killed before it was followed
+            session.delete(session.get(Tracked, open_one))
+        assert store.get(Test, open_one).state == "completed"
+    with serving(tmp_path, short_dir, STUB) as (_, client):
+        soon(lambda: len(trials(client)) == 2)
+        document = tracked(client).json()
+        assert document["tracking"]["test_id"] == open_one
+        assert gain(document, client.get(MODEL).json()) == pytest.approx(0.98**2)
+        assert gain(before.json(), client.get(MODEL).json()) == pytest.approx(0.98)
+        play(client)
+        assert tracked(client).json()["tracking"]["trial"] == 3
 
 
 # ---- the reference ------------------------------------------------------------------------------------------------

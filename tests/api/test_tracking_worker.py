@@ -21,7 +21,7 @@ from stimrig.api.workers import tracking_verbs
 from stimrig.api.workers.pool import WORKER
 from stimrig.identify import tracking
 from stimrig.rig import messages as m
-from tests.api.conftest import Service, run_service, run_test, soon, wait_done
+from tests.api.conftest import Service, run_test, serving, soon, wait_done
 from tests.api.fake_rig import PATIENT, write_recording
 from tests.api.test_tracked import play, say
 from tests.harness.sessions import Planned, record
@@ -246,29 +246,28 @@ BODY = {"participant": "P1", "kind": "sequence", "segments": TRIAL}
 
 
 def test_a_muscle_that_stays_is_followed_through_the_service(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, WORKER):
-        with service.client() as client:
-            client.timeout = 300
-            client.post("/v1/participants", json={"code": "P1"})
-            test = run_test(client, "P1", 300)
-            assert client.post(f"/v1/models/{test['model_id']}/approve").status_code == 200
-            for number in (1, 2):
-                wait_done(client, client.post("/v1/tests", json=BODY).json()["id"], 300)
+    with serving(tmp_path, short_dir, WORKER) as (_, client):
+        client.timeout = 300
+        client.post("/v1/participants", json={"code": "P1"})
+        test = run_test(client, "P1", 300)
+        assert client.post(f"/v1/models/{test['model_id']}/approve").status_code == 200
+        for number in (1, 2):
+            wait_done(client, client.post("/v1/tests", json=BODY).json()["id"], 300)
+            served = client.get(f"{PERSON}/model", params={"tracked": True})
+            for _ in range(60):  # a fetch waits two seconds at most, and the first trial may wait for the worker
+                if served.json().get("tracking", {}).get("trial") == number:
+                    break
                 served = client.get(f"{PERSON}/model", params={"tracked": True})
-                for _ in range(60):  # a fetch waits two seconds at most, and the first trial may wait for the worker
-                    if served.json().get("tracking", {}).get("trial") == number:
-                        break
-                    served = client.get(f"{PERSON}/model", params={"tracked": True})
-            document, plain = served.json(), client.get(f"{PERSON}/model").json()
-            told = document["tracking"]
-            (one, two) = client.get(f"{PERSON}/tracking").json()["trials"]
-            assert told["trial"] == 2 and told["ask"] is None and two["outcome"] == "followed", (one, two)
-            gain = told["now"]["gain"]
-            assert gain["low"] < 1.0 < gain["high"] and gain["high"] - gain["low"] < 0.2
-            moved, approved = (np.array(d["recruitment"]["torque_nm"]) for d in (document, plain))
-            assert moved[-1] / approved[-1] == pytest.approx(told["coming"]["gain"]["value"], abs=0.02)
-            assert parsedate_to_datetime(served.headers["last-modified"]).isoformat()[:19] == two["at_utc"][:19]
-            wanted = {"reference_torque_nm": np.r_[np.zeros(20), np.full(60, 1.0)].tolist()}
-            widths = client.post(f"/v1/models/{document['model_id']}/widths", json=wanted)
-            assert widths.status_code == 200, widths.text
-            assert widths.json()["predicted_torque_nm"][-1] == pytest.approx(1.0, abs=0.1)
+        document, plain = served.json(), client.get(f"{PERSON}/model").json()
+        told = document["tracking"]
+        (one, two) = client.get(f"{PERSON}/tracking").json()["trials"]
+        assert told["trial"] == 2 and told["ask"] is None and two["outcome"] == "followed", (one, two)
+        gain = told["now"]["gain"]
+        assert gain["low"] < 1.0 < gain["high"] and gain["high"] - gain["low"] < 0.2
+        moved, approved = (np.array(d["recruitment"]["torque_nm"]) for d in (document, plain))
+        assert moved[-1] / approved[-1] == pytest.approx(told["coming"]["gain"]["value"], abs=0.02)
+        assert parsedate_to_datetime(served.headers["last-modified"]).isoformat()[:19] == two["at_utc"][:19]
+        wanted = {"reference_torque_nm": np.r_[np.zeros(20), np.full(60, 1.0)].tolist()}
+        widths = client.post(f"/v1/models/{document['model_id']}/widths", json=wanted)
+        assert widths.status_code == 200, widths.text
+        assert widths.json()["predicted_torque_nm"][-1] == pytest.approx(1.0, abs=0.1)

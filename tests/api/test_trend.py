@@ -19,7 +19,7 @@ from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.store.tables import Analysis, Model
 from stimrig.api.workers.pool import WORKER
-from tests.api.conftest import Service, run_service, shared_service
+from tests.api.conftest import Service, serving, shared_service
 from tests.harness import sessions
 from tests.harness.muscle import Patient
 from tests.harness.sessions import Planned
@@ -123,9 +123,8 @@ def test_other_effects_are_said_and_only_large_differences_told() -> None:
 
 
 def test_models_from_before_the_figures_are_read_once(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, WORKER):
-        with service.client() as client:
-            _read_once(service, client)
+    with serving(tmp_path, short_dir, WORKER) as (service, client):
+        _read_once(service, client)
 
 
 def _read_once(service: Service, client: httpx.Client) -> None:

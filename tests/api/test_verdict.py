@@ -25,7 +25,7 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.identify.estimation import quality
-from tests.api.conftest import REAL, Service, csrf, run_service, run_test, signed_in
+from tests.api.conftest import REAL, Service, csrf, run_test, serving, signed_in
 from tests.harness import few_effects
 from tests.harness.patients import Patient, make_record
 from tests.identify import hidden_muscles
@@ -63,22 +63,21 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
     assert json.loads(said(capsys, "fit", data, "--json"))["quality"] == stored
     assert stored["words"] in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
     pages = {"report of the command line": report.read_text("utf-8")}
-    for service in run_service(tmp_path / "service", short_dir, REAL):
-        with service.client() as client:
-            client.post("/v1/participants", json={"code": "P1"})
-            sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
-            assert sent.status_code == 201, sent.text
-            found = sent.json()["model"]
-            whole = client.get(f"/v1/models/{found['id']}").json()
-            for answer in (found, whole, whole["model"]["quality"], *client.get("/v1/participants/P1/models").json()):
-                assert {key: answer[key] for key in ("verdict", "words", "reasons")} == {
-                    key: stored[key] for key in ("verdict", "words", "reasons")
-                }
-            for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
-                pages[path] = client.get(path).text
-            for path in ("/", "/participants/P1"):
-                text = client.get(path).text
-                assert '<span class="tag tag-not-usable">not usable</span>' in text, path
+    with serving(tmp_path / "service", short_dir, REAL) as (_, client):
+        client.post("/v1/participants", json={"code": "P1"})
+        sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
+        assert sent.status_code == 201, sent.text
+        found = sent.json()["model"]
+        whole = client.get(f"/v1/models/{found['id']}").json()
+        for answer in (found, whole, whole["model"]["quality"], *client.get("/v1/participants/P1/models").json()):
+            assert {key: answer[key] for key in ("verdict", "words", "reasons")} == {
+                key: stored[key] for key in ("verdict", "words", "reasons")
+            }
+        for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
+            pages[path] = client.get(path).text
+        for path in ("/", "/participants/P1"):
+            text = client.get(path).text
+            assert '<span class="tag tag-not-usable">not usable</span>' in text, path
     for place, text in pages.items():
         assert "verdict-not-usable" in text and ">not usable" in text, place
         for words in (stored["words"], *stored["reasons"][1:]):
@@ -97,18 +96,17 @@ def test_level_held_out_torque_has_no_percent(
     assert fit["held_out_rms_nm"] > 0
     assert stored_model.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
     assert stored_model.UNDEFINED in report.read_text("utf-8")
-    for service in run_service(tmp_path / "service", short_dir, REAL):
-        with service.client() as client:
-            client.post("/v1/participants", json={"code": "P1"})
-            sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
-            assert sent.status_code == 201, sent.text
-            found = sent.json()["model"]
-            assert found["verdict"] == "not usable" and "whose torque is constant" in found["words"]
-            assert found["held_out_fit_percent"] is None and found["held_out_rms_nm"] > 0
-            assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
-            for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
-                assert stored_model.UNDEFINED in client.get(path).text
-            assert client.get("/participants/P1").status_code == client.get("/").status_code == 200
+    with serving(tmp_path / "service", short_dir, REAL) as (_, client):
+        client.post("/v1/participants", json={"code": "P1"})
+        sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
+        assert sent.status_code == 201, sent.text
+        found = sent.json()["model"]
+        assert found["verdict"] == "not usable" and "whose torque is constant" in found["words"]
+        assert found["held_out_fit_percent"] is None and found["held_out_rms_nm"] > 0
+        assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
+        for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
+            assert stored_model.UNDEFINED in client.get(path).text
+        assert client.get("/participants/P1").status_code == client.get("/").status_code == 200
 
 
 @pytest.mark.parametrize(
