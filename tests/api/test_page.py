@@ -354,7 +354,7 @@ def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service, client: h
 def tab_to(page: Any, name: str) -> None:
     """Press Tab until what has this id or text has the focus; each stop on the way is seen."""
     page.wait_for_load_state()
-    for _ in range(40):
+    for _ in range(page.locator("a, button, input, select, textarea, summary").count()):  # once round the page
         page.keyboard.press("Tab")
         at = page.evaluate(
             """() => { const e = document.activeElement, s = getComputedStyle(e);

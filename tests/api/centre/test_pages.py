@@ -19,27 +19,19 @@ from stimrig.api.store.centre_tables import CentreRig
 from stimrig.rig.messages import RigState
 from tests.api.centre.conftest import Centre, Teller, run_centre
 from tests.api.conftest import TOKEN
+from tests.api.test_scopes import ROWS as SCOPES
 
 HOLDERS = ("nobody", "reader", "rig", "administrator")
+SHARED = """
+/health /metrics /static/page.css /docs /sign-in /language /colours /v1/sessions /sign-out /locked /unlock
+/lock /rig/acted /v1/sessions/lock /v1/sessions/unlock /v1/sessions/current /v1/users /v1/users/x/password
+/v1/users/x /v1/tokens /v1/tokens/x /v1/audit /administration /administration/users
+/administration/users/x/password /administration/users/x/remove /administration/keys
+/administration/tokens/x/revoke /administration/audit.jsonl
+"""
+"""What a centre answers as a rig's service does: who may, stands in tests/api/test_scopes.py."""
 TABLE = """
-GET    /health                                    anybody        200
-GET    /metrics                                   anybody        200
-GET    /static/page.css                           anybody        200
-GET    /docs                                      anybody        200
 GET    /                                          page           200
-GET    /sign-in                                   anybody        200
-POST   /sign-in                                   anybody        401
-POST   /language                                  anybody        4xx
-POST   /colours                                   anybody        4xx
-POST   /v1/sessions                               anybody        401
-POST   /sign-out                                  anyone         303
-GET    /locked                                    anyone         303
-POST   /unlock                                    anyone         303
-POST   /lock                                      anyone         303
-POST   /rig/acted                                 anyone         204
-POST   /v1/sessions/lock                          anyone         409
-POST   /v1/sessions/unlock                        anyone         422
-DELETE /v1/sessions/current                       anyone         404
 GET    /v1/rigs                                   reader         200
 GET    /v1/warnings                               reader         200
 GET    /v1/participants                           reader         200
@@ -56,21 +48,6 @@ POST   /v1/warnings/1/acknowledge                 administrator  404
 POST   /rigs                                      administrator  422
 POST   /rigs/x/revoke                             administrator  404
 POST   /warnings/1/acknowledge                    administrator  404
-GET    /v1/users                                  administrator  200
-POST   /v1/users                                  administrator  422
-PUT    /v1/users/x/password                       administrator  428
-DELETE /v1/users/x                                administrator  404
-GET    /v1/tokens                                 administrator  200
-POST   /v1/tokens                                 administrator  422
-DELETE /v1/tokens/x                               administrator  404
-GET    /v1/audit                                  administrator  200
-GET    /administration                            administrator  200
-POST   /administration/users                      administrator  422
-POST   /administration/users/x/password           administrator  428
-POST   /administration/users/x/remove             administrator  404
-POST   /administration/keys                       administrator  422
-POST   /administration/tokens/x/revoke            administrator  404
-GET    /administration/audit.jsonl                administrator  200
 POST   /v1/rig/hello                              rig            400
 POST   /v1/rig/items                              rig            400
 GET    /v1/rig/files                              rig            200
@@ -79,6 +56,9 @@ PUT    /v1/rig/files/{zeros}                      rig            404
 """
 """Method, path, who may, and what they are answered, where nothing of the name x is there and no body is sent."""
 ROWS = [tuple(line.replace("{zeros}", "0" * 64).split()) for line in TABLE.strip().splitlines()]
+ROWS += [
+    (*row[:2], row[2].replace("administer", "administrator"), row[3]) for row in SCOPES if row[1] in SHARED.split()
+]
 IN_PATHS = {"{recording_id}": "1", "{warning_id}": "1", "{sha256}": "0" * 64}
 HOSTILE = ["../../etc/passwd", "'; DROP TABLE centre_rigs; --", "<script>boom()</script>", "a\x00b", "\u202egnp.exe"]
 
