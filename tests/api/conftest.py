@@ -25,6 +25,7 @@ from sqlalchemy import text
 from websockets.sync.client import ClientConnection, connect
 
 from stimrig.api.centre.postgres import programs
+from stimrig.api.cli import main
 from stimrig.api.clock import Clock
 from stimrig.api.errors import SettingsError
 from stimrig.api.people import accounts
@@ -424,6 +425,22 @@ def s3() -> Iterator[Any]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A table of a made-up muscle's test."""
+    from tests.api.test_worker import made_up_csv
+
+    return made_up_csv(tmp_path_factory.mktemp("record") / "record.csv")
+
+
+@pytest.fixture(scope="module")
+def model(record: Path) -> Path:
+    """MODEL.json beside it, made by the command line."""
+    path = record.with_name("MODEL.json")
+    assert main.run(["fit", str(record), "-o", str(path)]) == 0
+    return path
 
 
 @pytest.fixture

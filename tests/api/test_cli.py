@@ -35,18 +35,6 @@ def edited(line: int, text: str) -> list[str]:
     return [*GOOD[: line - 1], text, *GOOD[line:]]
 
 
-@pytest.fixture(scope="module")
-def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_up_csv(tmp_path_factory.mktemp("cli") / "record.csv")
-
-
-@pytest.fixture(scope="module")
-def model(record: Path) -> Path:
-    path = record.parent / "MODEL.json"
-    assert main.run(["fit", str(record), "-o", str(path)]) == 0
-    return path
-
-
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
     capsys.readouterr()
     code = main.run(list(map(str, arguments)))

@@ -361,8 +361,8 @@ def browser(service: Service) -> Iterator[httpx.Client]:
 
 
 @pytest.fixture(scope="module")
-def places(service: Service) -> dict[str, str]:
-    """Addresses of the pages, of a participant with two tests."""
+def ids(service: Service) -> dict[str, str]:
+    """Of a participant with two tests, what its pages' addresses name."""
     with service.client() as http:
         for code in ("X1", "X2"):
             http.post("/v1/participants", json={"code": code})
@@ -370,33 +370,28 @@ def places(service: Service) -> dict[str, str]:
         model, other = first["model_id"], second["model_id"]
         http.get(f"/v1/models/{model}/diagnosis")
         http.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"})
-    return {
-        "home": "/", "new participant": "/participants/X2", "participant": "/participants/X1",
-        "model": f"/models/{model}", "other model": f"/models/{other}", "test": f"/tests/{first['id']}",
-        "calibration": "/participants/X1/calibration", "trend": "/participants/X1/trend",
-        "compare": f"/compare?model={model}&model={other}", "report": f"/models/{model}/report",
-        "administration": "/administration", "sign-in": "/sign-in", "nothing": "/models/none",
-    }  # fmt: skip
+    return {"model": model, "other": other, "test": first["id"]}
 
 
 PAGES = (
-    "home", "new participant", "participant", "model", "other model", "test", "calibration", "trend", "compare",
-    "report", "administration", "sign-in", "nothing",
+    "/", "/participants/X2", "/participants/X1", "/models/{model}", "/models/{other}", "/tests/{test}",
+    "/participants/X1/calibration", "/participants/X1/trend", "/compare?model={model}&model={other}",
+    "/models/{model}/report", "/administration", "/sign-in", "/models/none",
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_every_text_of_a_page_is_a_message(name: str, browser: httpx.Client, places: dict[str, str]) -> None:
-    answer = browser.get(places[name], headers={"Accept": "text/html"})
+@pytest.mark.parametrize("page", PAGES)
+def test_every_text_of_a_page_is_a_message(page: str, browser: httpx.Client, ids: dict[str, str]) -> None:
+    answer = browser.get(page.format(**ids), headers={"Accept": "text/html"})
     assert answer.headers["content-language"] == MADE_UP and answer.status_code in (200, 404)
     assert untranslated(answer.text) == [], "\n".join(untranslated(answer.text))
 
 
-def test_the_question_before_a_test_is_translated(browser: httpx.Client, places: dict[str, str]) -> None:
+def test_the_question_before_a_test_is_translated(browser: httpx.Client, ids: dict[str, str]) -> None:
     seen = re.findall(r'name="seen" value="([^"]+)"', browser.get("/participants/X1").text)[0]
     form = {"csrf": csrf(browser), "seen": seen}
     asked = browser.post("/participants/X1/tests", data=form, follow_redirects=True)
-    assert "/confirm/" in str(asked.url), places
+    assert "/confirm/" in str(asked.url), ids
     assert untranslated(asked.text) == []
 
 

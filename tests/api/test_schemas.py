@@ -24,7 +24,6 @@ from stimrig.identify.json_text import json_value
 from stimrig.identify.model import SCHEMA_VERSION, Covariance
 from stimrig.identify.simulation.joint_surface import joint_tables
 from tests.api.conftest import REAL, TOKEN, run_service
-from tests.api.test_worker import made_up_csv
 from tests.harness import few_effects
 
 ALL = {name: schemas.load(name) for name in schemas.NAMES}
@@ -36,18 +35,6 @@ def unmet(name: str, document: dict[str, Any]) -> list[str]:
     check = jsonschema_rs.validator_for(schemas.load(name), registry=REGISTRY)
     unknown = sorted(set(document) - set(schemas.load(name)["properties"]))
     return [f"{list(error.instance_path)}: {error.message[:200]}" for error in check.iter_errors(document)] + unknown
-
-
-@pytest.fixture(scope="module")
-def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_up_csv(tmp_path_factory.mktemp("schemas") / "record.csv")
-
-
-@pytest.fixture(scope="module")
-def model(record: Path) -> Path:
-    path = record.parent / "MODEL.json"
-    assert main.run(["fit", str(record), "-o", str(path)]) == 0
-    return path
 
 
 @pytest.mark.parametrize("verb", ["fit", "predict", "compare", "diagnose", "improve", "invert", "effects", "doctor"])

@@ -53,6 +53,14 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return capsys.readouterr().out
 
 
+def uploaded(client: httpx.Client, data: Path) -> dict[str, Any]:
+    """A new participant's model of it."""
+    client.post("/v1/participants", json={"code": "P1"})
+    sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
+    assert sent.status_code == 201, sent.text
+    return sent.json()["model"]
+
+
 @pytest.mark.slow
 def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = record_csv(tmp_path / "noise.csv", follows=False)
@@ -64,10 +72,7 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
     assert stored["words"] in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
     pages = {"report of the command line": report.read_text("utf-8")}
     with serving(tmp_path / "service", short_dir, REAL) as (_, client):
-        client.post("/v1/participants", json={"code": "P1"})
-        sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
-        assert sent.status_code == 201, sent.text
-        found = sent.json()["model"]
+        found = uploaded(client, data)
         whole = client.get(f"/v1/models/{found['id']}").json()
         for answer in (found, whole, whole["model"]["quality"], *client.get("/v1/participants/P1/models").json()):
             assert {key: answer[key] for key in ("verdict", "words", "reasons")} == {
@@ -97,10 +102,7 @@ def test_level_held_out_torque_has_no_percent(
     assert stored_model.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
     assert stored_model.UNDEFINED in report.read_text("utf-8")
     with serving(tmp_path / "service", short_dir, REAL) as (_, client):
-        client.post("/v1/participants", json={"code": "P1"})
-        sent = client.post("/v1/participants/P1/recordings", content=data.read_bytes(), timeout=200)
-        assert sent.status_code == 201, sent.text
-        found = sent.json()["model"]
+        found = uploaded(client, data)
         assert found["verdict"] == "not usable" and "whose torque is constant" in found["words"]
         assert found["held_out_fit_percent"] is None and found["held_out_rms_nm"] > 0
         assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
