@@ -50,6 +50,16 @@ class NotFoundError(ApiError):
         super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {fix}".strip())
 
 
+def invalid(detail: str, **extra: Any) -> ApiError:
+    """422: something in the request does not hold."""
+    return ApiError(422, "invalid-input", "The request is not valid", detail, **extra)
+
+
+def forbidden(detail: str) -> ApiError:
+    """403: it is known who asks, and they may not."""
+    return ApiError(403, "forbidden", "Not allowed", detail)
+
+
 def not_answering() -> ApiError:
     """503: the database is gone, or somebody else has been writing for long."""
     return ApiError(503, "database", "The database does not answer", "Nothing was changed. Try again in a minute.")

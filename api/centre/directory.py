@@ -10,7 +10,7 @@ from sqlalchemy import Select, exists, select, tuple_
 
 from stimrig.api.centre import clean
 from stimrig.api.clock import local_day
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import NotFoundError, invalid
 from stimrig.api.models.stored_model import VERDICTS
 from stimrig.api.store import Store
 from stimrig.api.store.centre_tables import (
@@ -58,13 +58,13 @@ def asked(
     """
     for name, given in (("from", from_), ("to", to)):
         if given and clean.a_day(given) is None:
-            raise ApiError(422, "invalid-input", "The request is not valid", f"{name}: give a day as 2026-11-23")
+            raise invalid(f"{name}: give a day as 2026-11-23")
     if effect and not clean.EFFECT.fullmatch(effect):
-        raise ApiError(422, "invalid-input", "The request is not valid", "effect: give an effect's id, as fatigue")
+        raise invalid("effect: give an effect's id, as fatigue")
     if verdict and verdict not in VERDICT_NAMES:
-        raise ApiError(422, "invalid-input", "The request is not valid", f"verdict: one of {', '.join(VERDICT_NAMES)}")
+        raise invalid(f"verdict: one of {', '.join(VERDICT_NAMES)}")
     if after and clean.code(after) is None:
-        raise ApiError(422, "invalid-input", "The request is not valid", "after: give it as the last page gave it")
+        raise invalid("after: give it as the last page gave it")
     rig_id = the_rig(store, rig).id if rig else None
     return Search(q.strip()[:32], rig_id, from_ or None, to or None, effect or None, verdict or None, after or "")
 
@@ -149,7 +149,7 @@ def page_key(before: str | None) -> tuple[str, int] | None:
         return None
     day, _, number = before.partition("~")
     if clean.a_day(day) is None or (number and (not number.isdecimal() or len(number) > 9)):
-        raise ApiError(422, "invalid-input", "The request is not valid", "before: give it as the last page gave it")
+        raise invalid("before: give it as the last page gave it")
     return day, int(number or 0)
 
 
@@ -231,5 +231,5 @@ def document(row: CentreRecording, rig: str) -> dict[str, Any]:
 def _key(after: str) -> tuple[str, int]:
     label, mark, number = after.partition("~")
     if not mark or not number.isdecimal() or len(number) > 18 or clean.label(label, "") != label:
-        raise ApiError(422, "invalid-input", "The request is not valid", "after: give it as the last page gave it")
+        raise invalid("after: give it as the last page gave it")
     return label, int(number)

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from stimrig.api.centre import clean, rigs, warnings
 from stimrig.api.centre.project import Projector
 from stimrig.api.clock import Clock, unix_of
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, invalid
 from stimrig.api.outbox.chain import BEGIN, NOWHERE, Position, item_hash
 from stimrig.api.outbox.messages import BatchIn, HelloIn, ItemIn
 from stimrig.api.store import Store
@@ -53,8 +53,7 @@ def read(model: type[BaseModel], raw: bytes) -> Any:
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "body"
-        detail = f"{place[:120]}: {first['msg']}"
-        raise ApiError(422, "invalid-input", "The request is not valid", detail) from error
+        raise invalid(f"{place[:120]}: {first['msg']}") from error
 
 
 def checked(sent: ItemIn) -> Item:
@@ -75,8 +74,7 @@ def checked(sent: ItemIn) -> Item:
         detail = f"Item {sent.seq} ({sent.kind}) differs from its hash. Nothing of the batch was taken."
         raise ApiError(422, "hash-differs", "An item differs from its hash", detail)
     if (sent.seq == 1) != (sent.kind == BEGIN) or (sent.file is None) != (sent.file_bytes is None):
-        detail = f"Item {sent.seq}: only the first item is `begin`, and a file has its length."
-        raise ApiError(422, "invalid-input", "The request is not valid", detail)
+        raise invalid(f"Item {sent.seq}: only the first item is `begin`, and a file has its length.")
     return Item(sent, text)
 
 

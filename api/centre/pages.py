@@ -20,7 +20,7 @@ from stimrig.api.centre.ingest import LEAST_DISK_BYTES, LEAST_DISK_SHARE, MOST_C
 from stimrig.api.charts import trend_charts
 from stimrig.api.clock import unix_of
 from stimrig.api.effect_words import effect_words
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, NotFoundError, forbidden
 from stimrig.api.models import changes
 from stimrig.api.models.stored_model import followed
 from stimrig.api.people.auth import LOCKED, Principal, Scope
@@ -63,7 +63,7 @@ async def rigs(request: Request, context: Ctx) -> Response:
             return problem_page(request, error)
         return await sign_in_page(request, context, "/")  # pyright: ignore[reportArgumentType]
     if not who.may(Scope.READ_MODEL):
-        return problem_page(request, ApiError(403, "forbidden", "Not allowed", "This needs the scope read-model."))
+        return problem_page(request, forbidden("This needs the scope read-model."))
     return await rig_page(request, context)
 
 

@@ -30,7 +30,7 @@ from stimrig.api.centre.responses import (
     WarningOut,
 )
 from stimrig.api.clock import unix_of
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import NotFoundError, invalid
 from stimrig.api.store.centre_tables import CentreModel, CentreRecording, CentreRig
 from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
 from stimrig.api.web.responses.base import describe_answer
@@ -133,7 +133,7 @@ def recordings(
 ) -> dict[str, Any]:  # fmt: skip
     """Recordings in order of time; `after` of an answer leads to the next page."""
     if participant and clean.code(participant) is None:
-        raise ApiError(422, "invalid-input", "The request is not valid", "participant: give a code")
+        raise invalid("participant: give a code")
     begin, end = moment("from", from_, 0), moment("to", to, 1)
     asked = Cohort(participant or None, the_rig(context.store, rig).id if rig else None, begin, end, after or None)
     found, last = directory.recordings(context.store, asked, limit)
@@ -148,8 +148,7 @@ def moment(name: str, given: str | None, days: int) -> str | None:
         return clean.days_later(given, days)
     if clean.label(given, "") == given:
         return given
-    detail = f"{name}: give a day as 2026-11-23, or a time as 2026-11-23T08:00:00Z"
-    raise ApiError(422, "invalid-input", "The request is not valid", detail)
+    raise invalid(f"{name}: give a day as 2026-11-23, or a time as 2026-11-23T08:00:00Z")
 
 
 @v1.get(

@@ -11,7 +11,7 @@ from pydantic import Field, FiniteFloat
 from sqlalchemy import select
 
 from stimrig.api.decisions import MODEL_TAG
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, forbidden
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Auth, Principal, Scope, outside
 from stimrig.api.sessions.profiles import LIMITS
@@ -180,7 +180,7 @@ def refuse_maker_without(maker: Principal) -> None:
     if lacking:
         who = maker.name
         detail = f"A key holds {', '.join(KEY_SCOPES)}. Who makes one holds them all; {who} lacks {', '.join(lacking)}."
-        raise ApiError(403, "forbidden", "Not allowed", detail)
+        raise forbidden(detail)
 
 
 def make_key(

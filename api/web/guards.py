@@ -21,12 +21,12 @@ from fastapi.security import APIKeyCookie, APIKeyHeader, HTTPBearer
 from pydantic import ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect
+from starlette.requests import ClientDisconnect, HTTPConnection
 
 from stimrig.api import decisions
 from stimrig.api.clock import local_day
 from stimrig.api.decisions import MODEL_TAG, OF_RIG, Decision
-from stimrig.api.errors import ApiError, not_answering
+from stimrig.api.errors import ApiError, forbidden, not_answering
 from stimrig.api.models.places import kept, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.people.auth import Principal, Scope, outside
@@ -55,8 +55,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
         principal = await identified(request)
         if not principal.may(scope):
             who = principal.name
-            detail = f"This needs the scope {scope}; {who} holds {', '.join(sorted(principal.scopes))}."
-            raise ApiError(403, "forbidden", "Not allowed", detail)
+            raise forbidden(f"This needs the scope {scope}; {who} holds {', '.join(sorted(principal.scopes))}.")
         await check_csrf(request, principal)
         await note_version(request)
         if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
@@ -178,11 +177,11 @@ def _approved(versions: Versions, participant: str, model_id: str) -> bool:
     return re.fullmatch(rf"{own}(\.{approval.id}\.[0-9]+)?", model_id) is not None
 
 
-def same_origin(request: Request) -> None:
-    """Refuse a sign-in that another site's page sends: there is no session yet whose CSRF token could be asked for."""
+def same_origin(request: HTTPConnection) -> None:
+    """Refuse what another site's page sends where no CSRF token can be asked for: a sign-in, a WebSocket."""
     origin = request.headers.get("origin")
     if origin and urlsplit(origin).netloc != request.headers.get("host"):
-        raise ApiError(403, "forbidden", "Not allowed", "The request came from a page of another site.")
+        raise forbidden("The request came from a page of another site.")
 
 
 def set_cookie(context: Any, answer: Response, cookie: str) -> None:

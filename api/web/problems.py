@@ -13,7 +13,7 @@ from sqlalchemy.exc import DataError, InterfaceError, OperationalError, SQLAlche
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
-from stimrig.api.errors import ApiError, not_answering
+from stimrig.api.errors import ApiError, invalid, not_answering
 from stimrig.api.store import seen
 from stimrig.api.store.seen import ChangedError
 from stimrig.api.web.middleware import wants_html
@@ -30,7 +30,7 @@ def from_validation(error: RequestValidationError) -> ApiError:
         place = ".".join(str(part) for part in item.get("loc", ()) if part != "body") or "body"
         found.append({"field": place, "detail": str(item.get("msg", "")), "got": _short(item.get("input"))})
     names = "; ".join(f"{item['field']}: {item['detail']}" for item in found)
-    return ApiError(422, "invalid-input", "The request is not valid", names, errors=found)
+    return invalid(names, errors=found)
 
 
 def _short(value: Any) -> str:
@@ -80,7 +80,7 @@ def install(app: FastAPI) -> None:
         return await respond(request, error)
 
     @app.exception_handler(RequestValidationError)
-    async def invalid(request: Request, error: RequestValidationError) -> Response:
+    async def does_not_hold(request: Request, error: RequestValidationError) -> Response:
         return await respond(request, from_validation(error))
 
     @app.exception_handler(HTTPException)
@@ -97,7 +97,7 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(DataError)
     async def not_to_be_kept(request: Request, error: DataError) -> Response:
         detail = f"The database takes no such value: {str(error.orig).splitlines()[0]}"
-        return await respond(request, ApiError(422, "invalid-input", "The request is not valid", detail))
+        return await respond(request, invalid(detail))
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:

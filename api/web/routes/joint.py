@@ -12,6 +12,7 @@ from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError
 from stimrig.api.models import together
 from stimrig.api.sessions import profiles
+from stimrig.api.sessions.kinds import no_sensor
 from stimrig.api.sessions.requests import AngleRad, Body
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
@@ -65,8 +66,7 @@ def sensor(context: Context) -> AngleStatus:
     """The rig's angle sensor; 409 where it has none."""
     status = context.rig.status
     if status is None or not status.angle.present:
-        detail = "This rig has no angle sensor. The rig file names one under [angle_sensor]."
-        raise ApiError(409, "no-angle-sensor", "There is no angle sensor", detail)
+        raise no_sensor()
     return status.angle
 
 

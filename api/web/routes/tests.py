@@ -6,14 +6,13 @@ import asyncio
 import contextlib
 import logging
 from typing import Any
-from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Response, WebSocket, WebSocketDisconnect
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api import language
 from stimrig.api.clinical_words import missing_words
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, NotFoundError, forbidden
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.playing import other_than
@@ -22,7 +21,7 @@ from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import KEY_TURN
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, context_of
-from stimrig.api.web.guards import refuse_outside
+from stimrig.api.web.guards import refuse_outside, same_origin
 from stimrig.api.web.middleware import chosen_language
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import LeftOut, TestOut
@@ -131,10 +130,9 @@ def _admit(socket: WebSocket, context: Context) -> Principal:
     principal = context.auth.identify(socket, bound=True)
     refuse_outside(context.versions, principal, "WS", socket.url.path)
     if not principal.may(Scope.READ_LIVE):
-        raise ApiError(403, "forbidden", "Not allowed", f"This needs the scope {Scope.READ_LIVE}.")
-    origin = socket.headers.get("origin")
-    if principal.csrf is not None and origin and urlsplit(origin).netloc != socket.headers.get("host"):
-        raise ApiError(403, "forbidden", "Not allowed", "The request came from a page of another site.")
+        raise forbidden(f"This needs the scope {Scope.READ_LIVE}.")
+    if principal.csrf is not None:
+        same_origin(socket)
     if principal.page_session is not None:
         context.auth.idle.watches(principal.page_session.hash)
     return principal
