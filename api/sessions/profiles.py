@@ -15,13 +15,15 @@ Profile = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Named:
-    """How people call a limit, its unit, the rig's name of its bound, and the least and the most that any rig takes.
+    """How people call a limit, in a sentence and beside its field, its unit, the rig's name of its bound, and the least
+    and the most that any rig takes.
 
     Below the least there is no limit but a slip: the finest step in which a stimulator tells currents and widths apart,
     and a torque that every muscle at rest has.
     """
 
     words: str
+    label: str
     unit: str
     bound: str
     least: float
@@ -29,9 +31,11 @@ class Named:
 
 
 LIMITS: dict[str, Named] = {
-    "current_ma": Named("current", "mA", "current_ma", 0.5, 130.0),
-    "max_pulse_width_us": Named("comfort maximum", "µs", "pulse_width_us", 1.0, 500.0),
-    "max_torque_nm": Named("torque that stops a test", "N·m", "torque_nm", 0.1, 200.0),
+    "current_ma": Named("current", "Current of every pulse (mA)", "mA", "current_ma", 0.5, 130.0),
+    "max_pulse_width_us": Named("comfort maximum", "Comfort maximum (µs)", "µs", "pulse_width_us", 1.0, 500.0),
+    "max_torque_nm": Named(
+        "torque that stops a test", "Torque that stops a test (N·m)", "N·m", "torque_nm", 0.1, 200.0
+    ),
 }
 FOUND = ("sensory_pulse_width_us", "motor_pulse_width_us", "set_at_utc", "expires_at_utc")
 """What only a calibration finds."""

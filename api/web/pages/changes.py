@@ -13,7 +13,6 @@ from stimrig.api.language import _, lazy, localised, plain, translated
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import profiles
 from stimrig.api.store.seen import MOST_TOLD, ChangedError
-from stimrig.api.web.pages.limits_form import LABELS
 from stimrig.api.web.pages.starting import site_words
 
 KEPT_OUT = ("csrf", "seen", "password", "latch")
@@ -162,5 +161,5 @@ def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[st
         plan = {name: f"{texts.get(field, '')} {unit}" for name, (field, unit) in PLAN.items()}
         plan["trials"] = texts.get("trials", "")
         return [texts.get("name", ""), _("%(trials)s trials of at most %(duration)s, %(current)s, %(width)s", **plan)]
-    return [f"{plain(label)} {texts[name]}" for name, label in LABELS.items()
+    return [f"{plain(limit.label)} {texts[name]}" for name, limit in profiles.LIMITS.items()
             if name in texts and texts[name] != texts.get(f"seen_{name}")]  # fmt: skip

@@ -112,11 +112,11 @@ def _one(sent: FormData, name: str) -> str | None:
 
 def fields(status: Status | None) -> list[dict[str, str]]:
     """What the fields are called, and what this rig takes in them."""
-    found = []
-    for name in profiles.LIMITS:
-        words = profiles.takes(name, status.limits if status else {})
-        found.append({"name": name, "label": LABELS[name], "help": words})
-    return found + angle_fields(status)
+    limits: Mapping[str, Bound] = status.limits if status else {}
+    return [
+        {"name": name, "label": limit.label, "help": profiles.takes(name, limits)}
+        for name, limit in profiles.LIMITS.items()
+    ] + angle_fields(status)
 
 
 def angle_texts(profile: Mapping[str, Any], status: Status | None) -> dict[str, str]:
@@ -185,10 +185,3 @@ def asked_angles(
     if saved is not None and abs(saved[0] - low) < near and abs(saved[1] - high) < near:
         return {}, {}
     return {profiles.RANGE: [low, high]}, {}
-
-
-LABELS = {
-    "current_ma": "Current of every pulse (mA)",
-    "max_pulse_width_us": "Comfort maximum (µs)",
-    "max_torque_nm": "Torque that stops a test (N·m)",
-}
