@@ -129,14 +129,14 @@ def poles_as_constants(block: Discrete) -> tuple[float, float]:
     return float(1 / natural), float(np.real(-(pole + other)) / (2 * natural))
 
 
-def literal(noise_nm: float, seed: int, *, through_a: bool, rate_hz: float = 40.0) -> tuple[Record, np.ndarray]:
+def literal(noise_nm: float, seed: int, *, through_a: bool) -> tuple[Record, np.ndarray]:
     """As `paper.simulate`, or with the noise of equation (9), passed through 1/A(q)."""
-    record, clean = paper.simulate(noise_nm, seed, rate_hz)
+    record, clean = paper.simulate(noise_nm, seed, 40.0)
     if not through_a:
         return record, clean
     from scipy.signal import lfilter
 
-    a = SecondOrder(paper.TIME_CONSTANT_S, paper.DAMPING).discrete(rate_hz)[1]
+    a = SecondOrder(paper.TIME_CONSTANT_S, paper.DAMPING).discrete(40.0)[1]
     coloured = lfilter([1.0], a, record.torque_nm - clean)
     coloured *= np.std(record.torque_nm - clean) / np.std(coloured) if noise_nm else 1.0
     return record.with_torque(clean + coloured), clean

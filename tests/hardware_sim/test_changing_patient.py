@@ -31,8 +31,8 @@ def session(trials: int, rest_s: float = 15.0, width_us: float = THIRD_US, trial
     return np.tile(one, trials)
 
 
-def varied(seconds: float, seed: int = 3) -> np.ndarray:
-    return np.repeat(np.random.default_rng(seed).uniform(0.0, 300.0, round(seconds * 4)), 10)
+def varied(seconds: float) -> np.ndarray:
+    return np.repeat(np.random.default_rng(3).uniform(0.0, 300.0, round(seconds * 4)), 10)
 
 
 def recruitment(widths_us: np.ndarray, shift_us: float = 0.0) -> np.ndarray:

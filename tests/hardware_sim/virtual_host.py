@@ -15,8 +15,8 @@ LAYOUT = struct.Struct("<fHBB")
 
 
 class VirtualHost:
-    def __init__(self, arm: str | None = None, **settings: Any) -> None:
-        self.devices = make_devices(Settings(**settings), arm)
+    def __init__(self, **settings: Any) -> None:
+        self.devices = make_devices(Settings(**settings))
         self.answered_s = 0.0
         self._decoder = ScienceMode4()
 

@@ -9,9 +9,9 @@ from stimrig.identify.records.record import Record
 from tests.harness.muscle import Patient
 
 
-def prbs(seconds: float, level_us: float, rng: np.random.Generator, hold: int = 8) -> np.ndarray:
+def prbs(seconds: float, level_us: float, rng: np.random.Generator) -> np.ndarray:
     n = int(seconds * 40)
-    return np.repeat(rng.integers(0, 2, n // hold + 1), hold)[:n] * level_us
+    return np.repeat(rng.integers(0, 2, n // 8 + 1), 8)[:n] * level_us
 
 
 def ramp(seconds: float = 10.0, top_us: float = 300.0) -> np.ndarray:
@@ -20,9 +20,9 @@ def ramp(seconds: float = 10.0, top_us: float = 300.0) -> np.ndarray:
     return np.r_[up, top_us - up]
 
 
-def multilevel(seconds: float, top_us: float, rng: np.random.Generator, hold: int = 20) -> np.ndarray:
+def multilevel(seconds: float, top_us: float, rng: np.random.Generator) -> np.ndarray:
     n = int(seconds * 40)
-    return np.repeat(rng.uniform(0, top_us, n // hold + 1), hold)[:n]
+    return np.repeat(rng.uniform(0, top_us, n // 20 + 1), 20)[:n]
 
 
 def protocol(rng: np.random.Generator, top_us: float = 300.0, validate: bool = True) -> tuple[np.ndarray, list[str]]:
@@ -55,13 +55,12 @@ def make_record(
     rate_hz: float = 400.0,
     noise_nm: float = 0.05,
     ar1: float = 0.0,
-    top_us: float = 300.0,
     validate: bool = True,
     baseline_nm: float = 0.0,
     pulses: tuple[np.ndarray, list[str]] | None = None,
 ) -> tuple[Record, np.ndarray]:
     """A record and its clean torque; `pulses`: a width and a segment for each pulse, drawn if None."""
-    widths, names = pulses or protocol(rng, top_us, validate)
+    widths, names = pulses or protocol(rng, validate=validate)
     clean = patient.torque(widths, rate_hz) + baseline_nm
     noise = rng.standard_normal(clean.size) * noise_nm
     if ar1:

@@ -20,6 +20,7 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Note, Participant, Recording, Test
 from tests.harness.muscle import Patient
+from tests.harness.patients import as_record
 
 FIRST = datetime(2026, 8, 3, 11, 0, tzinfo=UTC)
 """The same day from Pago Pago to Auckland in winter, wherever the tests run."""
@@ -66,10 +67,9 @@ class Planned:
     noise_nm: float = 0.04
 
 
-def weeks(count: int, seed: int = 1, patient: Patient | None = None) -> list[Planned]:
+def weeks(count: int) -> list[Planned]:
     """Sessions two or three days apart, in which a muscle gains torque and the threshold comes down."""
-    rng = np.random.default_rng(seed)
-    muscle = patient or Patient()
+    rng, muscle = np.random.default_rng(1), Patient()
     found = []
     for number in range(count):
         share = number / max(count - 1, 1)
@@ -95,9 +95,8 @@ def record(session: Planned, seed: int) -> identify.Record:
     widths = np.concatenate(list(parts.values()))
     names = np.concatenate([[name] * values.size for name, values in parts.items()])
     torque = session.patient.torque(widths, RATE_HZ)
-    index = np.minimum(np.arange(torque.size) * 40 // RATE_HZ, widths.size - 1)
     noisy = torque + session.noise_nm * rng.standard_normal(torque.size)
-    return identify.Record.from_arrays(np.arange(torque.size) / RATE_HZ, widths[index], noisy, names[index])
+    return as_record(noisy, widths, RATE_HZ, list(names))
 
 
 def make(store: Store, folder: Path, code: str, planned: list[Planned], seed: int = 1, by: str = "Ada") -> list[str]:

@@ -22,6 +22,7 @@ from tests.harness.patients import make_record, protocol
 
 PULSE_S = 0.025
 FINE = round(FINE_HZ * PULSE_S)
+LAG_S = 0.004
 QUICK = Patient(time_constant_s=0.15)
 """Fast enough to show single pulses that came late."""
 
@@ -29,9 +30,7 @@ QUICK = Patient(time_constant_s=0.15)
 # ---- simulation ---------------------------------------------------------------------------------------------
 
 
-def late_pulses(
-    widths_us: np.ndarray, rng: np.random.Generator, most_s: float = 0.06
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def late_pulses(widths_us: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A busy host: 5 % of the pulses late, those due until 0.6 intervals later dropped, as the rig does.
 
     Widths sent, lateness, dropped.
@@ -39,19 +38,19 @@ def late_pulses(
     widths, late = widths_us.copy(), np.zeros(widths_us.size)
     for k in np.flatnonzero(rng.random(widths.size) < 0.05):
         if widths[k] > 0:
-            late[k] = rng.uniform(0.002, most_s)
+            late[k] = rng.uniform(0.002, 0.06)
             widths[k + 1 : k + 1 + int(late[k] / PULSE_S + 0.6)] = 0.0
     late[widths == 0] = 0.0
     return widths, late, (widths == 0) & (widths_us > 0)
 
 
-def torque_of(widths_us: np.ndarray, late_s: np.ndarray, rate_hz: float, patient: Patient = QUICK) -> np.ndarray:
+def torque_of(widths_us: np.ndarray, late_s: np.ndarray, rate_hz: float) -> np.ndarray:
     """Clean torque at `rate_hz`, at 8 kHz: each pulse acts for one interval from when it is felt, and they add up."""
-    drive, effect = np.zeros((widths_us.size + 6) * FINE), patient.recruitment(widths_us)
+    drive, effect = np.zeros((widths_us.size + 6) * FINE), QUICK.recruitment(widths_us)
     felt = np.arange(widths_us.size) * FINE + np.round(late_s * FINE_HZ).astype(int)
     for k in np.flatnonzero(widths_us > 0):
         drive[felt[k] : felt[k] + FINE] += effect[k]
-    torque = second_order(drive[: widths_us.size * FINE], patient.time_constant_s, patient.damping, FINE_HZ)
+    torque = second_order(drive[: widths_us.size * FINE], QUICK.time_constant_s, QUICK.damping, FINE_HZ)
     return torque[:: round(FINE_HZ / rate_hz)]
 
 
@@ -61,8 +60,6 @@ def seal(
     rate_hz: float = 400.0,
     noise_nm: float = 0.02,
     seed: int = 0,
-    lag_s: float = 0.004,
-    ack_s: float = 0.003,
     sync: bool = True,
     late: bool = True,
     ack_late: dict[int, float] | None = None,
@@ -75,16 +72,16 @@ def seal(
     widths, late_s, dropped = late_pulses(planned_us, rng) if late else nothing
     clean = torque_of(widths, late_s, rate_hz)
     planned = np.arange(widths.size) * PULSE_S
-    felt = planned + lag_s + late_s
+    felt = planned + LAG_S + late_s
     status = np.where(dropped, 2, np.where(widths > 0, 0, 1)).astype(np.uint8)
-    written = np.where(status == 0, planned + lag_s + np.minimum(late_s, 0.009), np.nan)
-    acknowledged = felt + ack_s
+    written = np.where(status == 0, planned + LAG_S + np.minimum(late_s, 0.009), np.nan)
+    acknowledged = felt + 0.003
     for pulse, by_s in (ack_late or {}).items():
         acknowledged[pulse] += by_s
     for pulse, code in (status_of or {}).items():
         status[pulse] = code
     acknowledged[status != 0] = np.nan
-    time_s = np.arange(clean.size) / rate_hz + lag_s
+    time_s = np.arange(clean.size) / rate_hz + LAG_S
     line = np.zeros(clean.size, np.uint8)
     fired = felt[widths > 0]
     line[np.clip(np.searchsorted(time_s, fired - 1e-9), 0, line.size - 1)] = 1

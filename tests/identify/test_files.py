@@ -109,7 +109,7 @@ def test_files_that_are_none(tmp_path):
         read(write(tmp_path, *ROWS), pulse_rate_hz=float("nan"))
 
 
-def seal(path: Path, *, drop: int | None = None, lag_s: float = 0.004) -> tuple[np.ndarray, np.ndarray]:
+def seal(path: Path, *, drop: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """A recording as docs/recording.md lays it out, written apart from the rig; widths and clean torque."""
     record, clean = make_record(Patient(), np.random.default_rng(0), rate_hz=1600, noise_nm=0.02)
     widths = record.pulse_width_us[::40].copy()
@@ -122,12 +122,12 @@ def seal(path: Path, *, drop: int | None = None, lag_s: float = 0.004) -> tuple[
     if drop is not None:
         sent[drop], status[drop] = np.nan, 2
     jitter = np.random.default_rng(1).uniform(-1e-4, 1e-4, widths.size)
-    written = np.where(status == 0, planned + lag_s + jitter, np.nan)
+    written = np.where(status == 0, planned + 0.004 + jitter, np.nan)
     with h5py.File(path, "w") as file:
         file.attrs.update(
             format="stimrig-recording", format_version=1, recording_id="rec-1", pulse_rate_hz=40.0, content_sha256="ab"
         )
-        file["/torque/time_s"] = record.time_s + lag_s
+        file["/torque/time_s"] = record.time_s + 0.004
         file["/torque/torque_nm"] = record.torque_nm
         file["/pulses/planned_time_s"] = planned
         file["/pulses/pulse_width_us"] = widths

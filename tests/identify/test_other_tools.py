@@ -216,14 +216,14 @@ def test_rows_without_a_number_and_lost_rows_are_gaps(tmp_path: Path) -> None:
     same(identify.fit(record), expected(), 5e-3)
 
 
-def uneven(seed: int, noise_nm: float = 0.03) -> tuple[Patient, np.ndarray, np.ndarray, np.ndarray]:
+def uneven(seed: int) -> tuple[Patient, np.ndarray, np.ndarray, np.ndarray]:
     """A muscle sampled at uneven times of its own: patient, times, widths, torque."""
     rng, patient = np.random.default_rng(seed), Patient(time_constant_s=0.2, damping=0.8)
     widths, _ = protocol(rng)
     fine_nm = patient.torque(widths, FINE_HZ)
     at = np.cumsum(rng.integers(40, 121, fine_nm.size // 80))
     at = at[at < fine_nm.size - 1]
-    torque = fine_nm[at] + noise_nm * rng.standard_normal(at.size)
+    torque = fine_nm[at] + 0.03 * rng.standard_normal(at.size)
     return patient, at / FINE_HZ, widths[at * 40 // FINE_HZ], torque
 
 

@@ -355,9 +355,9 @@ class FakeSensor:
 
     async def close(self) -> None: ...
 
-    def block(self, n: int = PER_BLOCK, at_s: float | None = None) -> Block:
+    def block(self, n: int = PER_BLOCK) -> Block:
         """The next samples; the last one is taken now."""
-        now_s = self.clock.now_s() if at_s is None else at_s
+        now_s = self.clock.now_s()
         if not self.repeating:
             self.counter += n + self.skip
         self.skip = 0

@@ -29,15 +29,15 @@ PPM = 150.0
 
 
 def on_one_bus(
-    duration_s: float, rng: np.random.Generator, stamps: str = "", delay_ms: float = 2.0, sensor_hz: float = SENSOR_HZ
+    duration_s: float, rng: np.random.Generator, stamps: str = "", delay_ms: float = 2.0
 ) -> tuple[np.ndarray, Reference, np.ndarray]:
     """Angle samples, torque samples and when the angles were taken; both are read late, in batches, in their order.
 
     Without `stamps` there are none; of the "bus" one clock stamps both, of the "sensor" each stamps itself.
     """
-    torque, angle = np.zeros(int(duration_s * CELL_HZ), SAMPLE), np.zeros(int(duration_s * sensor_hz), ANGLE_SAMPLE)
+    torque, angle = np.zeros(int(duration_s * CELL_HZ), SAMPLE), np.zeros(int(duration_s * SENSOR_HZ), ANGLE_SAMPLE)
     cell_s = np.arange(len(torque)) / CELL_HZ
-    taken_s = 0.0021 + np.arange(len(angle)) / sensor_hz / (1 + PPM * 1e-6)
+    taken_s = 0.0021 + np.arange(len(angle)) / SENSOR_HZ / (1 + PPM * 1e-6)
     both_s = np.concatenate([cell_s, taken_s])
     order = np.argsort(both_s, kind="stable")
     batch_s = np.ceil(both_s[order] / 0.004) * 0.004 + 1e-3 * rng.exponential(delay_ms, len(order))
@@ -259,7 +259,7 @@ def test_angles_that_overlap_are_taken_once(tmp_path: Path, rig: VirtualRig, bac
 RATE_HZ = 1600.0
 
 
-def made(seed: int, ppm: float, jitter_ms: float, duration_s: float = 38.7, sync: bool = True, batch: int = 8):
+def made(seed: int, ppm: float, jitter_ms: float, duration_s: float = 38.7, sync: bool = True):
     """A cell whose clock is off by `ppm`, samples that arrive late in batches, pulses that the cell sees."""
     rng = np.random.default_rng(seed)
     n = int(duration_s * RATE_HZ)
@@ -269,7 +269,7 @@ def made(seed: int, ppm: float, jitter_ms: float, duration_s: float = 38.7, sync
     late_s += (rng.random(n) < 2e-4) * rng.uniform(0, 0.05, n)  # the process was not scheduled
     arrived_s = true_s + 1e-4 + late_s
     host_s = np.maximum.accumulate(arrived_s)
-    host_s = np.repeat(host_s[batch - 1 :: batch], batch)[:n] if batch > 1 else host_s
+    host_s = np.repeat(host_s[7::8], 8)[:n]
     host_s = np.concatenate([host_s, np.full(n - len(host_s), host_s[-1])])
     written_s = np.arange(0.5, duration_s, 0.025) + rng.exponential(1e-4, len(np.arange(0.5, duration_s, 0.025)))
     felt_s = written_s + 5e-5

@@ -60,9 +60,9 @@ def write_journal(path: Path, seed: int, rest_s: float, long_s: float, ppm: floa
     book.close()
 
 
-def streamed(source: Path, copy: Path, seed: int = 0, test: LiveTest | None = None, upto: float = 1.0) -> list[Batch]:
+def streamed(source: Path, copy: Path, test: LiveTest | None = None, upto: float = 1.0) -> list[Batch]:
     """Follow a copy that grows by pieces of any size; each piece is seen, however it cuts the blocks."""
-    data, rng = source.read_bytes(), np.random.default_rng(seed)
+    data, rng = source.read_bytes(), np.random.default_rng(0)
     test, batches, at, tail = test or LiveTest(), [], 0, None
     with copy.open("wb", buffering=0) as file:
         while at < int(len(data) * upto):
