@@ -29,6 +29,7 @@ import numpy as np
 
 from bench.centre_load_parts import PATIENCE_S, Kept, Lines, Seen, all_over, look
 from bench.common import RESULTS, TOKEN, parser, table, written_by
+from tests.harness.looks_first import LooksFirst
 from tests.harness.postgres import free_port
 
 CENTRE = [sys.executable, "-m", "stimrig.api.centre.server"]
@@ -87,8 +88,7 @@ def ask(rig: Rig, method: str, path: str, **given: object) -> httpx.Response:
     end = time.monotonic() + 10 * PATIENCE_S
     while True:
         try:
-            headers = {"Authorization": f"Bearer {TOKEN}"}
-            answer = httpx.request(method, f"{rig.url}{path}", headers=headers, timeout=PATIENCE_S, **given)  # pyright: ignore[reportArgumentType]
+            answer = httpx.request(method, f"{rig.url}{path}", auth=LooksFirst(TOKEN), timeout=PATIENCE_S, **given)  # pyright: ignore[reportArgumentType]
             if answer.status_code < 500:
                 return answer
         except httpx.HTTPError:

@@ -254,7 +254,7 @@ def main() -> None:
     given = made.parse_args()
     trial = Trial(given.sessions, given.recordings)
     with running() as cluster:
-        address = cluster.empty("centre")
+        address = cluster.empty("pages")
         store = Store(address)
         filled_s = fill(address, trial)
         with store.read() as session:
