@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from stimrig.api.language import _, lazy
+from stimrig.api.language import _, lazy, translated
+from stimrig.rig.messages import LABEL_TITLES
 
 WORDS: dict[str, dict[str | None, Any]] = {
     "segment": {
@@ -81,6 +82,11 @@ def segment_words(name: str | None) -> str:
     kind, _space, number = (name or "").partition(" ")
     known = WORDS["segment"].get(kind if number.isdecimal() else name or "")
     return (name or "") if known is None else f"{known} {number}".strip()
+
+
+def label_rows(test: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Title and text of each label that somebody has said of a test; of its document, its plan, or its request."""
+    return [(translated(title), test[name]) for name, title in LABEL_TITLES.items() if test.get(name) is not None]
 
 
 def missing_words(missing: Sequence[Mapping[str, Any]] | None) -> list[str]:

@@ -22,6 +22,7 @@ from stimrig.rig.align_angle import Reference
 from stimrig.rig.clock import utc_text
 from stimrig.rig.errors import RecordingError
 from stimrig.rig.journal import JournalContents, Kind, LaidBlock, Segment
+from stimrig.rig.messages import Labels
 from stimrig.rig.signals import SAMPLE, PulseStatus
 
 FORMAT = "stimrig-recording"
@@ -100,8 +101,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
         "format_version": FORMAT_VERSION,
         "recording_id": header["recording_id"],
         "test_id": header["plan"]["test_id"],
-        "participant": header["plan"]["participant"],
-        "kind": header["plan"]["kind"],
+        **Labels.model_validate(header["plan"]).model_dump(exclude_none=True),
         "created_utc": utc_text(unix_s),
         "outcome": end["outcome"],
         "reason": end["reason"],

@@ -112,7 +112,23 @@ class AdaptivePlan(Message):
     )
 
 
-class TestPlan(Message):
+class Labels(BaseModel):
+    """What a test is known by: asked for, sent to the rig, sealed into the recording, shown, and chosen by in cohorts.
+
+    A new one is a field here with the default None, and a title under which pages and the command line take it and show
+    it; CONTRIBUTING says what follows by itself.
+    """
+
+    participant: str = Field(description="code of the participant")
+    kind: str = Field(description="kind of test")
+
+
+LABELS = tuple(Labels.model_fields)
+LABEL_TITLES = {name: field.title for name, field in Labels.model_fields.items() if field.title}
+"""Labels that a person types and reads."""
+
+
+class TestPlan(Labels, Message):
     """A whole pre-session test.
 
     With `adaptive` the segments are a fixed plan to fall back on. Its first segment always plays. At each later
@@ -122,7 +138,6 @@ class TestPlan(Message):
     __test__ = False  # keeps pytest from collecting it
 
     test_id: str
-    participant: str
     kind: str = "pre-session"
     profile: Profile
     segments: list[SegmentPlan] | None = Field(None, description="None: those of the protocol")

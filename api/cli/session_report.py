@@ -11,7 +11,7 @@ from stimrig.api.cli.terminal import carried_lines, model_report, number
 from stimrig.api.client.documents import SessionTest
 from stimrig.api.client.errors import Unreachable
 from stimrig.api.client.rest import Client
-from stimrig.api.clinical_words import words
+from stimrig.api.clinical_words import label_rows, words
 
 
 def run_test(
@@ -114,9 +114,9 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
         dose += f", {number(torque_time, 0)} N·m·s planned"
     return [
         f"test           {test['id']}  participant {test['participant']}, {number(summary.get('duration_s'), 1)} s",
-        *(
-            [] if test.get("adaptive") else [f"segments       {segments}"]
-        ),  # else what is planned is not what was played
+        *(f"{title.lower():14} {said}" for title, said in label_rows(test)),
+        # what is planned of a test that stops itself is not what was played
+        *([] if test.get("adaptive") else [f"segments       {segments}"]),
         f"dose           {dose}",
         f"torque         {summary.get('samples')} samples at {number(summary.get('sample_rate_hz'), 1)} Hz, "
         f"lost {summary.get('lost_samples')}, peak {number(summary.get('torque_peak_nm'))} N·m",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
     from stimrig.identify import Model
@@ -27,13 +27,13 @@ class Note(TypedDict):
 
     id: str
     participant: str
-    test_id: str | None
-    at_s: float | None
+    test_id: Annotated[str | None, "null: on the participant's session, not on a test"]
+    at_s: Annotated[float | None, "time in the test, from its start, s; null: on the whole of it"]
     kind: str
     text: str
     by: str
     at_utc: str
-    struck_by: str | None
+    struck_by: Annotated[str | None, "who marked it as wrong; null: it stands"]
     struck_utc: str | None
 
 
@@ -43,25 +43,25 @@ class Version(TypedDict):
     id: str
     participant: str
     recording_id: str
-    parent_id: str | None
-    added_effect: str | None
+    parent_id: Annotated[str | None, "the version it was made from"]
+    added_effect: Annotated[str | None, "what it holds more than that one"]
     carried_from_id: str | None
     carried: dict[str, Any] | None
     method: str
     effects: list[str]
     fit_percent: float | None
-    ceiling_percent: float | None
-    held_out_fit_percent: float | None
+    ceiling_percent: Annotated[float | None, "what the noise allows, %"]
+    held_out_fit_percent: Annotated[float | None, "null: nothing is held out, or the torque is level there"]
     rms_nm: float | None
     held_out_rms_nm: float | None
     noise_sd_nm: float | None
     figures: dict[str, dict[str, Any]]
     verdict: Literal["usable", "usable with care", "not usable", "unknown"]
-    words: str
-    reasons: list[str]
+    words: Annotated[str, "the verdict in one sentence"]
+    reasons: Annotated[list[str], "what speaks against the model, worst first"]
     decision: Literal["approved", "rejected"] | None
     tracking: dict[str, float] | None
-    served: bool
+    served: Annotated[bool, "the controller gets this one"]
     created_utc: str
 
 
@@ -88,11 +88,11 @@ class Tracking(TypedDict):
     approved_model_id: str
     approved_utc: str
     limits: dict[str, float] | None
-    threshold_us: float | None
-    served_utc: str | None
-    served_trial: int | None
-    etag: str | None
-    ask: str | None
+    threshold_us: Annotated[float | None, "of the approved curve, µs: what the limit of the threshold is of"]
+    served_utc: Annotated[str | None, "since when that is known which is served"]
+    served_trial: Annotated[int | None, "the trial it was tracked to; 0: the approved model"]
+    etag: Annotated[str | None, "of what is served with `?tracked=true`"]
+    ask: Annotated[str | None, "why a new test is needed now, in a sentence"]
     trials: list[dict[str, Any]]
 
 
@@ -106,30 +106,32 @@ class SessionTest(TypedDict):
     id: str
     participant: str
     kind: str
-    state: str
-    done: bool
-    reason: str
-    segment: str | None
+    state: Literal[
+        "requested", "running", "sealing", "identifying", "completed", "refused", "stopped", "fault", "failed"
+    ]
+    done: Annotated[bool, "true in every final state"]
+    reason: Annotated[str, "why it ended other than completed"]
+    segment: Annotated[str | None, "what is played now"]
     elapsed_s: float
     duration_s: float
     time_left_s: float
-    progress: float
+    progress: Annotated[float, "share that is done, 0 to 1"]
     identification: dict[str, Any] | None
     requested_by: str
-    ran_by: str
-    side: Literal["left", "right"] | None
-    muscle: str | None
+    ran_by: Annotated[str, "who ran it at the rig"]
+    side: Annotated[Literal["left", "right"] | None, "of the body, when it was begun; null: nobody has said"]
+    muscle: Annotated[str | None, "the muscle that was stimulated, as it was called when the test was begun"]
     requested_utc: str
     finished_utc: str | None
     planned: dict[str, Any]
     recording_id: Any
     recording_url: Any
-    joint: dict[str, Any] | None
-    joins: str | None
+    joins: Annotated[str | None, "the model whose recording this one is joined to"]
     model_id: Any
     model_url: Any
     summary: dict[str, Any]
     adaptive: dict[str, Any] | None
+    joint: dict[str, Any] | None
     fit: Version | None
 
 
@@ -138,8 +140,8 @@ class Job(TypedDict):
 
     id: str
     kind: str
-    model_id: str | None
-    participant: str | None
+    model_id: Annotated[str | None, "of which it is; null of `fit-recordings`"]
+    participant: Annotated[str | None, "of `fit-recordings`"]
     state: Literal["running", "completed", "failed", "cancelled"]
     done: bool
     progress: float

@@ -17,6 +17,7 @@ import numpy as np
 from stimrig.api.cohort.export import ERRORS, NoExport, Put, Who
 from stimrig.api.cohort.export_state import FOLDER, State
 from stimrig.api.cohort.parquet import STATUS, record_row, segment_at
+from stimrig.api.cohort.select import FIELDS, LABELS
 from stimrig.api.cohort.whole_record import WholeRecord
 from stimrig.api.version import software_version
 from stimrig.identify.records.cells import cell_text
@@ -64,8 +65,8 @@ EVENTS: Words = {
 SCANS: Words = {
     "filename": {"Description": "the continuous recording of torque; its stim and events files are called alike"},
     "acq_time": {"Description": "when the recording was made (UTC); moved or n/a where days are hidden"},
-    "kind": {"Description": "kind of test"},
-    "outcome": {"Description": "how the test ended: completed, stopped, fault"},
+    **{name: {"Description": label.says} for name, label in LABELS.items()},
+    "outcome": {"Description": FIELDS["outcome"].says},
     "duration_s": {"Description": "from the first sample in a segment to the last", "Units": "s"},
     "sample_rate_hz": {"Description": "samples a second", "Units": "Hz"},
     "record_id": {"Description": "id of the recording"},
@@ -101,7 +102,6 @@ NAME: str = "bids"
 MOST_ROWS = 20_000_000
 EVEN_S = 1e-6
 """Samples further from an even grid than this have a column of their own with their times."""
-SCAN_COLUMNS = ("kind", "outcome", "duration_s", "sample_rate_hz", "record_id", "sha256")
 
 
 def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
@@ -170,8 +170,7 @@ def finish(state: State, put: Put) -> None:
 def _scans(rows: Iterable[tuple[str, str, dict[str, Any]]]) -> Iterator[dict[str, Any]]:
     for _, _, row in sorted(rows, key=lambda row: str(row[2]["begun_utc"])):
         begun = row["begun_utc"]
-        told = {name: row[name] for name in SCAN_COLUMNS}
-        yield {"filename": row["file"], "acq_time": begun and begun.replace("+00:00", "Z"), **told}
+        yield {**row, "filename": row["file"], "acq_time": begun and begun.replace("+00:00", "Z")}
 
 
 def grid(record: WholeRecord) -> tuple[float, float, np.ndarray, bool]:

@@ -24,6 +24,7 @@ from stimrig.api.whole_file import whole_file
 from stimrig.identify.errors import IdentifyError
 from stimrig.identify.records.bounds import LARGEST_FILE_BYTES
 from stimrig.identify.records.cells import lines
+from stimrig.rig.messages import LABEL_TITLES
 
 UNDATED = "undated"
 ERRORS = "errors.csv"
@@ -106,6 +107,7 @@ def hidden(record: WholeRecord, days: Days) -> WholeRecord:
     if days.kept:
         return record
     told = {"address", "name", "origin", "reason", "configuration", "events", "laid", "day", "begun_utc", "test_id"}
+    told |= LABEL_TITLES.keys()  # a person typed them
     return replace(record, about={key: value for key, value in record.about.items() if key not in told}, notes=())
 
 

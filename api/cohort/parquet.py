@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, fields
 from itertools import islice
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +12,7 @@ import pyarrow.parquet as pq
 
 from stimrig.api.cohort.export import Put, Who
 from stimrig.api.cohort.export_state import State
+from stimrig.api.cohort.select import FIELDS, LABELS
 from stimrig.api.cohort.table import table_of
 from stimrig.api.cohort.whole_record import WholeRecord
 from stimrig.identify.records.cells import lines
@@ -20,9 +20,7 @@ from stimrig.identify.records.cells import lines
 Kind = Literal["text", "number", "integer", "true or false", "time"]
 
 
-@dataclass(frozen=True)
-class Column:
-    table: str
+class Column(NamedTuple):
     name: str
     type: Kind
     unit: str
@@ -31,12 +29,12 @@ class Column:
     source: str
 
 
-WHO: tuple[tuple[str, Kind, str, str, str, str], ...] = (
+WHO = (
     ("record_id", "text", "", "id of the recording; of a table its first 16 digits of the SHA-256", "", "recording_id"),
     ("participant", "text", "", "code of the participant, as it was given", "", "participant"),
     ("session", "text", "", "session: the day of the recording (UTC), or the label in its place", "", "created_utc"),
 )
-COLUMNS: dict[str, tuple[tuple[str, Kind, str, str, str, str], ...]] = {
+COLUMNS = {table: [Column(*entry) for entry in entries] for table, entries in {
     "samples": (
         *WHO,
         ("time_s", "number", "s", "time of the sample on the test's clock; 0 is the start of the first segment",
@@ -81,9 +79,9 @@ COLUMNS: dict[str, tuple[tuple[str, Kind, str, str, str, str], ...]] = {
         ("content_sha256", "text", "", "the recording's own hash over its datasets", "64 digits", "content_sha256"),
         ("format", "text", "", "what the file was", "sealed recording, table", "computed"),
         ("address", "text", "", "where it was read; null where days are hidden", "", "DATA"),
-        ("rig", "text", "", "id of the rig, where a centre knows it", "", "centre"),
-        ("test_id", "text", "", "id of the test", "", "test_id"),
-        ("kind", "text", "", "kind of test", "", "kind"),
+        ("rig", "text", "", FIELDS["rig"].says, "", "centre"),
+        ("test_id", "text", "", FIELDS["test_id"].says, "", "test_id"),
+        *((name, "text", "", label.says, "", name) for name, label in LABELS.items()),
         ("begun_utc", "time", "", "when the recording was made (UTC); moved or null where days are hidden", "",
          "created_utc"),
         ("outcome", "text", "", "how the test ended", "completed, stopped, fault", "outcome"),
@@ -104,11 +102,7 @@ COLUMNS: dict[str, tuple[tuple[str, Kind, str, str, str, str], ...]] = {
         ("settings", "text", "", "JSON: the plan as it was asked for; null where days are hidden", "", "configuration"),
         ("notes", "text", "", "what was assumed when it was read, one sentence a line", "", "computed"),
     ),
-}  # fmt: skip
-
-
-def columns_of(table: str) -> list[Column]:
-    return [Column(table, *entry) for entry in COLUMNS[table]]
+}.items()}  # fmt: skip
 
 
 def schema_of(table: str) -> Any:
@@ -122,25 +116,23 @@ def schema_of(table: str) -> Any:
         "time": pa.timestamp("us", tz="UTC"),
     }
     return pa.schema([
-        pa.field(c.name, types[c.type], metadata={"unit": c.unit, "description": c.meaning}) for c in columns_of(table)
+        pa.field(c.name, types[c.type], metadata={"unit": c.unit, "description": c.meaning}) for c in COLUMNS[table]
     ])  # fmt: skip
 
 
 def as_json(title: str) -> str:
     """The dictionary for programs."""
-    tables = {name: {c.name: _described(c) for c in columns_of(name)} for name in COLUMNS}
+    tables = {
+        table: {name: dict(zip(Column._fields[1:], said, strict=True)) for name, *said in columns}
+        for table, columns in COLUMNS.items()
+    }
     return json.dumps({"title": title, "tables": tables}, ensure_ascii=False, indent=2) + "\n"
 
 
 def as_csv() -> str:
     """The dictionary as a table, for a spreadsheet."""
-    names = [field.name for field in fields(Column)]
-    rows = (asdict(column).values() for name in COLUMNS for column in columns_of(name))
-    return "".join(lines([names, *rows]))
-
-
-def _described(column: Column) -> dict[str, str]:
-    return {key: value for key, value in asdict(column).items() if key not in ("table", "name")}
+    rows = ((table, *column) for table, columns in COLUMNS.items() for column in columns)
+    return "".join(lines([("table", *Column._fields), *rows]))
 
 
 NAME: str = "parquet"
@@ -222,7 +214,7 @@ def segment_at(record: WholeRecord, time_s: np.ndarray) -> np.ndarray:
 def record_row(record: WholeRecord, who: Who) -> dict[str, Any]:
     about = record.about
     plan = _plan(about.get("configuration"))
-    row = {column.name: about.get(column.name) for column in columns_of("records")}
+    row = {column.name: about.get(column.name) for column in COLUMNS["records"]}
     return row | {
         "record_id": who.record_id,
         "participant": who.participant,

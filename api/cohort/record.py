@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cohort.select import Selection, as_day
+from stimrig.api.cohort.select import FIELDS, Selection, as_day
 from stimrig.api.cohort.tasks import Task
 from stimrig.api.workers import confinement
 from stimrig.api.workers.json_values import clean
@@ -21,12 +21,10 @@ from stimrig.identify.errors import BadRecord, BadRequest, IdentifyError, NotIde
 from stimrig.identify.records import HDF5_MAGIC, bounds
 from stimrig.identify.records.hdf5 import StrictFile
 
-ABOUT = {
-    "participant": "participant", "kind": "kind", "created_utc": "begun_utc", "recording_id": "record_id",
-    "test_id": "test_id", "outcome": "outcome", "software": "recorded_by",
-}  # fmt: skip
-"""Attributes of a sealed recording, and the columns that repeat them."""
-SAID = ("participant", "day", "kind", "rig", "record_id", "test_id", "outcome")
+REPEATED = {name: field.attribute for name, field in FIELDS.items() if field.attribute}
+ABOUT = {**REPEATED, "begun_utc": "created_utc", "recorded_by": "software"}
+"""Columns that repeat attributes of a sealed recording, and these."""
+SAID = ("day", "rig", *REPEATED)
 LIBRARIES = (
     "stimrig.identify.fitting", "stimrig.identify.diagnosis", "stimrig.identify.diagnosis.improvement",
     "stimrig.identify.records.csv", "stimrig.identify.records.mat", "stimrig.identify.records.recording",
@@ -103,7 +101,7 @@ def describe(path: Path, row: Row) -> bool:
         if start.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
             return False
     file = StrictFile(bounds.content_of(path), str(path))
-    given: Row = {column: file.text(name, "") for name, column in ABOUT.items()}
+    given: Row = {column: file.text(name, "") for column, name in ABOUT.items()}
     given["day"] = as_day(given["begun_utc"])
     row |= {name: value for name, value in given.items() if value}
     row |= {name: row.get(name) for name in SAID}  # what it does not say is known not to be said

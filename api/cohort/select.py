@@ -16,31 +16,37 @@ from datetime import date
 from typing import Any, Literal
 
 from stimrig.api.cohort.tasks import CohortError
+from stimrig.rig.messages import Labels
 
 Type = Literal["text", "number", "day"]
 
 
 @dataclass(frozen=True)
 class Field:
-    """One field: its type, and what it says, for messages and docs."""
+    """One field: its type, what it says, its unit, and the attribute of a sealed recording that it repeats."""
 
     type: Type
     says: str
+    unit: str = ""
+    attribute: str = ""
 
 
+LABELS = {name: Field("text", about.description or "", "", name) for name, about in Labels.model_fields.items()}
+PARTICIPANT = LABELS.pop("participant")
+"""Labels of a test, as its recording repeats them; the participant stands apart."""
 FIELDS: dict[str, Field] = {
-    "participant": Field("text", "code of the participant"),
-    "day": Field("day", "day of the session (UTC), as 2026-01-31"),
-    "kind": Field("text", "kind of test"),
+    "participant": PARTICIPANT,
+    "day": Field("day", "day of the session, UTC"),
+    **LABELS,
     "rig": Field("text", "id of the rig, where a centre knows it"),
     "name": Field("text", "name of the file, or id at a centre"),
-    "origin": Field("text", "the DATA it was found in"),
-    "record_id": Field("text", "id of the recording"),
-    "test_id": Field("text", "id of the test"),
-    "outcome": Field("text", "completed, stopped or fault"),
-    "duration_s": Field("number", "from the first sample to the last, s"),
-    "rate_hz": Field("number", "samples a second"),
-    "bytes": Field("number", "size of the file"),
+    "origin": Field("text", "the DATA in which it was found"),
+    "record_id": Field("text", "id of the recording, where it says one", "", "recording_id"),
+    "test_id": Field("text", "id of the test", "", "test_id"),
+    "outcome": Field("text", "how the test ended: completed, stopped, fault", "", "outcome"),
+    "duration_s": Field("number", "from the first sample to the last", "s"),
+    "rate_hz": Field("number", "samples a second", "Hz"),
+    "bytes": Field("number", "size of the file", "B"),
 }
 """Every field that `--select` may name. A field is absent from a mapping as long as it is unknown, and None where the
 record says nothing of it."""

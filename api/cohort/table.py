@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from stimrig.api.cohort.computing import COPY, LEFT_OUT, digest
 from stimrig.api.cohort.record import OF_EFFECT, OF_STEP
+from stimrig.api.cohort.select import FIELDS, LABELS
 from stimrig.api.cohort.tasks import CohortError
 
 FORMAT = "stimrig-cohort"
@@ -36,24 +37,26 @@ STEP = pa.struct([("added", pa.string()), *((name, pa.float64()) for name in OF_
 REFUSED = pa.struct([("effect", pa.string()), ("log_evidence_gain", pa.float64())])
 INSTANT = pa.timestamp("us", tz="UTC")
 
+TYPES = {"text": pa.string(), "day": pa.date32(), "number": pa.float64(), "bytes": pa.int64()}
+
+
+def _fields(*names: str) -> Iterator[tuple[str, pa.DataType, str, str]]:
+    """Columns that a selection may name, too."""
+    for name, field in ((name, FIELDS[name]) for name in names):
+        yield name, TYPES.get(name, TYPES[field.type]), field.unit, field.says
+
+
 COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
-    ("record_id", pa.string(), "", "id of the recording, where it says one"),
+    *_fields("record_id"),
     ("address", pa.string(), "", "where it was read"),
-    ("name", pa.string(), "", "name of the file, or id at a centre"),
-    ("origin", pa.string(), "", "the DATA in which it was found"),
+    *_fields("name", "origin"),
     ("sha256", pa.string(), "", "SHA-256 of the file; null where it could not be read"),
     ("stamp", pa.string(), "", "state of the file when it was listed: it changes with the content"),
-    ("bytes", pa.int64(), "B", "size of the file"),
-    ("participant", pa.string(), "", "code of the participant"),
-    ("day", pa.date32(), "", "day of the session, UTC"),
+    *_fields("bytes", "participant", "day"),
     ("begun_utc", INSTANT, "", "when the recording was made"),
-    ("kind", pa.string(), "", "kind of test"),
-    ("rig", pa.string(), "", "id of the rig, where a centre knows it"),
-    ("test_id", pa.string(), "", "id of the test"),
-    ("outcome", pa.string(), "", "how the test ended: completed, stopped, fault"),
+    *_fields(*LABELS, "rig", "test_id", "outcome"),
     ("recorded_by", pa.string(), "", "software that sealed the recording"),
-    ("duration_s", pa.float64(), "s", "from the first sample to the last"),
-    ("rate_hz", pa.float64(), "Hz", "samples a second"),
+    *_fields("duration_s", "rate_hz"),
     ("verb", pa.string(), "", "fit, diagnose or improve"),
     ("software", pa.string(), "", "version of stimrig that computed the row"),
     ("computed_utc", INSTANT, "", "when the row came"),
@@ -227,6 +230,7 @@ def options_of(file: Path) -> dict[str, Any]:
         if about.get(b"format_version") != FORMAT_VERSION.encode():
             raise CohortError(f"{file}: format version {about.get(b'format_version', b'?').decode()}. Update stimrig.")
         types = dict(zip(schema.names, schema.types, strict=True))
+        types = dict.fromkeys(LABELS, pa.string()) | types  # a label may be younger than the table
         if odd := [column.name for column in SCHEMA if types.get(column.name) != column.type]:
             raise CohortError(f"{file}: its column {odd[0]} is missing or of another type. {fix}")
         return dict(json.loads(about[b"options"]))

@@ -29,10 +29,10 @@ SENTENCES = (
     "identify/estimation/effect_fit.py", "identify/estimation/averaged.py", "identify/methods/**/*.py",
     "identify/simulation/joint_surface.py", "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/adapters/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py",
-    "rig/journal.py", "rig/limits.py", "rig/plan.py", "rig/protocols.py", "rig/score.py", "rig/sequences/*.py",
-    "rig/phase.py", "api/models/*.py", "api/people/*.py", "api/sessions/*.py", "api/store/seen.py",
-    "api/web/*.py", "api/web/routes/*.py", "api/web/pages/*.py", "api/workers/*.py", "api/errors.py",
-    "api/centre/directory.py", "api/centre/downloads.py", "api/centre/rigs.py", "api/record_files.py",
+    "rig/journal.py", "rig/limits.py", "rig/messages.py", "rig/plan.py", "rig/protocols.py", "rig/score.py",
+    "rig/sequences/*.py", "rig/phase.py", "api/models/*.py", "api/people/*.py", "api/sessions/*.py",
+    "api/store/seen.py", "api/web/*.py", "api/web/routes/*.py", "api/web/pages/*.py", "api/workers/*.py",
+    "api/errors.py", "api/centre/directory.py", "api/centre/downloads.py", "api/centre/rigs.py", "api/record_files.py",
 )  # fmt: skip
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {
@@ -40,7 +40,7 @@ FOR_PROGRAMMERS = {
     "confinement.py", "child.py", "_can.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
-NAMED = {"Effect": ("name", "main"), "Parameter": ("about",)}
+NAMED = {"Effect": ("name", "main"), "Parameter": ("about",), "Field": ("title",)}
 """Calls with arguments (of a dictionary its values) that pages show although they may be a single word."""
 NOT_SHOWN = {
     "Field",

@@ -44,8 +44,16 @@ PAGE = 1000
 LONGEST_BODY = 500_000
 LONGEST_LIST = 100
 DEEPEST = 20
-OF_SERVICES = ("followed_by", "rig")
-"""Columns of a test that say which service follows it, and at which socket."""
+OF_TEST = (
+    "id", "participant", "kind", "state", "reason", "summary", "recording_id", "model_id", "requested_by",
+    "requested_utc", "finished_utc", "ran_by",
+)  # fmt: skip
+OF_PLAN = (
+    "test_id", "profile", "segments", "protocol", "pulse_rate_hz", "max_pulse_width_us", "max_torque_nm", "adaptive",
+    "angle", "preview", "joins", "side", "muscle", "tokens", "target", "reach", "bounds", "joint", "approval_id",
+    "reference_torque_nm", "participant", "kind",
+)  # fmt: skip
+"""What a centre is told of a test, and of its plan. Nothing else leaves: a new column or label only once it is here."""
 SHA256 = re.compile(r"[0-9a-f]{64}")
 TABLES: dict[type[Table], tuple[Any, Any]] = {
     Participant: (Participant.created_utc, Participant.code),
@@ -172,12 +180,10 @@ def telling(row: Table) -> Telling | None:
 
 
 def _test(row: Test) -> dict[str, Any]:
-    plan = dict(row.plan or {})
-    preview = plan.get("preview")
-    if isinstance(preview, dict):
+    plan = {name: value for name, value in (row.plan or {}).items() if name in OF_PLAN}
+    if isinstance(preview := plan.get("preview"), dict):
         plan["preview"] = {name: value for name, value in preview.items() if not isinstance(value, list)}
-    body = {**row.as_dict(), "plan": plan}
-    return {name: value for name, value in body.items() if name not in OF_SERVICES}
+    return {**{name: getattr(row, name) for name in OF_TEST}, "plan": plan}
 
 
 def _recording(row: Recording) -> Telling:

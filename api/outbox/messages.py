@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, WithJsonSchema
 
 from stimrig.api.outbox.chain import Position
 from stimrig.api.outbox.receipts import Receipt
@@ -27,20 +26,8 @@ ChainId = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
 Count = Annotated[int, Field(ge=0, le=LARGEST)]
 
 
-def _counts(value: int) -> int:
-    if not 0 <= value < LARGEST:
-        raise ValueError("it counts nothing")
-    return value
-
-
-def _hash(value: str) -> str:
-    if not re.fullmatch(r"[0-9a-f]{64}", value):
-        raise ValueError("no SHA-256")
-    return value
-
-
-Number = Annotated[int, AfterValidator(_counts)]
-Digest = Annotated[str, AfterValidator(_hash)]
+Number = Annotated[int, Field(ge=0, lt=LARGEST), WithJsonSchema({"type": "integer"})]
+Digest = Annotated[Sha256, WithJsonSchema({"type": "string"})]
 """As `Count` and `Sha256`, but not said in the centre's OpenAPI document."""
 
 

@@ -134,10 +134,8 @@ class JointTests(Watched):
         """As `Watched`."""
         lost = begun(row) and row.kind != HELD
         why = "What is seen is not counted any more: the service was restarted during the test." if lost else ""
-        return {
-            "state": "alone" if lost else "watching", "problem": why, "ended": "", "angle_rad": None,
-            "velocity_rad_s": None, "torque_time_nm_s": None, "coverage": None,
-        }  # fmt: skip
+        state = {"state": "alone" if lost else "watching", "problem": why, "ended": ""}
+        return dict.fromkeys(Seen.__dataclass_fields__) | state
 
     # ---- today's ---------------------------------------------------------------------------------------------
 

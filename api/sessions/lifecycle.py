@@ -22,7 +22,7 @@ from stimrig.api.store import Store, audit
 from stimrig.api.store.holds import Holds, Turn
 from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
 from stimrig.api.workers.pool import Call, Pool
-from stimrig.rig.messages import FinishedEvent
+from stimrig.rig.messages import LABEL_TITLES, FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
 ROW = (
@@ -76,7 +76,7 @@ class Lifecycle:
             "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
             "identification": call.document() if call else None,
             "ran_by": row.ran_by or row.requested_by,
-            **{name: row.plan.get(name) for name in ("side", "muscle", "joins")},
+            **{name: row.plan.get(name) for name in ("side", "muscle", "joins", *LABEL_TITLES)},
             "planned": planned,
             "recording_url": f"/v1/recordings/{row.recording_id}" if row.recording_id else None,
             "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,

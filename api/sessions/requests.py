@@ -24,7 +24,7 @@ from stimrig.api.models.tracking import USUAL_PERCENT, Limits
 from stimrig.api.people import accounts
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
-from stimrig.rig.messages import HELD, MOVING, PASSIVE, Profile
+from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, Labels, Profile
 
 LONGEST_NOTE = 500
 Side = Literal["left", "right"]
@@ -175,7 +175,7 @@ PLANNED_BY_ITSELF = {"segments", "protocol", "joins"}
 """What is not chosen for a test that chooses its own segments."""
 
 
-class TestIn(Body):
+class TestIn(Labels, Body):
     """A test to be run now."""
 
     __test__ = False
@@ -233,6 +233,11 @@ class TestIn(Body):
         description="kind `sequence`: the torque that the controller wants, one value for each pulse of the whole "
         "test, N·m. Only to tell the error against it; it changes nothing that is played",
     )
+
+    @field_validator(*LABELS)
+    @classmethod
+    def _one_line(cls, text: str | None) -> str | None:
+        return None if text is None else _plain(text)
 
     @model_validator(mode="after")
     def _check_kind(self) -> TestIn:

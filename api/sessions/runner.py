@@ -198,8 +198,7 @@ class Runner(Playing):
             segments = [messages.SegmentPlan(**segment.model_dump()) for segment in body.segments]
         plan = messages.TestPlan(
             test_id=self._new_id(),
-            participant=participant.code,
-            kind=body.kind,
+            **{name: getattr(body, name) for name in messages.LABELS},
             segments=segments,
             **({} if body.protocol is None else {"protocol": body.protocol}),
             pulse_rate_hz=body.pulse_rate_hz,

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records import bounds, columns
-from stimrig.identify.records.mat import is_mat
-from stimrig.identify.records.record import Record
+
+if TYPE_CHECKING:
+    from stimrig.identify.records.record import Record
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+"""How a sealed recording begins; the service asks, too, and loads no reader for it."""
 
 
 def read(
@@ -35,6 +37,9 @@ def read(
     BadRecord
         With file, line and column, and what to do.
     """
+    from stimrig.identify.records import bounds, columns
+    from stimrig.identify.records.mat import is_mat, read_mat
+
     path = Path(path)
     if pulse_rate_hz is not None:
         bounds.check_rate(pulse_rate_hz, "pulse rate")
@@ -47,8 +52,6 @@ def read(
             raise BadRecord("a sealed recording has its own columns", place=str(path), fix="Leave --map out.")
         return read_recording(content, path, pulse_rate_hz)
     if is_mat(content) or path.suffix.lower() == ".mat":
-        from stimrig.identify.records.mat import read_mat
-
         return read_mat(content, path, pulse_rate_hz, given)
     from stimrig.identify.records.csv import read_csv
 

@@ -10,6 +10,7 @@ from fastapi.routing import APIRoute
 
 from stimrig.api.web import pages
 from stimrig.api.web.app import routers
+from stimrig.rig.messages import LABEL_TITLES
 from tests.api.conftest import HTML, TOKEN, Service, run_test, shared_service
 
 FOLDER = Path(pages.__file__).parent
@@ -18,7 +19,7 @@ FIELDS = r'<(?:input|select|textarea)[^>]*\bname="(\w+)"', r"(\w+): (?:Text|Anno
 SOURCES = [path.read_text("utf-8") for kind in ("templates/*.html", "*.py") for path in FOLDER.glob(kind)]
 FROM_MACROS = (
     "seen", "step_us", "max_torque_nm", "gain_percent", "threshold_percent", "time_scale_percent", "angle_deg",
-    "angle_from_deg", "angle_to_deg",
+    "angle_from_deg", "angle_to_deg", *LABEL_TITLES,
 )  # fmt: skip
 NAMES = sorted({*FROM_MACROS} | {name for text in SOURCES for field in FIELDS for name in re.findall(field, text)})
 ODD = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 import secrets
@@ -20,6 +21,7 @@ from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
 from stimrig.api.cli.terminal import Json, given, say, say_json, writing
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
+from stimrig.rig.messages import LABEL_TITLES, Labels
 
 
 def test(
@@ -48,12 +50,13 @@ def test(
     ] = None,
     anyway: Annotated[bool, typer.Option("--anyway", help="play it although the target is out of reach")] = False,
     as_json: Json = False,
+    **labels: str | None,
 ) -> None:
     """One pre-session test: a fixed protocol is played, and the muscle is identified. Approves nothing.
 
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
-    asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway)
+    asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway) | given(**labels)
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
@@ -74,6 +77,19 @@ def test(
         return
     say(*report_lines(found["test"], found["model"]))
     say(f"recording      {output or found['test']['recording_url']}")
+
+
+def take_labels(verb: Any) -> None:
+    """Make an option of each label that a person types, in the place of the verb's keywords."""
+    *parameters, _labels = inspect.signature(verb, eval_str=True).parameters.values()
+    for name in LABEL_TITLES:
+        says = Annotated[str | None, typer.Option(help=Labels.model_fields[name].description, show_default=False)]
+        parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=says))
+        verb.__annotations__[name] = says
+    verb.__signature__ = inspect.Signature(parameters)
+
+
+take_labels(test)
 
 
 def how(

@@ -16,6 +16,7 @@ from stimrig.api import clinical_words, effect_words, language
 from stimrig.api.charts.figure import PAGE_CONFIG
 from stimrig.api.language import words
 from stimrig.api.models.stored_model import followed
+from stimrig.rig.messages import LABEL_TITLES
 
 HERE = Path(__file__).parent
 
@@ -73,7 +74,8 @@ environment.filters.update({name: in_its_language(words_of) for name, words_of i
     "translated": language.translated, "plain_words": language.plain, "localised": language.localised,
     "words": clinical_words.words, "segment_words": clinical_words.segment_words, "degrees": clinical_words.degrees,
     "effect_words": effect_words.effect_words, "effects_words": effect_words.effects_words,
+    "label_rows": clinical_words.label_rows,
 }.items()})  # fmt: skip
 environment.globals["chart_config"] = PAGE_CONFIG
 environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": in_words}
-environment.globals |= {"language": language, "known_words": clinical_words.WORDS}
+environment.globals |= {"language": language, "known_words": clinical_words.WORDS, "label_titles": LABEL_TITLES}

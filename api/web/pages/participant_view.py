@@ -34,6 +34,7 @@ from stimrig.api.web.pages.render import page, signed
 from stimrig.api.web.pages.starting import site_words
 from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import participants, recordings
+from stimrig.rig.messages import LABEL_TITLES
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
 
@@ -156,16 +157,17 @@ def asked_test(sent: FormData, code: str) -> TestIn:
     Raises
     ------
     ApiError
-        422: what was typed is no target.
+        422: what was typed is no target, or no label.
     """
-    if sent.get("plan") != "adaptive":
-        return TestIn(participant=code)
-    percent = typed.wanted(str(sent.get("target") or ""), no_target)
-    if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
-        within = f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %"
-        raise typed.unusable(no_target(within))
-    target = TargetIn(curve_percent=percent, step_percent=percent)
-    return TestIn(participant=code, kind="adaptive", target=target, anyway=True)
+    asked: dict[str, Any] = {name: str(sent.get(name) or "").strip() or None for name in LABEL_TITLES}
+    if sent.get("plan") == "adaptive":
+        percent = typed.wanted(str(sent.get("target") or ""), no_target)
+        if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
+            within = f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %"
+            raise typed.unusable(no_target(within))
+        target = TargetIn(curve_percent=percent, step_percent=percent)
+        asked |= {"kind": "adaptive", "target": target, "anyway": True}
+    return typed.checked(TestIn, participant=code, **asked)
 
 
 def no_target(why: str) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from stimrig.api.clinical_words import degrees, words
+from stimrig.api.clinical_words import degrees, label_rows, words
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised, translated, until, when
 from stimrig.api.models.places import Site, site_of
@@ -82,7 +82,8 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         title=_("Start the %(kind)s of %(code)s?", kind=words(body.kind, "kind"), code=row.code),
         button=_("Start now: %(strength)s", strength=strength) if stimulates else _("Start now: no stimulation"),
         action=action,
-        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context)),
+        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context))
+        + [Row(*said) for said in label_rows(vars(body))],
         warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
         stimulates=stimulates,
         back=back,
@@ -121,22 +122,21 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
         dose = _("at most %(most)s of torque", most=most)
         more = [Row(_("Stops once known within"), number(preview["target"]["curve_percent"], 1, "%"))]
         more += [Row(_("Expected"), translated(reach["words"]))] if reach["reachable"] else []
-    profile = row.profile
-    if not widest_us(preview):
-        return [Row(_("Who"), row.code), *more, Row(_("How long"), long), Row(_("Dose"), dose),
-                Row(_("Stops at"), number(profile["max_torque_nm"], 1, "N·m")), Row(_("Run by"), ran_by),
-                Row(_("Rig"), rig)]  # fmt: skip
-    widest, most = number(widest_us(preview), 0, "µs"), number(profile["max_pulse_width_us"], 0, "µs")
-    return [
-        Row(_("Who"), row.code),
+    widest, most = number(widest_us(preview), 0, "µs"), number(row.profile["max_pulse_width_us"], 0, "µs")
+    current = [
         Row(_("Side and muscle"), site_words(site_of(row))),
         Row(_("Current of every pulse"), current_words(row)),
         Row(_("Widest pulse"), _("%(widest)s, comfort maximum %(most)s", widest=widest, most=most)),
+    ]
+    stimulates = widest_us(preview) > 0.0
+    return [
+        Row(_("Who"), row.code),
+        *(current if stimulates else []),
         *more,
         Row(_("How long"), long),
         Row(_("Dose"), dose),
-        Row(_("Stops at"), number(profile["max_torque_nm"], 1, "N·m")),
-        Row(_("Calibration"), standing.words),
+        Row(_("Stops at"), number(row.profile["max_torque_nm"], 1, "N·m")),
+        *([Row(_("Calibration"), standing.words)] if stimulates else []),
         Row(_("Run by"), ran_by),
         Row(_("Rig"), rig),
     ]

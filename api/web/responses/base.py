@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, create_model
 
 from stimrig.api.schemas import component_name
 
@@ -13,6 +13,16 @@ class Document(BaseModel):
     """Base of all answers; newer versions may add fields."""
 
     model_config = ConfigDict(extra="allow")
+
+
+def fields_of(document: type, *without: str) -> type[Document]:
+    """The fields of a client's document (`stimrig.api.client.documents`), each with the text that stands beside it."""
+    fields = {
+        name: (hint, Field(description=next(iter(getattr(hint, "__metadata__", ())), None)))
+        for name, hint in get_type_hints(document, include_extras=True).items()
+        if name not in without
+    }
+    return create_model(document.__name__, __base__=Document, **cast("dict[str, Any]", fields))
 
 
 class FieldProblem(Document):

@@ -6,7 +6,8 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from stimrig.api.web.responses.base import Document, Problem, SegmentOut
+from stimrig.api.client import documents
+from stimrig.api.web.responses.base import Document, Problem, SegmentOut, fields_of
 
 
 class ParameterOut(Document):
@@ -50,38 +51,19 @@ class TrackingLimits(Document):
     time_scale_percent: float
 
 
-class VersionOut(Document):
+class VersionOut(fields_of(documents.Version)):
     """One model version."""
 
-    id: str
-    participant: str
-    recording_id: str
-    parent_id: str | None = Field(description="the version it was made from")
-    added_effect: str | None = Field(description="what it holds more than that one")
     carried_from_id: str | None = Field(
         None, description="the model of an earlier session whose structure this version has"
     )
     carried: CarriedOut | None = Field(None, description="what the recording said of that structure")
-    method: str
-    effects: list[str]
-    fit_percent: float | None
-    ceiling_percent: float | None = Field(description="what the noise allows, %")
-    held_out_fit_percent: float | None = Field(description="null: nothing is held out, or the torque is level there")
-    rms_nm: float | None
-    held_out_rms_nm: float | None
-    noise_sd_nm: float | None
     figures: dict[str, ParameterOut] = Field(
         {}, description="threshold, plateau, dynamics and effects; empty: stored before they were"
     )
-    verdict: Literal["usable", "usable with care", "not usable", "unknown"]
-    words: str = Field(description="the verdict in one sentence")
-    reasons: list[str] = Field(description="what speaks against the model, worst first")
-    decision: Literal["approved", "rejected"] | None
     tracking: TrackingLimits | None = Field(
         None, description="how far it may be tracked; null: not approved, or before it could be"
     )
-    served: bool = Field(description="the controller gets this one")
-    created_utc: str
 
 
 class Place(Document):
@@ -192,20 +174,9 @@ class ImprovementOut(Document):
     versions: list[VersionOut] = Field(description="the versions of these steps, the first one included")
 
 
-class JobOut(Document):
+class JobOut(fields_of(documents.Job)):
     """Long work: how far, and how long yet."""
 
-    id: str
-    kind: str
-    model_id: str | None = Field(description="of which it is; null of `fit-recordings`")
-    participant: str | None = Field(description="of `fit-recordings`")
-    state: Literal["running", "completed", "failed", "cancelled"]
-    done: bool
-    progress: float
-    text: str
-    elapsed_s: float
-    time_left_s: float | None
-    result_url: str | None
     problem: Problem | None
 
 
@@ -398,16 +369,8 @@ class TrialOut(Document):
     disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches that do not fit, s")
 
 
-class TrackingOut(Document):
+class TrackingOut(fields_of(documents.Tracking)):
     """What was tracked since the approval that holds."""
 
-    participant: str
-    approved_model_id: str
-    approved_utc: str
     limits: TrackingLimits | None = Field(description="null: nobody has allowed it")
-    threshold_us: float | None = Field(description="of the approved curve, µs: what the limit of the threshold is of")
-    served_utc: str | None = Field(description="since when that is known which is served")
-    served_trial: int | None = Field(description="the trial it was tracked to; 0: the approved model")
-    etag: str | None = Field(description="of what is served with `?tracked=true`")
-    ask: str | None = Field(description="why a new test is needed now, in a sentence")
     trials: list[TrialOut]

@@ -6,9 +6,10 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
+from stimrig.api.client import documents
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.requests import NoteKind
-from stimrig.api.web.responses.base import Document
+from stimrig.api.web.responses.base import Document, fields_of
 from stimrig.rig.messages import CalibrationStatus, RigState
 
 
@@ -104,32 +105,20 @@ class ProfileOut(Document):
     angle_set_at_utc: str | None = Field(None, description="of the angle sensor: its calibration when that was said")
 
 
-class ParticipantOut(Document):
+class ParticipantOut(fields_of(documents.Participant)):
     """A participant: a code, never a name."""
 
-    code: str
     profile: ProfileOut
-    created_utc: str
-    created_by: str
     side: Literal["left", "right"] | None = Field(None, description="of the body; null: nobody has said")
     muscle: str | None = Field(None, description="the muscle that is stimulated")
     placement: str | None = Field(None, description="of the electrodes: with side and muscle the site")
     archived_utc: str | None = Field(None, description="since when it is archived: no test starts, nothing is deleted")
 
 
-class NoteOut(Document):
+class NoteOut(fields_of(documents.Note)):
     """A note on a session, or at a time in a test."""
 
-    id: str
-    participant: str
-    test_id: str | None = Field(description="null: on the participant's session, not on a test")
-    at_s: float | None = Field(description="time in the test, from its start, s; null: on the whole of it")
     kind: NoteKind
-    text: str
-    by: str
-    at_utc: str
-    struck_by: str | None = Field(description="who marked it as wrong; null: it stands")
-    struck_utc: str | None
 
 
 class ChangedOut(ParticipantOut):

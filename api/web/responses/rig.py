@@ -6,7 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from stimrig.api.web.responses.base import Document, Holder, SegmentOut
+from stimrig.api.client import documents
+from stimrig.api.web.responses.base import Document, Holder, SegmentOut, fields_of
 from stimrig.api.web.responses.models import SegmentSpan, VersionOut
 from stimrig.rig.messages import AngleStatus, Bound, CalibrationStatus, ProtocolInfo, RigState, StopEvidence
 
@@ -212,34 +213,14 @@ class LeftOut(Document):
     ended_by: str
 
 
-class TestOut(Document):
+class TestOut(fields_of(documents.SessionTest, "fit")):
     """A test."""
 
     __test__ = False
-    id: str
-    participant: str
-    kind: str
-    state: Literal[
-        "requested", "running", "sealing", "identifying", "completed", "refused", "stopped", "fault", "failed"
-    ]
-    done: bool = Field(description="true in every final state")
-    reason: str = Field(description="why it ended other than completed")
-    segment: str | None = Field(description="what is played now")
-    elapsed_s: float
-    duration_s: float
-    time_left_s: float
-    progress: float = Field(description="share that is done, 0 to 1")
     identification: WorkOut | None
-    requested_by: str
-    ran_by: str = Field(description="who ran it at the rig")
-    side: Literal["left", "right"] | None = Field(description="of the body, when it was begun; null: nobody has said")
-    muscle: str | None = Field(description="the muscle that was stimulated, as it was called when the test was begun")
-    requested_utc: str
-    finished_utc: str | None
     planned: PlannedOut
     recording_id: str | None
     recording_url: str | None
-    joins: str | None = Field(description="the model whose recording this one is joined to")
     model_id: str | None
     model_url: str | None
     summary: TestSummary

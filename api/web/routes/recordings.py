@@ -24,6 +24,7 @@ from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import UploadOut
 from stimrig.api.web.routes import participants
+from stimrig.identify.records import HDF5_MAGIC
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
@@ -37,7 +38,6 @@ RAW = {
 GONE = problem("the file is not in its place any more")
 MOST_COLUMNS = 8
 KINDS = {".csv": "text/csv", ".mat": "application/x-matlab-data"}
-HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
 @router.get("/recordings/{recording_id}", response_class=FileResponse, responses={200: RAW, 410: GONE})

@@ -37,9 +37,7 @@ def rig_state(context: Context) -> dict[str, Any]:
             if status
             else {"state": "disconnected", "reason": "the rig has not spoken yet"}
         ),
-        "holder": {"test_id": current.test_id, "participant": current.participant, "by": current.by}
-        if current
-        else None,
+        "holder": current.holder if current else None,
     }
 
 

@@ -129,7 +129,8 @@ def test_the_docs_list_the_fields_that_there_are() -> None:
     lines = (Path(__file__).parents[3] / "docs" / "cohorts.md").read_text("utf-8").splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
     written = {row[0].strip("`"): row[1:] for row in rows if len(row) == 3}
-    assert written == {name: [field.type, field.says] for name, field in FIELDS.items()}
+    said = {name: f"{field.says}, {field.unit}" if field.unit else field.says for name, field in FIELDS.items()}
+    assert written == {name: [FIELDS[name].type, says] for name, says in said.items()}
 
 
 # ---- the real thing: processes that are interrupted and killed

@@ -14,6 +14,7 @@ from stimrig.api.outbox import chain, feed
 from stimrig.api.outbox.feed import Feed
 from stimrig.api.store import audit, uploads
 from stimrig.api.store.tables import Approval, Model, Note, OutboxItem, Participant, Recording, Test
+from stimrig.rig.messages import LABELS, TestPlan
 from tests.api.outbox.conftest import Rig, assert_chain, sha256
 
 
@@ -67,6 +68,18 @@ def test_a_test_is_told_once_it_is_closed_and_without_its_pulses(rig: Rig) -> No
     with rig.store.write() as session:
         session.get(Test, test_id).ran_by = "Bob"  # pyright: ignore[reportOptionalMemberAccess]
     assert rig.told()[-2:] == [("test", test_id)] * 2 and body_of(rig, "test")["ran_by"] == "Bob"
+
+
+def test_what_a_test_newly_holds_stays_at_the_rig(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A field of a plan, a label and a column leave only where they are named."""
+    typed = {"posture": "sits as Mr Miller wants", "placement": "A", "participant": "P1", "side": "left"}
+    told = feed.telling(Test(id="T0", state="completed", plan=typed, summary={}))
+    assert told is not None and told.body["plan"] == {"participant": "P1", "side": "left"}
+    assert set(told.body) == set(Test.__table__.columns.keys()) - {"followed_by", "rig"}
+    assert set(TestPlan.model_fields) - set(feed.OF_PLAN) <= set(LABELS) - {"participant", "kind"}
+    monkeypatch.setattr(Test.__table__, "columns", {**Test.__table__.columns, "posture": Test.__table__.c.reason})
+    again = feed.telling(Test(id="T0", state="completed", plan=typed, summary={}))
+    assert again == told
 
 
 def test_what_is_rolled_back_is_not_told(rig: Rig) -> None:
