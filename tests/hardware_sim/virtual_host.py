@@ -15,8 +15,8 @@ LAYOUT = struct.Struct("<fHBB")
 
 
 class VirtualHost:
-    def __init__(self, **settings: Any) -> None:
-        self.devices = make_devices(Settings(**settings))
+    def __init__(self, arm: str | None = None, **settings: Any) -> None:
+        self.devices = make_devices(Settings(**settings), arm)
         self.answered_s = 0.0
         self._decoder = ScienceMode4()
 
