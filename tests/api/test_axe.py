@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from tests.api.browser import PASSWORD, PHONE, WIDE, open_tab, participant, sign_in_with_token, start
-from tests.api.conftest import Service, run_test, shared_service, soon, wait_done
+from tests.api.conftest import Service, play_test, run_test, shared_service, soon, wait_done
 
 axe_path = pytest.importorskip("axe_playwright_python.base").AXE_FILE_PATH
 pytestmark = pytest.mark.browser
@@ -129,8 +129,7 @@ def test_a_test_and_its_ends(tab: Any, service: Service) -> None:
 
 
 def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: httpx.Client) -> None:
-    client.post("/v1/participants", json={"code": "X3"})
-    first = run_test(client, "X3")
+    first = play_test(client, "X3")
     second = run_test(client, "X3")
 
     def drawn() -> None:
@@ -156,8 +155,7 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: http
 
 
 def test_trials_of_a_controller(tab: Any, service: Service, client: httpx.Client) -> None:
-    client.post("/v1/participants", json={"code": "X7"})
-    model = run_test(client, "X7")["model_id"]
+    model = play_test(client, "X7")["model_id"]
     client.post(f"/v1/models/{model}/approve")
     (service.data / "recordings" / "track.json").write_text(json.dumps({"values": {"gain": 0.5}}))
     trial = client.post("/v1/tests", json={"participant": "X7", "kind": "sequence"}).json()
@@ -168,8 +166,7 @@ def test_trials_of_a_controller(tab: Any, service: Service, client: httpx.Client
 
 def test_in_the_dark(browser: Any, service: Service, client: httpx.Client) -> None:
     """The main pages, their notices and their states, where the system is dark."""
-    client.post("/v1/participants", json={"code": "X5"})
-    done = run_test(client, "X5")
+    done = play_test(client, "X5")
     model = f"/models/{done['model_id']}"
 
     def opened() -> None:
@@ -199,8 +196,7 @@ def test_in_the_dark(browser: Any, service: Service, client: httpx.Client) -> No
 
 def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:
     """The longest pages in the language with the longer words."""
-    client.post("/v1/participants", json={"code": "X6"})
-    done = run_test(client, "X6")
+    done = play_test(client, "X6")
 
     def opened() -> None:
         tab.get_by_role("link", name="Ermüdung").wait_for()
@@ -215,9 +211,7 @@ def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:
 
 
 def test_widths_for_a_torque_and_a_controllers_key(tab: Any, service: Service, tmp_path: Path) -> None:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "X7"})
-        model = run_test(http, "X7")["model_id"]
+    model = service.play_test("X7")["model_id"]
     reference = tmp_path / "reference.csv"
     reference.write_text("torque_nm\n0\n1\n2\n")
     visit(tab, service, f"/models/{model}/widths")

@@ -19,7 +19,7 @@ from stimrig.api.cli.terminal import carried_lines
 from stimrig.api.models.carried_structure import CarriedStructure
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Approval
-from tests.api.conftest import STUB, Service, csrf, run_service, run_test, signed_in, soon, wait_done
+from tests.api.conftest import STUB, Service, csrf, play_test, run_service, run_test, signed_in, soon, wait_done
 from tests.api.test_one_service import command
 
 CSV = "time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n"
@@ -253,8 +253,7 @@ def test_structure_that_the_recording_does_not_bear_is_left_out_and_said(site: S
     """A person went through the test: it gives a model all the same."""
     site.context.settings.structure = ("bad",)
     with site.client() as client:
-        client.post("/v1/participants", json={"code": "P1"})
-        test = run_test(client, "P1")
+        test = play_test(client, "P1")
         assert test["state"] == "completed"
         assert client.get(f"/v1/models/{test['model_id']}").json()["effects"] == []
         assert "not with bad: no effect bad" in test["summary"]["warnings"][-1]

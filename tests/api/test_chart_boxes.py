@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.api.browser import open_tab
-from tests.api.conftest import Service, run_test, shared_service
+from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = {"width": 1366, "height": 768}, {"width": 820, "height": 1180}
@@ -34,9 +34,7 @@ service = shared_service()
 
 @pytest.fixture(scope="module")
 def model(service: Service) -> str:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "B1"})
-        return run_test(http, "B1")["model_id"]
+    return service.play_test("B1")["model_id"]
 
 
 def drawn(page: Any, service: Service, model: str) -> None:

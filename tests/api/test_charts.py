@@ -26,7 +26,7 @@ from stimrig.api.workers.curves import curves
 from stimrig.api.workers.pool import WORKER
 from tests.api import made_up_joint
 from tests.api.browser import open_tab
-from tests.api.conftest import Service, run_test, serving, shared_service
+from tests.api.conftest import Service, play_test, run_test, serving, shared_service
 from tests.api.fake_rig import default_widths, muscle
 from tests.api.test_axe import examined
 from tests.api.test_chart_boxes import COVERED, LAPTOP
@@ -388,8 +388,7 @@ service = shared_service()
 def models(service: Service) -> tuple[str, str]:
     """Of a joint at rest, and with g and h."""
     with service.client() as http:
-        http.post("/v1/participants", json={"code": "J1"})
-        test = run_test(http, "J1")
+        test = play_test(http, "J1")
         both = http.post("/v1/participants/J1/models", json={"recordings": [test["recording_id"]]})
         assert both.status_code == 201, both.text
         return test["model_id"], both.json()["id"]

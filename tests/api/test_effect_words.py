@@ -12,7 +12,7 @@ from stimrig.api.effect_words import effects_words, library, parameter_words
 from stimrig.api.language import translated
 from stimrig.api.models import changes, explanation, stored_model
 from stimrig.identify import effects
-from tests.api.conftest import Service, run_test, shared_service, signed_in, soon
+from tests.api.conftest import Service, play_test, run_test, shared_service, signed_in, soon
 
 PLAIN = {
     "sample_rate_hz": 40.0,
@@ -96,8 +96,7 @@ def test_a_page_that_waits_reads_its_own_language(service: Service) -> None:
     slow.parent.mkdir(parents=True, exist_ok=True)
     slow.write_text("0.4")
     with service.client() as http, signed_in(service) as browser:
-        http.post("/v1/participants", json={"code": "G1"})
-        model = run_test(http, "G1")["model_id"]
+        model = play_test(http, "G1")["model_id"]
         job = http.get(f"/v1/models/{model}/diagnosis", params={"wait": False}).json()["id"]
         now = soon(lambda: (told := browser.get(f"/jobs/now/{job}", headers=GERMAN).json())["text"] and told)
         assert now == {"progress": 0.4, "text": "geprüft: Ermüdung", "time_left_s": now["time_left_s"], "done": False}
@@ -108,8 +107,7 @@ def test_a_page_that_waits_reads_its_own_language(service: Service) -> None:
 
 def test_the_live_page_hears_its_own_language(service: Service, client: httpx.Client) -> None:
     carrying = service.context.settings.recordings_dir / "carrying-slowly"
-    client.post("/v1/participants", json={"code": "G2"})
-    first = run_test(client, "G2")["model_id"]
+    first = play_test(client, "G2")["model_id"]
     added = client.post(f"/v1/models/{first}/effects", json={"effects": ["tremor"], "force": True, "reason": "seen"})
     client.post(f"/v1/models/{added.json()['id']}/approve", json={"reason": "follows the measurement well"})
     carrying.touch()

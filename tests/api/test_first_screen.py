@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.api.browser import bring_to_rest, expected
-from tests.api.conftest import Service, run_test, shared_service
+from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = (1366, 768), (820, 1180)
@@ -26,9 +26,7 @@ service = shared_service(speed=8.0, emulated=True)
 
 @pytest.fixture(scope="module")
 def model(service: Service) -> str:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "F1"})
-        return run_test(http, "F1")["model_id"]
+    return service.play_test("F1")["model_id"]
 
 
 def show(tab: Any, address: str, size: tuple[int, int]) -> None:
@@ -54,9 +52,7 @@ def test_a_diagnosis_under_way_moves_nothing(tab: Any, service: Service, size: t
     marker = service.data / "recordings" / "slow"
     marker.write_text("0.4")
     try:
-        with service.client() as http:
-            http.post("/v1/participants", json={"code": "F2"})
-            slow = run_test(http, "F2")["model_id"]
+        slow = service.play_test("F2")["model_id"]
         show(tab, f"{service.url}/models/{slow}", size)
         meter = tab.locator("#why progress")
         meter.wait_for()

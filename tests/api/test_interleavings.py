@@ -18,7 +18,7 @@ import httpx
 import pytest
 
 from stimrig.api.store.tables import AuditEntry, Model
-from tests.api.conftest import Service, run_test
+from tests.api.conftest import Service, play_test
 from tests.api.fake_rig import FakeRig
 from tests.api.test_overtaken import TRIAL, key_of
 from tests.harness.looks_first import LooksFirst
@@ -69,8 +69,7 @@ def one(service: Service, random: Random) -> Run:
     """Some people and a controller, each in a thread; then what the trail and the rig tell is judged."""
     run = Run()
     with service.client() as admin:
-        admin.post("/v1/participants", json={"code": CODE})
-        model = run_test(admin, CODE)["model_id"]
+        model = play_test(admin, CODE)["model_id"]
         admin.post(f"/v1/models/{model}/approve", json={})
         child = admin.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
         key, controller = key_of(service, admin, CODE)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.api.browser import bring_to_rest, expected, gone, open_tab, participant, start
-from tests.api.conftest import Service, run_test, shared_service, soon
+from tests.api.conftest import Service, shared_service, soon
 
 pytestmark = pytest.mark.browser
 SPEED, SLOW = 4.0, 0.2
@@ -30,9 +30,7 @@ def tab(tab: Any, service: Service) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def done(service: Service) -> dict[str, Any]:
     """A finished test with its model."""
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "E1"})
-        return run_test(http, "E1")
+    return service.play_test("E1")
 
 
 def every_page(service: Service, done: dict[str, Any]) -> list[str]:

@@ -20,7 +20,7 @@ from alembic.runtime.migration import MigrationContext
 from stimrig.api.errors import ApiError
 from stimrig.api.store import Store, audit, migrations
 from stimrig.api.store.tables import Approval, AuditEntry, Participant, Recording, Table, User
-from tests.api.conftest import STUB, run_service, run_test, serving
+from tests.api.conftest import STUB, play_test, run_service, serving
 
 pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
@@ -112,8 +112,7 @@ def test_an_upgrade_that_fails_leaves_the_database_as_it_was(tmp_path: Path) -> 
 
 def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Path) -> None:
     with serving(tmp_path, short_dir, STUB) as (_, http):
-        http.post("/v1/participants", json={"code": "P1"})
-        model = run_test(http, "P1")["model_id"]
+        model = play_test(http, "P1")["model_id"]
         http.post(f"/v1/models/{model}/approve", json={"reason": "good"})
     change(
         tmp_path / "stimrig.db", "DROP TABLE alembic_version", "DROP TABLE schema_version", "DROP TABLE confirmations",

@@ -16,7 +16,7 @@ from stimrig.api.charts.figure import CHART_CONFIG
 from stimrig.api.web.pages.report_file import comparison_html, improvement_html
 from stimrig.api.workers.curves import curves, thinned
 from tests.api.browser import open_tab
-from tests.api.conftest import Service, run_test, shared_service
+from tests.api.conftest import Service, play_test, shared_service
 from tests.api.test_worker import made_up_csv
 
 pytestmark = pytest.mark.browser
@@ -98,8 +98,7 @@ def saved_here(page: Any, figures: int) -> None:
 
 def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service) -> None:
     with service.client() as http:
-        http.post("/v1/participants", json={"code": "N1"})
-        model = run_test(http, "N1")["model_id"]
+        model = play_test(http, "N1")["model_id"]
         added = http.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
     added = added.get("id") or added["model"]["id"]
     paths = (f"/models/{model}?diagnose=1", f"/models/{added}?diagnose=0", f"/compare?model={model}&model={added}")

@@ -33,7 +33,7 @@ from tests.api.browser import (
     there,
     without_values,
 )
-from tests.api.conftest import HTML, Service, csrf, run_test, shared_service, wait_done
+from tests.api.conftest import HTML, Service, csrf, shared_service, wait_done
 
 pytestmark = pytest.mark.browser
 
@@ -189,14 +189,8 @@ def blank(browser: Any, service: Service) -> Iterator[Any]:
     yield from open_tab(browser, service, signed_in=False)
 
 
-def a_model(service: Service, code: str) -> dict[str, Any]:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": code})
-        return run_test(http, code)
-
-
 def test_approval_wants_the_password_a_rejection_a_reason_and_says_what_is_wrong(tab: Any, service: Service) -> None:
-    model = a_model(service, "C1")["model_id"]
+    model = service.play_test("C1")["model_id"]
     tab.goto(f"{service.url}/models/{model}")
     tab.get_by_role("button", name="Approve").click()
     assert tab.url.endswith(model), "the browser asks for the password first"
@@ -220,14 +214,14 @@ def test_approval_wants_the_password_a_rejection_a_reason_and_says_what_is_wrong
 
 
 def test_a_form_without_a_reason_decides_nothing(service: Service, pages: httpx.Client, client: httpx.Client) -> None:
-    model = a_model(service, "C2")["model_id"]
+    model = service.play_test("C2")["model_id"]
     refused = pages.post(f"/models/{model}/reject", data={"csrf": csrf(pages), "reason": "  "})
     assert refused.status_code == 422 and "needs a reason" in refused.text
     assert client.get(f"/v1/models/{model}").json()["decision"] is None
 
 
 def test_every_export_of_a_model_and_a_test_is_there(tab: Any, service: Service) -> None:
-    done = a_model(service, "C3")
+    done = service.play_test("C3")
     tab.goto(f"{service.url}/models/{done['model_id']}")
     exports = tab.get_by_role("group", name="Export")
     for name, suffix in (("MODEL.json", ".json"), ("HDF5", ".h5"), ("CSV", ".csv")):
@@ -267,7 +261,7 @@ def test_stop_during_a_fit_is_confirmed_and_the_model_still_comes(tab: Any, serv
 
 
 def test_a_reader_sees_no_deeds_and_may_stop(service: Service, client: httpx.Client) -> None:
-    model = a_model(service, "C4")["model_id"]
+    model = service.play_test("C4")["model_id"]
     body = {"name": "Rosa", "password": PASSWORD, "scopes": ["read-live", "read-model"]}
     assert client.post("/v1/users", json=body).status_code in (201, 409)
     with service.client(token=None, headers=HTML, follow_redirects=True) as page:

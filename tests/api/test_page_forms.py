@@ -11,7 +11,7 @@ from fastapi.routing import APIRoute
 from stimrig.api.web import pages
 from stimrig.api.web.app import routers
 from stimrig.rig.messages import LABEL_TITLES
-from tests.api.conftest import HTML, TOKEN, Service, run_test, shared_service
+from tests.api.conftest import HTML, TOKEN, Service, play_test, shared_service
 
 FOLDER = Path(pages.__file__).parent
 FIELDS = r'<(?:input|select|textarea)[^>]*\bname="(\w+)"', r"(\w+): (?:Text|Annotated\[.*Form\()"
@@ -49,8 +49,7 @@ service = shared_service()
 def known(service: Service) -> dict[str, str]:
     """What is there, by the name it has in an address."""
     with service.client() as client:
-        client.post("/v1/participants", json={"code": "P017"})
-        test = run_test(client, "P017")
+        test = play_test(client, "P017")
         client.post("/v1/participants/P017/calibration")
     return {
         "code": "P017",

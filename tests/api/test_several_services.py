@@ -24,7 +24,7 @@ from stimrig.api.store import Store, audit, holds
 from stimrig.api.store.holds import Among
 from stimrig.api.store.tables import AuditEntry, Model, Test
 from stimrig.api.web.app import create_app
-from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Server, Service, run_test, soon, wait_done
+from tests.api.conftest import PATIENCE_S, STUB, TOKEN, Server, Service, play_test, soon, wait_done
 from tests.api.fake_rig import RigThread
 from tests.api.test_one_service import served
 from tests.harness.postgres import Cluster, running
@@ -66,8 +66,7 @@ def test_a_rejection_and_a_revoked_token_count_everywhere_at_once(
     tmp_path: Path, short_dir: Path, address: str
 ) -> None:
     with two(tmp_path, short_dir, address) as (a, b), a.client() as at_a, b.client() as at_b:
-        at_a.post("/v1/participants", json={"code": "P1"})
-        model = run_test(at_a, "P1")["model_id"]
+        model = play_test(at_a, "P1")["model_id"]
         text = b.token("reader", "read-model")
         with a.client(text) as reader_at_a, b.client(text) as reader_at_b:
             for round_ in range(5):
