@@ -110,21 +110,23 @@ def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
         examined(stranger, "a new key")
 
 
-def test_a_test_and_its_ends(tab: Any, service: Service) -> None:
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_test_and_its_ends(browser: Any, service: Service, scheme: str) -> None:
     service.rig.speed = 0.7
-    participant(tab, service, "X2")
-    start(tab)
-    tab.locator("#age", has_text="ms").wait_for()
-    examined(tab, "live")
-    tab.get_by_role("button", name="Stop stimulation").click()
-    tab.get_by_text("The rig confirms").wait_for()
-    examined(tab, "stopped")
-    visit(tab, service, "/")
-    visit(tab, service, "/participants/X2")
-    service.rig.confirms_stop = False
-    tab.get_by_role("button", name="Stop stimulation").click()
-    tab.get_by_role("heading", name="The stop is not confirmed").wait_for()
-    examined(tab, "not confirmed")
+    for page in open_tab(browser, service, color_scheme=scheme):
+        participant(page, service, f"X2-{scheme}")
+        start(page)
+        page.locator("#age", has_text="ms").wait_for()
+        examined(page, "live")
+        page.get_by_role("button", name="Stop stimulation").click()
+        page.get_by_text("The rig confirms").wait_for()
+        examined(page, "stopped")
+        visit(page, service, "/")
+        visit(page, service, f"/participants/X2-{scheme}")
+        service.rig.confirms_stop = False
+        page.get_by_role("button", name="Stop stimulation").click()
+        page.get_by_role("heading", name="The stop is not confirmed").wait_for()
+        examined(page, "not confirmed")
     service.rig.speed = 8.0
 
 
@@ -165,7 +167,7 @@ def test_trials_of_a_controller(tab: Any, service: Service, client: httpx.Client
 
 
 def test_in_the_dark(browser: Any, service: Service, client: httpx.Client) -> None:
-    """The main pages, their notices and their states, where the system is dark."""
+    """The main pages and their notices, where the system is dark; a test's states are above."""
     done = play_test(client, "X5")
     model = f"/models/{done['model_id']}"
 
@@ -181,17 +183,8 @@ def test_in_the_dark(browser: Any, service: Service, client: httpx.Client) -> No
         page.get_by_role("button", name="Begin the calibration").click()
         page.get_by_role("button", name="Discard").wait_for()
         examined(page, "calibration")
-        service.rig.speed = 0.7
         page.get_by_role("button", name="Discard").click()
         page.wait_for_url("**/participants/X5")
-        start(page)
-        page.locator("#age", has_text="ms").wait_for()
-        examined(page, "live")
-        service.rig.confirms_stop = False
-        page.get_by_role("button", name="Stop stimulation").click()
-        page.get_by_role("heading", name="The stop is not confirmed").wait_for()
-        examined(page, "not confirmed")
-        service.rig.speed = 8.0
 
 
 def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:

@@ -29,6 +29,7 @@ from tests.api.conftest import (
     TOKEN,
     Service,
     SetClock,
+    csrf,
     run_service,
     run_test,
     signed_in,
@@ -275,6 +276,12 @@ def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
     assert later.auth.bearer("second-one").may(Scope.ADMINISTER)
     with pytest.raises(ApiError, match="revoked"):
         later.auth.bearer("first-one")
+
+
+def test_signing_out_ends_the_session(service: Service, pages: httpx.Client) -> None:
+    cookie = dict(pages.cookies)
+    pages.post("/sign-out", data={"csrf": csrf(pages)})
+    assert service.client(None, cookies=cookie).get("/v1/rig").status_code == 401
 
 
 def test_sign_in_leads_nowhere_else(service: Service) -> None:

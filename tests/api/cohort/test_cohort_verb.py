@@ -14,14 +14,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jsonschema_rs
 import pyarrow.parquet as pq
 import pytest
 
-from stimrig.api import schemas
 from stimrig.api.cli import main
 from stimrig.api.cohort import cluster
 from stimrig.api.cohort.select import FIELDS
+from tests.api.test_schemas import unmet
 from tests.harness.cohort_records import cohort
 from tests.harness.pauses import below, stat
 
@@ -117,14 +116,6 @@ def test_a_scheduler_without_workers_is_one_line(capsys: pytest.CaptureFixture[s
     assert "no worker within 0.5 s" in words
 
 
-def unmet(document: dict[str, Any]) -> list[str]:
-    """What a document lacks of the schema, and which keys at the top the schema does not know."""
-    schema = schemas.load("cohort")
-    check = jsonschema_rs.validator_for(schema)
-    unknown = sorted(set(document) - set(schema["properties"]))
-    return [f"{list(error.instance_path)}: {error.message[:200]}" for error in check.iter_errors(document)] + unknown
-
-
 def test_the_docs_list_the_fields_that_there_are() -> None:
     lines = (Path(__file__).parents[3] / "docs" / "cohorts.md").read_text("utf-8").splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
@@ -196,7 +187,7 @@ def test_killed_and_with_a_worker_killed_it_is_whole_in_the_end(folder: Path, tm
     out, err = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 0, err
     told = json.loads(out)
-    assert unmet(told) == []
+    assert unmet("cohort", told) == []
     found = pq.read_table(output).to_pylist()
     names = [row["name"] for row in found]
     assert len(names) == len(set(names)) == SESSIONS + 1
@@ -217,12 +208,12 @@ def test_the_dashboard_is_told_and_people_are_given_words(
     assert "1 with a result" in out and str(output) in out
     assert main.run(["cohort", "changed", str(output), str(output), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert unmet(told) == [] and told["unchanged"] == 1
+    assert unmet("cohort", told) == [] and told["unchanged"] == 1
     assert main.run(["cohort", "changed", str(output), str(output)]) == 0
     assert "1 records in both: 1 unchanged" in capsys.readouterr().out
     assert main.run(["cohort", "figures", str(output), "--html", str(tmp_path / "f.html"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert unmet(told) == [] and told["records"] == 1
+    assert unmet("cohort", told) == [] and told["records"] == 1
     assert (tmp_path / "f.html").stat().st_size > 1000
 
 
