@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -40,6 +41,12 @@ def test_every_document_and_every_table_has_it(name: str) -> None:
 
     assert {name} <= set(table.SCHEMA.names) & set(parquet.schema_of("records").names)
     assert name in bids.SCANS or name == "participant"
+
+
+def test_the_docs_list_them() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "recording.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| ([^|]*) \|$", text.partition("### Labels")[2].partition("### Events")[0], re.M)
+    assert rows == [(name, field.description) for name, field in Labels.model_fields.items()]
 
 
 def test_a_label_stands_in_one_line() -> None:
