@@ -91,7 +91,8 @@ def test_the_command_line_takes_it() -> None:
     app.command()(verb)
     for words in (["--often", "2"], ["--kind", "next-experiment"]):
         assert CliRunner().invoke(app, words).exit_code == 0
-    assert given == [{"often": 2, "kind": None}, {"often": 1, "kind": "next-experiment"}]
+    none = dict.fromkeys(LABEL_TITLES)
+    assert given == [{**none, "often": 2}, {**none, "often": 1, "kind": "next-experiment"}]
     assert "kind of test" in CliRunner().invoke(app, ["--help"]).stdout
 
 
