@@ -176,12 +176,11 @@ class Player:
     async def _not_begun(self, before: Phase) -> None:
         """No pulse was sent. A stop that came meanwhile counts as one of an idle rig."""
         state, halted = self.state, self.state.phase
-        state.change(before)
-        if halted.lost:
-            state.change(before.disconnected(halted.lost))
-        if halted.latch:
-            state.halted(halted.reason)
+        idle = before.disconnected(halted.lost) if halted.lost else before
+        if halted.latch:  # in one step: it must not be told as ready on the way
+            state.halted(halted.reason, idle)
         else:
+            state.change(idle)
             with contextlib.suppress(RigError):
                 await state.file.clear()
         self.evidence_ready.set()

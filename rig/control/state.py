@@ -101,9 +101,10 @@ class State:
         """Somebody or something asked for a stop: whoever re-arms must have seen it."""
         self._stops += 1
 
-    def halted(self, reason: str) -> None:
-        """A stop or a fault: the state that follows, and its latch for the next process."""
-        following = self.phase.halted(reason)
+    def halted(self, reason: str, phase: Phase | None = None) -> None:
+        """A stop or a fault: the state that follows (on `phase`, or on the present one), and its latch for the next
+        process."""
+        following = (phase or self.phase).halted(reason)
         if following.state in STOPPED or following.state == "sealing":
             # behind whatever is being written: a clear that was under way does not come last
             self._latching = self._tasks.spawn(self.remember(following), "latch file")

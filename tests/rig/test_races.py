@@ -18,6 +18,7 @@ from stimrig.rig.control.replies import refusal
 from stimrig.rig.errors import (
     BusyError,
     DeviceError,
+    JournalError,
     LatchChangedError,
     LatchedError,
     PlanError,
@@ -161,6 +162,28 @@ def test_a_stop_at_each_moment_holds_until_a_person_undoes_it(make: Make, story:
         assert live.states[-1] == "ready"
         assert live.play("two", hold_s=0.5).outcome == "completed"
     assert ended == errors
+
+
+def test_a_stop_while_a_start_fails_holds_too(make: Make, monkeypatch: pytest.MonkeyPatch):
+    """The rig is not told as ready on its way from the start that could not begin to the latch."""
+
+    def no_journal(*_: object) -> None:
+        raise JournalError("no room")
+
+    def fails(live: LiveRig) -> None:
+        monkeypatch.setattr(live.rig.player.store, "begin", no_journal)
+
+    def given_up(live: LiveRig) -> bool:
+        return "arming" in live.states and live.states[-1] == "ready"
+
+    for live, task in moments(make, begin_test, given_up, fails):
+        told = len(live.states)
+        assert live.stop("now").confirmed
+        live.until(task.done.is_set)
+        assert isinstance(task.error, JournalError | LatchedError)
+        live.machine.wait(2.0)
+        assert live.states[-1] == "latched" and "ready" not in live.states[told:]
+        assert remembered(live) == {"state": "latched", "reason": "now (by nurse)"}
 
 
 def test_an_end_of_the_process_at_each_moment_of_a_start(make: Make):
