@@ -62,7 +62,7 @@ LANES = {
 
 CAMPAIGNS = {
     "make campaigns": "whole grids, of which one of each kind is run here",
-    "make postgresql": "every test of the service on PostgreSQL, of which seven files are run here",
+    "make postgresql": "every test of the service on PostgreSQL, of which six files are run here",
     "make pauses": "every test while its processes are stopped and continued at random",
     "make late": "the page's tests with answers that come late and in pieces",
     "make soak": "an hour of recording with fits beside it, of which 30 s are run here",
