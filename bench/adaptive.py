@@ -30,7 +30,7 @@ from stimrig.hardware_sim.hidden.scenario import draw_scenario, rng_of
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
-from stimrig.identify.estimation.plain import prepare
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.experiments.adaptive import Target
 from stimrig.identify.experiments.designs import pieces
 from stimrig.identify.experiments.knowledge import Knowledge, step_responses, whole_band

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.effects import get
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.effect_fit import add_effects, effect_names, renewed_curve
+from stimrig.identify.estimation.effect_fit import add_effects, effect_names
 from stimrig.identify.estimation.finish import finish
-from stimrig.identify.estimation.plain import fitted_rows, prepare
+from stimrig.identify.estimation.plain import renewed_curve
+from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.methods import check_options, method_of
 from stimrig.identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
 from stimrig.identify.model import Model
@@ -74,16 +76,21 @@ def fit(
         raise BadRequest(f"not a list of different effects: {given}", place="effects", fix="Name each effect once.")
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            if not wanted:
-                if len(record.parts) > 1 and chosen is not MAXIMUM_LIKELIHOOD:
-                    message = f"{method} takes a single recording; this record has {len(record.parts)} parts"
-                    raise BadRequest(message, place="method", fix="Use maximum-likelihood, or give one of the parts.")
-                return chosen.fit(prepare(record)[0], names, **options)
             against = [method] if chosen is not MAXIMUM_LIKELIHOOD else sorted(set(options) & NO_EFFECTS_WITH)
-            if against:
+            if wanted and against:
                 message = f"effects cannot be fitted with {' and '.join(against)}"
                 raise BadRequest(message, place="effects", fix="Use maximum-likelihood without this option.")
-            return _fit_effects(record, wanted, names, options, progress or (lambda _share, _text: None))
+            if len(record.parts) > 1 and chosen is not MAXIMUM_LIKELIHOOD:
+                message = f"{method} takes a single recording; this record has {len(record.parts)} parts"
+                raise BadRequest(message, place="method", fix="Use maximum-likelihood, or give one of the parts.")
+            grid, raw = prepare(record)
+            if not wanted:
+                return chosen.fit(grid, names, **options)
+            rows = fitted_rows(grid, names)
+            tell = progress or (lambda _share, _text: None)
+            if AUTO in wanted:
+                return _fit_auto(grid, raw, wanted, rows, options, tell)
+            return _fit_effects(grid, raw, wanted, rows, options, tell)
     except np.linalg.LinAlgError as error:
         raise NotIdentifiable(
             f"{method} finds no solution on this record ({error})", fix="Check that torque follows the pulses."
@@ -95,33 +102,37 @@ def fit(
         raise
 
 
+def _fit_auto(
+    grid: Grid, raw: Raw, wanted: Sequence[str], rows: np.ndarray, options: dict[str, Any], progress: Progress
+) -> Model:
+    """Maximum likelihood with the effects that the evidence asks for."""
+    if len(wanted) > 1:
+        others = ", ".join(name for name in wanted if name != AUTO)
+        raise BadRequest(
+            f"{AUTO} chooses the effects itself, but {others} is given as well",
+            place="effects",
+            fix=f"Give {AUTO}, or a list of effects.",
+        )
+    if options:
+        given = ", ".join(sorted(options))
+        raise BadRequest(
+            f"{AUTO} takes no options, but {given} is given", place="effects", fix="Leave out the options."
+        )
+    from stimrig.identify.diagnosis.search import helpful, search_effects  # here: a fit without a search needs it not
+
+    search = search_effects(grid, raw, progress, fitted=rows)
+    last = helpful(search)[0][-1]
+    progress(1.0, "done")
+    added = f"effects added: {', '.join(effect_names(last.fitted)) or 'none'}"
+    return finish(MAXIMUM_LIKELIHOOD.id, last.fitted, [added], last.statistics)
+
+
 def _fit_effects(
-    record: Record, wanted: Sequence[str], fit_on: tuple[str, ...] | None, options: dict[str, Any], progress: Progress
+    grid: Grid, raw: Raw, wanted: Sequence[str], rows: np.ndarray, options: dict[str, Any], progress: Progress
 ) -> Model:
     """Maximum likelihood with the named effects, each in its most likely form or in the one given after a colon."""
-    grid, raw = prepare(record)
-    rows = fitted_rows(grid, fit_on)
-    if AUTO in wanted:
-        if len(wanted) > 1:
-            others = ", ".join(name for name in wanted if name != AUTO)
-            raise BadRequest(
-                f"{AUTO} chooses the effects itself, but {others} is given as well",
-                place="effects",
-                fix=f"Give {AUTO}, or a list of effects.",
-            )
-        if options:
-            given = ", ".join(sorted(options))
-            raise BadRequest(
-                f"{AUTO} takes no options, but {given} is given", place="effects", fix="Leave out the options."
-            )
-        from stimrig.identify.diagnosis.improvement import helpful  # here: a fit without a search does not load it
-        from stimrig.identify.diagnosis.search import search_effects
-
-        last = helpful(search_effects(record, progress, fitted=rows))[0][-1].fitted
-        progress(1.0, "done")
-        return finish(MAXIMUM_LIKELIHOOD.id, last, [f"effects added: {', '.join(effect_names(last)) or 'none'}"])
     for name in wanted:
-        get(name.partition(":")[0])  # an unknown one is refused before anything is fitted
+        find_effect(name.partition(":")[0])  # an unknown one is refused before anything is fitted
     base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
     steps = count(1)
 

@@ -21,7 +21,7 @@ from stimrig.api.web import routes
 from stimrig.api.web.app import routers
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.effects import registry
-from stimrig.identify.estimation.plain import prepare
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.paper import simulate
 from stimrig.rig import sequences
 from stimrig.rig.acquire.health import Watch

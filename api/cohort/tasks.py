@@ -85,7 +85,7 @@ def checked(task: Task) -> Task:
     CohortError
         An unknown method or effect, a column that cannot be meant.
     """
-    from stimrig.identify.effects import get
+    from stimrig.identify.effects import find_effect
     from stimrig.identify.methods import method_of
     from stimrig.identify.records.columns import parsed
 
@@ -93,7 +93,7 @@ def checked(task: Task) -> Task:
         method_of(task.method)
         for name in task.effects:
             if name != AUTO:
-                get(name.partition(":")[0])
+                find_effect(name.partition(":")[0])
         parsed(list(task.columns) or None)
     except IdentifyError as error:
         raise CohortError(str(error)) from error

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of, runs
-from stimrig.identify.estimation.plain import block_means
-from stimrig.identify.noise.kernels import profile_noise
+from stimrig.identify.estimation.samples import block_means
+from stimrig.identify.noise import profile_noise
 
 LAGS = 25
 DRAWS = 1500

@@ -9,9 +9,10 @@ from stimrig.identify.diagnosis.result import diagnosis_of
 from stimrig.identify.diagnosis.search import Progress, search_effects
 from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.effect_fit import fitted_with
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.experiments import NOTHING, Experiment, plan
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
@@ -46,7 +47,8 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
     NotIdentifiable
         Less than three seconds may be fitted, or the record does not determine the model.
     """
-    search = search_effects(record, progress, structure=structure_of(model))
+    structure = structure_of(model)
+    search = search_effects(*prepare(record), progress, structure=structure)
     result = diagnosis_of(search, judge(search))
     if progress is not None:
         progress(1.0, "done")
@@ -100,7 +102,7 @@ def next_experiment(about: Record | Diagnosis, rivals: Sequence[str] = ()) -> Ex
         raise TypeError("rivals are told apart on a record: next_experiment(record, rivals)")
     names = list(dict.fromkeys(rivals))
     for name in names:
-        get(name)  # an unknown one is refused before anything is fitted
+        find_effect(name)  # an unknown one is refused before anything is fitted
     fits = {name: fitted_with(about, [name]) for name in names}
     if len(names) == 1:
         fits[NOTHING] = fitted_with(about, [])

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from stimrig.identify.diagnosis.search import LAST, Judged, Progress, Reason, prior, rise, silent, still_needed
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from stimrig.identify.diagnosis.residual import held_out_rise, quiet_rows, residual_structure
+from stimrig.identify.diagnosis.search import Progress, prior, silent, without_effect
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
-from stimrig.identify.effects import get, registry
-from stimrig.identify.estimation.effect_fit import detected_effects, effect_names, renewed_curve
+from stimrig.identify.effects import Effect, find_effect, registry
+from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.estimation.effect_fit import add_effect, detected_effects, effect_names, try_effect
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
-from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.estimation.plain import fit_plain, renewed_curve
+from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Carried
 
 METHOD = "maximum-likelihood"
+LAST = "fitting last session's structure"
 FIGURES = ("fit_percent", "ceiling_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "held_out_by")
 UNUSABLE = "not usable"
 
@@ -83,6 +90,131 @@ def _refused(model: Model) -> Reason | None:
     return None if model.effects else Reason("plain-before", "The earlier model has the plain structure as well.")
 
 
+# ---- effects of an earlier model -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why something is so: as a word for programs, and as a sentence."""
+
+    why: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a record says of one carried effect: None if it cannot tell. `gain` is None if it was not compared."""
+
+    effect: Effect
+    needed: bool | None
+    because: Reason
+    gain: float | None = None
+
+
+def still_needed(plain: Fitted, model: Model, raw: Raw, say: Progress) -> tuple[Fitted, dict[str, Judged]]:
+    """The plain model with those effects of an earlier one that the record asks for, and the verdict on each.
+
+    Parameters
+    ----------
+    plain : Fitted
+        The plain structure on the new record.
+    model : Model
+        The earlier model. It lends its effects and their forms.
+    raw : Raw
+        What the samples of the new record show before any fit.
+    say : callable
+        Called with the share done and a line of text.
+    """
+    judged: dict[str, Judged] = {}
+    full = _add_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
+    last = _reduced(full, raw, judged, lambda share, text: say(0.6 + 0.4 * share, text))
+    if residual_structure(last, quiet_rows(last), raw.noise_sd_nm).left:
+        judged = {name: _undecided(verdict) for name, verdict in judged.items()}
+    return last, judged
+
+
+def _add_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
+    """The plain model with all effects of the earlier one that this record can hold; the others are judged.
+
+    The effect that explains most is added first, then the next: a weak one that is fitted alone takes what belongs to
+    the strong one. So the order in which the earlier model lists them does not matter.
+    """
+    fitted, left = plain, {str(entry["id"]): entry for entry in model.effects}
+    while left:
+        names = ", ".join(find_effect(name).name.lower() for name in left)
+        say(1.0 - len(left) / len(model.effects), f"{LAST}: {names}")
+        held: dict[str, Fitted] = {}
+        for name, entry in left.items():
+            try:
+                held[name] = add_effect(fitted, find_effect(name), _form_of(entry), raw)
+            except NotIdentifiable as error:
+                seen = Reason("not-seen", f"{error.message[:1].upper()}{error.message[1:]}.")
+                judged[name] = Judged(find_effect(name), False, seen)
+        if not held:
+            return fitted
+        strongest = max(held, key=lambda name: (held[name].log_evidence, name))
+        fitted = held[strongest]
+        left = {name: entry for name, entry in left.items() if name in held and name != strongest}
+    return fitted
+
+
+def _form_of(entry: Mapping[str, Any]) -> str:
+    """The form to fit; empty (all of them) if they are a chain, whose length depends on the record."""
+    forms, name = find_effect(str(entry["id"])).forms, str(entry.get("form") or "")
+    return name if name in {known.name for known in forms} and not any(known.grows for known in forms) else ""
+
+
+def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
+    """The model without the effects that are not needed: the weakest is dropped, then the others are judged anew."""
+    shown = {effect for effect, _, _ in detected_effects(raw)}
+    last, first_count, tried = full, len(effect_names(full)), set[str]()
+    while held := effect_names(last):
+        say(1.0 - len(held) / (first_count + 1), f"{LAST}: which of its effects are still needed")
+        found = [_judged(find_effect(name), last, name in shown) for name in held]
+        judged.update({verdict.effect.id: verdict for verdict, _ in found})
+        weak = [pair for pair in found if not pair[0].needed]
+        if not weak:
+            break
+        worst, last = min(weak, key=lambda pair: pair[0].gain or 0.0)
+        if worst.effect.id not in tried:
+            tried.add(worst.effect.id)
+            other = try_effect(worst.effect, last)  # in its most likely form, if the evidence asks for that form
+            last = other.fitted if other is not None and other.gain >= FIRST_MARGIN else last
+    return last
+
+
+def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted]:
+    """What the record says of an effect of a model, and the model without it."""
+    if shown:
+        return Judged(effect, True, Reason("in-samples", "The samples show it directly, before any fit.")), fitted
+    without = without_effect(fitted, effect.id)
+    gain = fitted.log_evidence - without.log_evidence + prior(effect)
+    if gain < FIRST_MARGIN:
+        why, words = ("against", "The evidence is against it") if gain <= 0.0 else ("weak", "Too little evidence")
+        text = f"{words}: log evidence changes by {gain:+.1f} with it; at least {FIRST_MARGIN:g} is required."
+        return Judged(effect, False, Reason(why, text), gain), without
+    risen = rise(without, fitted)
+    text = f"Log evidence is higher by {gain:.0f} with it; at least {FIRST_MARGIN:g} is required."
+    return Judged(effect, risen is None, risen or Reason("asked-for", text), gain), without
+
+
+def rise(before: Fitted, after: Fitted) -> Reason | None:
+    """The error on held-out rows as a reason if it rises; else None."""
+    errors = held_out_rise(before, after)
+    if errors is None:
+        return None
+    text = f"The error on held-out rows rises from {errors[0]:.3g} to {errors[1]:.3g} N·m."
+    return Reason("held-out-error", text)
+
+
+def _undecided(verdict: Judged) -> Judged:
+    """The verdict on an effect if something else is missing in the model: it may hide what the effect explains."""
+    if verdict.needed or verdict.gain is None:
+        return verdict
+    text = f"{verdict.because.reason} But something else is missing in the model, so this record cannot tell yet."
+    return replace(verdict, needed=None, because=Reason("undecided", text))
+
+
 # ---- which model is offered ---------------------------------------------------------------------------------
 
 
@@ -98,14 +230,14 @@ def _verdict(plain: Fitted, last: Fitted, raw: Raw) -> tuple[bool, Reason]:
     held = effect_names(last)
     # The log evidence says little of an effect that the samples show.
     in_samples = any(effect in held for effect, _, _ in detected_effects(raw))
-    total = last.log_evidence - plain.log_evidence + sum(prior(get(name)) for name in held)
+    total = last.log_evidence - plain.log_evidence + sum(prior(find_effect(name)) for name in held)
     if total < FIRST_MARGIN and not in_samples:
         text = f"Together the effects change the log evidence by {total:+.1f}; at least {FIRST_MARGIN:g} is required."
         return False, Reason("no-gain", text)
     risen = rise(plain, last)
     if risen is not None:
         return False, risen
-    names = "; ".join(get(name).name.lower() for name in held)
+    names = "; ".join(find_effect(name).name.lower() for name in held)
     if in_samples:
         return True, Reason("better", f"This record asks for: {names}.")
     text = f"This record asks for: {names}. Log evidence is higher by {total:.0f} than without effects."

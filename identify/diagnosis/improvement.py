@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from stimrig.identify.diagnosis import structure_of
-from stimrig.identify.diagnosis.residual import held_out_rise
-from stimrig.identify.diagnosis.result import Step, steps
-from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, search_effects
+from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful, search_effects
 from stimrig.identify.diagnosis.verdict import judge
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Improvement
@@ -58,9 +56,10 @@ def improve(
         A forced effect needs a column that the record does not have, or its fit finds nothing to start from.
     """
     for effect in force:
-        get(effect)
+        find_effect(effect)
     most = MOST if max_effects is None else min(max_effects, MOST)
-    search = search_effects(record, progress, most=most, structure=structure_of(model))
+    structure = structure_of(model)
+    search = search_effects(*prepare(record), progress, most=most, structure=structure)
     verdict = judge(search)
     row, against = helpful(search)
     if max_effects is not None:
@@ -86,20 +85,9 @@ def improve(
     )
 
 
-def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
-    """The steps up to the first that raises the error on held-out rows, and the effect refused for that reason."""
-    row = steps(search)
-    for number in range(1 + len(search.detected), len(row)):
-        errors = held_out_rise(row[number - 1].fitted, row[number].fitted)
-        if errors is not None:
-            reason = f"The error on held-out rows would rise from {errors[0]:.3g} to {errors[1]:.3g} N·m."
-            return row[:number], [{"effect": row[number].added, "log_evidence_gain": None, "reason": reason}]
-    return row, []
-
-
 def _reason(search: EffectSearch, step: Step) -> str:
     if step.added is None:
-        held = ", ".join(get(name).name.lower() for name in effect_names(search.base))
+        held = ", ".join(find_effect(name).name.lower() for name in effect_names(search.base))
         return (
             f"The given structure, with {held}."
             if held
@@ -138,7 +126,7 @@ def refused(search: EffectSearch) -> list[dict[str, Any]]:
 def _forced(last: Step, effect: str, raw: Raw) -> Step | None:
     if effect in effect_names(last.fitted):
         return None
-    fitted = add_effect(last.fitted, get(effect), "", raw)
+    fitted = add_effect(last.fitted, find_effect(effect), "", raw)
     return Step(effect, fitted, evaluate(fitted))
 
 

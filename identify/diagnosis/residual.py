@@ -17,10 +17,9 @@ from stimrig.identify.diagnosis.thresholds import (
     STRUCTURE_SHARE,
 )
 from stimrig.identify.dynamics.grid import Grid, ends_of, runs
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.noise import band_part
-from stimrig.identify.noise.kernels import profile_noise
+from stimrig.identify.noise import band_part, profile_noise
 from stimrig.identify.records.record import FORGOTTEN_S, Record
 
 MEDIAN = 0.6745
@@ -172,7 +171,7 @@ def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | No
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
     allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
-    if all(get(effect).predictable for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
+    if all(find_effect(effect).predictable for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
         return HeldOutError(float(np.sqrt(np.mean(residual**2))), float(allowed))
     return HeldOutError(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from stimrig.identify.caution import OPEN
 from stimrig.identify.criticism import worst_places
-from stimrig.identify.diagnosis.search import EffectSearch
+from stimrig.identify.diagnosis.search import EffectSearch, Step, steps
 from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict
-from stimrig.identify.effects import get
-from stimrig.identify.estimation.effect_fit import Candidate, effect_names, knows_joint, renewed_curve
+from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters
-from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.joint import Fitted, band_as_effect, predict_fitted
+from stimrig.identify.estimation.joint import predict_fitted
 from stimrig.identify.experiments import Experiment, plan
 from stimrig.identify.results import Diagnosis
 from stimrig.identify.summary import probability, sure
@@ -27,30 +25,6 @@ STATISTICS = (
     "fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent",
     "held_out_by",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Step:
-    """One of the models of a search, each with one effect more than the one before."""
-
-    added: str | None  # None for the base
-    fitted: Fitted
-    statistics: dict[str, Any]  # see `evaluate`
-
-
-def steps(search: EffectSearch) -> list[Step]:
-    """The base, then the detected effects, then the effects found, in this order.
-
-    The search compares models with one and the same curve. Once it is over, those in which it found what the joint
-    does choose their curve with all rows; a base that knew of the joint has done so before.
-    """
-    models = [search.base, *search.with_detected, *search.chain[1:]]
-    if not knows_joint(search.base):
-        models = list(map(renewed_curve, models))
-    return [
-        Step(name, fitted, evaluate(fitted))
-        for name, fitted in zip([None, *search.detected, *search.added], models, strict=True)
-    ]
 
 
 def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
@@ -100,13 +74,13 @@ def _ranked(search: EffectSearch, verdict: Verdict) -> list[str]:
 def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step]) -> dict[str, Any]:
     number = next(i for i, step in enumerate(row) if step.added == effect)
     before, after = row[number - 1].statistics, row[number].statistics
-    fitted = band_as_effect(search.last)
+    fitted = search.last.written
     index = [e for e, _ in fitted.effects].index(effect)
     rivals = verdict.rivals.get(effect, {})
     named = _close(search, effect)
     ranked = sorted((name for name in rivals if name and name != effect), key=lambda name: -rivals[name])
     confused = [name for name in ranked if rivals[name] >= RIVAL or name in named]
-    described = get(effect)
+    described = find_effect(effect)
     experiment = _experiment(search, effect, confused)
     return {
         "effect": effect,
@@ -134,7 +108,7 @@ def _close(search: EffectSearch, effect: str) -> set[str]:
         return set()
     round_ = search.rounds[search.added.index(effect)]
     gains = {c.effect.id: c.gain for c in round_}
-    alike = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(get(effect).resembles)
+    alike = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(find_effect(effect).resembles)
     return {name for name in alike if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
 
 
@@ -143,7 +117,7 @@ def _experiment(search: EffectSearch, effect: str, confused: list[str]) -> Exper
     if not confused or effect not in search.added:
         return None
     found = {c.effect.id: c.fitted for c in search.rounds[search.added.index(effect)]}
-    rivals = {name: found[name] for name in (effect, confused[0]) if name in found and not get(name).band}
+    rivals = {name: found[name] for name in (effect, confused[0]) if name in found and not find_effect(name).band}
     return plan(search.record, rivals) if len(rivals) == 2 else None
 
 
@@ -169,7 +143,7 @@ def _plain(
     search: EffectSearch, verdict: Verdict, base: dict[str, Any], final: dict[str, Any], missing: list, where: list
 ) -> list[str]:
     noise = search.raw.noise_sd_nm
-    held = " and ".join(get(name).name.lower() for name in effect_names(search.base))
+    held = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
     lines = [
         f"The model {f'with {held}' if held else 'without effects'} fits {base['fit_percent']:.1f} %; the noise of "
         f"{noise:.3g} N·m allows {base['ceiling_percent']:.1f} % at most. On rows that were not fitted its error is "
@@ -190,7 +164,7 @@ def _plain(
         if entry["part"]:
             text += f" In the paper's Fig. 2 it stands in {PARTS[entry['part']]}."
         if entry["confused_with"]:
-            others = ", ".join(get(name).name.lower() for name in entry["confused_with"])
+            others = ", ".join(find_effect(name).name.lower() for name in entry["confused_with"])
             text += f" This record cannot clearly separate it from: {others}. To decide: {entry['next_experiment']}"
         lines.append(text)
     if missing and verdict.kind == "effect_missing":

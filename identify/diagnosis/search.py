@@ -1,12 +1,11 @@
-"""Searches over structures: effects that a record asks for, one after the other; those that it still asks for.
+"""The search over structures: effects that a record asks for, one after the other.
 
-`search_effects` adds effects of the library to a model as long as the evidence is sufficient. `still_needed` adds all
-effects of an earlier model, then drops those that the record does not ask for.
+`search_effects` adds effects of the library to a model as long as the evidence is sufficient; `steps` are its models.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,24 +20,23 @@ from stimrig.identify.diagnosis.residual import (
 )
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
-from stimrig.identify.effects import Effect, Form, Parameter, Scene, form, get, registry
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.effects import Effect, Form, Parameter, Scene, find_effect, form, registry
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import (
     BAND_COST,
     Candidate,
-    add_effect,
     add_effects,
     detected_effects,
     effect_names,
     fit_form,
     fit_from,
-    renewed_curve,
     try_effect,
 )
+from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
-from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
-from stimrig.identify.estimation.samples import Raw
-from stimrig.identify.model import Model
+from stimrig.identify.estimation.plain import fit_plain, knows_joint, renewed_curve
+from stimrig.identify.estimation.samples import Raw, fitted_rows
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
@@ -47,7 +45,6 @@ MOST = 3
 """Effects at most."""
 FORMS = 3
 """Forms of an effect that are tried beside another effect."""
-LAST = "fitting last session's structure"
 
 Progress = Callable[[float, str], None]
 """Called with the share done, 0 to 1, and a line of text. It may raise `Cancelled`."""
@@ -94,7 +91,8 @@ class EffectSearch:
 
 
 def search_effects(
-    record: Record,
+    grid: Grid,
+    raw: Raw,
     progress: Progress | None = None,
     *,
     most: int = MOST,
@@ -105,8 +103,8 @@ def search_effects(
 
     Parameters
     ----------
-    record : Record
-        What was measured.
+    grid, raw : Grid, Raw
+        What was measured, as `prepare` makes it.
     progress : callable or None
         Called with the share done and a line of text; it may raise `Cancelled`.
     most : int
@@ -121,13 +119,12 @@ def search_effects(
     NotIdentifiable
         Less than `thresholds.LEAST_S` may be fitted, or as `fit_plain`.
     """
-    grid, raw = prepare(record)
     rows = fitted_rows(grid, None) if fitted is None else fitted
     count = int(rows.sum())
     if count * grid.step_s < thresholds.LEAST_S:
         raise NotIdentifiable(f"only {count} pulse intervals may be fitted", fix="Give at least a few seconds of data.")
     plain = fit_plain(grid, rows)
-    search = EffectSearch(record, raw, plain, renewed_curve(add_effects(plain, structure, raw)))
+    search = EffectSearch(grid.record, raw, plain, renewed_curve(add_effects(plain, structure, raw)))
     start = _add_detected(search)
     search.quiet = quiet_rows(start)
     search.append(start)
@@ -270,7 +267,7 @@ def _margin(search: EffectSearch, number: int, candidate: Candidate | None = Non
 def _first_gain(search: EffectSearch) -> float:
     """Log evidence gained by the first effect, or by those of the structure; 0 for a narrow band, which is noise."""
     if search.held:
-        band = any(get(name).band for name in search.held)
+        band = any(find_effect(name).band for name in search.held)
         return 0.0 if band else search.base.log_evidence - search.plain.log_evidence
     first = search.rounds[0][0]
     return 0.0 if first.effect.band else first.gain
@@ -287,7 +284,7 @@ def _required_share(search: EffectSearch, candidate: Candidate) -> float:
         return thresholds.CONFIRMED_SHARE
     for name, own in search.last.effects:
         both_dynamic = own.stage in thresholds.DYNAMIC and stage in thresholds.DYNAMIC
-        alike = both_dynamic or name in effect.resembles or effect.id in get(name).resembles
+        alike = both_dynamic or name in effect.resembles or effect.id in find_effect(name).resembles
         if alike and name not in search.detected:
             return thresholds.SIMILAR_SHARE
     return thresholds.NEXT_SHARE
@@ -339,7 +336,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
     search.added, search.chain, search.residuals = [], search.chain[:1], search.residuals[:1]
     search.rounds, search.margins, search.free_gain = [], [], search.free_gain[: len(wanted)]
     for number, effect in enumerate(wanted):
-        before, described = search.last, get(effect)
+        before, described = search.last, find_effect(effect)
         fitted = last if number == len(wanted) - 1 else _part(last, before, [*effect_names(before), effect])
         known = next((c.forms for c in tried[number] if c.effect.id == effect), {})
         gain = fitted.log_evidence - before.log_evidence + described.prior - (BAND_COST if described.band else 0.0)
@@ -358,7 +355,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
 def _part(last: Fitted, before: Fitted, kept: list[str]) -> Fitted:
     """The last model with only some of its effects, fitted from their present values."""
     problem = Problem(last.problem.setup, [(effect, own) for effect, own in last.effects if effect in kept])
-    noise = last.noise if any(get(name).band for name in kept) else before.noise
+    noise = last.noise if any(find_effect(name).band for name in kept) else before.noise
     return solve(problem, start_from(problem, last, {}), noise)
 
 
@@ -372,126 +369,39 @@ def without_effect(fitted: Fitted, effect: str) -> Fitted:
     return solve(problem, start_from(problem, fitted, {}), noise)
 
 
-# ---- effects of an earlier model -----------------------------------------------------------------------------------
+# ---- the models of a search ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Reason:
-    """Why something is so: as a word for programs, and as a sentence."""
+class Step:
+    """One of the models of a search, each with one effect more than the one before."""
 
-    why: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Judged:
-    """What a record says of one carried effect: None if it cannot tell. `gain` is None if it was not compared."""
-
-    effect: Effect
-    needed: bool | None
-    because: Reason
-    gain: float | None = None
+    added: str | None  # None for the base
+    fitted: Fitted
+    statistics: dict[str, Any]  # see `evaluate`
 
 
-def still_needed(plain: Fitted, model: Model, raw: Raw, say: Progress) -> tuple[Fitted, dict[str, Judged]]:
-    """The plain model with those effects of an earlier one that the record asks for, and the verdict on each.
+def steps(search: EffectSearch) -> list[Step]:
+    """The base, then the detected effects, then the effects found, in this order.
 
-    Parameters
-    ----------
-    plain : Fitted
-        The plain structure on the new record.
-    model : Model
-        The earlier model. It lends its effects and their forms.
-    raw : Raw
-        What the samples of the new record show before any fit.
-    say : callable
-        Called with the share done and a line of text.
+    The search compares models with one and the same curve. Once it is over, those in which it found what the joint
+    does choose their curve with all rows; a base that knew of the joint has done so before.
     """
-    judged: dict[str, Judged] = {}
-    full = _add_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
-    last = _reduced(full, raw, judged, lambda share, text: say(0.6 + 0.4 * share, text))
-    if residual_structure(last, quiet_rows(last), raw.noise_sd_nm).left:
-        judged = {name: _undecided(verdict) for name, verdict in judged.items()}
-    return last, judged
+    models = [search.base, *search.with_detected, *search.chain[1:]]
+    if not knows_joint(search.base):
+        models = list(map(renewed_curve, models))
+    return [
+        Step(name, fitted, evaluate(fitted))
+        for name, fitted in zip([None, *search.detected, *search.added], models, strict=True)
+    ]
 
 
-def _add_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
-    """The plain model with all effects of the earlier one that this record can hold; the others are judged.
-
-    The effect that explains most is added first, then the next: a weak one that is fitted alone takes what belongs to
-    the strong one. So the order in which the earlier model lists them does not matter.
-    """
-    fitted, left = plain, {str(entry["id"]): entry for entry in model.effects}
-    while left:
-        names = ", ".join(get(name).name.lower() for name in left)
-        say(1.0 - len(left) / len(model.effects), f"{LAST}: {names}")
-        held: dict[str, Fitted] = {}
-        for name, entry in left.items():
-            try:
-                held[name] = add_effect(fitted, get(name), _form_of(entry), raw)
-            except NotIdentifiable as error:
-                seen = Reason("not-seen", f"{error.message[:1].upper()}{error.message[1:]}.")
-                judged[name] = Judged(get(name), False, seen)
-        if not held:
-            return fitted
-        strongest = max(held, key=lambda name: (held[name].log_evidence, name))
-        fitted = held[strongest]
-        left = {name: entry for name, entry in left.items() if name in held and name != strongest}
-    return fitted
-
-
-def _form_of(entry: Mapping[str, Any]) -> str:
-    """The form to fit; empty (all of them) if they are a chain, whose length depends on the record."""
-    forms, name = get(str(entry["id"])).forms, str(entry.get("form") or "")
-    return name if name in {known.name for known in forms} and not any(known.grows for known in forms) else ""
-
-
-def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
-    """The model without the effects that are not needed: the weakest is dropped, then the others are judged anew."""
-    shown = {effect for effect, _, _ in detected_effects(raw)}
-    last, first_count, tried = full, len(effect_names(full)), set[str]()
-    while held := effect_names(last):
-        say(1.0 - len(held) / (first_count + 1), f"{LAST}: which of its effects are still needed")
-        found = [_judged(get(name), last, name in shown) for name in held]
-        judged.update({verdict.effect.id: verdict for verdict, _ in found})
-        weak = [pair for pair in found if not pair[0].needed]
-        if not weak:
-            break
-        worst, last = min(weak, key=lambda pair: pair[0].gain or 0.0)
-        if worst.effect.id not in tried:
-            tried.add(worst.effect.id)
-            other = try_effect(worst.effect, last)  # in its most likely form, if the evidence asks for that form
-            last = other.fitted if other is not None and other.gain >= FIRST_MARGIN else last
-    return last
-
-
-def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted]:
-    """What the record says of an effect of a model, and the model without it."""
-    if shown:
-        return Judged(effect, True, Reason("in-samples", "The samples show it directly, before any fit.")), fitted
-    without = without_effect(fitted, effect.id)
-    gain = fitted.log_evidence - without.log_evidence + prior(effect)
-    if gain < FIRST_MARGIN:
-        why, words = ("against", "The evidence is against it") if gain <= 0.0 else ("weak", "Too little evidence")
-        text = f"{words}: log evidence changes by {gain:+.1f} with it; at least {FIRST_MARGIN:g} is required."
-        return Judged(effect, False, Reason(why, text), gain), without
-    risen = rise(without, fitted)
-    text = f"Log evidence is higher by {gain:.0f} with it; at least {FIRST_MARGIN:g} is required."
-    return Judged(effect, risen is None, risen or Reason("asked-for", text), gain), without
-
-
-def rise(before: Fitted, after: Fitted) -> Reason | None:
-    """The error on held-out rows as a reason if it rises; else None."""
-    errors = held_out_rise(before, after)
-    if errors is None:
-        return None
-    text = f"The error on held-out rows rises from {errors[0]:.3g} to {errors[1]:.3g} N·m."
-    return Reason("held-out-error", text)
-
-
-def _undecided(verdict: Judged) -> Judged:
-    """The verdict on an effect if something else is missing in the model: it may hide what the effect explains."""
-    if verdict.needed or verdict.gain is None:
-        return verdict
-    text = f"{verdict.because.reason} But something else is missing in the model, so this record cannot tell yet."
-    return replace(verdict, needed=None, because=Reason("undecided", text))
+def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
+    """The steps up to the first that raises the error on held-out rows, and the effect refused for that reason."""
+    row = steps(search)
+    for number in range(1 + len(search.detected), len(row)):
+        errors = held_out_rise(row[number - 1].fitted, row[number].fitted)
+        if errors is not None:
+            reason = f"The error on held-out rows would rise from {errors[0]:.3g} to {errors[1]:.3g} N·m."
+            return row[:number], [{"effect": row[number].added, "log_evidence_gain": None, "reason": reason}]
+    return row, []

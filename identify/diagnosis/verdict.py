@@ -9,7 +9,7 @@ import numpy as np
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, held_out_rise, held_readings
 from stimrig.identify.diagnosis.search import EffectSearch, seen_at_rest
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import Candidate
 
 
@@ -63,7 +63,7 @@ def _only_at_work(search: EffectSearch, number: int) -> bool:
     """Whether an unpredictable added torque does not appear at rest."""
     effect, holder = search.added[number], search.chain[number + 1]
     form = dict(holder.effects).get(effect)
-    if form is None or form.stage != "additive" or get(effect).predictable:
+    if form is None or form.stage != "additive" or find_effect(effect).predictable:
         return False
     return seen_at_rest(search.quiet, holder, effect) < thresholds.SEEN_AT_REST
 
@@ -111,7 +111,7 @@ def judge(search: EffectSearch) -> Verdict:
             found[effect] = min(found[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
         if held_out_rise(search.chain[number], search.chain[number + 1]) is not None:
             found[effect] = min(found[effect], thresholds.DOUBTED)
-            notes.append(f"{get(effect).name}: it raises the error on held-out rows.")
+            notes.append(f"{find_effect(effect).name}: it raises the error on held-out rows.")
     structure = left.ratio
     if last.noise.band > 0.0:
         # The narrow band itself is not structure: what counts is what remains beside it.
@@ -124,11 +124,11 @@ def judge(search: EffectSearch) -> Verdict:
         strange = strange or (explained < thresholds.LEAST_EXPLAINED and left.left)
         lawless = search.free_gain[0] > search.rounds[0][0].gain + thresholds.FREE_GAIN_MARGIN
         strange = strange or (lawless and explained < thresholds.EXPLAINED_BY_LAWS)
-        if get(effects[0]).band:
+        if find_effect(effects[0]).band:
             strange = strange or (
                 explained < thresholds.LEAST_EXPLAINED_BY_BAND and structure > thresholds.STRUCTURE_BESIDE_BAND
             )
-        elif search.added and not get(search.added[0]).predictable:
+        elif search.added and not find_effect(search.added[0]).predictable:
             strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
     else:
         strange = strange or left.left

@@ -6,7 +6,8 @@ import numpy as np
 
 from stimrig.identify.effects import registry
 from stimrig.identify.estimation.joint import start_from
-from stimrig.identify.estimation.plain import fit_plain, fitted_rows, prepare
+from stimrig.identify.estimation.plain import fit_plain
+from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.noise import find_band
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -74,7 +74,7 @@ def registry() -> dict[str, Effect]:
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 
 
-def get(effect_id: str) -> Effect:
+def find_effect(effect_id: str) -> Effect:
     """One effect by its id.
 
     Raises
@@ -88,9 +88,25 @@ def get(effect_id: str) -> Effect:
     return effects[effect_id]
 
 
+def depend_on_joint(names: Iterable[str]) -> bool:
+    """Whether one of some effects depends on the angle or the velocity of the joint."""
+    return any(find_effect(name).moves_with_joint for name in names)
+
+
 def library() -> list[dict[str, Any]]:
     """The library as dicts, for `stimrig effects` and the page."""
     return [effect.to_dict() for effect in registry().values()]
 
 
-__all__ = ["BadEffect", "Effect", "Form", "Parameter", "Scene", "form", "get", "library", "registry"]
+__all__ = [
+    "BadEffect",
+    "Effect",
+    "Form",
+    "Parameter",
+    "Scene",
+    "depend_on_joint",
+    "find_effect",
+    "form",
+    "library",
+    "registry",
+]

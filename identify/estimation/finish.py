@@ -13,7 +13,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid, runs
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
 from stimrig.identify.estimation.fit_statistics import evaluate, fit_statistics, white_sd
-from stimrig.identify.estimation.joint import Fitted, band_as_effect
+from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
@@ -49,7 +49,7 @@ def finish(
     statistics = statistics or evaluate(fitted)
     tests = residual_tests(fitted)
     known = fitted.problem.size
-    written = band_as_effect(fitted)
+    written = fitted.written
     problem, values, setup = written.problem, written.physical, written.problem.setup
     covariance = _covariance(written, known)
     torque, rate = setup.sign * values[list(problem.initials)[:2]]
@@ -73,11 +73,10 @@ def finish(
         reasons=tuple(reasons),
         extra=_parts(written),
     )
+    change_nm = _unpenalised_change(fitted)
     model = _named(model, setup.grid)
-    model = model.with_(
-        bands=bands(model, _unpenalised_change(fitted)), valid_for=valid_for(model, setup.grid, setup.fitted)
-    )
     model = model.with_(joint=_joint(model, written, known))
+    model = model.with_(bands=bands(model, change_nm), valid_for=valid_for(model, setup.grid, setup.fitted))
     return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.converged))
 
 
@@ -166,7 +165,7 @@ def _covariance(fitted: Fitted, known: int) -> Covariance:
     values = fitted.physical[:known] * sign
     first = problem.baselines.start
     values[first : problem.baselines.stop] += problem.setup.zero_nm
-    matrix = fitted.covariance()[:known, :known] * sign[:, None] * sign[None, :]
+    matrix = fitted.covariance[:known, :known] * sign[:, None] * sign[None, :]
     return Covariance(problem.names[:known], values, matrix)
 
 
@@ -198,7 +197,7 @@ def describe_parameters(fitted: Fitted, index: int) -> dict[str, dict[str, Any]]
     the sign of the record.
     """
     chosen = fitted.problem.chosen[index]
-    matrix = fitted.covariance()
+    matrix = fitted.covariance
     values = fitted.physical
     turned = fitted.problem.setup.sign < 0 and chosen.form.stage != "sensor"
     return {

@@ -157,9 +157,9 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     """The key `fit` of MODEL.json: errors, best-fit %, and the best fit that the noise allows."""
     setup = fitted.problem.setup
     grid = setup.grid
+    change = None if grid.record.has_held_out else held_out_change(fitted)
     predicted = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
-    change = None if grid.record.has_held_out else held_out_change(fitted)
     found = fit_statistics(grid, setup.fitted, predicted, noise, change)
     return found | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
 

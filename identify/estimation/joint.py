@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects import get, registry
+from stimrig.identify.effects import find_effect, registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.noise import NoiseLevel, band_part, profile
@@ -105,11 +105,17 @@ class Fitted:
                 return {p.name: float(values[i]) for i, p in zip(chosen.places, chosen.parameters, strict=True)}
         return {}
 
+    @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance of the parameters in their units, shape (P, P)."""
         inverse = np.linalg.pinv(self.hessian, hermitian=True)
         slope = np.where(self.problem.log, self.physical, 1.0)
         return inverse * slope[:, None] * slope[None, :]
+
+    @cached_property
+    def written(self) -> Fitted:
+        """With the narrow band of its noise written as the effect `tremor`; itself without a band."""
+        return band_as_effect(self)
 
 
 def _penalty(problem: Problem, theta: np.ndarray) -> float:
@@ -339,9 +345,8 @@ def band_as_effect(fitted: Fitted) -> Fitted:
 
 def predict_fitted(fitted: Fitted) -> np.ndarray:
     """Free-run torque of a candidate at its own record's samples, N·m, shape (N,)."""
-    record = fitted.problem.setup.grid.record
-    fitted = band_as_effect(fitted)
-    unpredictable = frozenset(e for e, _ in fitted.effects if not get(e).predictable)
+    record, fitted = fitted.problem.setup.grid.record, fitted.written
+    unpredictable = frozenset(e for e, _ in fitted.effects if not find_effect(e).predictable)
     predictable = fitted.problem.at_samples(fitted.theta, unpredictable)
     if not unpredictable:
         return predictable

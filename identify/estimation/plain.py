@@ -4,43 +4,45 @@ Of a moving joint, the rows at one angle are fitted to begin with. The set-up is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import Grid, make_grid
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.joint import Fitted, solve
+from stimrig.identify.effects import depend_on_joint
+from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.estimation.joint import Fitted, gram, solve
 from stimrig.identify.estimation.projection import (
     Projection,
     Solution,
     State,
     ar1_or_white,
     bounded,
+    curve_points,
     descend_from,
     search,
     whiten,
 )
-from stimrig.identify.estimation.samples import Raw, inspect, white_noise
+from stimrig.identify.estimation.samples import white_noise
 from stimrig.identify.noise import NoiseLevel
-from stimrig.identify.records.record import HELD_OUT, Record
+from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import (
     KNOTS,
     PILOT_KNOTS,
     QUIET_KNOTS,
-    adapted_knots,
     bending_order,
+    choose_weight,
+    fitting_spline,
     knots_for,
     spline_roughness,
 )
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
-LEAST_ROWS = 8
 STILL_RAD_S = 0.05
 """A joint that moves more slowly is held still."""
 ONE_ANGLE_RAD = 0.09
@@ -50,52 +52,6 @@ LEAST_S = 3.0
 LEAST_WIDTHS = 5
 WIDEST_SHARE = 0.9
 """The widest pulse at this angle is at least this share of the widest one anywhere."""
-
-
-def rows_of(grid: Grid, names: Sequence[str]) -> np.ndarray:
-    """bool, shape (K,): intervals of segments with these names."""
-    wanted = np.array([name in names for name in grid.record.segment_names])
-    return wanted[grid.segment]
-
-
-def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
-    """Rows to fit: those of the named segments and the rests, which determine the baseline; never held-out rows.
-
-    Raises
-    ------
-    BadRequest
-        A named segment is not in the record, or is the held-out one.
-    NotIdentifiable
-        Fewer than eight pulse intervals are left to fit.
-    """
-    if fit_on is not None:
-        check_segments(grid, fit_on)
-        rows = grid.fitted & rows_of(grid, (*fit_on, "rest"))
-    else:
-        rows = grid.fitted
-    refuse_few(rows)
-    return rows
-
-
-def refuse_few(rows: np.ndarray) -> None:
-    """Refuse too few rows to fit. Raises NotIdentifiable: with their number."""
-    if rows.sum() < LEAST_ROWS:
-        raise NotIdentifiable(
-            f"only {int(rows.sum())} pulse intervals may be fitted", fix="Give rows of segments other than `validate`."
-        )
-
-
-def check_segments(grid: Grid, names: Sequence[str]) -> None:
-    """Refuse names of segments that the record does not have, and the held-out one.
-
-    Raises BadRequest: with the names that can be used.
-    """
-    there = tuple(dict.fromkeys(grid.record.segment_names))
-    for name in names:
-        if name == HELD_OUT:
-            raise BadRequest("rows of `validate` are never fitted", place="fit_on", fix="Name other segments.")
-        if name not in there:
-            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", fix=f"It has: {', '.join(there)}.")
 
 
 def still_rows(grid: Grid, rows: np.ndarray) -> np.ndarray:
@@ -166,7 +122,6 @@ ROUNDING = 2e-5
 QUIET = 0.0015
 """If the noise of a sample is below this share of the torque's range, the spline gets more knots: its error at a bend
 would be visible."""
-CURVE_POINTS = 201
 
 
 def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Solution:
@@ -199,35 +154,15 @@ def designed(first: Solution, count: int | None = None) -> tuple[Projection, Sec
     The few knots of the pilot show roughly where the curve bends. A curve with all knots shows place and size of the
     bend better; repeating this once improves a steep rise.
     """
-    old = first.projection
-    curve = pilot_curve(first)
-    count = knots_for(curve) if count is None else count
-    basis = SplineBasis(adapted_knots(curve, float(np.max(old.grid.pulse_width_us)), count))
-    order = bending_order(old.grid.pulse_width_us[old.rows])
-    projection = Projection(old.grid, basis, spline_roughness(basis, order=order), old.rows, old.delay_s)
-    target = whiten(projection.target, projection.stretches, 0.0)
+    old, largest_us = first.projection, float(np.max(first.projection.grid.pulse_width_us))
+    widths_us, target = old.grid.pulse_width_us[old.rows], whiten(old.target, old.stretches, 0.0)
+    count = knots_for(first.curve) if count is None else count
+    basis, roughness = fitting_spline(first.curve, largest_us, count, widths_us)
     for _ in range(2):
-        coefficients = State(projection, first.linear, target, 0.0, None).coefficients[: basis.size]
-        projection, basis = _redesigned(projection, basis, coefficients, count)
-    return projection, first.linear
-
-
-def _redesigned(
-    old: Projection, basis: SplineBasis, coefficients: np.ndarray, count: int
-) -> tuple[Projection, SplineBasis]:
-    """The projection with knots and penalty from a first curve."""
-    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
-    new = SplineBasis(adapted_knots((u, basis.design(u) @ coefficients), basis.largest_us, count))
-    order = bending_order(old.grid.pulse_width_us[old.rows])
-    roughness = spline_roughness(new, (basis, coefficients), order)
-    return Projection(old.grid, new, roughness, old.rows, old.delay_s), new
-
-
-def pilot_curve(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
-    """The curve of a solution on 201 pulse widths."""
-    basis = solution.projection.basis
-    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
-    return u, basis.design(u) @ solution.coefficients[: basis.size]
+        projection = Projection(old.grid, basis, roughness, old.rows, old.delay_s)
+        shown = basis, State(projection, first.linear, target, 0.0, None).coefficients[: basis.size]
+        basis, roughness = fitting_spline(curve_points(*shown), largest_us, count, widths_us, shown)
+    return Projection(old.grid, basis, roughness, old.rows, old.delay_s), first.linear
 
 
 def estimate(
@@ -262,28 +197,6 @@ LEAST_SPREAD = 0.2
 NEGLIGIBLE_LAG_S, QUICK_S = 1e-3, 3e-3
 """A second lag below the first value hardly changes the torque, and a search stops there: it is restarted at
 QUICK_S."""
-
-
-def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
-    """Means over pulse intervals, N·m; NaN where there is no sample."""
-    total = np.bincount(grid.interval, torque_nm, minlength=grid.size) / np.maximum(grid.count, 1)
-    return np.where(grid.count > 0, total, np.nan)
-
-
-def prepare(record: Record) -> tuple[Grid, Raw]:
-    """Put a record on its grid, without hum and with its white noise; and what its samples show.
-
-    Raises BadRecord, NotIdentifiable: no grid can be made, too few rows may be fitted, there is no pulse, or the
-    torque never changes.
-    """
-    grid = make_grid(record)
-    refuse_few(grid.fitted)
-    if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
-        raise NotIdentifiable("the record has no pulse", fix="Record a PRBS and a ramp.")
-    if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
-        raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
-    raw = inspect(record, grid.start_s)
-    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm), raw
 
 
 def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
@@ -396,3 +309,78 @@ def _reference(grid: Grid, rows: np.ndarray) -> float:
     partly = rows & (width > 0) & (width < 0.97 * width.max())
     at = np.flatnonzero(partly if partly.any() else rows & (width > 0))
     return float(np.mean(at) * grid.step_s) if at.size else 0.0
+
+
+TIMES = 2
+"""The first curve shows roughly where the knots belong, the second one better."""
+RENEWED_POINTS = 1001
+
+
+def renewed_curve(base: Fitted) -> Fitted:
+    """The model with the knots and the smoothness of its curve chosen with all rows, where the evidence rises by that.
+
+    The plain structure is fitted where the joint is held still (`still_rows`), since elsewhere it lacks g and h; its
+    curve is as smooth as those rows alone ask for. Once g and h are there, the other rows tell of f, too.
+
+    Parameters
+    ----------
+    base : Fitted
+        A model with its effects. It is returned as it is if its curve was chosen with all rows already (also where
+        the joint was nowhere still for long enough), if no effect of it depends on the joint, or if its curve is no
+        smoothed spline.
+    """
+    if not _can_be_renewed(base):
+        return base
+    with suppress(np.linalg.LinAlgError):  # then the curve as it is remains the best one known
+        for _ in range(TIMES):
+            found = _renewed(base)
+            if not found.log_evidence > base.log_evidence or (base.converged and not found.converged):
+                break
+            base = found
+    return base
+
+
+def knows_joint(fitted: Fitted) -> bool:
+    """Whether an effect of the model depends on the joint."""
+    return depend_on_joint(name for name, _ in fitted.effects)
+
+
+def _can_be_renewed(base: Fitted) -> bool:
+    setup = base.problem.setup
+    smoothed = isinstance(setup.basis, SplineBasis) and np.any(setup.roughness) and not np.any(setup.curve_nm)
+    return bool(smoothed and knows_joint(base) and not np.all(still_rows(setup.grid, setup.fitted)[setup.fitted]))
+
+
+def _renewed(base: Fitted) -> Fitted:
+    """The model with more knots, where its present curve bends, and with the smoothness that all rows ask for."""
+    setup, values = base.problem.setup, base.physical
+    old, place = setup.basis, base.problem.coefficients
+    assert isinstance(old, SplineBasis)
+    curve_nm = values[place]
+    u = np.linspace(0.0, old.largest_us, RENEWED_POINTS)
+    torque_nm = old.design(u) @ curve_nm
+    widths_us, curve = setup.grid.pulse_width_us[setup.fitted], (u[::5], torque_nm[::5])
+    basis, roughness = fitting_spline(curve, old.largest_us, QUIET_KNOTS, widths_us, (old, curve_nm))
+    start_nm = np.linalg.lstsq(basis.design(u), torque_nm, rcond=None)[0]
+    rough = Problem(setup.with_(basis=basis, roughness=roughness), base.effects)
+    theta = rough.from_physical(np.concatenate([values[: place.start], start_nm, values[place.stop :]]))
+    precision = _precision(rough, theta, base, roughness)
+    return solve(Problem(setup.with_(basis=basis, roughness=precision), base.effects), theta, base.noise)
+
+
+def _precision(problem: Problem, theta: np.ndarray, base: Fitted, roughness: np.ndarray) -> np.ndarray:
+    """The prior precision of the curve's coefficients, by REML at a point; all else is linear there, too."""
+    setup, place = problem.setup, problem.coefficients
+    mean, slopes = problem.run(theta, derivatives=True)
+    assert slopes is not None
+    curve = np.arange(place.start, place.stop)
+    others = np.delete(np.arange(problem.size), curve)
+    # what the curve and the others' changes have to explain: the residual, and the curve itself
+    left = setup.target_nm - mean + theta[place] @ slopes[place]
+    products = gram(setup.whitened(np.vstack([left, slopes[curve], slopes[others]]), base.noise))
+    inner = 1 + curve.size
+    bound = products[inner:, inner:] + problem.prior[1][np.ix_(others, others)]
+    own = products[:inner, :inner] - products[:inner, inner:] @ np.linalg.solve(bound, products[inner:, :inner])
+    design, moment = ((own + own.T) / 2)[1:, 1:].copy(), own[1:, 0].copy()
+    chosen = choose_weight(design, moment, float(own[0, 0]), int(setup.fitted.sum()), roughness, others.size)
+    return chosen.weight / chosen.variance * roughness

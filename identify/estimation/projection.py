@@ -20,6 +20,7 @@ from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.recruitment import Basis
 from stimrig.identify.recruitment.smoothing import choose_weight, straight_lines
 
+CURVE_POINTS = 201
 INITIAL_RIDGE = 1e-8
 """Penalty on the initial torque: it keeps a state that no row shows at zero, and is negligible for all others."""
 RATE_S = 0.1
@@ -101,8 +102,8 @@ class Projection:
     def columns(self, linear: SecondOrder) -> np.ndarray:
         """Interval means of the response to each linear coefficient, shape (K, P + extras)."""
         even = np.tile(step_matrix(*linear.core, self.grid.step_s), (len(self.rows_nm), 1))
-        torque, rate = held_states(self.rows_nm, even, self.grid.starts, self.beginnings)
-        rows = read_means(torque, rate, *self.grid.mean_weights(linear.delay_s, self.grid.curve(linear.core)))
+        weights = self.grid.mean_weights(linear.delay_s, self.grid.curve(linear.core))
+        rows = read_means(*held_states(self.rows_nm, even, self.grid.starts, self.beginnings), *weights)
         size = self.basis.size
         return np.concatenate([rows[:size], self.levels.T, rows[size:]]).T
 
@@ -172,6 +173,17 @@ class Solution:
     def residual_nm(self) -> np.ndarray:
         """Measured minus model on the grid, N·m, shape (K,); meaningful in rows with samples only."""
         return self.projection.target - self.columns @ self.coefficients
+
+    @cached_property
+    def curve(self) -> tuple[np.ndarray, np.ndarray]:
+        """The recruitment curve: pulse widths, µs, and torques, N·m."""
+        return curve_points(self.projection.basis, self.coefficients[: self.projection.basis.size])
+
+
+def curve_points(basis: Basis, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve on evenly spaced pulse widths."""
+    u = np.linspace(0.0, basis.largest_us, CURVE_POINTS)
+    return u, basis.design(u) @ coefficients
 
 
 DAMPING = Damping(first=0.0, less=10.0, more=10.0, raised=1e-2)

@@ -9,9 +9,10 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
+from stimrig.identify.effects import depend_on_joint
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.predict import moves_with_joint, refuse_rate
+from stimrig.identify.simulation.predict import refuse_rate
 
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
@@ -258,7 +259,7 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
 
 def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     """Whether the joint moved in a test that a model of a joint at rest does not follow."""
-    if grid.angle_rad is None or moves_with_joint(model):
+    if grid.angle_rad is None or depend_on_joint(_names(model)):
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
     little = moved_rad <= LARGEST_MOVE_RAD or _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
@@ -268,11 +269,16 @@ def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]
 
 def _joint_seen(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     """Whether the joint moved in the tests of a model of a joint that moves."""
-    if grid.angle_rad is None or not moves_with_joint(model):
+    if grid.angle_rad is None or not depend_on_joint(_names(model)):
         return _gate(True, "care", "")
     moved_rad = float(np.diff(np.quantile(grid.angle_rad[rows], SEEN))[0])  # one spike of the sensor is no movement
     says = f"the joint moved by {math.degrees(moved_rad):.0f}° only: what depends on it is a guess; move it in a test"
     return _gate(moved_rad > LARGEST_MOVE_RAD, "care", says)
+
+
+def _names(model: Model) -> list[str]:
+    """Ids of its effects."""
+    return [str(entry["id"]) for entry in model.effects]
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:

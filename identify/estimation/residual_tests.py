@@ -8,13 +8,14 @@ times I - H, where H is the smoother; the mean and covariance of any sum or prod
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import erfc, sqrt
 from typing import Any
 
 import numpy as np
 
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.noise import correlation_slopes
+from stimrig.identify.noise import MEAN_OF_SLOW, SHORTEST, NoiseLevel
 
 LAGS = 20
 ALARM = 0.01
@@ -86,6 +87,59 @@ def _whiteness(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str
     left = left[:, strength > 1e-3]
     part = part - left @ (left.T @ part)
     return _verdict(float(part @ part), max(int(kept.sum()) - left.shape[1], 1)) | {"lags": lags}
+
+
+POINTS = 1 << 14
+"""Number of frequencies of a spectrum: a band with a memory of 1000 steps covers ten of them."""
+NUDGE = 1e-4
+LEAST_SHARE = 1e-9
+
+
+def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
+    """Derivatives of the innovations' correlations at lags 1 to `lags` by the estimated parameters of the noise.
+
+    A parameter at its bound, or without influence, has no row.
+
+    Returns
+    -------
+    ndarray, shape (numbers, lags)
+        From the derivative of the log spectrum by each parameter: the spectrum that a wrong value leaves.
+    """
+    slow = noise.share > LEAST_SHARE and noise.ar1 > LEAST_SHARE
+    names = []
+    if slow:
+        names += ["share"] if noise.share < 2.0 else []
+        names += ["ar1"] if noise.ar1 < 1.0 - SHORTEST - LEAST_SHARE else []
+    if noise.band > 0.0:
+        names += ["band", "turn", "keep"]
+    rows = []
+    for name in names:
+        # Towards smaller values: away from the bounds, and from the kink of `share` at 1.
+        nudge = -NUDGE * max(1.0 - getattr(noise, name), NUDGE) if name in ("ar1", "keep") else -NUDGE
+        moved = replace(noise, **{name: max(getattr(noise, name) + nudge, 0.0)})
+        change = (_log_spectrum(moved) - _log_spectrum(noise)) / nudge
+        rows.append(np.fft.irfft(change)[1 : lags + 1])
+    return np.array(rows).reshape(len(rows), lags)
+
+
+def _log_spectrum(noise: NoiseLevel) -> np.ndarray:
+    """Log of the noise's spectrum from frequency 0 to half the pulse rate, up to a constant."""
+    # A narrow band is 100 times narrower than the spectrum of the slowest noise.
+    angle = np.linspace(0.0, np.pi, (POINTS if noise.band > 0.0 else POINTS // 4) // 2 + 1)
+    if noise.band <= 0.0 and noise.share > 1.0:
+        mean = (noise.share - 1.0) * MEAN_OF_SLOW
+        return np.log(1.0 + mean * mean + 2.0 * mean * np.cos(angle)) + np.log(_pole(angle, noise.ar1))
+    white = max(1.0 - noise.share - noise.band, 1e-9)
+    power = white + noise.share * _pole(angle, noise.ar1)
+    if noise.band > 0.0:
+        band = _pole(angle - noise.turn, noise.keep) + _pole(angle + noise.turn, noise.keep)
+        power = power + 0.5 * noise.band * band
+    return np.log(power)
+
+
+def _pole(angle: np.ndarray, keep: float) -> np.ndarray:
+    """Spectrum of noise of variance 1 whose correlation falls by the factor `keep` per step."""
+    return (1.0 - keep * keep) / (1.0 + keep * keep - 2.0 * keep * np.cos(angle))
 
 
 class PaddedRows:

@@ -1,15 +1,18 @@
-"""What the samples show before means are taken: hum, clipping and white noise."""
+"""A record put on its grid, and what its samples show before means are taken: hum, clipping and white noise."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import runs
+from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.effects.mains_hum import HARMONICS, line
-from stimrig.identify.records.record import Record
+from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.records.record import HELD_OUT, Record
 
+LEAST_ROWS = 8
 LEAST_EQUAL = 20
 """Number of samples at exactly the largest (or smallest) value from which they count as clipping."""
 LEAST_LINE = 30.0
@@ -42,6 +45,74 @@ class Raw:
     floor_nm: float | None
 
 
+def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
+    """Means over pulse intervals, N·m; NaN where there is no sample."""
+    total = np.bincount(grid.interval, torque_nm, minlength=grid.size) / np.maximum(grid.count, 1)
+    return np.where(grid.count > 0, total, np.nan)
+
+
+def prepare(record: Record) -> tuple[Grid, Raw]:
+    """Put a record on its grid, without hum and with its white noise; and what its samples show.
+
+    Raises BadRecord, NotIdentifiable: no grid can be made, too few rows may be fitted, there is no pulse, or the
+    torque never changes.
+    """
+    grid = make_grid(record)
+    refuse_few(grid.fitted)
+    if not np.max(grid.pulse_width_us[grid.fitted]) > 0:
+        raise NotIdentifiable("the record has no pulse", fix="Record a PRBS and a ramp.")
+    if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
+        raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
+    raw = inspect(record, grid.start_s)
+    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm), raw
+
+
+def refuse_few(rows: np.ndarray) -> None:
+    """Refuse too few rows to fit. Raises NotIdentifiable: with their number."""
+    if rows.sum() < LEAST_ROWS:
+        raise NotIdentifiable(
+            f"only {int(rows.sum())} pulse intervals may be fitted", fix="Give rows of segments other than `validate`."
+        )
+
+
+def rows_of(grid: Grid, names: Sequence[str]) -> np.ndarray:
+    """bool, shape (K,): intervals of segments with these names."""
+    wanted = np.array([name in names for name in grid.record.segment_names])
+    return wanted[grid.segment]
+
+
+def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
+    """Rows to fit: those of the named segments and the rests, which determine the baseline; never held-out rows.
+
+    Raises
+    ------
+    BadRequest
+        A named segment is not in the record, or is the held-out one.
+    NotIdentifiable
+        Fewer than eight pulse intervals are left to fit.
+    """
+    if fit_on is not None:
+        check_segments(grid, fit_on)
+        rows = grid.fitted & rows_of(grid, (*fit_on, "rest"))
+    else:
+        rows = grid.fitted
+    refuse_few(rows)
+    return rows
+
+
+def check_segments(grid: Grid, names: Sequence[str]) -> None:
+    """Refuse names of segments that the record does not have, and the held-out one.
+
+    Raises BadRequest: with the names that can be used.
+    """
+    there = tuple(dict.fromkeys(grid.record.segment_names))
+    for name in names:
+        if name == HELD_OUT:
+            raise BadRequest("rows of `validate` are never fitted", place="fit_on", fix="Name other segments.")
+        if name not in there:
+            raise BadRequest(f"no segment {name!r} in the record", place="fit_on", fix=f"It has: {', '.join(there)}.")
+
+
 def inspect(record: Record, start_s: float | None = None) -> Raw:
     """Find hum, clipping and white noise in a record, without its held-out and doubted rows.
 
@@ -51,10 +122,11 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
     kept = ~record.held_out if record.doubted is None else ~record.held_out & ~record.doubted
     torque = record.torque_nm
     ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
-    hum = find_hum(record, own_s, kept)
+    known = runs(kept)
+    hum = find_hum(record, own_s, kept, known)
     if hum is not None:
         torque = torque - line(hum, own_s)
-        torque = torque - hum_variation(record, torque, hum["frequency_hz"], kept)
+        torque = torque - hum_variation(record, torque, hum["frequency_hz"], known)
     noise = white_noise(record, torque[kept])
     return Raw(torque, noise, hum, ceiling, None if floor is None else -floor)
 
@@ -87,12 +159,12 @@ def white_noise(record: Record, torque: np.ndarray) -> float:
     return float(np.sqrt(np.median(difference**2) / 0.4549 / gain))
 
 
-def find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray) -> dict[str, float] | None:
+def find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray, known: list[slice]) -> dict[str, float] | None:
     """Parameters of the mains hum: a line at 50 or 60 Hz and its harmonics; None if there is none."""
     rate_hz = record.sample_rate_hz
     if rate_hz < 99.0 or kept.sum() < 4 * rate_hz:
         return None
-    longest = max(runs(kept), key=lambda run: run.stop - run.start)
+    longest = max(known, key=lambda run: run.stop - run.start)
     # Differences whiten the spectrum of the muscle, so that neighbouring frequencies can be compared.
     signal = np.diff(record.torque_nm[longest], 2)
     # The FFT is slow for lengths with a large prime factor: up to 1 % of the samples are left out.
@@ -126,14 +198,14 @@ def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: 
     return float(power[inside].max() / max(np.mean(power[around]), 1e-30))
 
 
-def hum_variation(record: Record, torque: np.ndarray, mains_hz: float, kept: np.ndarray) -> np.ndarray:
+def hum_variation(record: Record, torque: np.ndarray, mains_hz: float, known: list[slice]) -> np.ndarray:
     """Hum that remains because its amplitude and phase vary, N·m: each harmonic is tracked with a window of 1 s."""
     rate_hz = record.sample_rate_hz
     width = 2 * max(round(rate_hz / record.pulse_rate_hz), 2) + 1
     box = np.ones(width) / width
     window = np.hanning(max(round(FOLLOWED_S * rate_hz), 8) + 2)[1:-1]
     found = np.zeros(torque.size)
-    for run in runs(kept):
+    for run in known:
         part = torque[run]
         if part.size < 2 * window.size:
             continue

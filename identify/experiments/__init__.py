@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.grid import make_grid
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.experiments.designs import Design, designs
 from stimrig.identify.noise import whitened
@@ -107,7 +107,7 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
 
 
 def _text(design: Design, duration_s: float, gain: float, names: tuple[str, ...]) -> str:
-    those = " from ".join(get(name).name.lower() for name in names[:2])
+    those = " from ".join(find_effect(name).name.lower() for name in names[:2])
     test = f"{design.words} ({duration_s:.0f} s)"
     if gain >= ENOUGH:
         return f"{test} should separate {those}: expected log evidence {gain:.0f}."
@@ -161,7 +161,7 @@ def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.nda
     """Interval means of a fitted candidate on another record, without unpredictable effects."""
     grid = make_grid(record)
     setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
-    kept = [(effect, form) for effect, form in fitted.effects if get(effect).predictable]
+    kept = [(effect, form) for effect, form in fitted.effects if find_effect(effect).predictable]
     problem = Problem(setup, kept)
     # Parameters are copied by name: the new test has one part, starts at rest, and has no unpredictable effects.
     known = {name: place for place, name in enumerate(fitted.problem.names)}

@@ -22,8 +22,8 @@ from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest, IdentifyError
 from stimrig.identify.estimation.averaged import averaged
 from stimrig.identify.estimation.earlier import Change, Earlier
-from stimrig.identify.estimation.plain import prepare
 from stimrig.identify.estimation.residual_tests import residual_tests
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.estimation.short_record import Short, fit_short
 from stimrig.identify.experiments.designs import Piece, Segment, pieces
 from stimrig.identify.experiments.knowledge import Foresight, Knowledge, Target, knowledge

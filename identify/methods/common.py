@@ -6,7 +6,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, runs
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.plain import rows_of
+from stimrig.identify.estimation.samples import rows_of
 
 
 def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarray:

@@ -18,8 +18,9 @@ from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUND
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.plain import estimate, fitted_rows, still_rows, to_fitted
+from stimrig.identify.estimation.plain import estimate, still_rows, to_fitted
 from stimrig.identify.estimation.projection import Projection, Solution, log_likelihood, project, search, whiten
+from stimrig.identify.estimation.samples import fitted_rows
 from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.two_stage import general
 from stimrig.identify.model import Model

@@ -17,7 +17,7 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import finish_discrete
-from stimrig.identify.estimation.plain import fitted_rows
+from stimrig.identify.estimation.samples import fitted_rows
 from stimrig.identify.methods.common import shifted
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve, fit_shape

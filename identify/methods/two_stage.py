@@ -29,7 +29,7 @@ from stimrig.identify.dynamics.second_order import recursion
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.estimation.finish import finish, finish_discrete
-from stimrig.identify.estimation.plain import pilot_curve, pilot_solution, to_fitted
+from stimrig.identify.estimation.plain import pilot_solution, to_fitted
 from stimrig.identify.estimation.projection import Projection, Solution, project, search
 from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted
 from stimrig.identify.model import Model
@@ -322,9 +322,9 @@ def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) 
     largest = float(np.max(grid.pulse_width_us))
     coarse = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
     pilot = project(Projection(grid, coarse, spline_roughness(coarse), rows), linear)
-    first = SplineBasis(adapted_knots(pilot_curve(pilot), largest, knots))
+    first = SplineBasis(adapted_knots(pilot.curve, largest, knots))
     rough = project(Projection(grid, first, spline_roughness(first), rows), linear)
-    basis = SplineBasis(adapted_knots(pilot_curve(rough), largest, knots))
+    basis = SplineBasis(adapted_knots(rough.curve, largest, knots))
     roughness = spline_roughness(basis, (first, rough.coefficients[: first.size]))
     return project(Projection(grid, basis, roughness, rows), linear)
 
@@ -385,7 +385,7 @@ def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
 
 def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """Drive if all segments are used at once: the curve of a second-order pilot fit, scaled to a range of 1."""
-    u, curve = pilot_curve(pilot_solution(grid, rows))
+    u, curve = pilot_solution(grid, rows).curve
     drive = np.interp(grid.pulse_width_us, u, curve)
     return drive / max(float(np.ptp(curve)), 1e-300)
 

@@ -87,6 +87,18 @@ def spline_roughness(
     return third.T @ (third * (ease * gaps)[:, None]) * basis.largest_us**5
 
 
+def fitting_spline(
+    curve: tuple[np.ndarray, np.ndarray],
+    largest_us: float,
+    count: int,
+    widths_us: np.ndarray,
+    pilot: tuple[SplineBasis, np.ndarray] | None = None,
+) -> tuple[SplineBasis, np.ndarray]:
+    """A spline with so many knots, where a curve bends, and the penalty on it that the fitted widths ask for."""
+    basis = SplineBasis(adapted_knots(curve, largest_us, count))
+    return basis, spline_roughness(basis, pilot, bending_order(widths_us))
+
+
 LOWEST, HIGHEST = 1e-9, 1e9
 """Bounds of the weight, relative to the balance of data and penalty."""
 

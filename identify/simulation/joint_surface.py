@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Effect, Form, Scene
 from stimrig.identify.errors import BadModel
 from stimrig.identify.model_schema import parameter_value
@@ -55,7 +55,7 @@ class Acting:
         Raises BadModel: the effect or its form is unknown here, or a parameter is missing.
         """
         try:
-            effect = get(entry["id"])
+            effect = find_effect(entry["id"])
             form = effect.form(entry.get("form", ""))
             values = {p.name: float(parameter_value(entry["parameters"][p.name])) for p in form.parameters}
         except Exception as error:

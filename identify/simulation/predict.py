@@ -12,7 +12,7 @@ import numpy as np
 from stimrig.identify import model_schema
 from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, narx_at_samples
-from stimrig.identify.effects import get
+from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadModel
 from stimrig.identify.records.record import Record
@@ -74,7 +74,7 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
             return narx_at_samples(model.extra["narx"], grid, model.linear.centre)
         return model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us)) + model.baseline_nm
     problem, theta = problem_of(model, grid)
-    unpredictable = frozenset(e["id"] for e in model.effects if not get(e["id"]).predictable)
+    unpredictable = frozenset(e["id"] for e in model.effects if not find_effect(e["id"]).predictable)
     predictable = problem.at_samples(theta, unpredictable)
     if not unpredictable or not same_data(model, grid.record):
         return predictable
@@ -146,11 +146,6 @@ def problem_of(
     return problem, problem.from_physical(values)
 
 
-def moves_with_joint(model: Muscle) -> bool:
-    """Whether an effect of the model depends on the angle or the velocity of the joint."""
-    return any(get(entry["id"]).moves_with_joint for entry in model.effects)
-
-
 def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The reference angle and the range of fitted angles; a model of an older version knows them of its own record.
 
@@ -158,7 +153,7 @@ def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> d
     """
     if "reference_rad" in settings:
         return {"reference_rad": settings["reference_rad"], "angle_range_rad": angle_range(settings)}
-    if moves_with_joint(model) and not same_data(model, record):
+    if depend_on_joint(entry["id"] for entry in model.effects) and not same_data(model, record):
         raise BadModel(
             "the model does not say at which angle its curve holds",
             place="effects.0.settings.reference_rad",

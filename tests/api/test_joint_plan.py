@@ -26,7 +26,7 @@ from stimrig.api.sessions.joint_plan import (
 )
 from stimrig.api.sessions.joint_plan import coverage_grid as grid
 from stimrig.api.web.routes.joint import EffectId
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.rig.limits import HARD_LIMITS, for_profile
 from stimrig.rig.messages import Profile, TestPlan
@@ -130,7 +130,7 @@ def test_each_form_is_known_and_may_be_asked_for():
     for name in JOINT_EFFECTS:
         assert TypeAdapter(EffectId).validate_python(name) == name
         effect, _, forms = name.partition(":")
-        assert [get(effect).form(form).name for form in forms.split("|")] == forms.split("|")
+        assert [find_effect(effect).form(form).name for form in forms.split("|")] == forms.split("|")
 
 
 SAMPLES_HZ = 200.0

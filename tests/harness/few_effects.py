@@ -12,7 +12,7 @@ from stimrig.identify import effects
 @contextlib.contextmanager
 def only(*names: str) -> Iterator[None]:
     """In this process the library holds these effects alone."""
-    kept = [effects.get(name) for name in names]
+    kept = [effects.find_effect(name) for name in names]
     try:
         with mock.patch.object(effects, "_own", lambda: kept):
             effects._everything.cache_clear()

@@ -10,10 +10,11 @@ import pytest
 
 from stimrig.hardware_sim.hidden.library import EFFECTS
 from stimrig.identify import fit
-from stimrig.identify.effects import get, library, registry
+from stimrig.identify.effects import find_effect, library, registry
 from stimrig.identify.effects.base import STAGES, Scene
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.plain import fit_plain, prepare
+from stimrig.identify.estimation.plain import fit_plain
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
@@ -74,7 +75,7 @@ def test_the_library_is_plain_data_with_everything_a_page_shows():
 @pytest.mark.parametrize(("effect", "name"), FORMS)
 def test_at_its_neutral_values_a_form_is_the_base_bit_for_bit(setup, effect, name):
     base = Problem(setup, [])
-    problem = Problem(setup, [(effect, get(effect).form(name))])
+    problem = Problem(setup, [(effect, find_effect(effect).form(name))])
     assert np.array_equal(problem.run(_theta(problem))[0], base.run(_theta(base))[0])
 
 
@@ -82,7 +83,7 @@ def test_at_its_neutral_values_a_form_is_the_base_bit_for_bit(setup, effect, nam
     ("effect", "name"), [f for f in FORMS if not f[1].startswith(("waxing_45", "waxing_9", "waxing_1"))]
 )
 def test_a_form_changes_something_and_stays_finite_at_its_starts(setup, effect, name):
-    form = get(effect).form(name)
+    form = find_effect(effect).form(name)
     problem = Problem(setup, [(effect, form)])
     theta = _theta(problem)
     values = problem.physical(theta)
@@ -90,13 +91,13 @@ def test_a_form_changes_something_and_stays_finite_at_its_starts(setup, effect, 
         values[place] = p.lower + 0.7 * (p.upper - p.lower) if p.scale == "linear" else np.sqrt(p.lower * p.upper)
     mean, slopes = problem.run(problem.from_physical(values), derivatives=True)
     assert slopes is not None and np.all(np.isfinite(mean)) and np.all(np.isfinite(slopes))
-    if not get(effect).raw or effect == "sensor_clipping":
+    if not find_effect(effect).raw or effect == "sensor_clipping":
         assert np.max(np.abs(mean - problem.run(theta)[0])) > 1e-4
 
 
 def test_a_form_of_one_function_can_be_pickled():
     for effect, name in (("torque_angle", "smooth"), ("torque_angle", "drive"), ("passive_torque", "surface")):
-        known = get(effect).form(name)
+        known = find_effect(effect).form(name)
         assert pickle.loads(pickle.dumps(known)) == known
 
 
@@ -131,7 +132,7 @@ def test_what_cannot_be_had_is_said(moving):
 @pytest.mark.parametrize("size", [60, 200, 400])
 def test_an_effort_is_proposed_where_it_is(name: str, size: int):
     """Also in a record that is shorter than the widest shape that is tried."""
-    form = get("voluntary_effort").form(name)
+    form = find_effect("voluntary_effort").form(name)
     scene = Scene(0.025 * np.arange(size), np.zeros(size), 0.025, 8.0, 200.0)
     at_s = 0.6 * scene.span_s
     values = {p.name: np.full((1, 1), p.on(scene).start[0]) for p in form.parameters} | {

@@ -10,7 +10,8 @@ from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.fit_statistics import BLOCK_S, FOLDS, best_fit_percent, held_out_change
 from stimrig.identify.estimation.joint import solve
-from stimrig.identify.estimation.plain import fit_plain, prepare
+from stimrig.identify.estimation.plain import fit_plain
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 from tests.harness.patients import Patient, make_record

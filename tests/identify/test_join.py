@@ -12,7 +12,8 @@ from stimrig import identify
 from stimrig.identify import Record
 from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.estimation.plain import fit_plain, prepare
+from stimrig.identify.estimation.plain import fit_plain
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.records.join import PAUSE_S, join, write_joined
 from stimrig.identify.records.record import Part, Pulses, Source
 

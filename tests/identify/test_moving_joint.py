@@ -16,7 +16,7 @@ from stimrig import identify
 from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import changed, record
 from stimrig.identify.dynamics.grid import make_grid
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.passive_torque import relaxed
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.estimation.quality import quality, range_warnings
@@ -299,8 +299,8 @@ def test_the_angle_stands_beside_the_torque_in_a_table():
 
 def test_the_diagnosis_names_the_part_of_fig_2():
     parts = {"passive_torque": "h", "torque_angle": "g", "torque_velocity": "g", "fatigue": "f", "tremor": ""}
-    assert {name: get(name).part for name in parts} == parts
-    assert get("electromechanical_delay").part == get("asymmetric_relaxation").part == "G"
+    assert {name: find_effect(name).part for name in parts} == parts
+    assert find_effect("electromechanical_delay").part == find_effect("asymmetric_relaxation").part == "G"
 
 
 def test_several_forms_of_an_effect_and_the_likelier_is_taken():

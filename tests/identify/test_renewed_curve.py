@@ -10,11 +10,11 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.arm_records import record
-from stimrig.identify.diagnosis.result import steps
-from stimrig.identify.diagnosis.search import search_effects
-from stimrig.identify.estimation.effect_fit import add_effects, fitted_with, renewed_curve
+from stimrig.identify.diagnosis.search import search_effects, steps
+from stimrig.identify.estimation.effect_fit import add_effects, fitted_with
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.plain import fitted_rows, prepare
+from stimrig.identify.estimation.plain import renewed_curve
+from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.methods.maximum_likelihood import METHOD
 from stimrig.identify.records.record import Record
@@ -107,7 +107,7 @@ def test_the_number_of_knots_that_somebody_asks_for_is_kept():
 
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():
     with few_effects.only("passive_torque"):
-        search = search_effects(whole(), most=1)
+        search = search_effects(*prepare(whole()), most=1)
         plain, found = steps(search)
     assert plain.fitted is search.base and found.added == "passive_torque"
     assert found.fitted.log_evidence > search.last.log_evidence

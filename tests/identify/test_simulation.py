@@ -8,12 +8,12 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.hidden_records import generate
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import fitted_with, try_effect
 from stimrig.identify.estimation.joint import predict_fitted
-from stimrig.identify.estimation.plain import fit_plain, prepare
-from stimrig.identify.noise import NoiseLevel, band_part, profile, whitened
-from stimrig.identify.noise.kernels import whiten_rows
+from stimrig.identify.estimation.plain import fit_plain
+from stimrig.identify.estimation.samples import prepare
+from stimrig.identify.noise import NoiseLevel, band_part, profile, whiten_rows, whitened
 from stimrig.identify.records.join import join
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
@@ -72,7 +72,7 @@ def test_derivatives_are_those_of_central_differences(names):
     record = hidden_muscles.record(seed=2, rate_hz=100)
     grid, _ = prepare(record)
     setup = fit_plain(grid, grid.fitted).problem.setup
-    problem = Problem(setup, [(n.split(":")[0], get(n.split(":")[0]).form(n.split(":")[1])) for n in names])
+    problem = Problem(setup, [(n.split(":")[0], find_effect(n.split(":")[0]).form(n.split(":")[1])) for n in names])
     values = np.r_[[0.2, 0.8, 0.001, 0.1, 0.5, 0.2], np.linspace(0, 6, setup.basis.size)]
     starts = [p.start[0] for c in problem.chosen for p in c.parameters]
     theta = problem.from_physical(np.r_[values, starts])
@@ -132,7 +132,7 @@ def test_a_form_whose_start_promises_little_is_followed_all_the_same():
     made = generate("series_compliance", "middle", 5, rate_hz=100)
     record = as_record(made)
     grid, _ = prepare(record)
-    effect = get("series_compliance")
+    effect = find_effect("series_compliance")
     found = try_effect(effect, fit_plain(grid, grid.fitted), [effect.form("series"), effect.form("toe")])
     assert found is not None
     assert found.form.name == "toe"
@@ -147,7 +147,7 @@ def of_two_parts() -> Setup:
 
 
 def test_every_part_has_its_baseline_and_its_initial_state(of_two_parts: Setup):
-    problem = Problem(of_two_parts, [("sensor_clipping", get("sensor_clipping").form("ceiling"))])
+    problem = Problem(of_two_parts, [("sensor_clipping", find_effect("sensor_clipping").form("ceiling"))])
     coefficients = tuple(f"recruitment_{i}_nm" for i in range(of_two_parts.basis.size))
     assert problem.names[:-1] == (
         "time_constant_s", "damping", "delay_s", "baseline_nm", "baseline_2_nm",
@@ -170,7 +170,7 @@ def test_every_part_has_its_baseline_and_its_initial_state(of_two_parts: Setup):
 @pytest.mark.parametrize("effect", ["sensor_clipping:both", "activation_dependent_speed:torque", ""])
 def test_derivatives_on_two_parts_are_those_of_central_differences(of_two_parts: Setup, effect: str):
     name, _, form = effect.partition(":")  # "": the base
-    problem = Problem(of_two_parts, [(name, get(name).form(form))] if effect else [])
+    problem = Problem(of_two_parts, [(name, find_effect(name).form(form))] if effect else [])
     states = [0.1, -0.2, 0.5, 0.2, -0.3, 0.4]
     starts = [p.start[0] for chosen in problem.chosen for p in chosen.parameters]
     physical = np.r_[0.2, 0.8, 0.001, states, np.linspace(0, 6, of_two_parts.basis.size), starts]

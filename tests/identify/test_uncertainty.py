@@ -11,9 +11,9 @@ import pytest
 from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.projection import ar1_or_white, best_ar1
-from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p
+from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p, correlation_slopes
 from stimrig.identify.estimation.uncertainty import prediction_band
-from stimrig.identify.noise import NoiseLevel, correlation_slopes
+from stimrig.identify.noise import NoiseLevel
 from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 

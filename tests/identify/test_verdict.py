@@ -13,13 +13,13 @@ from stimrig.identify.diagnosis import verdict
 from stimrig.identify.diagnosis.residual import HeldOutError, ResidualStructure
 from stimrig.identify.diagnosis.search import EffectSearch
 from stimrig.identify.diagnosis.verdict import Verdict, judge, shares
-from stimrig.identify.effects import get
+from stimrig.identify.effects import find_effect
 
 FIRST, SECOND, EFFORT, TREMOR = "fatigue", "output_saturation", "voluntary_effort", "tremor"
 
 
 def candidate(effect: str, gain: float) -> Any:
-    return SimpleNamespace(effect=get(effect), gain=gain)
+    return SimpleNamespace(effect=find_effect(effect), gain=gain)
 
 
 def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters: float) -> Any:
@@ -29,7 +29,9 @@ def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters
         assert effect in effects
         return parameters
 
-    forms = tuple((effect, SimpleNamespace(stage=get(effect).forms[0].stage, name="bumps")) for effect in effects)
+    forms = tuple(
+        (effect, SimpleNamespace(stage=find_effect(effect).forms[0].stage, name="bumps")) for effect in effects
+    )
     return SimpleNamespace(
         log_likelihood=log_likelihood - 20.0,
         effects=forms,
@@ -278,7 +280,7 @@ def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
     assert found.found[SECOND] == 0.45
     assert found.found[FIRST] > 0.9
     assert len(found.notes) == 1
-    assert found.notes[0].startswith(get(SECOND).name)
+    assert found.notes[0].startswith(find_effect(SECOND).name)
 
 
 @pytest.mark.parametrize(
