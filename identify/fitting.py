@@ -120,7 +120,7 @@ def _fit_auto(
         )
     from stimrig.identify.diagnosis.search import helpful, search_effects  # here: a fit without a search needs it not
 
-    search = search_effects(grid, raw, progress, fitted=rows)
+    search = search_effects(grid, raw, rows, progress)
     last = helpful(search)[0][-1]
     progress(1.0, "done")
     added = f"effects added: {', '.join(effect_names(last.fitted)) or 'none'}"

@@ -12,7 +12,7 @@ from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.effect_fit import fitted_with
-from stimrig.identify.estimation.samples import prepare
+from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.experiments import NOTHING, Experiment, plan
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
@@ -48,7 +48,8 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
         Less than three seconds may be fitted, or the record does not determine the model.
     """
     structure = structure_of(model)
-    search = search_effects(*prepare(record), progress, structure=structure)
+    grid, raw = prepare(record)
+    search = search_effects(grid, raw, fitted_rows(grid, None), progress, structure=structure)
     result = diagnosis_of(search, judge(search))
     if progress is not None:
         progress(1.0, "done")

@@ -12,7 +12,7 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.samples import Raw, prepare
+from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Improvement
@@ -59,7 +59,8 @@ def improve(
         find_effect(effect)
     most = MOST if max_effects is None else min(max_effects, MOST)
     structure = structure_of(model)
-    search = search_effects(*prepare(record), progress, most=most, structure=structure)
+    grid, raw = prepare(record)
+    search = search_effects(grid, raw, fitted_rows(grid, None), progress, most=most, structure=structure)
     verdict = judge(search)
     row, against = helpful(search)
     if max_effects is not None:

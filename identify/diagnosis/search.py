@@ -36,7 +36,7 @@ from stimrig.identify.estimation.effect_fit import (
 from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
 from stimrig.identify.estimation.plain import fit_plain, knows_joint, renewed_curve
-from stimrig.identify.estimation.samples import Raw, fitted_rows
+from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
@@ -93,10 +93,10 @@ class EffectSearch:
 def search_effects(
     grid: Grid,
     raw: Raw,
+    rows: np.ndarray,
     progress: Progress | None = None,
     *,
     most: int = MOST,
-    fitted: np.ndarray | None = None,
     structure: Sequence[str] = (),
 ) -> EffectSearch:
     """Try all effects on a record, add the best, and continue while the evidence is sufficient.
@@ -105,12 +105,12 @@ def search_effects(
     ----------
     grid, raw : Grid, Raw
         What was measured, as `prepare` makes it.
+    rows : ndarray of bool, shape (K,)
+        Pulse intervals to fit.
     progress : callable or None
         Called with the share done and a line of text; it may raise `Cancelled`.
     most : int
         Effects to add at most.
-    fitted : ndarray of bool or None, shape (K,)
-        Pulse intervals to fit; by default all that may be fitted.
     structure : sequence of str
         Effects, "id" or "id:form", that the examined model already has.
 
@@ -119,7 +119,6 @@ def search_effects(
     NotIdentifiable
         Less than `thresholds.LEAST_S` may be fitted, or as `fit_plain`.
     """
-    rows = fitted_rows(grid, None) if fitted is None else fitted
     count = int(rows.sum())
     if count * grid.step_s < thresholds.LEAST_S:
         raise NotIdentifiable(f"only {count} pulse intervals may be fitted", fix="Give at least a few seconds of data.")

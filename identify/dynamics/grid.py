@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from stimrig.identify.dynamics.second_order import Core
-from stimrig.identify.dynamics.states import CUBIC, boundary_states, curve_weights, mean_weights, read_at, read_means
+from stimrig.identify.dynamics.second_order import CUBIC, Core, curve_weights
+from stimrig.identify.dynamics.states import boundary_states, mean_weights, read_at, read_means
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
 from stimrig.identify.records.clock import pulse_phase_s

@@ -35,6 +35,37 @@ def step_matrix(time_constant_s: float, damping: float, step_s: float) -> tuple[
     )
 
 
+CUBIC = (0.0, 1.0)
+"""Used in place of T and ζ if no dynamics are given."""
+
+
+def curve_weights(fraction: np.ndarray, step_s: float, time_constant_s: float, damping: float) -> np.ndarray:
+    """Weights of (y0, y0', y1, y1') for the curve between two boundary states, shape (N, 4).
+
+    It is the cubic with the smallest change that makes it exact for a held input. Without the change, a lag of a few
+    milliseconds would bend the curve more sharply than a cubic can.
+
+    Parameters
+    ----------
+    fraction : ndarray, shape (N,)
+        Place in the step, 0 to 1.
+    step_s, time_constant_s, damping : float
+        Of the step, and T and ζ of the dynamics; T = 0 for the cubic itself.
+    """
+    s, t = fraction, 1.0 - fraction
+    weights = np.stack([(1.0 + 2.0 * s) * t * t, s * t * t, s * s * (3.0 - 2.0 * s), -s * s * t], axis=1)
+    if time_constant_s > 0.0:
+        # The three possible motions with a held input: constant, response to a step, response to an initial rate.
+        p11, p12, p21, p22 = step_matrix(time_constant_s, damping, step_s)
+        last = p12 / step_s, p22
+        ends = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, -step_s * p21 / (1.0 - p11)], [0.0, 1.0, *last]])
+        own = step_matrix(time_constant_s, damping, s * step_s)  # pyright: ignore[reportArgumentType]
+        short = np.stack([np.ones_like(s), (1.0 - own[0]) / (1.0 - p11), own[1] / step_s], axis=1)
+        weights += (short - weights @ ends.T) @ np.linalg.solve(ends @ ends.T, ends)
+    weights[:, 1::2] *= step_s
+    return weights
+
+
 def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Exact transition of T² y'' + 2 ζ T y' + y = w over one step with w held.
 

@@ -106,56 +106,6 @@ def boundary_states(
     return (torque[0], rate[0]) if drive_nm.ndim == 1 else (torque.T, rate.T)
 
 
-CUBIC = (0.0, 1.0)
-"""Used in place of T and ζ if no dynamics are given."""
-
-
-def curve_weights(fraction: np.ndarray, step_s: float, time_constant_s: float, damping: float) -> np.ndarray:
-    """Weights of (y0, y0', y1, y1') for the curve between two boundary states, shape (N, 4).
-
-    It is the cubic with the smallest change that makes it exact for a held input. Without the change, a lag of a few
-    milliseconds would bend the curve more sharply than a cubic can.
-
-    Parameters
-    ----------
-    fraction : ndarray, shape (N,)
-        Place in the step, 0 to 1.
-    step_s, time_constant_s, damping : float
-        Of the step, and T and ζ of the dynamics; T = 0 for the cubic itself.
-    """
-    ends, lift, reached = np.zeros((3, 4)), np.zeros((3, 4)), 1.0
-    if time_constant_s > 0.0:
-        # The three possible motions with a held input: constant, response to a step, response to an initial rate.
-        p11, p12, p21, p22 = second_order.step_matrix(time_constant_s, damping, step_s)
-        ends[0, 0] = ends[0, 2] = ends[1, 2] = ends[2, 1] = 1.0
-        ends[1, 3] = -step_s * p21 / (1.0 - p11)
-        ends[2, 2], ends[2, 3] = p12 / step_s, p22
-        lift, reached = np.linalg.solve(ends @ ends.T, ends), 1.0 - p11
-    return _curve_weights(fraction, step_s, time_constant_s, damping, ends, lift, reached)
-
-
-@njit(cache=True, nogil=True)
-def _curve_weights(fraction, step_s, time_constant_s, damping, ends, lift, reached):  # pragma: no cover
-    out = np.zeros((fraction.size, 4))
-    exact = time_constant_s > 0.0
-    for n in range(fraction.size):
-        s = fraction[n]
-        t = 1.0 - s
-        c0, c1, c2, c3 = (1.0 + 2.0 * s) * t * t, s * t * t, s * s * (3.0 - 2.0 * s), -s * s * t
-        if exact:
-            own = step_matrix(time_constant_s, damping, s * step_s)
-            short = (1.0, (1.0 - own[0]) / reached, own[1] / step_s)
-            for i in range(3):
-                missing = short[i] - ends[i, 0] * c0 - ends[i, 1] * c1 - ends[i, 2] * c2 - ends[i, 3] * c3
-                for j in range(4):
-                    out[n, j] += missing * lift[i, j]
-        out[n, 0] += c0
-        out[n, 1] = step_s * (out[n, 1] + c1)
-        out[n, 2] += c2
-        out[n, 3] = step_s * (out[n, 3] + c3)
-    return out
-
-
 @njit(cache=True, nogil=True)
 def read_at(torque, rate, interval, place, offset, weights):  # pragma: no cover
     """The curve through boundary states at samples, shape (N,); constant before the first and after the last state.

@@ -112,18 +112,19 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
         `verdict`: usable, usable with care, or not usable; `words`: one sentence with the main reason; `reasons`: the
         texts of the failed checks, "refuse" first; `gates`: the checks by name, {"passed", "severity", "says"}.
     """
+    moving = depend_on_joint(str(entry["id"]) for entry in model.effects)
     gates = {
         "stable": _stable(model),
         "converged": _gate(converged, "care", "the search for the dynamics did not converge"),
         "torque": _torque(model, grid, rows),
-        "joint": _joint_at_rest(model, grid, rows),
+        "joint": _joint_at_rest(model, grid, rows, moving),
         "monotone": _monotone(model),
         "range": _range(grid, rows),
         "ceiling": _ceiling(model),
         "held_out": _held_out(model),
         "gap": _gap(model),
         "residual": _residual(model, float(np.ptp(grid.torque_nm[rows]))),
-        "joint_seen": _joint_seen(model, grid, rows),
+        "joint_seen": _joint_seen(grid, rows, moving),
         "sensor": _sensor(grid, model.baseline_nm),
     }
     failed = [gate for gate in gates.values() if not gate["passed"]]
@@ -257,9 +258,9 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
     return _gate(not failed, "care", f"the residual is not pure noise ({', '.join(failed)} test): see the diagnosis")
 
 
-def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
+def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
     """Whether the joint moved in a test that a model of a joint at rest does not follow."""
-    if grid.angle_rad is None or depend_on_joint(_names(model)):
+    if grid.angle_rad is None or moving:
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
     little = moved_rad <= LARGEST_MOVE_RAD or _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
@@ -267,18 +268,13 @@ def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]
     return _gate(little, "care", f"{says}: hold it still, or add what depends on the joint")
 
 
-def _joint_seen(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
+def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
     """Whether the joint moved in the tests of a model of a joint that moves."""
-    if grid.angle_rad is None or not depend_on_joint(_names(model)):
+    if grid.angle_rad is None or not moving:
         return _gate(True, "care", "")
     moved_rad = float(np.diff(np.quantile(grid.angle_rad[rows], SEEN))[0])  # one spike of the sensor is no movement
     says = f"the joint moved by {math.degrees(moved_rad):.0f}° only: what depends on it is a guess; move it in a test"
     return _gate(moved_rad > LARGEST_MOVE_RAD, "care", says)
-
-
-def _names(model: Model) -> list[str]:
-    """Ids of its effects."""
-    return [str(entry["id"]) for entry in model.effects]
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:

@@ -173,7 +173,8 @@ class Setup:
     @cached_property
     def design(self) -> np.ndarray:
         """Spline basis at the recorded widths, shape (n, K)."""
-        return np.ascontiguousarray(self.basis.design(self.grid.pulse_width_us).T)
+        widths_us, place = self.grid.widths_us
+        return np.ascontiguousarray(self.basis.design(widths_us)[place].T)
 
     @cached_property
     def penalty(self) -> np.ndarray:

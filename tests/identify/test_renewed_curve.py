@@ -69,7 +69,7 @@ def test_a_model_is_not_lost_where_no_better_curve_is_found(monkeypatch: pytest.
         raise np.linalg.LinAlgError("not positive definite")
 
     base = first()
-    monkeypatch.setattr(f"stimrig.identify.estimation.effect_fit.{step}", fails)
+    monkeypatch.setattr(f"stimrig.identify.estimation.plain.{step}", fails)
     assert renewed_curve(base) is base
 
 
@@ -107,7 +107,8 @@ def test_the_number_of_knots_that_somebody_asks_for_is_kept():
 
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():
     with few_effects.only("passive_torque"):
-        search = search_effects(*prepare(whole()), most=1)
+        grid, raw = prepare(whole())
+        search = search_effects(grid, raw, fitted_rows(grid, None), most=1)
         plain, found = steps(search)
     assert plain.fitted is search.base and found.added == "passive_torque"
     assert found.fitted.log_evidence > search.last.log_evidence
