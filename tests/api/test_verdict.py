@@ -138,7 +138,7 @@ def test_older_models_are_read(stored: dict[str, Any] | None, verdict: str, word
 
 
 NONE = ["", " ", ".", "ok", "asdf", "......", "xxxxxxxxxxxx", "asdf asdf asdf", "a b c", "aaaa bbbb cccc dddd",
-        "1234 5678 9012", "ja ja ja ja", "ok ok ok", "test test test test"]  # fmt: skip
+        "1234 5678 9012", "ja ja ja ja", "ok ok ok", "test test test test", "measured twice measured"]  # fmt: skip
 SOME = ["only the delay is used today", "Nur die Verzögerung wird heute gebraucht", "plateau measured twice, same",
         "Engineer Kim watches every trial"]  # fmt: skip
 
