@@ -73,9 +73,10 @@ def in_one_line(error: BaseException) -> str:
 
 def _place(path: Path, error: BaseException) -> str:
     """The file and the line in it at which an error arose."""
-    if isinstance(error, SyntaxError) and error.filename == str(path) and error.lineno:
+    itself = str(path.absolute())  # the loader's name for it, also where the folder is named from here
+    if isinstance(error, SyntaxError) and error.filename == itself and error.lineno:
         return f"{path}, line {error.lineno}"
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == itself]
     return f"{path}, line {lines[-1]}" if lines else str(path)
 
 

@@ -155,8 +155,10 @@ def test_what_cannot_be_an_effect_is_told_with_its_file(tmp_path, monkeypatch, o
 def test_an_error_in_the_file_is_told_with_its_line(tmp_path, monkeypatch, old: str, new: str, says: str) -> None:
     text, first = GOOD.replace(old, new, 1), new.splitlines()[0]
     number = next(number for number, line in enumerate(text.splitlines(), start=1) if first in line)
-    line = told(tmp_path, monkeypatch, text)
-    assert line.startswith(f"{tmp_path / 'mine.py'}, line {number}") and says in line, line
+    monkeypatch.chdir(tmp_path)
+    for folder in (tmp_path, Path("my_effects")):  # as the page names it, too: from where one works
+        line = told(folder, monkeypatch, text)
+        assert line.startswith(f"{folder / 'mine.py'}, line {number}") and says in line, line
 
 
 def test_a_folder_that_is_not_there_is_told(tmp_path, monkeypatch) -> None:
