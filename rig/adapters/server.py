@@ -179,7 +179,7 @@ class Server:
     def _refuse_long(self, line: bytes, kind: str) -> None:
         if len(line) > LONG_LINE_BYTES and kind == "":
             raise PlanError(f"request: if over {LONG_LINE_BYTES // 1000} kB, it must begin with its kind and its id")
-        if len(line) > LONG_LINE_BYTES and self.rig.state.trial.busy:
+        if len(line) > LONG_LINE_BYTES and self.rig.state.phase.busy:
             raise BusyError("a test is in progress; wait or stop it")
 
     async def _obey(self, request: Any, writer: asyncio.StreamWriter) -> None:

@@ -17,11 +17,15 @@ import pytest
 from stimrig.rig import __main__ as program
 from stimrig.rig.adapters import previews
 from stimrig.rig.adapters.previews import Previews
-from stimrig.rig.adapters.server import Server
+from stimrig.rig.adapters.server import LONG_LINE_BYTES, Server
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
+from stimrig.rig.control.replies import internal_error
 from stimrig.rig.errors import BusyError
 from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.messages import Reply, StateEvent, Status, StopEvidence
+from stimrig.rig.phase import Phase
+from stimrig.rig.requests import LONGEST_LINE
+from tests.rig.live import LiveRig
 
 READY = Status(state="ready")
 
@@ -90,6 +94,38 @@ def test_whatever_comes_to_the_door_for_stops_stops(tmp_path: Path, line: bytes,
     server.close()
     assert asked == ([] if stops is None else [stops])
     assert bool(reply) is (stops is not None) and (not reply or json.loads(reply)["body"]["confirmed"])
+
+
+@pytest.mark.parametrize(("phase", "answer"), [(Phase("ready"), "internal"), (Phase("running"), "busy")])
+def test_a_long_plan_is_parsed_beside_no_test_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase, answer: str
+) -> None:
+    """Who asks is answered in any case; `internal` says here that the rig was asked."""
+    monkeypatch.setattr("stimrig.rig.adapters.server.obey", lambda _, asked: internal_error(asked.id, ValueError()))
+    rig = LiveRig(tmp_path, monkeypatch).rig
+    rig.state.phase = phase
+    widths = {"name": "s", "sequence": "widths", "settings": {"pulse_width_us": [100.25] * 10_000}}
+    line = json.dumps({"kind": "start", "id": 7, "plan": {**PLAN, "segments": [widths]}}).encode() + b"\n"
+
+    def ask(do: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        done.set_result(do())
+        return done
+
+    async def asked() -> dict[str, Any]:
+        server = Server()
+        server.rig, server._ask = rig, ask
+        async with await asyncio.start_unix_server(server._serve, tmp_path / "t", limit=LONGEST_LINE):
+            reader, writer = await asyncio.open_unix_connection(tmp_path / "t", limit=LONGEST_LINE)
+            writer.write(line)
+            async with asyncio.timeout(20.0):
+                reply = json.loads(await reader.readline())
+            writer.close()
+            return reply
+
+    assert len(line) > LONG_LINE_BYTES
+    reply = asyncio.run(asked())
+    assert (reply["id"], reply["ok"], reply["problem"]["code"]) == (7, False, answer)
 
 
 def test_a_rig_whose_thread_hangs_is_in_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
