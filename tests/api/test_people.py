@@ -375,6 +375,7 @@ def urls(tmp_path: Path, short_dir: Path) -> Iterator[list[str]]:
                 yield [one.url, other.url, centre.url]
 
 
+@pytest.mark.sqlite  # three services of one folder, each with a database of its own
 def test_one_browser_stays_signed_in_at_every_service_of_a_host(urls: list[str]) -> None:
     for url in urls:
         answer = httpx.post(
