@@ -33,10 +33,18 @@ def main() -> None:
     options = parsed()
     os.nice(options.nice)
     say(out, {"ready": True, "left_open": shut_in(options)})
-    while select.select([sys.stdin], [], [], options.idle_s)[0] and (line := sys.stdin.readline()):
+    while called_within(options.idle_s) and (line := sys.stdin.readline()):
         request = json.loads(line)
         confinement.limit_time(request.get("processor_s", PROCESSOR_S))
         say(out, {"call": request["call"], **run(request, out, options.verbs)})
+
+
+def called_within(idle_s: float | None) -> bool:
+    """Whether to wait for the next line: always, unless there is a bound.
+
+    With one, a call must come after the answer on the one before: of two that came together the second is read already.
+    """
+    return idle_s is None or bool(select.select([sys.stdin], [], [], idle_s)[0])
 
 
 def own_output() -> TextIO:

@@ -163,7 +163,7 @@ def _open(rules: int, path: Path, rights: int) -> None:
 
 def code_roots() -> list[Path]:
     """Folders from which this software is imported: a data folder may lie in one, so only packages in it are open."""
-    return [PACKAGE.parent]
+    return [PACKAGE.parent.resolve()]  # as the folders of `sys.path`, from which it is taken
 
 
 def code_folders() -> list[Path]:

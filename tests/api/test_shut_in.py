@@ -41,7 +41,9 @@ def kernel_shuts() -> set[str]:
     return {name for name, can in (("files", landlock), ("network", filters)) if can}
 
 
-def shut_in(code: str, *folders: Path, writes: tuple[Path, ...] = ()) -> subprocess.CompletedProcess[str]:
+def shut_in(
+    code: str, *folders: Path, writes: tuple[Path, ...] = (), root: Path = ROOT
+) -> subprocess.CompletedProcess[str]:
     """A process that shuts itself in, does what `code` says and tells `left` and what `code` put into `found`."""
     program = (
         "import json, os, sys\nfrom pathlib import Path\n"
@@ -53,14 +55,15 @@ def shut_in(code: str, *folders: Path, writes: tuple[Path, ...] = ()) -> subproc
         "    except BaseException as error:\n        found[name] = type(error).__name__\n"
         f"{code}\nprint(json.dumps({{'left': left, 'found': found}}))"
     )
-    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT)}
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(root)}
     command = [sys.executable, "-c", program]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    # not from the checkout's folder: that one is left out anyway
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=root.parent, timeout=120)
 
 
-def attempt(code: str, *folders: Path, writes: tuple[Path, ...] = ()) -> dict[str, Any]:
+def attempt(code: str, *folders: Path, writes: tuple[Path, ...] = (), root: Path = ROOT) -> dict[str, Any]:
     """What a process that is shut in can still do."""
-    done = shut_in(code, *folders, writes=writes)
+    done = shut_in(code, *folders, writes=writes, root=root)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -110,6 +113,15 @@ attempt('memory', lambda: bytearray({confinement.MEMORY_BYTES}))
     if "files" not in left:
         closed = ("theirs", "parent", "write ours", "program")
         assert {name: found[name] for name in closed} == dict.fromkeys(closed, "PermissionError")
+
+
+@pytest.mark.skipif("files" not in kernel_shuts(), reason="no Landlock here")
+def test_a_checkout_behind_a_link_is_not_open_as_a_whole(tmp_path: Path) -> None:
+    """A data folder lies in it: by default `var`."""
+    link = tmp_path / "link"
+    link.symlink_to(ROOT)
+    code = f"attempt('theirs', lambda: open({str(ROOT / 'README.md')!r}).read())\nimport stimrig.identify.fitting"
+    assert attempt(code, root=link)["found"] == {"theirs": "PermissionError"}
 
 
 def test_what_cannot_be_shut_is_said() -> None:

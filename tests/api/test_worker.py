@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import subprocess
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,8 @@ from typing import Any
 import pytest
 
 from stimrig.api.errors import ApiError
-from stimrig.api.workers.pool import Pool
+from stimrig.api.workers.pool import WORKER, Pool
+from stimrig.api.workers.process import environment
 from tests.api.fake_rig import default_widths, muscle
 from tests.api.stub_worker import COMMAND
 
@@ -70,6 +73,22 @@ async def test_queued_job_can_be_cancelled(pool: Pool) -> None:
     with pytest.raises(ApiError, match="cancelled"):
         await queued.result
     assert slow.state == "running"
+
+
+def test_a_call_that_came_while_the_worker_started_is_answered_after_the_one_before() -> None:
+    """As of a follower that was cancelled, and the next test's."""
+    calls = "".join(json.dumps({"call": n, "verb": "effects", "arguments": {}}) + "\n" for n in (1, 2))
+    process = subprocess.Popen(WORKER, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment())
+    assert process.stdin is not None and process.stdout is not None
+    process.stdin.write(calls)
+    process.stdin.flush()
+    ends = threading.Timer(100.0, process.kill)
+    ends.start()
+    answered = (json.loads(line) for line in process.stdout)
+    assert [next(found["call"] for found in answered if "result" in found) for _ in range(2)] == [1, 2]
+    ends.cancel()
+    process.kill()
+    process.communicate()
 
 
 @pooled()
