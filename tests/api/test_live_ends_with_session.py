@@ -78,6 +78,24 @@ def test_it_goes_on_whatever_is_sent_to_it(service: Service, test_id: str) -> No
         goes_on(socket)
 
 
+def test_it_tells_nothing_to_whom_it_is_not_for(service: Service, test_id: str) -> None:
+    """Nobody, an unknown token, a token of another scope, and a page of elsewhere with a person's cookie."""
+
+    def said(**headers: str) -> tuple[str, int]:
+        with service.live(test_id, None, **headers) as socket:
+            first = json.loads(socket.recv(20))
+            assert first["type"] == "problem", first
+            assert last(socket) == {}, "nor anything after it"
+            return first["problem"]["type"], first["problem"]["status"]
+
+    with signed_in(service, "Ada") as http:
+        assert said(**cookie(http), Origin="https://elsewhere.example") == ("/problems/forbidden", 403)
+        assert said() == ("/problems/unauthorized", 401)
+        assert said(Authorization="Bearer nobody") == ("/problems/unauthorized", 401)
+        reader = service.token("reader", "read-model", "run-test")
+        assert said(Authorization=f"Bearer {reader}") == ("/problems/forbidden", 403)
+
+
 def sign_out(http: httpx.Client, _service: Service) -> None:
     assert http.delete("/v1/sessions/current").status_code == 204
 
