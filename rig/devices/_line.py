@@ -45,8 +45,10 @@ def unstuff(stuffed: bytes) -> bytes:
     Raises
     ------
     WireError
-        The last byte is an escape.
+        The last byte is an escape, or there is a start or stop byte: a wrong length took it from the next frame.
     """
+    if START in stuffed or STOP in stuffed:
+        raise WireError("a start or stop byte within the payload")
     out = bytearray()
     rest = iter(stuffed)
     for byte in rest:

@@ -300,6 +300,14 @@ def test_a_wrong_byte_is_never_taken_and_costs_its_frame_only(
     assert found in ([NEXT] * (2 - lost) for lost in range(codec.lost + 1))
 
 
+def test_a_wrong_length_never_makes_one_packet_of_three_frames():
+    """The length is in no sum, and with what lies in between one of eight bits may happen to fit."""
+    rig = CODECS["rig 2"]
+    frame = bytearray(rig.encode(Packet(42, 42, bytes.fromhex("2a84626e819dd1"))))
+    frame[4] ^= 1 << 4
+    assert read(rig.decoder(), bytes(frame) + 2 * rig.encode(NEXT)) == [NEXT, NEXT]
+
+
 @EACH
 @given(garbage=st.binary(max_size=600))
 @settings(max_examples=60, deadline=None)
