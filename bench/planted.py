@@ -9,18 +9,16 @@ copied, never changed. Writes docs/results/planted.md where nothing is left out.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from bench.common import RESULTS, ROOT, line, parser, table, written_by
+from tests.harness.planted import copy_tree, places, plant, read_faults
 
-FAULTS = ROOT / "tests" / "planted_faults.toml"
 TARGET = RESULTS / "planted.md"
 LONGEST_S = 1200.0
 """A suite that hangs on a fault has found it."""
@@ -28,40 +26,6 @@ PYTEST = ("-m", "pytest", "-x", "-q", "-n", "2", "-p", "no:cacheprovider")
 SIMULATOR = ("-m", "tests.simulator", "--seed", "900000", "--lives", "200", "--first")
 UNITS = (*PYTEST, "-m", "not realtime and not wire", "tests/rig")
 REST = (*PYTEST, "-m", "realtime or wire", "tests/rig", "tests/wire")
-
-
-def plant(tree: Path, at: str, find: str, put: str, old: bool) -> None:
-    """Change one place of a tree. Raises ValueError if it is not there, or not once."""
-    path = tree / at
-    lines = path.read_text("utf-8").splitlines()
-    wanted = [_bare(line) for line in find.splitlines()]
-    starts = [
-        n
-        for n in range(len(lines) - len(wanted) + 1)
-        if all(_bare(line).startswith(word) for line, word in zip(lines[n:], wanted, strict=False))
-    ]
-    if len(starts) != 1:
-        raise ValueError(f"{at}: {find!r} stands there {len(starts)} times")
-    first, last = starts[0], starts[0] + len(wanted) - 1
-    indent = lines[first][: len(lines[first]) - len(lines[first].lstrip())]
-    tail = _bare(lines[last]).removeprefix(wanted[-1])
-    words = (put.replace("await ", "") if old else put).splitlines()
-    words[-1] += tail if words[-1].endswith("(") else ""
-    lines[first : last + 1] = [indent + line for line in words]
-    path.write_text("\n".join(lines) + "\n", "utf-8")
-
-
-def _bare(line: str) -> str:
-    return line.strip().replace("await ", "")
-
-
-def places(fault: dict[str, Any], old: bool) -> list[tuple[str, str, str]]:
-    """Where a fault is planted: file, what stands there, what is put there."""
-    if old and "old" in fault:
-        return [tuple(place) for place in fault["old"]]
-    here = [(fault["at"], fault["find"], fault["put"])]
-    here += [(fault["at"], find, put) for find, put in fault.get("also", [])]
-    return here + [tuple(place) for place in fault.get("more", [])]
 
 
 def finds(tree: Path, command: tuple[str, ...]) -> tuple[bool, float]:
@@ -83,7 +47,7 @@ def searched(source: Path, fault: dict[str, Any], commands: dict[str, tuple[str,
     found = {}
     with tempfile.TemporaryDirectory(prefix="planted-") as folder:
         tree = Path(folder) / "tree"
-        shutil.copytree(source, tree, ignore=shutil.ignore_patterns(".git", ".venv*", "build", "__pycache__"))
+        copy_tree(source, tree)
         for place in places(fault, old):
             plant(tree, *place, old)
         for name, command in commands.items():
@@ -96,7 +60,7 @@ def searched(source: Path, fault: dict[str, Any], commands: dict[str, tuple[str,
 
 def run(old: Path | None, only: str) -> None:
     """Measure, print, write."""
-    faults = [fault for fault in tomllib.loads(FAULTS.read_text("utf-8"))["fault"] if only in fault["name"]]
+    faults = [fault for fault in read_faults() if only in fault["name"]]
     rows, totals = [], {"old": 0, "simulator": 0, "units": 0, "together": 0}
     for number, fault in enumerate(faults, start=1):
         print(f"{number} of {len(faults)}: {fault['name']}", flush=True)
