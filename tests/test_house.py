@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -100,3 +101,13 @@ def test_tests_import_nothing_from_the_benches() -> None:
     pattern = re.compile(r"""^\s*(?:from|import)\s+bench\b|import_module\(["']bench\b""", re.M)
     found = [path for path in (ROOT / "tests").rglob("*.py") if pattern.search(path.read_text(encoding="utf-8"))]
     assert found == []
+
+
+def test_a_test_of_no_cases_is_no_test(tmp_path: Path) -> None:
+    """Many lists of cases are found by scanning a folder or a table."""
+    (tmp_path / "test_none.py").write_text(
+        "import pytest\n@pytest.mark.parametrize('case', [])\ndef test_it(case): assert case\n"
+    )
+    command = [sys.executable, "-m", "pytest", "-q", "-c", ROOT / "pyproject.toml", "--rootdir", tmp_path, tmp_path]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, "Empty parameter set" in done.stdout) == (2, True), done.stdout
