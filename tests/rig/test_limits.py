@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import FrozenInstanceError, replace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from stimrig.rig import limits
 from stimrig.rig.errors import RefusedError
 from stimrig.rig.limits import HARD_LIMITS, Admitted, Refusal, admit
-from stimrig.rig.messages import Profile, Status, TestPlan
+from stimrig.rig.messages import PASSIVE, AdaptivePlan, AnglePlan, Profile, Status, TestPlan
 from stimrig.rig.signals import Pulse
 
 anything = st.one_of(
@@ -213,7 +214,10 @@ def test_each_row_refuses_just_beside_its_bounds_and_says_by_how_much(name: str)
         assert limits.check(row, nonsense) is not None
 
 
-def request(profile: Profile, **fields: float) -> TestPlan:
+BOUNDS = AdaptivePlan(max_duration_s=9.0, max_torque_time_nms=1e3)
+
+
+def request(profile: Profile, **fields: Any) -> TestPlan:
     return TestPlan(test_id="t", participant="P", profile=profile, **fields)
 
 
@@ -240,6 +244,31 @@ def test_of_hard_limit_rig_file_profile_and_request_the_tightest_wins():
             limits.for_plan(HARD_LIMITS, request(Profile(), **wrong))
     with pytest.raises(RefusedError, match="rest_between_tests_s"):
         limits.for_plan(HARD_LIMITS, request(Profile(rest_between_tests_s=math.nan)))
+
+
+def test_what_the_kind_of_a_test_narrows_is_one_row_with_its_owner():
+    """The angle of profile and request, no pulse in a passive test, and the end of an adaptive one."""
+    at = Profile(angle_range_rad=(0.5, 1.5))
+    plain = limits.for_plan(HARD_LIMITS, request(Profile()))
+    for profile, fields, name, owner, lo, hi in (
+        (at, {}, "angle_rad", "participant's profile", 0.5, 1.5),
+        (Profile(), {"angle": AnglePlan(range_rad=(0.6, 1.4))}, "angle_rad", "request", 0.6, 1.4),
+        (at, {"angle": AnglePlan(range_rad=(0.6, 1.4))}, "angle_rad", "request", 0.6, 1.4),
+        (Profile(), {"kind": PASSIVE}, "pulse_width_us", "passive test", plain["pulse_width_us"].lo, 0.0),
+        (Profile(), {"adaptive": BOUNDS}, "duration_s", "request", plain["duration_s"].lo, 9.0),
+    ):
+        row = replace(plain[name], owner=owner, lo=lo, hi=hi)
+        assert limits.for_plan(HARD_LIMITS, request(profile, **fields)) == {**plain, name: row}
+    wide = AnglePlan(range_rad=(0.1, 2.0))
+    assert limits.for_plan(HARD_LIMITS, request(at, angle=wide)) == limits.for_plan(HARD_LIMITS, request(at))
+
+
+def test_what_is_refused_is_refused_at_its_place():
+    row = HARD_LIMITS["current_ma"]
+    limits.refuse(row, row.hi, "request")
+    with pytest.raises(RefusedError) as refused:
+        limits.refuse(row, row.hi + 1, "request")
+    assert str(refused.value) == f"request: {limits.check(row, row.hi + 1)}"
 
 
 def test_clients_are_told_the_bounds_of_this_rig():

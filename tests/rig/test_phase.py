@@ -69,6 +69,7 @@ def test_each_step_is_taken_from_its_own_states_alone(phase: Phase):
     for step, states in {
         "connected": ("disconnected",),
         "armed": ("arming",),
+        "withdrawn": ("arming", "running"),
         "ended": ("running", "stopping", "arming"),
         "sealed": ("sealing",),
         "calibrated": ("calibrating",),
@@ -97,6 +98,7 @@ def test_what_each_step_gives():
     for begun in (ARMING, TRAIN):
         assert begun.armed() == replace(begun, state="running")
         assert begun.ended() == begun.armed().ended() == replace(begun, state="sealing")
+        assert begun.withdrawn() == begun.armed().withdrawn() == replace(begun, state="stopping"), "no latch"
     assert STOPPING.ended() == SEALING
 
 
