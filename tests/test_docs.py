@@ -34,6 +34,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 FOLDERS = {path.name for path in ROOT.iterdir() if path.is_dir()} - {"var"}
 PACKAGES = ("rig", "identify", "api", "hardware_sim", "bench", "tests", "stimrig", "examples")
+PARTS = {"rig", "identify", "api", "hardware_sim"}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 ENTRY_POINTS = "stimrig.effects"
 QUOTE = re.compile(r"<!-- quote: ([^|]+?) \| (.+?) \| ([^|]+?) -->")
@@ -92,10 +93,10 @@ def test_paths_and_names_in_backticks_exist(page: Path) -> None:
         name = word.split("::")[0]
         if re.fullmatch(r"[\w.\-]+(/[\w.\-]+)*/?", name) and "/" in name and name.split("/")[0] in FOLDERS:
             assert (ROOT / name).exists(), word
-        if re.fullmatch(rf"({'|'.join(PACKAGES)})(\.\w+)+", word) and not re.search(
-            r"\.(md|toml|py|json|log|env)$", word
-        ):
-            assert resolves(word), word
+        called = re.fullmatch(rf"(({'|'.join(PACKAGES)})(\.\w+)+)(\(.*\))?", word)
+        if called and not re.search(r"\.(md|toml|py|json|log|env)$", word):
+            assert called[2] not in PARTS, f"{word}: nobody can import it but as part of stimrig"
+            assert resolves(called[1]), word
 
 
 def resolves(name: str) -> bool:
