@@ -20,7 +20,7 @@ from typing import Any, Generic, TypeVar
 
 from stimrig.rig.clock import Clock
 
-log = logging.getLogger("stimrig.rig.tasks")
+log = logging.getLogger("rig.tasks")
 
 T = TypeVar("T")
 Outcome = Callable[[Any, BaseException | None], None]

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -168,7 +169,8 @@ class Worker:
                 if found is not None:
                     return found
                 await process.wait()
-        except ValueError as error:  # no line of ours: this worker is not one to go on with
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            # no line of ours: this worker is not one to go on with
             await self.close()
             detail = "Its answer cannot be read. Your data are safe. Try again, or see logs/api.log."
             raise ApiError(500, "worker-died", "The worker process was ended", detail) from error
@@ -199,7 +201,9 @@ class Worker:
                 return message["result"]
             if "error" in message:
                 raise call_error(call.verb, message["error"])
-            call.progress, call.text = message["progress"], message["text"]
+            if not math.isfinite(fraction := float(message["progress"])):
+                raise ValueError("how far it is is no number")
+            call.progress, call.text = fraction, str(message["text"])
             if call.on_progress is not None:
                 call.on_progress(call)
         return None

@@ -33,7 +33,7 @@ LONGEST_WORDS = 300
 """Characters of the reason of a stop or a withdrawal that are kept: a longer one counts, too."""
 MOST_WITHDRAWN = 1000
 """Tests whose withdrawal is remembered."""
-_NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 class Player:
@@ -233,5 +233,5 @@ class Player:
 def check_names(place: str, **names: str) -> None:
     """Check names that become part of paths. Raises PlanError."""
     for name, value in names.items():
-        if not _NAME.match(value):
+        if not _NAME.fullmatch(value):
             raise PlanError(f"{place}.{name}: {value!r} use letters, digits, '.', '_' and '-', at most 100 characters")

@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -96,6 +97,26 @@ async def test_dead_worker_is_a_problem_and_the_next_job_gets_a_new_one(pool: Po
     with pytest.raises(ApiError, match="died"):
         await pool.submit("fit", data="x", effects=["die"]).result
     await pool.submit("fit", data="x").result
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["[]", "{", '{"call": 1}', '{"call": 1, "error": {}}', '{"call": 1, "error": 5}']
+    + [f'{{"call": 1, "text": "", "progress": {fraction}}}' for fraction in ('"far"', "NaN", "[]", "1" + "0" * 400)],
+)
+def test_a_worker_that_says_what_none_of_ours_says_is_ended(line: str) -> None:
+    """As one that a record has taken over: nothing of it is shown to whoever asks for jobs."""
+    code = f"import sys, time; sys.stdin.readline(); print({line!r}, flush=True); time.sleep(100)"
+
+    async def work(pool: Pool) -> None:
+        call = pool.submit("fit", data="x")
+        with pytest.raises(ApiError, match="was ended") as caught:
+            await call.result
+        assert caught.value.code == "worker-died" and call.document()["progress"] == 0.0
+        process = pool.workers[0].process
+        assert process is not None and process.returncode is not None
+
+    with_pool(work, command=(sys.executable, "-c", code))
 
 
 @pooled(workers=2)

@@ -42,8 +42,9 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
         assert file.attrs["test_id"] == "one"
     with pytest.raises(PlanError, match="already used"):
         live.start(live.plan("one"))
-    with pytest.raises(PlanError, match="letters, digits"):
-        live.start(live.plan("../two"))
+    for name in ("../two", "two\n", "", "ü", "t" * 101):
+        with pytest.raises(PlanError, match="letters, digits"):
+            live.start(live.plan(name))
 
 
 def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
