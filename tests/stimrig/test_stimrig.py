@@ -7,6 +7,7 @@ import re
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -120,12 +121,19 @@ def test_next_experiment_tells_two_rivals_apart(record: stimrig.Record) -> None:
 
 
 def test_next_experiment_of_a_diagnosis_is_its_first_undecided_effect(record: stimrig.Record) -> None:
-    diagnosis = stimrig.diagnose(record)
-    undecided = [row for row in diagnosis.missing if row["confused_with"] and row["next_experiment_plan"]]
-    found = stimrig.next_experiment(diagnosis)
-    assert (found is None) == (not undecided)
-    if found is not None:
-        assert found.rivals == (undecided[0]["effect"], undecided[0]["confused_with"][0])
+    diagnosis, planned = stimrig.diagnose(record), stimrig.next_experiment(record, ["threshold_drift"])
+    assert planned is not None
+    plan = {name: value for name, value in planned.to_dict().items() if name != "rivals"}
+    rows = [
+        {"effect": effect, "confused_with": confused, "next_experiment_plan": plan_of_it}
+        for effect, confused, plan_of_it in (
+            ("tremor", [], plan), ("mains_hum", ["tremor"], None), ("threshold_drift", ["fatigue", "tremor"], plan),
+            ("fatigue", ["tremor"], {**plan, "text": "of another"}),
+        )
+    ]  # fmt: skip
+    found = stimrig.next_experiment(replace(diagnosis, missing=rows))
+    assert found is not None and found.rivals == ("threshold_drift", "fatigue") and found.text == planned.text
+    assert stimrig.next_experiment(replace(diagnosis, missing=rows[:2])) is None
     with pytest.raises(TypeError, match="on a record"):
         stimrig.next_experiment(diagnosis, ["fatigue"])
 
