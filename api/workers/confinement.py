@@ -38,12 +38,26 @@ READ_FILE, READ_FOLDER, WRITE_FILE, TRUNCATE = 1 << 2, 1 << 3, 1 << 1, 1 << 14
 CHANGE_FOLDER = 1 << 4 | 1 << 5 | 1 << 7 | 1 << 8
 """Remove and make files and folders."""
 FORBIDDEN = {
-    "x86_64": (0xC000003E, {"socket": 41, "socketpair": 53, "ptrace": 101, "process_vm_readv": 310,
-                            "process_vm_writev": 311, "io_uring_setup": 425, "pidfd_getfd": 438}),
-    "aarch64": (0xC00000B7, {"socket": 198, "socketpair": 199, "ptrace": 117, "process_vm_readv": 270,
-                             "process_vm_writev": 271, "io_uring_setup": 425, "pidfd_getfd": 438}),
+    "x86_64": (0xC000003E, 302, {
+        "socket": 41, "socketpair": 53, "ptrace": 101, "process_vm_readv": 310, "process_vm_writev": 311,
+        "io_uring_setup": 425, "pidfd_getfd": 438,
+        "setpriority": 141, "ioprio_set": 251, "sched_setparam": 142, "sched_setscheduler": 144,
+        "sched_setaffinity": 203, "sched_setattr": 314,
+        "chmod": 90, "fchmod": 91, "fchmodat": 268, "fchmodat2": 452, "chown": 92, "fchown": 93, "lchown": 94,
+        "fchownat": 260, "setxattr": 188, "lsetxattr": 189, "fsetxattr": 190, "removexattr": 197, "lremovexattr": 198,
+        "fremovexattr": 199,
+    }),
+    "aarch64": (0xC00000B7, 261, {
+        "socket": 198, "socketpair": 199, "ptrace": 117, "process_vm_readv": 270, "process_vm_writev": 271,
+        "io_uring_setup": 425, "pidfd_getfd": 438,
+        "setpriority": 140, "ioprio_set": 30, "sched_setparam": 118, "sched_setscheduler": 119,
+        "sched_setaffinity": 122, "sched_setattr": 274,
+        "fchmod": 52, "fchmodat": 53, "fchmodat2": 452, "fchown": 55, "fchownat": 54, "setxattr": 5, "lsetxattr": 6,
+        "fsetxattr": 7, "removexattr": 14, "lremovexattr": 15, "fremovexattr": 16,
+    }),
 }  # fmt: skip
-"""System calls that reach a network or another process, by processor, with the processor's number for the filter."""
+"""By processor: its number for the filter, the number of prlimit64, and system calls that reach a network, another
+process, or the rights on another's files, which Landlock leaves alone."""
 
 
 def confine(
@@ -97,7 +111,7 @@ def taken() -> tuple[int, int] | None:
 
 
 def _shut_network() -> None:
-    """Refuse every system call that makes a socket or looks into another process.
+    """Refuse every system call that makes a socket, reaches another process, or changes who may open a file.
 
     Raises
     ------
@@ -109,10 +123,11 @@ def _shut_network() -> None:
         raise OSError(0, f"no filter of system calls for {sys.platform} on {platform.machine()}")
     load, equal, at_least, answer = 0x20, 0x15, 0x35, 0x06
     allow, refuse = 0x7FFF0000, 0x00050000 | 1
-    processor, numbers = known[0], sorted(known[1].values())
-    last = 5 + len(numbers)  # the line that refuses; jumps count from the line behind them
+    processor, prlimit, numbers = known[0], known[1], sorted(known[2].values())
+    last = 8 + len(numbers)  # the line that refuses; jumps count from the line behind them
     program = [(load, 0, 0, 4), (equal, 0, last - 2, processor), (load, 0, 0, 0), (at_least, last - 4, 0, 0x40000000)]
     program += [(equal, last - 1 - line, 0, number) for line, number in enumerate(numbers, start=4)]
+    program += [(equal, 0, 2, prlimit), (load, 0, 0, 16), (equal, 0, 1, 0)]  # bounds of this process (0) alone
     program += [(answer, 0, 0, allow), (answer, 0, 0, refuse)]
     packed = b"".join(struct.pack("HBBI", *line) for line in program)
     code = ctypes.create_string_buffer(packed, len(packed))

@@ -93,7 +93,7 @@ def test_a_process_that_is_shut_in_reaches_no_network_no_program_and_no_other_fi
         folder.mkdir()
         (folder / "file").write_text("x")
     code = f"""
-import socket, subprocess
+import resource, socket, subprocess
 attempt('ours', lambda: open({str(ours / "file")!r}).read())
 attempt('theirs', lambda: open({str(theirs / "file")!r}).read())
 attempt('parent', lambda: open(f'/proc/{{os.getppid()}}/environ', 'rb').read())
@@ -101,6 +101,13 @@ attempt('write there', lambda: open({str(out / "new")!r}, 'w').write('x'))
 attempt('write ours', lambda: open({str(ours / "new")!r}, 'w').write('x'))
 attempt('network', lambda: socket.socket())
 attempt('local', lambda: socket.socket(socket.AF_UNIX))
+attempt('rights', lambda: os.chmod({str(theirs)!r}, 0o777))
+attempt('owner', lambda: os.chown({str(theirs)!r}, os.getuid(), os.getgid()))
+attempt('bounds', lambda: resource.prlimit(os.getppid(), resource.RLIMIT_CORE))
+attempt('own bounds', lambda: limit_time(100))
+attempt('turn', lambda: os.sched_setscheduler(os.getppid(), os.SCHED_OTHER, os.sched_param(0)))
+attempt('cores', lambda: os.sched_setaffinity(os.getppid(), os.sched_getaffinity(os.getppid())))
+attempt('nice', lambda: os.setpriority(os.PRIO_PROCESS, os.getppid(), os.getpriority(os.PRIO_PROCESS, os.getppid())))
 attempt('program', lambda: subprocess.run(['true']))
 attempt('memory', lambda: bytearray({confinement.MEMORY_BYTES}))
 """
@@ -109,7 +116,9 @@ attempt('memory', lambda: bytearray({confinement.MEMORY_BYTES}))
     assert found["ours"] == found["write there"] == "done" and found["memory"] == "MemoryError"
     assert set(left) == {"files", "network"} - kernel_shuts(), left
     if "network" not in left:
-        assert found["network"] == found["local"] == "PermissionError"
+        closed = ("network", "local", "rights", "owner", "bounds", "turn", "cores", "nice")
+        assert {name: found[name] for name in closed} == dict.fromkeys(closed, "PermissionError")
+    assert found["own bounds"] == "done"
     if "files" not in left:
         closed = ("theirs", "parent", "write ours", "program")
         assert {name: found[name] for name in closed} == dict.fromkeys(closed, "PermissionError")
