@@ -201,6 +201,14 @@ def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:
     for path in ("/participants/X6", f"/tests/{done['id']}", "/participants/X6/trend"):
         visit(tab, service, path)
     assert tab.locator("html").get_attribute("lang") == "de"
+    long = {"effects": ["torque_velocity"], "force": True, "reason": "its name is long in German"}
+    version = client.post(f"/v1/models/{done['model_id']}/effects", json=long)
+    assert version.status_code == 201, version.text
+    for width, height in (WIDE, (1366, 768)):  # a person at a desk does not look for a state beyond the edge
+        tab.set_viewport_size({"width": width, "height": height})
+        tab.goto(f"{service.url}/models/{version.json()['id']}")
+        tab.get_by_text("diese", exact=True).wait_for()
+        assert tab.locator(".scroll:has(> .versions)").evaluate("(e) => e.scrollWidth <= e.clientWidth"), width
 
 
 def test_widths_for_a_torque_and_a_controllers_key(tab: Any, service: Service, tmp_path: Path) -> None:
