@@ -7,13 +7,14 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from itertools import chain, combinations
 from pathlib import Path
 
 import pytest
 
 from tests.__main__ import CAMPAIGNS, LANES, collected, dearest, main, not_run, plan, run
-from tests.runner.changed_types import keys
+from tests.runner.changed_types import checked, imports_of, keys
 from tests.runner.costs import AGAIN, Costs, Progress, repeating
 from tests.runner.lanes import TOGETHER
 
@@ -142,3 +143,9 @@ def test_types_are_checked_again_where_an_answer_may_differ(
     modules, imported = dict.fromkeys(("a", "a.top", "a.low", "a.alone"), "old"), {"a.top": {"a.low"}}
     before, now = keys(modules, imported, ""), keys(modules | content, imported, settings)
     assert {name for name in modules if now[name] != before[name]} == changed
+
+
+def test_the_checker_is_asked_of_every_module() -> None:
+    """The packages are links in `stimrig`, which it does not follow by itself."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["basedpyright"]
+    assert set(imports_of("stimrig")) - set(checked(settings)) == set()

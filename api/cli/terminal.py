@@ -111,7 +111,7 @@ def _needed(effects: Sequence[str]) -> list[str]:
     found: list[str] = []
     for effect in effects:
         with contextlib.suppress(identify.IdentifyError):
-            found += library.get(effect.partition(":")[0]).needs
+            found += library.find_effect(effect.partition(":")[0]).needs
     return list(dict.fromkeys(found))
 
 

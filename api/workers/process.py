@@ -202,7 +202,7 @@ class Worker:
             if "error" in message:
                 raise call_error(call.verb, message["error"])
             if not math.isfinite(fraction := float(message["progress"])):
-                raise ValueError("how far it is is no number")
+                raise ValueError(fraction)
             call.progress, call.text = fraction, str(message["text"])
             if call.on_progress is not None:
                 call.on_progress(call)

@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import grimp
 
@@ -49,20 +50,24 @@ def keys(content: dict[str, str], imported: dict[str, set[str]], settings: str) 
     return found
 
 
-def imports_of(packages: list[str]) -> dict[str, set[str]]:
+def checked(settings: dict[str, Any]) -> dict[str, Path]:
+    """The files that the checker is asked of, by their modules; like it, no link below a folder is followed."""
+    return {module(path): path for name in settings["include"] for path in (ROOT / name).rglob("*.py")}
+
+
+def imports_of(package: str) -> dict[str, set[str]]:
     """What each module imports, directly or not, a package's own files included."""
-    graph = grimp.build_graph(*packages, cache_dir=None)
+    graph = grimp.build_graph(package, cache_dir=None)
     return {name: set(graph.find_upstream_modules(name)) for name in graph.modules}
 
 
 def main() -> int:
     """The checker's exit code; 0 without asking it where nothing has changed."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["basedpyright"]
-    packages: list[str] = settings["include"]
-    files = {module(path): path for name in packages for path in (ROOT / name).rglob("*.py")}
+    files = checked(settings)
     locked = (ROOT / "requirements" / "test.txt").read_text()
     content = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
-    now = keys(content, imports_of(packages), json.dumps([settings, locked, sys.version]))
+    now = keys(content, imports_of("stimrig"), json.dumps([settings, locked, sys.version]))
     try:
         before = json.loads(KEPT.read_text())
     except (OSError, ValueError):
