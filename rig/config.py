@@ -152,7 +152,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         place = Path(str(stimulator if linked else line["stimulator"])).resolve()
     except OSError as error:
         raise ConfigError(f"--emulator-json {ready}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise ConfigError(f"--emulator-json: not the line that `stimrig emulate` prints ({error})") from None
     if place.parent != PSEUDO_TERMINALS:
         raise ConfigError(

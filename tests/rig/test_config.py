@@ -124,7 +124,8 @@ def test_the_emulators_line(tmp_path: Path):
     assert loaded.stimulator.model_dump()["port"] == "/dev/pts/3"
     (tmp_path / "ready.json").write_text(line)
     assert config.for_emulator(str(tmp_path / "ready.json"), **where) == loaded
-    for wrong in ("{}", "[1]", str(tmp_path / "none")):
+    (tmp_path / "list.json").write_text("[1]")
+    for wrong in ("{}", "[1]", str(tmp_path / "none"), str(tmp_path / "list.json")):
         with pytest.raises(ConfigError, match="--emulator-json"):
             config.for_emulator(wrong, **where)
 
