@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import groupby
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
+from stimrig.rig.control.sealing import MAY_BE_FELT
+from stimrig.rig.signals import PulseStatus
 from tests.harness.processes import Bench, RigClient, control, short_plan
 
 pytestmark = pytest.mark.wire
@@ -48,11 +51,10 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     over = client.ask("calibrate-step", direction="up")["problem"]
     assert over["code"] == "refused"
     assert "marked comfort maximum" in over["detail"]
-    pulses = felt(bench)[before:]
+    pulses = [round(p["width_us"]) for p in felt(bench)[before:]]
     trains = shown["trains"]
     assert all(t["pulses"] <= 20 for t in trains), trains
-    played = [t["pulse_width_us"] for t in trains for _ in range(t["pulses"])]
-    assert [round(p["width_us"]) for p in pulses] == played
+    assert [width for width, _ in groupby(pulses)] == [t["pulse_width_us"] for t in trains if t["pulses"]]
     assert [t["pulse_width_us"] for t in trains if t["pulses"]] == [25, 50, 75, 100, 125, 150, 175, 200]
     rise_nm = [t["torque_rise_nm"] for t in trains if t["torque_rise_nm"] is not None]
     assert rise_nm[-1] > 5 * rise_nm[0]
@@ -64,6 +66,13 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     assert profile["max_pulse_width_us"] == 200.0
     assert profile["expires_at_utc"] > profile["set_at_utc"]
     assert len(result["recordings"]) == len(trains)
+    for train, path in zip(trains, result["recordings"], strict=True):
+        with h5py.File(path) as file:
+            status = file["pulses/status"][:]
+        sure = int(np.sum(status == PulseStatus.ACKNOWLEDGED))
+        assert sure <= train["pulses"] == int(np.isin(status, MAY_BE_FELT).sum())  # what may be felt counts as felt
+        if train["pulses"]:  # one that was not acknowledged need not have been felt
+            assert sure <= pulses.count(train["pulse_width_us"]) <= train["pulses"]
     with h5py.File(result["recordings"][-1]) as file:
         assert file.attrs["kind"] == "calibration"
         assert np.nanmax(file["pulses/sent_pulse_width_us"][:]) == 200

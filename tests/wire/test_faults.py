@@ -40,7 +40,7 @@ def start(bench: Bench, test_id: str = "t", client: RigClient | None = None) -> 
     client.wait_state("running")
     end = time.monotonic() + 10
     while state(bench)["pulses_received"] < before + 30:
-        assert time.monotonic() < end
+        assert time.monotonic() < end, client.status()
         time.sleep(0.02)
     return client
 
