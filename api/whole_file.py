@@ -11,7 +11,9 @@ from typing import IO
 
 
 @contextlib.contextmanager
-def whole_file(path: Path, aside: Path | None = None, mode: int = 0o666) -> Iterator[IO[bytes]]:
+def whole_file(
+    path: Path, aside: Path | None = None, mode: int = 0o666, must_last: bool = False
+) -> Iterator[IO[bytes]]:
     """Write a file; who reads has the one before, or this one, whole.
 
     Parameters
@@ -20,6 +22,9 @@ def whole_file(path: Path, aside: Path | None = None, mode: int = 0o666) -> Iter
         Where it is written, on the same disk; default: a hidden name beside it. What is there is written over.
     mode : int
         Of the file, the process's mask aside.
+    must_last : bool
+        Whether to raise OSError where the folder's list of files is not brought to the disk; not every file system
+        does this.
     """
     part = aside or path.with_name(f".{path.name}.new")
     try:
@@ -30,17 +35,12 @@ def whole_file(path: Path, aside: Path | None = None, mode: int = 0o666) -> Iter
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # not every file system does this
-        sync_folder(path.parent)
-
-
-def sync_folder(path: Path) -> None:
-    """Bring a folder's list of files to the disk. Raises OSError."""
-    folder = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with contextlib.nullcontext() if must_last else contextlib.suppress(OSError):
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 def sha256_of(path: Path) -> str:

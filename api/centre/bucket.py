@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from stimrig.api.errors import ApiError, SettingsError
-from stimrig.api.whole_file import sync_folder, whole_file
+from stimrig.api.whole_file import whole_file
 
 PIECE = 2**20
 PROBE = "stimrig-centre"
@@ -85,9 +85,9 @@ class Bucket:
             raise FileNotFoundError(2, GONE)
         final.parent.mkdir(mode=0o700, exist_ok=True)
         part = final.with_name(f"{final.name}.{secrets.token_hex(4)}.part")
-        with path.open("rb") as source, whole_file(final, part, 0o600) as out:
+        # what is not there for good was not taken
+        with path.open("rb") as source, whole_file(final, part, 0o600, must_last=True) as out:
             shutil.copyfileobj(source, out, PIECE)
-        sync_folder(final.parent)  # what is not there for good was not taken
 
     def copy(self, sha256: str, out: IO[bytes] | None = None, seen: Callable[[int], object] | None = None) -> bool:
         """Read a file, into `out` if given; whether it is what its name says.

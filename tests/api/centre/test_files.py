@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -297,6 +298,23 @@ def test_a_copy_that_is_cut_off_leaves_nothing_under_the_name(tmp_path: Path, mo
     with pytest.raises(Exception, match="pulled out"):
         bucket.put(source, sha256(b"x" * 100))
     assert not [path for path in (tmp_path / "files").rglob("*") if path.is_file() and path.name != "stimrig-centre"]
+
+
+def test_a_copy_whose_name_may_be_lost_again_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bucket = Bucket(str(tmp_path / "files"))
+    (tmp_path / "files").mkdir()
+    bucket.ready(begin=True)
+    (tmp_path / "source").write_bytes(b"x" * 100)
+    synced = os.fsync
+
+    def of_files(file: int) -> None:
+        if stat.S_ISDIR(os.fstat(file).st_mode):
+            raise OSError(errno.EIO, "pulled out")
+        synced(file)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    with pytest.raises(Exception, match="pulled out"):
+        bucket.put(tmp_path / "source", sha256(b"x" * 100))
 
 
 def test_on_s3(tmp_path: Path, s3: Any) -> None:
