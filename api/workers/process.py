@@ -169,7 +169,7 @@ class Worker:
                 if found is not None:
                     return found
                 await process.wait()
-        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
             # no line of ours: this worker is not one to go on with
             await self.close()
             detail = "Its answer cannot be read. Your data are safe. Try again, or see logs/api.log."
@@ -198,7 +198,7 @@ class Worker:
             if message.get("call") != call.id:
                 continue
             if "result" in message:
-                return message["result"]
+                return dict(message["result"])
             if "error" in message:
                 raise call_error(call.verb, message["error"])
             if not math.isfinite(fraction := float(message["progress"])):

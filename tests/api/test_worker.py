@@ -101,7 +101,8 @@ async def test_dead_worker_is_a_problem_and_the_next_job_gets_a_new_one(pool: Po
 
 @pytest.mark.parametrize(
     "line",
-    ["[]", "{", '{"call": 1}', '{"call": 1, "error": {}}', '{"call": 1, "error": 5}']
+    ["[]", "{", "[" * 100_000, '{"call": 1}', '{"call": 1, "error": {}}', '{"call": 1, "error": 5}']
+    + [f'{{"call": 1, "result": {result}}}' for result in ("null", "5", "[1]")]
     + [f'{{"call": 1, "text": "", "progress": {fraction}}}' for fraction in ('"far"', "NaN", "[]", "1" + "0" * 400)],
 )
 def test_a_worker_that_says_what_none_of_ours_says_is_ended(line: str) -> None:
