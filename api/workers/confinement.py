@@ -45,7 +45,7 @@ FORBIDDEN = {
         "sched_setaffinity": 203, "sched_setattr": 314,
         "chmod": 90, "fchmod": 91, "fchmodat": 268, "fchmodat2": 452, "chown": 92, "fchown": 93, "lchown": 94,
         "fchownat": 260, "setxattr": 188, "lsetxattr": 189, "fsetxattr": 190, "removexattr": 197, "lremovexattr": 198,
-        "fremovexattr": 199,
+        "fremovexattr": 199, "setxattrat": 463, "removexattrat": 466,
     }),
     "aarch64": (0xC00000B7, 261, {
         "socket": 198, "socketpair": 199, "ptrace": 117, "process_vm_readv": 270, "process_vm_writev": 271,
@@ -53,7 +53,8 @@ FORBIDDEN = {
         "setpriority": 140, "ioprio_set": 30, "sched_setparam": 118, "sched_setscheduler": 119,
         "sched_setaffinity": 122, "sched_setattr": 274,
         "fchmod": 52, "fchmodat": 53, "fchmodat2": 452, "fchown": 55, "fchownat": 54, "setxattr": 5, "lsetxattr": 6,
-        "fsetxattr": 7, "removexattr": 14, "lremovexattr": 15, "fremovexattr": 16,
+        "fsetxattr": 7, "removexattr": 14, "lremovexattr": 15, "fremovexattr": 16, "setxattrat": 463,
+        "removexattrat": 466,
     }),
 }  # fmt: skip
 """By processor: its number for the filter, the number of prlimit64, and system calls that reach a network, another

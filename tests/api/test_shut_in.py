@@ -93,7 +93,11 @@ def test_a_process_that_is_shut_in_reaches_no_network_no_program_and_no_other_fi
         folder.mkdir()
         (folder / "file").write_text("x")
     code = f"""
-import resource, socket, subprocess
+import ctypes, resource, socket, subprocess
+system = ctypes.CDLL(None, use_errno=True)
+def call(*arguments):
+    if system.syscall(*arguments) < 0:
+        raise OSError(ctypes.get_errno(), 'refused')
 attempt('ours', lambda: open({str(ours / "file")!r}).read())
 attempt('theirs', lambda: open({str(theirs / "file")!r}).read())
 attempt('parent', lambda: open(f'/proc/{{os.getppid()}}/environ', 'rb').read())
@@ -102,6 +106,8 @@ attempt('write ours', lambda: open({str(ours / "new")!r}, 'w').write('x'))
 attempt('network', lambda: socket.socket())
 attempt('local', lambda: socket.socket(socket.AF_UNIX))
 attempt('rights', lambda: os.chmod({str(theirs)!r}, 0o777))
+attempt('set rights', lambda: call(463, -100, {os.fsencode(theirs)!r}, 0, b'system.posix_acl_access', None, 0))
+attempt('drop rights', lambda: call(466, -100, {os.fsencode(theirs)!r}, 0, b'system.posix_acl_access'))
 attempt('owner', lambda: os.chown({str(theirs)!r}, os.getuid(), os.getgid()))
 attempt('bounds', lambda: resource.prlimit(os.getppid(), resource.RLIMIT_CORE))
 attempt('own bounds', lambda: limit_time(100))
@@ -116,7 +122,9 @@ attempt('memory', lambda: bytearray({confinement.MEMORY_BYTES}))
     assert found["ours"] == found["write there"] == "done" and found["memory"] == "MemoryError"
     assert set(left) == {"files", "network"} - kernel_shuts(), left
     if "network" not in left:
-        closed = ("network", "local", "rights", "owner", "bounds", "turn", "cores", "nice")
+        closed = (
+            "network", "local", "rights", "set rights", "drop rights", "owner", "bounds", "turn", "cores", "nice",
+        )  # fmt: skip
         assert {name: found[name] for name in closed} == dict.fromkeys(closed, "PermissionError")
     assert found["own bounds"] == "done"
     if "files" not in left:
@@ -135,7 +143,8 @@ def test_a_checkout_behind_a_link_is_not_open_as_a_whole(tmp_path: Path) -> None
 
 def test_what_cannot_be_shut_is_said() -> None:
     program = (
-        "import json, api.workers.confinement as c\nc.LIBC = None\nc.FORBIDDEN = {}\nprint(json.dumps(c.confine()))"
+        "import json, stimrig.api.workers.confinement as c\n"
+        "c.LIBC = None\nc.FORBIDDEN = {}\nprint(json.dumps(c.confine()))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, timeout=120)
     assert set(json.loads(done.stdout)) == {"files", "network"}, done.stderr
