@@ -36,7 +36,8 @@ def written_by(command: str) -> str:
 
 def parser(doc: str | None, seeds: str = "", name: str = "--seeds") -> argparse.ArgumentParser:
     """A bench's options, to which it adds its own; with seeds a range of them, and a file for the rows."""
-    made = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
+    called = f"python -m bench.{Path(sys.argv[0]).stem}"
+    made = argparse.ArgumentParser(prog=called, description=(doc or "").partition("\n")[0])
     if seeds:
         made.add_argument(name, type=seed_range, default=seeds, help="first:last, last not included")
         made.add_argument("--json", type=Path, help="write every row here")

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import ROOT, pyplot, reveal, services, table, written_by
+from bench.common import ROOT, parser, pyplot, reveal, services, table, written_by
 from examples import ilc_controller as ilc
 
 SEEDS = (59, 29)
@@ -111,14 +111,14 @@ def knowing(service: Patient, test: dict[str, Any], trials: int, peak_nm: float,
 
 def main() -> None:
     """All cases, the page and the drawing."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--speed", type=float, default=1.0)
-    parser.add_argument("--trials", type=int, default=10)
-    parser.add_argument("--seeds", type=int, nargs="*", default=list(SEEDS))
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
-    parser.add_argument("--jobs", type=int, default=2, help="rigs at a time")
-    parser.add_argument("--only-hidden", action="store_true")
-    options = parser.parse_args()
+    made = parser(__doc__)
+    made.add_argument("--speed", type=float, default=1.0)
+    made.add_argument("--trials", type=int, default=10)
+    made.add_argument("--seeds", type=int, nargs="*", default=list(SEEDS))
+    made.add_argument("--out", type=Path, default=ROOT / "docs")
+    made.add_argument("--jobs", type=int, default=2, help="rigs at a time")
+    made.add_argument("--only-hidden", action="store_true")
+    options = made.parse_args()
     began = time.time()
     wanted: dict[str, dict[str, Any]] = {}
     if not options.only_hidden:
