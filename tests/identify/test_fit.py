@@ -74,6 +74,18 @@ def test_splitting_and_joining_segments_changes_nothing():
         assert np.array_equal(same, predicted)
 
 
+def test_resampling_changes_predictions_by_less_than_the_noise():
+    record, _ = make_record(Patient(delay_s=0.02), np.random.default_rng(6), rate_hz=1600, noise_nm=NOISY)
+    every = slice(None, None, 4)
+    names = np.array(record.segment_names)[record.segment]
+    coarse = Record.from_arrays(
+        record.time_s[every], record.pulse_width_us[every], record.torque_nm[every], names[every]
+    )
+    _, fine = fitted(record)
+    _, thin = fitted(coarse)
+    assert np.sqrt(np.mean((fine[every] - thin) ** 2)) < 0.2 * NOISY
+
+
 def test_held_out_rows_are_never_used():
     record, _ = make_record(Patient(), np.random.default_rng(7), noise_nm=NOISY)
     spoiled = record.with_torque(np.where(record.held_out, -50.0, record.torque_nm))
