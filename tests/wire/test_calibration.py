@@ -71,6 +71,7 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
             status = file["pulses/status"][:]
         sure = int(np.sum(status == PulseStatus.ACKNOWLEDGED))
         assert sure <= train["pulses"] == int(np.isin(status, MAY_BE_FELT).sum())  # what may be felt counts as felt
+        assert train["pulses"] - sure <= 1  # none follows one that is not acknowledged
         if train["pulses"]:  # one that was not acknowledged need not have been felt
             assert sure <= pulses.count(train["pulse_width_us"]) <= train["pulses"]
     with h5py.File(result["recordings"][-1]) as file:
