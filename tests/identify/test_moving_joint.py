@@ -189,7 +189,9 @@ def knowing_less(than: str) -> Model:
     """The model without those settings of its effects that are named so."""
     document = json.loads(model().to_json(None))
     for entry in document["effects"]:
-        entry["settings"] = {name: value for name, value in entry["settings"].items() if than not in name}
+        known = {name: value for name, value in entry["settings"].items() if than not in name}
+        assert known != entry["settings"]
+        entry["settings"] = known
     return Model.from_dict(document)
 
 

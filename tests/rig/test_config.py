@@ -169,11 +169,15 @@ DESCRIBED = {
 }
 
 
-@pytest.mark.parametrize("cell", [(name, count) for name, kind in CELLS.items() for count in kind.layouts])
+EMULATED = [(name, count) for name, kind in CELLS.items() for count in kind.layouts]
+
+
+@pytest.mark.parametrize("cell", EMULATED)
 @pytest.mark.parametrize("stimulator", library("stimulator"))
 def test_every_emulated_device_has_its_description(tmp_path: Path, stimulator: str, cell: tuple[str, int]):
     """The rig reads from an emulated cell's frame what that put into it, and every driver has an emulated device."""
     assert set(library("stimulator")) == set(STIMULATORS)
+    assert set(DESCRIBED) <= set(EMULATED)
     name, count = cell
     emulated = CELLS[name](count)
     line = {
