@@ -1,4 +1,9 @@
-"""Every text can be read in light and in dark, and the charts' colours are told apart by everybody."""
+"""Every text can be read in light and in dark, and the charts' colours are told apart by everybody.
+
+Contrast: WCAG 2.2, definitions of contrast ratio and relative luminance. Dichromacy: Machado, Oliveira and Fernandes,
+"A physiologically-based model for simulation of color vision deficiency", IEEE TVCG 15(6), 2009, table 1, severity 1.0,
+applied to linear RGB. Difference: CIEDE2000 as in Sharma, Wu and Dalal, Color Res. Appl. 30(1), 2005.
+"""
 
 from __future__ import annotations
 
