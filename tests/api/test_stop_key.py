@@ -39,10 +39,11 @@ class Terminal:
         return StopKey(stop, self.words.append, self.program)
 
     def press(self, key: bytes = b"x") -> str:
-        """What is said of a key."""
-        count = len(self.words)
+        """What is said of a key; nothing else is."""
         os.write(self.keyboard, key)
-        return soon(lambda: self.words[count:], 15)[0]
+        (said,) = soon(lambda: self.words, 15)
+        self.words.clear()
+        return said
 
 
 @pytest.fixture
