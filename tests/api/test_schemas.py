@@ -51,7 +51,9 @@ def test_a_verbs_json_holds_to_its_schema(
     capsys.readouterr()
     with few_effects.only("fatigue", "tremor") if verb in ("diagnose", "improve") else contextlib.nullcontext():
         assert main.run([verb, *map(str, given), "--json"]) == 0
-    assert unmet(verb, json.loads(capsys.readouterr().out)) == []
+    out, err = capsys.readouterr()
+    assert err == "" and out.count("\n") == 1, "one object and nothing else"
+    assert unmet(verb, json.loads(out)) == []
 
 
 def test_audits_json_holds_to_its_schema(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
