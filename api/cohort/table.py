@@ -200,9 +200,10 @@ def groups(files: Sequence[Path], kept: set[int]) -> Iterator[pa.Table]:
         with pq.ParquetFile(file) as table:
             for batch in table.iter_batches(ROWS_AT_ONCE):
                 rows = [index for index in range(batch.num_rows) if number + index in kept]
-                waiting.append(
-                    pa.Table.from_batches([batch]).select(SCHEMA.names).cast(SCHEMA).take(pa.array(rows, pa.int64()))
+                whole = pa.concat_tables(
+                    [SCHEMA.empty_table(), pa.Table.from_batches([batch])], promote_options="default"
                 )
+                waiting.append(whole.select(SCHEMA.names).cast(SCHEMA).take(pa.array(rows, pa.int64())))
                 number += batch.num_rows
                 if sum(part.num_rows for part in waiting) >= ROWS_A_GROUP:
                     yield pa.concat_tables(waiting)
