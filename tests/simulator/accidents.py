@@ -153,7 +153,9 @@ def requests_are_lost(life: Life, chance: random.Random) -> str:
 
 
 LIBRARY: dict[str, Accident] = {
-    name: found for name, found in [*globals().items()] if isfunction(found) and found.__module__ == __name__
+    name: found
+    for name, found in [*globals().items()]
+    if isfunction(found) and found.__module__ == __name__ and not name.startswith("_")
 }
 ODDS = {"device_fault": 6.0, "line_stalls": 3.0, "line_deviates": 3.0, "host_pauses": 3.0, "step_stalls": 2.0}
 """How often, beside 1 for the others."""
