@@ -53,7 +53,8 @@ def improve(
     BadRequest
         A forced effect is unknown, or effects cannot be added to the given model.
     NotIdentifiable
-        A forced effect needs a column that the record does not have, or its fit finds nothing to start from.
+        Less than three seconds may be fitted; or a forced effect needs a column that the record does not have, or its
+        fit finds nothing to start from.
     """
     for effect in force:
         find_effect(effect)

@@ -1,4 +1,4 @@
-"""An effect added to a model: its most likely form, the evidence for it, and the curve chosen again beside it."""
+"""An effect added to a model: its most likely form, and the evidence for it."""
 
 from __future__ import annotations
 

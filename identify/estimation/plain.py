@@ -1,6 +1,7 @@
-"""From a record to the fit of the plain structure: which rows are fitted, a pilot with few knots, the final spline.
+"""From a grid to the fit of the plain structure: a pilot with few knots, the final spline.
 
-Of a moving joint, the rows at one angle are fitted to begin with. The set-up is shared by all candidates."""
+Of a moving joint, the rows at one angle are fitted to begin with; the curve is chosen again with all rows once effects
+of the joint are there. The set-up is shared by all candidates."""
 
 from __future__ import annotations
 
