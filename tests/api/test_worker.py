@@ -85,11 +85,13 @@ def test_a_call_that_came_while_the_worker_started_is_answered_after_the_one_bef
     process.stdin.flush()
     ends = threading.Timer(100.0, process.kill)
     ends.start()
-    answered = (json.loads(line) for line in process.stdout)
-    assert [next(found["call"] for found in answered if "result" in found) for _ in range(2)] == [1, 2]
-    ends.cancel()
-    process.kill()
-    process.communicate()
+    try:
+        answered = (json.loads(line) for line in process.stdout)
+        assert [next(found["call"] for found in answered if "result" in found) for _ in range(2)] == [1, 2]
+    finally:
+        ends.cancel()
+        process.kill()
+        process.communicate()
 
 
 @pooled()
