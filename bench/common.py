@@ -89,11 +89,6 @@ def spread(values: Iterable[float], scale: float = 1e3) -> dict[str, float]:
     return {"median": float(np.median(found)), "p99": float(np.percentile(found, 99)), "max": float(np.max(found))}
 
 
-def share(flags: Sequence[bool]) -> str:
-    """A proportion with its count."""
-    return f"{100 * np.mean(flags):.0f} % ({sum(flags)}/{len(flags)})" if flags else "none"
-
-
 @contextmanager
 def services(*emulator: str) -> Iterator[Any]:
     """A service with its emulated rig, and its client."""

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import in_processes, keep, parser, share
+from bench.common import in_processes, keep, parser
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.diagnosis.thresholds import STRUCTURE
@@ -154,6 +154,11 @@ def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str,
         sets = [{}, {"noise": "ar1"}, {"steep": True}, {"noise": "slow"}]
         return [("", "middle", seed, options) for options in sets for seed in many]
     raise SystemExit(f"no set {kind!r}")
+
+
+def share(flags: list[bool]) -> str:
+    """A proportion with its count."""
+    return f"{100 * np.mean(flags):.0f} % ({sum(flags)}/{len(flags)})" if flags else "none"
 
 
 def tell(kind: str, rows: list[dict[str, Any]]) -> None:
