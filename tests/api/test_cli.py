@@ -246,6 +246,11 @@ def test_every_verb_of_the_contract_is_there_and_helps() -> None:
         assert f"\n  {verb}" in done.stdout
 
 
+def test_bad_input_as_a_process() -> None:
+    done = subprocess.run([sys.executable, "-m", "stimrig", "fit", "nowhere.csv"], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
+
+
 def test_emulate_hands_everything_on() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "stimrig", "emulate", "--patient", "nobody"], capture_output=True, text=True
