@@ -296,21 +296,20 @@ def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
         total += stop[i] - start[i]
     # a = log(1 - ar1), from log(SHORTEST) (long memory) to 0 (none).
     low, high = np.log(SHORTEST), 0.0
-    own = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high)
-    a, b, best, variance = own, min(max(share, 0.0), 2.0), np.inf, 0.0
+    a, b = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high), min(max(share, 0.0), 2.0)
+    best, variance = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
     for guess_a, guess_b in (
-        (own, b),
         (np.log(0.3), 0.9),
         (np.log(0.03), 0.3),
         (np.log(0.03), 1.0),
         (np.log(0.5), 0.02),
         (np.log(0.3), 1.7),
     ):
+        if not wide:
+            break
         value, squares = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
         if value < best:
             best, a, b, variance = value, guess_a, guess_b, squares
-        if not wide:
-            break
     da, db = (0.6, 0.2) if wide else (0.15, 0.05)
     while da > 0.01:
         moved = False

@@ -59,6 +59,15 @@ def test_noise_is_found_again():
     assert abs(found.ar1 - 0.95) < 0.04 and abs(found.share - 0.6) < 0.2 and abs(found.sd_nm - 0.03) < 0.006
 
 
+@pytest.mark.parametrize("residual", [np.nan, np.inf, 1e200])
+@pytest.mark.parametrize("wide", [True, False])
+def test_of_a_residual_beyond_numbers_no_small_noise_is_said(residual, wide):
+    row = np.full(40, residual)
+    found, log_likelihood = profile(row, (np.array([0]), np.array([40])), NoiseLevel(0.5, 0.5, 1.0), wide)
+    assert not found.sd_nm < np.inf
+    assert not log_likelihood > -np.inf
+
+
 @pytest.mark.parametrize(
     "names",
     [
