@@ -194,7 +194,12 @@ JOINT_SETTINGS = {
 EFFECT_STATE = number(0.0, 1.0, "Give a number from 0 (rested) to 1, or leave it out: rested.")
 EFFECT = fields(
     {"id": text, "parameters": each(lambda value, place: ANY(parameter_value(value), place))},
-    {"form": text, "settings": fields({}, SETTINGS | JOINT_SETTINGS), "state": EFFECT_STATE},
+    {
+        "form": text,
+        "settings": fields({}, SETTINGS | JOINT_SETTINGS),
+        "state": EFFECT_STATE,
+        "unforeseen": fields({"mean_nm": number(-PLAUSIBLE, PLAUSIBLE), "rms_nm": number(0.0, PLAUSIBLE)}),
+    },
 )
 WHOLE = number(0, LONGEST)
 _NARX = fields(

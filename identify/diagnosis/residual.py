@@ -171,7 +171,7 @@ def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | No
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
     allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
-    if all(find_effect(effect).predictable for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
+    if not any(find_effect(effect).sporadic for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
         return HeldOutError(float(np.sqrt(np.mean(residual**2))), float(allowed))
     return HeldOutError(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
 

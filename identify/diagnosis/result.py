@@ -30,13 +30,13 @@ STATISTICS = (
 def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     """The `Diagnosis` that a search and its verdict give."""
     record, raw = search.record, search.raw
-    base_prediction = predict_fitted(search.base)
+    base_prediction = predict_fitted(search.base)[0]
     row = steps(search)
     base = row[0].statistics
     missing = [_missing(search, verdict, effect, row) for effect in _ranked(search, verdict)]
     final = row[-1].statistics
     residual = record.torque_nm - (
-        predict_fitted(search.last) if verdict.kind == "unexplained_structure" else base_prediction
+        predict_fitted(search.last)[0] if verdict.kind == "unexplained_structure" else base_prediction
     )
     where = worst_places(
         record, residual, raw.noise_sd_nm, rows=~record.held_out & search.base.problem.setup.grid.counted

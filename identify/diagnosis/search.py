@@ -246,7 +246,7 @@ def seen_at_rest(quiet: np.ndarray, fitted: Fitted, effect: str) -> float:
 def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
     """The candidate with its gain reduced if it is an effort, and reduced more if it is only seen at work."""
     effect = candidate.effect
-    if effect.predictable or effect.band:
+    if effect.band or not effect.sporadic:
         return candidate
     at_rest = candidate.form.stage != "additive" or (
         seen_at_rest(search.quiet, candidate.fitted, effect.id) >= thresholds.SEEN_AT_REST
@@ -275,7 +275,7 @@ def _first_gain(search: EffectSearch) -> float:
 def _required_share(search: EffectSearch, candidate: Candidate) -> float:
     """Share of the first effect's gain that a further effect must gain."""
     effect, stage = candidate.effect, candidate.form.stage
-    if not effect.predictable:
+    if effect.sporadic:
         return thresholds.UNPREDICTABLE_SHARE
     if stage == "additive":
         return 0.5 * thresholds.CONFIRMED_SHARE

@@ -1,8 +1,8 @@
 """Every threshold that decides a verdict, with the reason for it.
 
 All were calibrated on development records only (seeds 0 to 99 of `bench.diagnosis`); docs/diagnosis.md gives the
-results on other records. Log evidence is a natural logarithm. A "predictable" effect follows from the pulse widths;
-efforts and tremor do not. The muscle is "at work" in the intervals in which it pulls, and "at rest" in all others.
+results on other records. Log evidence is a natural logarithm. A "sporadic" effect comes and goes by no
+law, as efforts and tremor do. The muscle is "at work" in the intervals in which it pulls, and "at rest" in all others.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CONFIRMED_SHARE = 0.03
 FREE_GAIN_CONFIRMS = 0.4
 """A gain without a law confirms a slow gain if it finds this share of its log evidence."""
 UNPREDICTABLE_SHARE = 0.4
-"""The same for effects that are not predictable: they can repair any error, so more is required."""
+"""The same for sporadic effects: they can repair any error, so more is required."""
 EFFORT_WEIGHT = 0.92
 """Weight of the evidence for efforts. Where a law explains as much, the law is preferred, since it can be tested."""
 EFFORT_WEIGHT_ONLY_AT_WORK = 0.85

@@ -60,10 +60,10 @@ def _no_effort(search: EffectSearch, explained: float, structure: bool) -> bool:
 
 
 def _only_at_work(search: EffectSearch, number: int) -> bool:
-    """Whether an unpredictable added torque does not appear at rest."""
+    """Whether a sporadic added torque does not appear at rest."""
     effect, holder = search.added[number], search.chain[number + 1]
     form = dict(holder.effects).get(effect)
-    if form is None or form.stage != "additive" or find_effect(effect).predictable:
+    if form is None or form.stage != "additive" or not find_effect(effect).sporadic:
         return False
     return seen_at_rest(search.quiet, holder, effect) < thresholds.SEEN_AT_REST
 
@@ -128,7 +128,7 @@ def judge(search: EffectSearch) -> Verdict:
             strange = strange or (
                 explained < thresholds.LEAST_EXPLAINED_BY_BAND and structure > thresholds.STRUCTURE_BESIDE_BAND
             )
-        elif search.added and not find_effect(search.added[0]).predictable:
+        elif search.added and find_effect(search.added[0]).sporadic:
             strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
     else:
         strange = strange or left.left

@@ -26,7 +26,7 @@ def warm() -> None:
     for effect in registry().values():
         if effect.needs or effect.raw or effect.band:
             continue
-        for form in effect.forms[:6] if effect.predictable else effect.forms[:1]:
+        for form in effect.forms[:6] if not effect.sporadic else effect.forms[:1]:
             problem = Problem(setup, [(effect.id, form)])
             problem.run(start_from(problem, base, {0: form.starts(setup.scene)[0]}), derivatives=True)
 

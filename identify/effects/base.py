@@ -320,7 +320,11 @@ class Effect:
     needs : tuple of str
         Columns that the record must have; otherwise the effect is not tried.
     predictable : bool
-        Whether it can be predicted from the pulse widths. Efforts and tremor cannot.
+        Whether it can be foreseen on another record, as what follows from the pulses can. Hum, a zero that moves,
+        efforts and tremor cannot: their mean over the fitted rows stays as a zero, their size widens the band.
+    sporadic : bool
+        Whether it comes and goes by no law, as efforts and tremor do. It can repair any error, so the evidence asks for
+        more of it; its mean does not stay either.
     raw : bool
         Whether it is detected in the samples, before the means over pulse intervals are taken.
     band : bool
@@ -348,6 +352,7 @@ class Effect:
     source: str = ""
     needs: tuple[str, ...] = ()
     predictable: bool = True
+    sporadic: bool = False
     raw: bool = False
     band: bool = False
     detect: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None

@@ -74,6 +74,7 @@ EFFECT = Effect(
     plain="The zero of the measurement drifts; the muscle is not the cause. Let the load cell warm up, support the "
     "limb, and set the zero again.",
     source="Warm-up of load cells, settling of the limb",
+    predictable=False,
     muscle=False,
     main={"slope_nm_per_s": "slope", "shift_nm": "shift", "period_s": "period", "knot_1_nm": "first shift"},
 )

@@ -43,6 +43,7 @@ EFFECT = Effect(
     separated_by="The spectrum of a rest, at a high sampling rate.",
     plain="The mains supply disturbs the load cell; the muscle is not the cause. Check shielding and earth.",
     source="Electrical interference",
+    predictable=False,
     raw=True,
     detect=lambda raw: None if raw.hum is None else ("line", raw.hum),
     muscle=False,

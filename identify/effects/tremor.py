@@ -48,6 +48,7 @@ EFFECT = Effect(
     plain="The limb trembles. This adds to the torque, but the pulses do not cause it, so it cannot be predicted.",
     source="Narrow band near 5 Hz (pathological) or from 8 to 12 Hz (physiological)",
     predictable=False,
+    sporadic=True,
     band=True,
     muscle=False,
     main={"frequency_hz": "frequency"},

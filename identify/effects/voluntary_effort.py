@@ -196,6 +196,7 @@ EFFECT = Effect(
     "with the instruction to relax, or leave these parts out.",
     source="Additive torque that does not depend on the stimulation",
     predictable=False,
+    sporadic=True,
     prior=-5.0,
     muscle=False,
     main={"height_0_nm": "peak torque"},

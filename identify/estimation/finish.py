@@ -172,6 +172,7 @@ def _covariance(fitted: Fitted, known: int) -> Covariance:
 def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
     chosen = fitted.problem.chosen[index]
     setup = fitted.problem.setup
+    own = fitted.unforeseen.get(chosen.effect)
     joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
     return {
         "id": chosen.effect,
@@ -187,7 +188,7 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
             "reference_s": setup.reference_s,
         }
         | {name: value for name, value in joint.items() if value is not None},
-    }
+    } | ({} if own is None else {"unforeseen": {"mean_nm": own[0], "rms_nm": own[1]}})
 
 
 def describe_parameters(fitted: Fitted, index: int) -> dict[str, dict[str, Any]]:

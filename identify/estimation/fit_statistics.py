@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted, predict_fitted
 from stimrig.identify.noise import whitened
 
@@ -86,7 +87,12 @@ def figures(measured_nm: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, pre
 
 
 def fit_statistics(
-    grid: Grid, rows: np.ndarray, predicted_nm: np.ndarray, sd_nm: float, held_out_change: np.ndarray | None = None
+    grid: Grid,
+    rows: np.ndarray,
+    predicted_nm: np.ndarray,
+    sd_nm: float,
+    held_out_change: np.ndarray | None = None,
+    foreseen_nm: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """The key `fit` of MODEL.json, computed at the record's samples.
 
@@ -104,9 +110,13 @@ def fit_statistics(
         White noise of a sample, N·m.
     held_out_change : ndarray or None, shape (K,)
         For a record without `validate`: see `held_out_change`, N·m.
+    foreseen_nm : ndarray or None, shape (N,)
+        Torque without what could not have been foreseen, N·m. By this the model is judged where rows are held out. What
+        it leaves out there (`unforeseen_nm`) counts as noise in the ceiling: it is known, and of no muscle.
     """
     record = grid.record
     measured = record.torque_nm
+    foreseen = predicted_nm if foreseen_nm is None else foreseen_nm
     used = rows[grid.interval] & ~record.held_out & grid.counted
     held = record.held_out & grid.counted
     result: dict[str, Any] = {
@@ -118,14 +128,16 @@ def fit_statistics(
         "held_out_by": "none",
         "samples": int(used.sum()),
         "held_out_samples": int(held.sum()),
-        "segments": segment_statistics(grid, predicted_nm, sd_nm),
+        "segments": segment_statistics(grid, np.where(record.held_out, foreseen, predicted_nm), sd_nm),
     }
+    left_out, by = foreseen, "validate"
+    if not held.any() and held_out_change is not None:
+        left_out, held, by = foreseen + held_out_change[grid.interval], used, "cross-validation"
     if held.any():
-        result |= figures(measured[held], predicted_nm[held], sd_nm, "held_out_") | {"held_out_by": "validate"}
-    elif held_out_change is not None:
-        left_out = predicted_nm[used] + held_out_change[grid.interval[used]]
-        result |= figures(measured[used], left_out, sd_nm, "held_out_")
-        result |= {"held_out_by": "cross-validation", "held_out_samples": int(used.sum())}
+        unforeseen = rms((predicted_nm - foreseen)[held])
+        result |= figures(measured[held], left_out[held], float(np.hypot(sd_nm, unforeseen)), "held_out_")
+        result |= {"held_out_by": by, "held_out_samples": int(held.sum())}
+        result |= {"unforeseen_nm": unforeseen} if unforeseen > 0.0 else {}
     return result
 
 
@@ -158,9 +170,9 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     setup = fitted.problem.setup
     grid = setup.grid
     change = None if grid.record.has_held_out else held_out_change(fitted)
-    predicted = predict_fitted(fitted)
+    predicted, foreseen = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
-    found = fit_statistics(grid, setup.fitted, predicted, noise, change)
+    found = fit_statistics(grid, setup.fitted, predicted, noise, change, foreseen)
     return found | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
 
 
@@ -169,8 +181,9 @@ def held_out_change(fitted: Fitted) -> np.ndarray:
 
     Blocks of 2 s are assigned to five folds in turn. The refit without a fold is one Gauss-Newton step from the
     solution, with the same noise: exact for all linear parameters (recruitment, baseline), first order for the others.
-    The initial state of the record is kept, since it could not be found without the first seconds. The resulting error
-    is an error of prediction, as on `validate`; it is not whitened.
+    The initial state of the record is kept, since it could not be found without the first seconds, and what an effect
+    that cannot be foreseen adds is no part of it. The resulting error is one of prediction, as on `validate`; it is not
+    whitened.
     """
     problem = fitted.problem
     setup, grid = problem.setup, problem.setup.grid
@@ -184,6 +197,9 @@ def held_out_change(fitted: Fitted) -> np.ndarray:
     slopes = fitted.slopes[kept] * scale[:, None]
     penalty = precision[np.ix_(kept, kept)] * scale[:, None] * scale[None, :] + 1e-9 * np.eye(kept.size)
     both = np.vstack([np.where(rows, fitted.residual_nm, 0.0), slopes]) / setup.spread
+    foreseen = np.ones(problem.size, bool)
+    for chosen in problem.chosen:
+        foreseen[chosen.places] = find_effect(chosen.effect).predictable
     change = np.zeros(grid.size)
     for number in range(FOLDS):
         left_out = rows & (fold == number)
@@ -191,5 +207,5 @@ def held_out_change(fitted: Fitted) -> np.ndarray:
             continue
         white = whitened(both, ends_of(grid.stretches(rows & ~left_out)), fitted.noise)
         step = np.linalg.solve(white[1:] @ white[1:].T + penalty, white[1:] @ white[0] - scale * pull)
-        change[left_out] = step @ slopes[:, left_out]
+        change[left_out] = (step * foreseen[kept]) @ slopes[:, left_out]
     return change

@@ -113,6 +113,19 @@ class Fitted:
         return inverse * slope[:, None] * slope[None, :]
 
     @cached_property
+    def unforeseen(self) -> dict[str, tuple[float, float]]:
+        """As `stimrig.identify.simulation.predict.unforeseen`."""
+        problem, grid = self.problem, self.problem.setup.grid
+        rows = self.problem.setup.fitted[grid.interval] & ~grid.record.held_out & grid.counted
+        found = {}
+        for effect in (find_effect(name) for name, _ in self.effects):
+            if not effect.predictable:
+                left = problem.at_samples(self.theta) - problem.at_samples(self.theta, frozenset([effect.id]))
+                mean = 0.0 if effect.sporadic else float(np.mean(left[rows]))
+                found[effect.id] = mean, float(np.sqrt(np.mean((left[rows] - mean) ** 2)))
+        return found
+
+    @cached_property
     def written(self) -> Fitted:
         """With the narrow band of its noise written as the effect `tremor`; itself without a band."""
         return band_as_effect(self)
@@ -343,11 +356,11 @@ def band_as_effect(fitted: Fitted) -> Fitted:
     )
 
 
-def predict_fitted(fitted: Fitted) -> np.ndarray:
-    """Free-run torque of a candidate at its own record's samples, N·m, shape (N,)."""
-    record, fitted = fitted.problem.setup.grid.record, fitted.written
-    unpredictable = frozenset(e for e, _ in fitted.effects if not find_effect(e).predictable)
-    predictable = fitted.problem.at_samples(fitted.theta, unpredictable)
-    if not unpredictable:
-        return predictable
-    return np.where(record.held_out, predictable, fitted.problem.at_samples(fitted.theta))
+def predict_fitted(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Free-run torque of a candidate at its own record's samples, N·m, shape (N,): as fitted, and as it could have been
+    foreseen."""
+    fitted = fitted.written
+    whole, own = fitted.problem.at_samples(fitted.theta), fitted.unforeseen
+    if not own:
+        return whole, whole
+    return whole, fitted.problem.at_samples(fitted.theta, frozenset(own)) + sum(mean for mean, _ in own.values())

@@ -207,9 +207,10 @@ def _held_out(model: Model) -> dict[str, Any]:
     error, fitted_error = _statistic(model, "held_out_rms_nm"), _statistic(model, "rms_nm")
     if not np.isfinite(error) or not np.isfinite(fitted_error):
         return _gate(True, "care", "")
+    unforeseen = float(model.fit.get("unforeseen_nm", 0.0))
+    like = float(np.hypot(max(fitted_error, model.noise.white_sd_nm), unforeseen))
     return _gate(
-        error
-        <= max(1.5 * fitted_error, 1.5 * model.noise.white_sd_nm, NEGLIGIBLE * np.ptp(model.valid_for["torque_nm"])),
+        error <= max(1.5 * like, NEGLIGIBLE * np.ptp(model.valid_for["torque_nm"])),
         "care",
         f"the error on held-out rows, {error:.3g} N·m, is {error / max(fitted_error, 1e-12):.1f} times "
         "that on fitted rows",
@@ -222,7 +223,8 @@ def _gap(model: Model) -> dict[str, Any]:
     If the torque is constant there, their error above the noise is taken as a share of the fitted torque's spread.
     """
     reached, ceiling, where, error = _reach(model)
-    gap, noise = ceiling - reached, model.noise.white_sd_nm
+    gap = ceiling - reached
+    noise = float(np.hypot(model.noise.white_sd_nm, model.fit.get("unforeseen_nm", 0.0)))
     says = f"on {where} the fit is {reached:.1f} %, and the noise allows {ceiling:.1f} %"
     unseen = _statistic(model, "held_out_rms_nm")
     if where == OWN and np.isfinite(unseen):

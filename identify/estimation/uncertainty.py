@@ -16,7 +16,7 @@ from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Basis
-from stimrig.identify.simulation.predict import slopes
+from stimrig.identify.simulation.predict import same_data, slopes, unforeseen
 
 POINTWISE = 1.959964
 BENT = 2.0
@@ -73,8 +73,8 @@ def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray)
 def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Pointwise 95 % band on the predicted torque without noise, N·m: lower and upper, each of shape (N,).
 
-    It contains the uncertainty of the model, not the noise of the measurement. Raises ValueError: the model has no
-    covariance (another method).
+    It contains the uncertainty of the model and, where it was not fitted, the size of what cannot be foreseen; not the
+    noise of the measurement. Raises ValueError: the model has no covariance (another method).
     """
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):
@@ -82,7 +82,9 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     grid = make_grid(record)
     sd = _sd(slopes(model, grid, covariance.names), covariance)
     middle = grid.start_s + (np.arange(grid.size) + float(np.mean(grid.fraction))) * grid.step_s
-    half = POINTWISE * np.interp(record.time_s, middle, sd)
+    share = np.sqrt(sum(rms**2 for _, rms in unforeseen(model).values()))
+    seen = ~record.held_out if same_data(model, record) else np.zeros(record.time_s.size, bool)
+    half = POINTWISE * np.hypot(np.interp(record.time_s, middle, sd), np.where(seen, 0.0, share))
     predicted = model.predict(record)
     return predicted - half, predicted + half
 

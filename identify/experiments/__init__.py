@@ -158,12 +158,12 @@ def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
 
 
 def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Interval means of a fitted candidate on another record, without unpredictable effects."""
+    """Interval means of a fitted candidate on another record, without sporadic effects."""
     grid = make_grid(record)
     setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
-    kept = [(effect, form) for effect, form in fitted.effects if find_effect(effect).predictable]
+    kept = [(effect, form) for effect, form in fitted.effects if not find_effect(effect).sporadic]
     problem = Problem(setup, kept)
-    # Parameters are copied by name: the new test has one part, starts at rest, and has no unpredictable effects.
+    # Parameters are copied by name: the new test has one part, starts at rest, and has no sporadic effects.
     known = {name: place for place, name in enumerate(fitted.problem.names)}
     place = np.array([known[name] for name in problem.names])
     theta = fitted.theta[place]

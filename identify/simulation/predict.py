@@ -55,8 +55,8 @@ class Muscle(Protocol):
 def predict(model: Muscle, record: Record) -> np.ndarray:
     """Torque that the model predicts for the record's pulse widths, N·m, shape (N,).
 
-    No measured torque is used: a controller would predict the same. Effects that are not predictable (efforts, tremor)
-    are included only on the rows that they were fitted on.
+    No measured torque is used: a controller would predict the same. What cannot be foreseen (`unforeseen`) is included
+    only on the rows that it was fitted on.
 
     Raises
     ------
@@ -74,17 +74,25 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
             return narx_at_samples(model.extra["narx"], grid, model.linear.centre)
         return model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us)) + model.baseline_nm
     problem, theta = problem_of(model, grid)
-    unpredictable = frozenset(e["id"] for e in model.effects if not find_effect(e["id"]).predictable)
-    predictable = problem.at_samples(theta, unpredictable)
-    if not unpredictable or not same_data(model, grid.record):
-        return predictable
-    return np.where(grid.record.held_out, predictable, problem.at_samples(theta))
+    whole, own = problem.at_samples(theta), unforeseen(model)
+    if not own or not same_data(model, grid.record):
+        return whole
+    foreseen = problem.at_samples(theta, frozenset(own)) + sum(mean for mean, _ in own.values())
+    return np.where(grid.record.held_out, foreseen, whole)
+
+
+def unforeseen(model: Muscle) -> dict[str, tuple[float, float]]:
+    """What cannot be foreseen on another record, by effect: the mean that stays there as a zero, and the root mean
+    square about it, in the fitted rows of its own record, N·m; 0 and 0 where an older version did not say."""
+    told = {e["id"]: e.get("unforeseen", {}) for e in model.effects if not find_effect(e["id"]).predictable}
+    return {effect: (said.get("mean_nm", 0.0), said.get("rms_nm", 0.0)) for effect, said in told.items()}
 
 
 def problem_of(
     model: Muscle, grid: Grid, further: Sequence[tuple[Form, Sequence[float]]] = ()
 ) -> tuple[Problem, np.ndarray]:
-    """The model as a `Problem` on a record, and its parameters there.
+    """The model as a `Problem` on a record, and its parameters there; on another record than its own without effects
+    that cannot be foreseen.
 
     Parameters
     ----------
@@ -119,10 +127,14 @@ def problem_of(
         **_own_angles(model, grid.record, settings),
         states={} if same_data(model, grid.record) else states_of(model),
     )
+    own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     effects = [(form.name, form) for form, _ in further if form.stage == "gain"]
     parameters = [value for form, values in further if form.stage == "gain" for value in values]
     for entry in model.effects:
         own = Acting.of(entry)
+        if not own.effect.predictable and not own_record:
+            baseline_nm += entry.get("unforeseen", {}).get("mean_nm", 0.0)
+            continue
         for need in own.effect.needs:
             if getattr(grid.record, need) is None:
                 fix = "Record this column, or fit without the effect."
@@ -136,8 +148,8 @@ def problem_of(
     problem = Problem(setup, effects)
     values = np.zeros(problem.size)
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s
-    values[list(problem.baselines)] = setup.to_muscle(np.asarray(model.baseline_nm))
-    if same_data(model, grid.record):
+    values[list(problem.baselines)] = setup.to_muscle(np.asarray(baseline_nm))
+    if own_record:
         parts = np.asarray(model.extra.get("parts", [[model.baseline_nm, *model.initial]]))[: grid.starts.size]
         values[np.array(problem.baselines)[grid.part[grid.starts[: len(parts)]]]] = setup.to_muscle(parts[:, 0])
         values[list(problem.initials)[: 2 * len(parts)]] = setup.sign * parts[:, 1:].ravel()

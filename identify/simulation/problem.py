@@ -166,13 +166,13 @@ class Problem:
         return found
 
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
-        """Torque at the record's samples, with its sign and zero, N·m; additive effects in `skip` are left out."""
+        """Torque at the record's samples, with its sign and zero, N·m; what effects in `skip` add is left out."""
         stages = _StagePass(self, theta, False)
         torque, rate, delay, _ = stages.to_boundaries()
         grid = self.setup.grid
         value = grid.at_samples(torque[0], rate[0], delay[0] / grid.step_s, stages.curves()[0])[None, :]
         value = stages.add(value, self.setup.scene_at_samples, skip)
-        return self.setup.to_record(stages.sense(value, self.setup.scene_at_samples)[0])
+        return self.setup.to_record(stages.sense(value, self.setup.scene_at_samples, skip)[0])
 
 
 class _StagePass:
@@ -397,12 +397,12 @@ class _StagePass:
             value[present:] += added[1:]
         return value
 
-    def sense(self, value: np.ndarray, scene=None) -> np.ndarray:
+    def sense(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         """Apply the sensor stage, which works with the record's own zero and sign."""
         for chosen in self.forms("sensor"):
             rows, values = self.join(chosen.places)
             value = value[rows]
-            if scene is None and chosen.form.fixed:  # the target was corrected for it
+            if chosen.effect in skip or (scene is None and chosen.form.fixed):  # the target was corrected for it
                 continue
             seen = self.setup.to_record(value)
             shown = np.asarray(chosen.form.call(seen, self.named(chosen, values), scene or self.setup.scene))

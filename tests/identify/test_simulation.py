@@ -107,7 +107,7 @@ def assert_slopes(problem: Problem, theta: np.ndarray, steps: dict[int, float]) 
 def test_a_model_meets_a_muscle_integrated_apart():
     """Without noise the base meets a Runge-Kutta muscle of two lags to a few thousandths of its range."""
     record = hidden_muscles.record(seed=4, noise_nm=1e-4)
-    error = predict_fitted(fitted_with(record, [])) - record.torque_nm
+    error = predict_fitted(fitted_with(record, []))[0] - record.torque_nm
     assert np.sqrt(np.mean(error[record.held_out] ** 2)) < 0.012
 
 
