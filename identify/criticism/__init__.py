@@ -63,7 +63,7 @@ def compare(model: Model, record: Record) -> Comparison:
     held = record.held_out & counted
     whole = _figures(record, predicted, noise, counted)
     held_out = _figures(record, predicted, noise, held) if held.any() else None
-    said = _left_out(grid)
+    said = [text for text in (_left_out(grid), raw.readings.words if raw.readings else "") if text]
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
@@ -73,9 +73,9 @@ def compare(model: Model, record: Record) -> Comparison:
         by=_error_shares(record, residual, noise, counted),
         tests=tests,
         where=tuple(places),
-        left_out=said,
+        left_out=_left_out(grid),
         series=_series(model, record, predicted, noise),
-        plain=(*_plain(whole, held_out, noise, tests, places), *([said] if said else []), *outside),
+        plain=(*_plain(whole, held_out, noise, tests, places), *said, *outside),
     )
 
 

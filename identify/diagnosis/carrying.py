@@ -128,7 +128,7 @@ def still_needed(plain: Fitted, model: Model, raw: Raw, say: Progress) -> tuple[
     judged: dict[str, Judged] = {}
     full = _add_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
     last = _reduced(full, raw, judged, lambda share, text: say(0.6 + 0.4 * share, text))
-    if residual_structure(last, quiet_rows(last), raw.noise_sd_nm).left:
+    if residual_structure(last, quiet_rows(last)).left:
         judged = {name: _undecided(verdict) for name, verdict in judged.items()}
     return last, judged
 

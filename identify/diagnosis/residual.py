@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.diagnosis.thresholds import (
-    COUNTS,
     FORM_ERROR,
     HELD_OUT_RISE,
     LEAST_HELD_OUT_ROWS,
@@ -20,7 +19,7 @@ from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.noise import band_part, profile_noise
-from stimrig.identify.records.record import FORGOTTEN_S, Record
+from stimrig.identify.records.record import FORGOTTEN_S
 
 MEDIAN = 0.6745
 """Median of the size of normal errors over their standard deviation."""
@@ -44,7 +43,7 @@ class ResidualStructure:
         return self.ratio > STRUCTURE and excess_nm > STRUCTURE_SHARE * self.scale_nm
 
 
-def residual_structure(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) -> ResidualStructure:
+def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
     """Compare a model's residual at work and at rest.
 
     Parameters
@@ -53,13 +52,10 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray, noise_sd_nm: float) ->
         The model.
     quiet : ndarray of bool, shape (K,)
         Intervals in which the muscle rests.
-    noise_sd_nm : float
-        White noise of a sample, N·m.
     """
     setup = fitted.problem.setup
     residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
-    count = float(np.median(setup.grid.count[setup.fitted]))
-    white = max(noise_sd_nm / np.sqrt(count), 1e-6 * setup.scale_nm)
+    white = max(setup.grid.mean_noise_nm(setup.fitted), 1e-6 * setup.scale_nm)
     rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)
     together = _profile(residual, rests + works)
     resting, working = _profile(residual, rests), _profile(residual, works)
@@ -113,16 +109,6 @@ def quiet_rows(fitted: Fitted) -> np.ndarray:
     tail = round(0.5 / setup.grid.step_s)
     busy = np.convolve(~still, np.r_[np.zeros(tail), np.ones(tail + 1)], "same") > 0
     return still & ~busy
-
-
-def held_readings(record: Record) -> float:
-    """Share of samples equal to the one before; 0 where coarse rounding of a quiet signal explains it."""
-    torque = record.torque_nm
-    change = np.abs(np.diff(torque[(torque > torque.min()) & (torque < torque.max())]))
-    moved = change[change > 1e-9 * max(float(np.ptp(torque)), 1e-300)]
-    if change.size < 100 or not moved.size or np.median(moved) < COUNTS * np.min(moved):
-        return 0.0  # it changes by single counts of the converter: between two of them it repeats
-    return float(np.mean(change == 0.0))
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ class EffectSearch:
         """One model more, with an effect more than the last."""
         self.added += [effect] if effect else []
         self.chain.append(fitted)
-        self.residuals.append(residual_structure(fitted, self.quiet, self.raw.noise_sd_nm))
+        self.residuals.append(residual_structure(fitted, self.quiet))
 
 
 def search_effects(

@@ -72,10 +72,8 @@ HELD_OUT_RISE = 1.1
 """If the error on held-out rows rises by this factor, it speaks against the effect, and `improve` stops there."""
 DOUBTED = 0.45
 """Largest probability of an effect that something speaks against."""
-REPEATED_SHARE = 0.3
-"""Share of repeated samples that no noisy converter gives."""
-COUNTS = 2.5
-"""If the median change between readings has this many counts, a repeated reading is not due to rounding."""
+LONGEST_HELD_S = 0.05
+"""A reading that is held for longer than two pulses hides how the torque rises and falls. Not calibrated."""
 QUIET = 0.025
 """Share of the largest torque below which the muscle counts as resting."""
 CLOSE = 0.8

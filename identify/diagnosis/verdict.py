@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, held_out_rise, held_readings
+from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, held_out_rise
 from stimrig.identify.diagnosis.search import EffectSearch, seen_at_rest
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import Candidate
@@ -97,8 +97,8 @@ def judge(search: EffectSearch) -> Verdict:
     left = search.residuals[-1]
     possible = max(left.ideal - first.log_likelihood, 1.0)
     explained = (last.log_likelihood - first.log_likelihood) / possible if effects else 0.0
-    held = held_readings(search.record)
-    notes: list[str] = []
+    readings = search.raw.readings
+    notes = [] if readings is None else [readings.words]
     found: dict[str, float] = dict.fromkeys(search.detected, 0.99)
     rivals: dict[str, dict[str, float]] = {}
     for number, effect in enumerate(search.added):
@@ -117,9 +117,7 @@ def judge(search: EffectSearch) -> Verdict:
         # The narrow band itself is not structure: what counts is what remains beside it.
         before = max(search.residuals[0].busy_nm ** 2 - left.white_nm**2, 1e-12)
         explained = 1.0 - max(left.busy_nm**2 - left.white_nm**2, 0.0) / before
-    strange = held > thresholds.REPEATED_SHARE
-    if strange:
-        notes.append(f"{100 * held:.0f} % of the readings equal the one before: the converter repeats values.")
+    strange = readings is not None and readings.held_s > thresholds.LONGEST_HELD_S
     if effects:
         strange = strange or (explained < thresholds.LEAST_EXPLAINED and left.left)
         lawless = search.free_gain[0] > search.rounds[0][0].gain + thresholds.FREE_GAIN_MARGIN

@@ -17,6 +17,7 @@ from stimrig.identify.dynamics.states import boundary_states, mean_weights, read
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
 from stimrig.identify.records.clock import pulse_phase_s
+from stimrig.identify.records.readings import Readings
 from stimrig.identify.records.record import FORGOTTEN_S, Record
 
 FUSED = 0.2
@@ -70,6 +71,8 @@ class Grid:
         Intervals at whose start the muscle's state is not known, since the stimulation before is not known.
     noise_sd_nm : float
         White noise of a sample, estimated from the samples, N·m; 0 if it was not estimated.
+    readings : Readings or None
+        The readings behind the samples, if they are fewer or coarse.
     """
 
     record: Record
@@ -89,6 +92,16 @@ class Grid:
     part: np.ndarray
     resumed: np.ndarray
     noise_sd_nm: float = 0.0
+    readings: Readings | None = None
+
+    def readings_in(self, rows: np.ndarray) -> float:
+        """Readings in one of these intervals, at least 1: held samples are not averaged."""
+        each = 1.0 if self.readings is None else self.readings.samples_each
+        return max(float(np.median(self.count[rows])) / each, 1.0)
+
+    def mean_noise_nm(self, rows: np.ndarray) -> float:
+        """White noise of the mean over one of these intervals, N·m."""
+        return self.noise_sd_nm / float(np.sqrt(self.readings_in(rows)))
 
     @property
     def size(self) -> int:

@@ -10,6 +10,7 @@ from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted, predict_fitted
 from stimrig.identify.noise import whitened
+from stimrig.identify.records.readings import contrasts
 
 CONSTANT = 1e-9
 """Torque whose standard deviation is below this (N·m, or share of its size) is constant, but for rounding."""
@@ -64,10 +65,13 @@ def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: 
     residual = grid.record.torque_nm - predicted_nm
     used = residual[rows]
     plain = float(np.sqrt(used @ used / max(used.size - freedom, 1.0)))
-    jump = np.diff(residual, 2)[rows[2:] & rows[1:-1] & rows[:-2]]
-    if white and abs(block_sd_nm * np.sqrt(np.median(grid.count[grid.fitted])) / max(plain, 1e-300) - 1.0) < 0.2:
+    at = slice(None) if grid.readings is None else grid.readings.at
+    jump = np.diff(residual, 2) / np.sqrt(6.0) if grid.readings is None else contrasts(at, residual[at], 2)
+    known = rows[at]
+    jump = jump[known[2:] & known[1:-1] & known[:-2]]
+    if white and abs(block_sd_nm * np.sqrt(grid.readings_in(grid.fitted)) / max(plain, 1e-300) - 1.0) < 0.2:
         return plain
-    return plain if jump.size < 16 else float(min(np.sqrt(np.mean(jump**2) / 6.0), plain))
+    return plain if jump.size < 16 else float(min(np.sqrt(np.mean(jump**2)), plain))
 
 
 def ceiling_percent(measured_nm: np.ndarray, sd_nm: float) -> float:

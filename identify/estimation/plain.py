@@ -284,7 +284,7 @@ def _spread(grid: Grid) -> np.ndarray | float:
         return 1.0
     record = grid.record
     kept = grid.counted & ~record.held_out
-    parts_sd = [_part_noise(record, record.torque_nm[kept & (record.part == part)]) for part in range(parts)]
+    parts_sd = [_part_noise(record, kept & (record.part == part)) for part in range(parts)]
     own = np.array(parts_sd)
     known = own[np.isfinite(own)]
     if not known.size:
@@ -295,13 +295,14 @@ def _spread(grid: Grid) -> np.ndarray | float:
     return (own / own.mean())[grid.part]
 
 
-def _part_noise(record: Record, torque_nm: np.ndarray) -> float:
+def _part_noise(record: Record, rows: np.ndarray) -> float:
     """White noise of a sample of one part, at least that of its quantisation, N·m; NaN with fewer than 16 samples."""
-    if torque_nm.size < 16:
+    if rows.sum() < 16:
         return float("nan")
-    step = np.abs(np.diff(torque_nm))
+    step = np.abs(np.diff(record.torque_nm[rows]))
     count = float(np.min(step[step > 0], initial=np.inf))
-    return max(white_noise(record, torque_nm), count / np.sqrt(12.0) if np.isfinite(count) else 0.0)
+    noise = white_noise(record, rows, record.torque_nm)[0]
+    return max(noise, count / np.sqrt(12.0) if np.isfinite(count) else 0.0)
 
 
 def _reference(grid: Grid, rows: np.ndarray) -> float:

@@ -10,6 +10,13 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.effects.mains_hum import HARMONICS, line
 from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.records.readings import (
+    Readings,
+    calm_samples,
+    find_readings,
+    noise_of_readings,
+    smoothed_readings,
+)
 from stimrig.identify.records.record import HELD_OUT, Record
 
 LEAST_ROWS = 8
@@ -36,6 +43,8 @@ class Raw:
         Parameters of the effect `mains_hum`; None if there is no hum.
     ceiling_nm, floor_nm : float or None
         Levels at which the sensor clips, N·m; None if it does not.
+    readings : Readings or None
+        The readings behind the samples, if they are fewer or coarse.
     """
 
     torque_nm: np.ndarray
@@ -43,6 +52,7 @@ class Raw:
     hum: dict[str, float] | None
     ceiling_nm: float | None
     floor_nm: float | None
+    readings: Readings | None = None
 
 
 def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:
@@ -64,7 +74,8 @@ def prepare(record: Record) -> tuple[Grid, Raw]:
     if not np.ptp(grid.torque_nm[grid.fitted]) > 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
     raw = inspect(record, grid.start_s)
-    return replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm), raw
+    torque = block_means(grid, raw.torque_nm)
+    return replace(grid, torque_nm=torque, noise_sd_nm=raw.noise_sd_nm, readings=raw.readings), raw
 
 
 def refuse_few(rows: np.ndarray) -> None:
@@ -127,8 +138,8 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
     if hum is not None:
         torque = torque - line(hum, own_s)
         torque = torque - hum_variation(record, torque, hum["frequency_hz"], known)
-    noise = white_noise(record, torque[kept])
-    return Raw(torque, noise, hum, ceiling, None if floor is None else -floor)
+    noise, readings = white_noise(record, kept, torque)
+    return Raw(torque, noise, hum, ceiling, None if floor is None else -floor, readings)
 
 
 def _flat(torque: np.ndarray) -> float | None:
@@ -146,17 +157,38 @@ def _flat(torque: np.ndarray) -> float | None:
     return top
 
 
-def white_noise(record: Record, torque: np.ndarray) -> float:
-    """Robust estimate of the white noise of a sample from third (or fourth) differences, N·m.
+def white_noise(record: Record, rows: np.ndarray, torque_nm: np.ndarray) -> tuple[float, Readings | None]:
+    """Robust estimate of the white noise of a sample from third (or fourth) differences, N·m, and the readings.
 
-    At low sampling rates the torque changes from sample to sample; the estimate is then an upper bound.
+    At low sampling rates the torque changes from sample to sample; the estimate is then an upper bound. So it is for
+    samples that are held, coarse, interpolated or smoothed, if the muscle never rests for long.
+
+    Parameters
+    ----------
+    record : Record
+        What was measured.
+    rows : ndarray of bool, shape (N,)
+        Samples that may be looked at.
+    torque_nm : ndarray, shape (N,)
+        Torque without mains hum, N·m.
     """
+    torque, width = torque_nm[rows], record.pulse_width_us[rows]
     if torque.size < 16:
-        return float(np.std(torque))
-    order = 3 if record.sample_rate_hz > 3.0 * record.pulse_rate_hz else 4
+        return float(np.std(torque)), None
+    rate_hz = record.sample_rate_hz
+    readings = find_readings(record.torque_nm[rows])
+    # Sampled more slowly, a tremor or an aliased line looks like smoothed noise.
+    if readings is None and rate_hz >= 4.0 * record.pulse_rate_hz:
+        readings = smoothed_readings(torque, calm_samples(width, rate_hz, rest=True))
+    samples_each = 1.0 if readings is None else readings.samples_each
+    order = 3 if rate_hz > 3.0 * record.pulse_rate_hz * samples_each else 4
+    if readings is not None:
+        noise = noise_of_readings(torque, calm_samples(width, rate_hz), readings, order)
+        held_s = samples_each / rate_hz if readings.kind in ("held", "interpolated") else 0.0
+        return noise, replace(readings, at=np.flatnonzero(rows)[readings.at], held_s=held_s)
     difference = np.diff(torque, order)
     gain = {3: 20.0, 4: 70.0}[order]
-    return float(np.sqrt(np.median(difference**2) / 0.4549 / gain))
+    return float(np.sqrt(np.median(difference**2) / 0.4549 / gain)), None
 
 
 def find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray, known: list[slice]) -> dict[str, float] | None:

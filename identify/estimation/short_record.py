@@ -127,8 +127,7 @@ class ShortData:
         self.grid, self.rows, self.sign = grid, rows, sign
         torque = grid.torque_nm[rows]
         scale = self.scale_nm = max(float(np.percentile(np.abs(torque - np.median(torque[:8])), 98)), 1e-9)
-        each = max(float(np.median(grid.count[rows])), 1.0)
-        self.first_sd_nm = max(grid.noise_sd_nm / np.sqrt(each), 1e-4 * scale)
+        self.first_sd_nm = max(grid.mean_noise_nm(rows), 1e-4 * scale)
         self.stretches = ends_of(grid.stretches(rows))
         states = grid.starts.size
         sd = np.r_[np.full(grid.begins.size, 0.5 * scale), np.tile([0.3 * scale, 2.0 * scale], states)]

@@ -177,7 +177,7 @@ def _misfit(short: Short) -> str | None:
         return "The estimate is not finite."
     if not _settled(short):
         return None
-    white = short.grid.noise_sd_nm / np.sqrt(max(float(np.median(short.grid.count[short.rows])), 1.0))
+    white = short.grid.mean_noise_nm(short.rows)
     own = float(np.sqrt(np.mean(short.residual_nm[short.rows] ** 2)))
     if own > EXCESS * white:
         return f"The structure leaves {own:.2g} N·m where the noise is {white:.2g} N·m."

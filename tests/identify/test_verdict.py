@@ -14,6 +14,7 @@ from stimrig.identify.diagnosis.residual import HeldOutError, ResidualStructure
 from stimrig.identify.diagnosis.search import EffectSearch
 from stimrig.identify.diagnosis.verdict import Verdict, judge, shares
 from stimrig.identify.effects import find_effect
+from stimrig.identify.records.readings import Readings
 
 FIRST, SECOND, EFFORT, TREMOR = "fatigue", "output_saturation", "voluntary_effort", "tremor"
 
@@ -47,17 +48,16 @@ class Made:
     """An analysis in which nothing is missing, to be changed; what the record says stands beside it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.held_share = 0.0
         self.at_rest = 1.0
         self.rises: set[int] = set()
         self.unseen: list[HeldOutError | None] = [None, None]
         self.forms: list[float] = []
         base = fitted(0.0)
+        self.raw = SimpleNamespace(readings=None)
         self.work = EffectSearch(
-            record=object(), raw=None, plain=base, base=base,  # pyright: ignore[reportArgumentType]
+            record=object(), raw=self.raw, plain=base, base=base,  # pyright: ignore[reportArgumentType]
             rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=[0.0], residuals=[self.left()],
         )  # fmt: skip
-        monkeypatch.setattr(verdict, "held_readings", self._held_readings)
         monkeypatch.setattr(verdict, "seen_at_rest", self._seen_at_rest)
         monkeypatch.setattr(verdict, "held_out_rise", self._rise)
         monkeypatch.setattr(verdict, "held_out_error", self._unseen)
@@ -92,9 +92,10 @@ class Made:
     def judged(self) -> Verdict:
         return judge(self.work)
 
-    def _held_readings(self, record: Any) -> float:
-        assert record is self.work.record
-        return self.held_share
+    def held(self, held_s: float) -> Made:
+        """A recorder that holds each reading so long, at 400 samples a second."""
+        self.raw.readings = Readings("held", np.arange(9), 400.0 * held_s, held_s=held_s)
+        return self
 
     def _seen_at_rest(self, quiet: Any, holder: Any, effect: str) -> float:
         assert quiet is self.work.quiet
@@ -222,7 +223,7 @@ RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any
         [(58.1, 89.0)],
         [(58.0, 89.0), (58.1, 90.0)],
     ),
-    "readings repeat": (lambda made, share: setattr(made, "held_share", share), [(0.31,)], [(0.3,)]),
+    "readings are held": (Made.held, [(0.0501,)], [(0.05,)]),
     "many efforts, none at rest": (apart, [(4, 1.25)], [(3, 1.25), (4, 1.2), (3, 1.2)]),
     "efforts must explain more": (
         lambda made, likelihood, ratio: made.add(EFFORT, 50.0, likelihood, **EFFORTS).leaves(ratio=ratio),
@@ -259,10 +260,10 @@ def test_what_is_left_is_told(made: Made):
     for ratio in (12.0, 12.1):
         made.leaves_first(ratio=ratio)
         assert made.judged().structure == ratio
-    for share, notes in ((0.3, []), (0.31, ["31 %"]), (0.9, ["90 %"])):
-        made.held_share = share
-        said = "of the readings equal the one before: the converter repeats values."
-        assert made.judged().notes == [f"{percent} {said}" for percent in notes]
+    assert made.judged().notes == []
+    assert made.held(0.0125).judged().notes == [
+        "The recorder holds each reading for 5 samples: the noise is that of the readings."
+    ]
 
 
 @pytest.mark.parametrize(
