@@ -63,7 +63,7 @@ class Design:
         return width, pulse, angle, velocity
 
 
-def _prbs(top: float, bits_held: int, seed: int) -> Floats:
+def prbs(top: float, bits_held: int, seed: int) -> Floats:
     """Maximal-length sequence of seven bits, between 0 and `top`."""
     register = [(seed >> i) & 1 for i in range(7)]
     if not any(register):
@@ -75,7 +75,8 @@ def _prbs(top: float, bits_held: int, seed: int) -> Floats:
     return np.repeat(np.array(bits) * top, bits_held)
 
 
-def _ramp(top: float, up_s: float) -> Floats:
+def triangle(top: float, up_s: float) -> Floats:
+    """A slow ramp: up to `top` in so many seconds, and down again."""
     n = round(up_s * PULSES_PER_S)
     up = np.arange(n) / n
     return np.concatenate([up, 1.0 - up]) * top
@@ -118,15 +119,15 @@ def make_design(
     if name not in DESIGNS:
         raise ValueError(f"design {name!r}: one of {', '.join(DESIGNS)}")
     rest = lambda seconds: ("rest", np.zeros(round(seconds * PULSES_PER_S)))  # noqa: E731
-    prbs = ("prbs", _prbs(top_us, 4, int(rng.integers(1, 128))))
-    ramp = ("ramp", _ramp(top_us, 5.0))
+    bits = ("prbs", prbs(top_us, 4, int(rng.integers(1, 128))))
+    ramp = ("ramp", triangle(top_us, 5.0))
     if name == "short":
-        parts = [prbs, ramp]
+        parts = [bits, ramp]
     else:
-        parts = [rest(2), prbs, rest(3), ramp, rest(2)]
+        parts = [rest(2), bits, rest(3), ramp, rest(2)]
         if name == "long":
             parts += [rest(2), ramp, rest(2), ("staircase", staircase(top_us, 5, 1.2)), rest(1)]
-            parts += [("ramp", _ramp(top_us, 1.5)), rest(2)]
+            parts += [("ramp", triangle(top_us, 1.5)), rest(2)]
         if with_validate:
             parts += [("validate", levels(rng, top_us, validate_s)), rest(2)]
     width = np.asarray(np.round(np.concatenate([w for _, w in parts])), dtype=np.float64)  # stimulators set whole µs

@@ -1,0 +1,207 @@
+"""What is learnt of muscles that no library holds, and of records as they are: error on what no fit was given.
+
+    python -m bench.strange --set physics|further|arms|sealed|plain --seeds 1000:1004 [--nudge] [--processor]
+
+Seeds 0 to 99 were developed on; report on seeds from 1000. Of `sealed` only sums are told: nobody who tunes should
+learn what is in it. Errors are over the noise's standard deviation, on a second record of the muscle that no fit was
+given, tared on its first rest; those of arms over the error of plain repetition, the mean of the other ramps.
+
+`--nudge` does everything again with every torque × (1 + 1e-9), `--processor` in a process of its own with the
+arithmetic of another processor, and both compare.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from bench.common import ROOT, in_processes, keep, line, parser, table
+from stimrig import identify
+from stimrig.hardware_sim.bout_records import record_of_bouts
+from stimrig.hardware_sim.physics_records import DISTURBED, SETS, record_of_physics
+from stimrig.identify.diagnosis import side_by_side as workers
+from tests.harness.carried_sessions import as_record
+
+NUDGE = 1.0 + 1e-9
+OTHER_PROCESSOR = {
+    "OPENBLAS_CORETYPE": "Haswell",
+    "NUMBA_CPU_NAME": "haswell",
+    "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
+}
+SURE = 0.9
+"""Probability from which a name counts as told for sure."""
+WORSE, CLOSE, MOVES = 1.02, 1.3, 0.01
+TRUE_OF_ARMS = {"mixed_fibres", "baseline_drift"}
+REST_S = 1.9
+HEADS = ("record", "plain", "improved", "added", "names and probabilities", "verdict", "seconds")
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def make(kind: str, seed: int) -> dict[str, Any]:
+    """A record of the set, with `true`: names that are no mistake."""
+    made = record_of_bouts(seed) if kind == "arms" else record_of_physics(kind, seed)
+    made["true"] = TRUE_OF_ARMS if kind == "arms" else set(made["truth"]["true"])
+    return made
+
+
+def score(made: dict[str, Any], model: identify.Model) -> float:
+    """The model's error on what no fit was given, over that of plain repetition, or over the noise."""
+    if "unseen" not in made:
+        unseen, repetition = repeated(made)
+        predicted = identify.predict(model, as_record(made))[unseen]
+        return rms(made["torque_nm"][unseen] - predicted) / rms(made["torque_nm"][unseen] - repetition)
+    unseen = made["unseen"]
+    off = identify.predict(model, as_record(unseen)) - unseen["torque_nm"]
+    return rms(off - np.mean(off[unseen["time_s"] < REST_S])) / made["truth"]["noise_sd_nm"]
+
+
+def repeated(made: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the unseen ramp and its decay, and the mean of the other three there."""
+    bouts = [np.flatnonzero(made["bout"] == made["bout"][-1] - back) for back in range(4)]
+    count = min(map(len, bouts))
+    return bouts[0][:count], np.mean([made["torque_nm"][rows[:count]] for rows in bouts[1:]], axis=0)
+
+
+def look(kind: str, seed: int, factor: float = 1.0, names: bool = False) -> dict[str, Any]:
+    """One record: its plain fit, what `improve` adds, and, where asked for, what `diagnose` names."""
+    workers.WORKERS = 1
+    made = make(kind, seed)
+    record = as_record(made | {"torque_nm": made["torque_nm"] * factor})
+    began = time.perf_counter()
+    plain = identify.fit(record)
+    improved = identify.improve(record)
+    seconds = time.perf_counter() - began
+    named = {row["effect"]: row["probability"] for row in identify.diagnose(record).missing} if names else {}
+    every = max(round(record.sample_rate_hz / record.pulse_rate_hz), 1)
+    own_nm = identify.predict(plain, record) / factor
+    fitted = made["segment"] != "validate"
+    return {
+        "seed": seed,
+        "kind": made["truth"].get("kind", kind),
+        "disturbed": made["truth"].get("disturbed", []),
+        "plain": score(made | {"torque_nm": made["torque_nm"] * factor}, plain),
+        "improved": score(made | {"torque_nm": made["torque_nm"] * factor}, improved.models[-1]),
+        "added": [step["added"] for step in improved.steps if step["added"]],
+        "named": named,
+        "untrue": [name for name, sure in named.items() if sure >= SURE and name not in made["true"]],
+        "verdict": improved.verdict,
+        "phi": plain.noise.ar1,
+        "white_nm": plain.noise.white_sd_nm,
+        "seconds": seconds,
+        "left_nm": rms((own_nm - made["torque_nm"])[fitted]),
+        "own_nm": own_nm[fitted][::every].tolist(),
+    }
+
+
+def elsewhere(kind: str, seed: int) -> dict[str, Any]:
+    """The same in a process of its own, with another processor's arithmetic."""
+    command = [sys.executable, "-m", "bench.strange", "--set", kind, "--seeds", str(seed), "--bare"]
+    done = subprocess.run(
+        command, env=os.environ | OTHER_PROCESSOR, capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    return json.loads(done.stdout)
+
+
+def moved(row: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """How far the plain fit moved on its own rows, over what it leaves, and whether other effects were added."""
+    shift = rms(np.subtract(row["own_nm"], other["own_nm"])) / row["left_nm"]
+    return {"moved": shift, "other": sorted(row["added"]) != sorted(other["added"]), "added": other["added"]}
+
+
+def compared(job: tuple[str, int, bool, bool, bool]) -> dict[str, Any]:
+    """One record, and again where that is asked for."""
+    kind, seed, names, nudge, processor = job
+    row = look(kind, seed, names=names)
+    if nudge:
+        row["nudge"] = moved(row, look(kind, seed, NUDGE))
+    if processor:
+        row["processor"] = moved(row, elsewhere(kind, seed))
+    del row["own_nm"]
+    if kind == "sealed":  # names and physics would tell what is in it
+        row |= {"kind": "", "added": len(row["added"]), "named": {}, "untrue": ["?" for _ in row["untrue"]]}
+    return row
+
+
+def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
+    """The summary."""
+    plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
+    unit = "plain repetition" if kind == "arms" else "noise"
+    yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
+    yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
+    yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
+    yield f"improved better by 10 % and more: {np.sum(improved <= 0.9 * plain)} of {len(rows)}"
+    yield f"records with a name that is untrue with {SURE} and more: {sum(bool(row['untrue']) for row in rows)}"
+    if kind == "arms":
+        held = sum(row["phi"] > 0.985 for row in rows), sum(row["phi"] > 0.9939 for row in rows)
+        yield f"plain repetition worse than plain by over 2 %: {np.sum(plain * WORSE < 1.0)} of {len(rows)}"
+        yield f"slow noise's φ above 0.985 in {held[0]}, at 0.994 in {held[1]}"
+    if kind == "plain":
+        asked = [(row, one) for row in rows for one in row["disturbed"] if DISTURBED[one]]
+        told = sum(DISTURBED[one] in {*row["added"], *row["named"]} for row, one in asked)
+        yield f"hum and slow zero told: {told} of {len(asked)}"
+    for again in ("nudge", "processor"):
+        found = [row[again] for row in rows if again in row]
+        if found:
+            over = sum(one["moved"] > MOVES for one in found)
+            most = max(one["moved"] for one in found)
+            other = sum(one["other"] for one in found)
+            yield (
+                f"{again}: plain fit moves by over 1 % of what it leaves in {over} of {len(found)} (most"
+                f" {100.0 * most:.2g} %), other effects in {other}"
+            )
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """A record's line."""
+    over = f" + {', '.join(row['disturbed'])}" if row["disturbed"] else ""
+    names = ", ".join(f"{name} {sure:.2f}" for name, sure in row["named"].items())
+    return [
+        f"{row['seed']} {row['kind']}{over}",
+        f"{row['plain']:.2f}",
+        f"{row['improved']:.2f}",
+        ", ".join(row["added"]) or "–",
+        names or "–",
+        row["verdict"],
+        f"{row['seconds']:.1f}",
+    ]
+
+
+def main() -> None:
+    """Make, fit, improve, tell."""
+    made = parser(__doc__, "1000:1004")
+    made.add_argument("--set", choices=[*SETS, "arms"], required=True)
+    made.add_argument("--nudge", action="store_true", help="again with every torque × (1 + 1e-9)")
+    made.add_argument("--processor", action="store_true", help="again with another processor's arithmetic")
+    made.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")
+    made.add_argument("--jobs", type=int, default=1, help="processes")
+    made.add_argument("--bare", action="store_true", help="print one record's row as JSON and nothing else")
+    asked = made.parse_args()
+    if asked.bare:
+        print(json.dumps(look(asked.set, asked.seeds.start), default=float))
+        return
+    jobs = [(asked.set, seed, not asked.no_names, asked.nudge, asked.processor) for seed in asked.seeds]
+    found = in_processes(compared, jobs, asked.jobs) if asked.jobs > 1 else map(compared, jobs)
+    rows = []
+    if asked.set != "sealed":
+        print(*table(HEADS, []), sep="\n", flush=True)
+    for row in found:
+        rows.append(row)
+        if asked.set != "sealed":
+            print(line(cells(row)), flush=True)
+    print(f"\n{asked.set}, seeds {asked.seeds.start} to {asked.seeds.stop - 1}", *tell(asked.set, rows), sep="\n")
+    keep(asked.json, rows)
+
+
+if __name__ == "__main__":
+    main()
