@@ -47,6 +47,11 @@ class NoiseLevel:
     fastest: float = 2.6
 
     @property
+    def at_bound(self) -> bool:
+        """Whether it is as slow as noise may be: a slower thing is a drift, and levels cost the likelihood nothing."""
+        return min(self.share, 1.0) > 0.05 and self.ar1 >= 1.0 - 1.01 * SHORTEST
+
+    @property
     def is_white(self) -> bool:
         """Whether hardly any of it is correlated from one interval to the next."""
         return self.band <= 0.0 and min(self.share, 1.0) * self.ar1 < 0.05

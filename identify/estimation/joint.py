@@ -33,6 +33,9 @@ def gram(rows):  # pragma: no cover
 DAMPING = Damping(first=1e-3, less=6.0, more=8.0, least=1e-7, raised=1e-3, patience=6)
 LARGEST_FIRST = 1e-3
 """Damping of the step by which the promised gain is judged, at most."""
+HEAVY_TAILS = 10.0
+"""Excess kurtosis above which a likelihood of normal innovations decides nothing: one row in a hundred may hold
+a sixth of the squares."""
 OPTIMISM = 3.0
 """A run is stopped only if it stays below the floor even with this many times the gain that a parabola predicts."""
 
@@ -81,6 +84,19 @@ class Fitted:
         scaled = self.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
         prior = precision * scale[:, None] * scale[None, :]
         return float(self.theta.size - np.trace(np.linalg.solve(scaled, prior)))
+
+    @cached_property
+    def excess_kurtosis(self) -> float:
+        """Of the innovations: 0 where they are normal; large where a few jumps hold most of the squares."""
+        white = self.problem.setup.whitened(self.residual_nm[None, :], self.noise)[0]
+        return float(np.mean(white**4) / max(np.mean(white**2) ** 2, 1e-300) - 3.0)
+
+    @property
+    def distrusted(self) -> tuple[str, ...]:
+        """Why its likelihood is no evidence, in words; empty where nothing speaks against it."""
+        slow = "The slow noise is as slow as it may be: zero and slow shapes cost the likelihood nothing."
+        heavy = f"A few jumps decide the likelihood: excess kurtosis {self.excess_kurtosis:.0f}."
+        return (slow,) * self.noise.at_bound + (heavy,) * (self.excess_kurtosis > HEAVY_TAILS)
 
     @property
     def effects(self) -> list[tuple[str, Form]]:

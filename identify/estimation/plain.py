@@ -25,8 +25,8 @@ from stimrig.identify.estimation.projection import (
     curve_points,
     descend_from,
     search,
-    whiten,
 )
+from stimrig.identify.estimation.rests import rest_levels
 from stimrig.identify.estimation.samples import white_noise
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record
@@ -142,9 +142,8 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
     basis = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
     order = bending_order(grid.pulse_width_us[rows])
     projection = Projection(grid, basis, spline_roughness(basis, order=order), rows, delay_s)
-    target = whiten(projection.target, projection.stretches, 0.0)
     delay = 0.0 if delay_s is None else delay_s
-    starts = [State(projection, bounded(projection, SecondOrder(t, 0.9, delay)), target, 0.0, None) for t in STARTS_S]
+    starts = [State(projection, bounded(projection, SecondOrder(t, 0.9, delay))) for t in STARTS_S]
     best = min(starts, key=lambda state: state.cost)
     return descend_from(best, most=12, tolerance=0.5)
 
@@ -156,14 +155,14 @@ def designed(first: Solution, count: int | None = None) -> tuple[Projection, Sec
     bend better; repeating this once improves a steep rise.
     """
     old, largest_us = first.projection, float(np.max(first.projection.grid.pulse_width_us))
-    widths_us, target = old.grid.pulse_width_us[old.rows], whiten(old.target, old.stretches, 0.0)
+    widths_us = old.grid.pulse_width_us[old.rows]
     count = knots_for(first.curve) if count is None else count
     basis, roughness = fitting_spline(first.curve, largest_us, count, widths_us)
     for _ in range(2):
-        projection = Projection(old.grid, basis, roughness, old.rows, old.delay_s)
-        shown = basis, State(projection, first.linear, target, 0.0, None).coefficients[: basis.size]
+        projection = replace(old, basis=basis, roughness=roughness)
+        shown = basis, State(projection, first.linear, variance=first.variance).coefficients[: basis.size]
         basis, roughness = fitting_spline(curve_points(*shown), largest_us, count, widths_us, shown)
-    return Projection(old.grid, basis, roughness, old.rows, old.delay_s), first.linear
+    return replace(old, basis=basis, roughness=roughness), first.linear
 
 
 def estimate(
@@ -173,19 +172,19 @@ def estimate(
     first = pilot_solution(grid, rows, delay_s)
     quiet = 0.0 < grid.noise_sd_nm < QUIET * float(np.ptp(grid.torque_nm[rows]))
     projection, start = designed(first, QUIET_KNOTS if knots is None and quiet else knots)
-    solution = search(projection, start)
+    solution = search(projection, start, variance=first.variance)
     ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
     if delta_bic > 0 and knots is None and projection.basis.size < KNOTS:
         # The correlation may come from a bend that few knots cannot follow: first try all knots.
         projection, start = designed(first, KNOTS)
-        solution = search(projection, start)
+        solution = search(projection, start, variance=first.variance)
         ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
     # Without noise the residual is rounding and the spline's own error, which need no noise model.
     still = solution.variance < (ROUNDING * float(np.ptp(projection.target[rows]))) ** 2
     for _ in range(0 if still else 3):
         if delta_bic <= 0:
             break
-        solution = search(projection, solution.linear, ar1=ar1)
+        solution = search(projection, solution.linear, ar1=ar1, variance=solution.whitened_variance(ar1))
         before = ar1
         ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
         if abs(ar1 - before) < 0.01:
@@ -260,6 +259,7 @@ def setup_of(solution: Solution, rows: np.ndarray) -> Setup:
     own_zero = sign * (solution.coefficients[size : size + parts][grid.part] - zero)
     smooth = np.convolve(np.where(rows, target - own_zero, 0.0), np.ones(3) / 3, "same")
     scale = float(np.percentile(np.abs(smooth[rows]), 99.5))
+    level_nm, sd_nm = projection.rests if rows is projection.rows else rest_levels(grid, rows)
     return Setup(
         grid=grid,
         target_nm=target,
@@ -271,6 +271,7 @@ def setup_of(solution: Solution, rows: np.ndarray) -> Setup:
         delay_bounds_s=grid.delay_bounds_s if projection.delay_s is None else (projection.delay_s, projection.delay_s),
         zero_nm=zero,
         sign=sign,
+        rests_nm=(sign * (level_nm - zero), sd_nm),
         spread=_spread(grid),
         reference_s=_reference(grid, rows),
         **joint_of(grid, rows),

@@ -17,14 +17,17 @@ from stimrig.identify.dynamics.second_order import Core, step_matrix
 from stimrig.identify.dynamics.states import held_states, read_means
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
+from stimrig.identify.estimation.rests import rest_levels
 from stimrig.identify.recruitment import Basis
 from stimrig.identify.recruitment.smoothing import choose_weight, straight_lines
 
 CURVE_POINTS = 201
-INITIAL_RIDGE = 1e-8
-"""Penalty on the initial torque: it keeps a state that no row shows at zero, and is negligible for all others."""
-RATE_S = 0.1
-"""The penalty on an initial rate is that on the torque rate × RATE_S."""
+WIDE = 3.0
+"""Coefficients of a curve are plausible within so many ranges of the torque."""
+USUAL_NOISE = 0.02
+"""Noise of an interval's mean, as a share of the torque's range, before anything is fitted."""
+RATE_S = 0.2
+"""An initial rate is plausible up to the torque's range in this time."""
 
 
 @dataclass
@@ -43,6 +46,8 @@ class Projection:
         Rows that are fitted.
     delay_s : float or None
         A fixed delay; None to estimate it.
+    rests : tuple of ndarray, optional
+        Zero of each part as its rests show it, and its sd, N·m, where they are known already (`rest_levels`).
     """
 
     grid: Grid
@@ -50,12 +55,14 @@ class Projection:
     roughness: np.ndarray
     rows: np.ndarray
     delay_s: float | None = None
+    rests: tuple[np.ndarray, np.ndarray] = ()  # type: ignore[assignment]
     stretches: list[slice] = field(init=False)
 
     def __post_init__(self) -> None:
         self.stretches = self.grid.stretches(self.rows)
         if not self.stretches:
             raise NotIdentifiable("no row may be fitted", fix="Give rows outside `validate`.")
+        self.rests = self.rests or rest_levels(self.grid, self.rows)
 
     @cached_property
     def rows_nm(self) -> np.ndarray:
@@ -88,16 +95,34 @@ class Projection:
         """Torque, with zeros where there is none (such rows are never fitted)."""
         return np.nan_to_num(self.grid.torque_nm)
 
+    @cached_property
+    def above_rest(self) -> np.ndarray:
+        """The target relative to the zero that the rests show, N·m: small numbers, whatever the sensor's offset."""
+        return self.target - self.rests[0][self.grid.part]
+
+    @cached_property
+    def range_nm(self) -> float:
+        """Of the torque, N·m."""
+        return max(float(np.ptp(self.target[self.rows])), 1e-9)
+
+    @property
+    def usual_variance(self) -> float:
+        """Of the noise, N²m², as long as nothing is known of it."""
+        return (USUAL_NOISE * self.range_nm) ** 2
+
     @property
     def extras(self) -> int:
         """Number of linear columns besides recruitment: baselines, and torque and rate of each initial state."""
         return self.grid.begins.size + 2 * self.grid.starts.size
 
-    @cached_property
-    def ridge(self) -> np.ndarray:
-        """Penalty on baselines (0) and initial states (very small)."""
-        states = np.tile([1.0, RATE_S**2], self.grid.starts.size)
-        return INITIAL_RIDGE * np.r_[np.zeros(self.grid.begins.size), states]
+    def ridge(self, variance: float) -> np.ndarray:
+        """Penalty on all coefficients, bending apart, at a noise variance: the prior of a `Setup`'s problem.
+
+        It is small, and keeps at zero what no row shows; baselines are held as far as the rests pin them.
+        """
+        curve = np.full(self.basis.size, float(np.any(self.roughness)) * (self.range_nm * WIDE) ** -2)
+        states = np.tile([1.0, RATE_S**2], self.grid.starts.size) * self.range_nm**-2
+        return variance * np.r_[curve, self.rests[1] ** -2, states]
 
     def columns(self, linear: SecondOrder) -> np.ndarray:
         """Interval means of the response to each linear coefficient, shape (K, P + extras)."""
@@ -174,6 +199,10 @@ class Solution:
         """Measured minus model on the grid, N·m, shape (K,); meaningful in rows with samples only."""
         return self.projection.target - self.columns @ self.coefficients
 
+    def whitened_variance(self, ar1: float) -> float:
+        """Variance of the innovations, N²m², if neighbours are correlated so."""
+        return float(np.mean(whiten(self.residual_nm, self.projection.stretches, ar1) ** 2))
+
     @cached_property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
         """The recruitment curve: pulse widths, µs, and torques, N·m."""
@@ -191,6 +220,8 @@ NEGLIGIBLE = 1e-5
 """Damping below which there is none."""
 REWEIGHTED = 2
 """After this many steps the weight of the penalty is kept, since a cost that changes has no minimum."""
+CLOSE = 1e-2
+"""A search ends when a step is smaller, in standard errors."""
 
 
 def search(
@@ -199,8 +230,9 @@ def search(
     *,
     ar1: float = 0.0,
     most: int = 25,
+    variance: float | None = None,
 ) -> Solution:
-    """Gauss-Newton on the dynamics with the coefficients projected out, damped where a step fails.
+    """Newton's method on the dynamics with the coefficients projected out, damped where a step fails.
 
     Parameters
     ----------
@@ -212,30 +244,33 @@ def search(
         Correlation of the noise.
     most : int
         Largest number of steps.
+    variance : float, optional
+        About the variance of the innovations, N²m²: what the rests say of the zero is weighed against it.
     """
-    target = whiten(projection.target, projection.stretches, ar1)
-    return descend_from(State(projection, bounded(projection, start), target, ar1, None), most, tolerance=0.01)
+    return descend_from(State(projection, bounded(projection, start), ar1, None, variance), most, CLOSE)
 
 
 def descend_from(start: State, most: int, tolerance: float) -> Solution:
     """The same from a state. It ends when a step is smaller than `tolerance` standard errors."""
-    projection, target, ar1 = start.projection, start.target, start.ar1
-    taken = 0
+    projection, taken, bend = start.projection, 0, _Bend(start)
 
     def trials(state: State, _step: int, _damping: float) -> Trial[State]:
+        curved = bend.at(state)
+
         def trial(damping: float) -> State | None:
             nonlocal taken
             taken += 1
             if taken > most:
                 return None
-            step = state.step(damping if damping > NEGLIGIBLE else 0.0)
+            step = state.step(damping if damping > NEGLIGIBLE else 0.0, curved)
             there = bounded(projection, _moved(state.linear, step))
             moved = _difference(state.linear, there)[: projection.searched]
             # Size of the step in standard errors, from the information matrix.
-            size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * target.size / state.squares))
+            size = float(np.sqrt(max(moved @ state.information @ moved, 0.0) * state.rows / state.squares))
             if size < tolerance or np.max(np.abs(moved)) < 1e-9:
                 return None
-            return State(projection, there, target, ar1, None if taken <= REWEIGHTED else state.weight)
+            weight = None if taken <= REWEIGHTED else state.weight
+            return State(projection, there, state.ar1, weight, state.asked_variance)
 
         return trial
 
@@ -246,27 +281,64 @@ def descend_from(start: State, most: int, tolerance: float) -> Solution:
     return descend(Search(DAMPING, trials, gain, lambda _gained, _step: False), start, most).at.solution()
 
 
+class _Bend:
+    """What the information lacks of the cost's second derivatives, learnt from how the gradient changes (SR1).
+
+    Where the residual is large, steps by the information alone overshoot, time after time, and the search would end
+    wherever its patience does (Dennis, Gay & Welsch 1981).
+    """
+
+    def __init__(self, start: State) -> None:
+        self.before, self.matrix = start, np.zeros_like(start.information)
+
+    def at(self, state: State) -> np.ndarray:
+        """Second derivatives at an accepted state, half of the cost's, shape (2, 2) or (3, 3)."""
+        before, self.before = self.before, state
+        if state is before or state.weight != before.weight:
+            self.matrix = np.zeros_like(self.matrix)
+            return state.information
+        moved = _difference(before.linear, state.linear)[: len(self.matrix)]
+        missing = before.gradient - state.gradient - (state.information + self.matrix) @ moved
+        along = float(missing @ moved)
+        if abs(along) > 1e-6 * float(np.linalg.norm(missing) * np.linalg.norm(moved)):
+            self.matrix = self.matrix + np.outer(missing, missing) / along
+        curved = state.information + self.matrix
+        size = np.sqrt(np.diag(state.information))
+        least = np.linalg.eigvalsh(curved / size / size[:, None])[0]
+        return curved if least > LEAST_BEND else state.information
+
+
+LEAST_BEND = 0.05
+"""Second derivatives are believed where, relative to the information, the cost bends at least so much everywhere."""
+
+
 def project(projection: Projection, linear: SecondOrder, *, ar1: float = 0.0, weight: float | None = None) -> Solution:
     """Coefficients for given dynamics: only the linear part of the problem."""
-    return State(projection, linear, whiten(projection.target, projection.stretches, ar1), ar1, weight).solution()
+    return State(projection, linear, ar1, weight).solution()
 
 
 class State:
     """The joint linear problem at one point of the search; without a weight of the roughness, the one by REML."""
 
     def __init__(
-        self, projection: Projection, linear: SecondOrder, target: np.ndarray, ar1: float, weight: float | None
+        self,
+        projection: Projection,
+        linear: SecondOrder,
+        ar1: float = 0.0,
+        weight: float | None = None,
+        variance: float | None = None,
     ) -> None:
-        self.projection, self.linear, self.target, self.ar1 = projection, linear, target, ar1
+        self.projection, self.linear, self.ar1, self.asked_variance = projection, linear, ar1, variance
         self.columns = projection.columns(linear)
+        self.target = whiten(projection.above_rest, projection.stretches, ar1)
+        self.rows = self.target.size
         white = whiten(self.columns, projection.stretches, ar1)
-        self.zz, self.zy = white.T @ white, white.T @ target
-        self.energy = float(target @ target)
+        self.zz, self.zy = white.T @ white, white.T @ self.target
+        self.energy = float(self.target @ self.target)
         size = projection.basis.size
+        self.ridge = np.diag(projection.ridge(projection.usual_variance if variance is None else variance))
         self.weight = self._chosen(size) if weight is None else weight
-        self.penalty = np.zeros_like(self.zz)
-        self.penalty[:size, :size] = self.weight * projection.roughness
-        self.penalty[size:, size:] = np.diag(projection.ridge)
+        self.penalty = self._penalty(self.weight)
         self.coefficients = _solve(self.zz + self.penalty, self.zy)
         self.cost = self.energy - float(self.zy @ self.coefficients)
         self.white = white
@@ -292,6 +364,11 @@ class State:
         return square - cross.T @ self._inner
 
     @cached_property
+    def gradient(self) -> np.ndarray:
+        """Along which the cost falls: half of its negative derivative by the searched parameters."""
+        return self._bent[2] - self._inner.T @ self.zy
+
+    @cached_property
     def freedom(self) -> float:
         """Effective number of parameters."""
         return float(np.trace(_solve(self.zz + self.penalty, self.zz))) + self.slopes.shape[1]
@@ -301,49 +378,53 @@ class State:
         """Sum of squared innovations, at least that of rounding errors."""
         c = self.coefficients
         left = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
-        return max(left, 1e-14 * self.energy, 1e-24 * self.target.size)
+        return max(left, 1e-14 * self.energy, 1e-24 * self.rows)
 
     @cached_property
     def variance(self) -> float:
         """Innovation variance, N²m²."""
-        return self.squares / max(self.target.size - self.freedom, 1.0)
+        return self.squares / max(self.rows - self.freedom, 1.0)
 
     def _chosen(self, size: int) -> float:
-        outer = self.zz[size:, size:]
-        right = np.concatenate([self.zz[size:, :size], self.zy[size:, None]], axis=1)
-        inner = _solve(outer + np.diag(self.projection.ridge), right)
-        gram = self.zz[:size, :size] - self.zz[:size, size:] @ inner[:, :-1]
-        moment = self.zy[:size] - self.zz[:size, size:] @ inner[:, -1]
-        energy = self.energy - float(self.zy[size:] @ inner[:, -1])
-        if not np.any(self.projection.roughness):
-            return 0.0
         roughness, free, null = self.projection.roughness, self.projection.extras, self.projection.null
-        return choose_weight((gram + gram.T) / 2, moment, energy, self.target.size, roughness, free, null).weight
+        if not np.any(roughness):
+            return 0.0
+        bound = self.zz + self.ridge
+        right = np.concatenate([bound[size:, :size], self.zy[size:, None]], axis=1)
+        inner = _solve(bound[size:, size:], right)
+        gram = bound[:size, :size] - bound[:size, size:] @ inner[:, :-1]
+        moment = self.zy[:size] - bound[:size, size:] @ inner[:, -1]
+        energy = self.energy - float(self.zy[size:] @ inner[:, -1])
+        return choose_weight((gram + gram.T) / 2, moment, energy, self.rows, roughness, free, null).weight
 
     def cost_at(self, weight: float) -> float:
         """The penalised cost at this point with another weight."""
-        size = self.projection.basis.size
-        other = self.penalty.copy()
-        other[:size, :size] = weight * self.projection.roughness
-        return self.energy - float(self.zy @ _solve(self.zz + other, self.zy))
+        return self.energy - float(self.zy @ _solve(self.zz + self._penalty(weight), self.zy))
 
-    def step(self, damping: float) -> np.ndarray:
-        """Step in (log T, log ζ, delay); parameters at a bound do not leave it."""
-        moment = self._bent[2]
-        gradient = moment - self._inner.T @ self.zy
+    def _penalty(self, weight: float) -> np.ndarray:
+        size, whole = self.projection.basis.size, self.ridge.copy()
+        whole[:size, :size] += weight * self.projection.roughness
+        return whole
+
+    def step(self, damping: float, curved: np.ndarray) -> np.ndarray:
+        """Step in (log T, log ζ, delay) by second derivatives; parameters at a bound do not leave it."""
+        gradient = self.gradient
         free = ~_held(self.projection, self.linear, gradient)
         step = np.zeros(gradient.size)
         if free.any():
-            information = self.information[np.ix_(free, free)]
-            step[free] = _solve(information + damping * np.diag(np.diag(information)), gradient[free])
+            square = curved[np.ix_(free, free)]
+            step[free] = _solve(square + damping * np.diag(np.diag(square)), gradient[free])
         return step
 
     def solution(self) -> Solution:
-        """The result at this point."""
+        """The result at this point; baselines are the record's own."""
+        coefficients, size = self.coefficients.copy(), self.projection.basis.size
+        level_nm = self.projection.rests[0]
+        coefficients[size : size + level_nm.size] += level_nm
         return Solution(
             projection=self.projection,
             linear=self.linear,
-            coefficients=self.coefficients,
+            coefficients=coefficients,
             weight=self.weight,
             ar1=self.ar1,
             columns=self.columns,

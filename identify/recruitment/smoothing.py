@@ -102,6 +102,9 @@ def fitting_spline(
 LOWEST, HIGHEST = 1e-9, 1e9
 """Bounds of the weight, relative to the balance of data and penalty."""
 
+TILT = 1e-3
+"""Of two weights between which the data do not decide, the smaller: log likelihood × 2 by which e times more loses."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -121,8 +124,8 @@ class Choice:
 
 def straight_lines(roughness: np.ndarray) -> int:
     """Dimension of the shapes that are not penalised."""
-    values = np.linalg.eigvalsh(roughness)
-    return int(np.sum(values <= 1e-13 * max(float(values[-1]), 1e-300)))
+    size = np.sqrt(np.maximum(np.diag(roughness), 1e-300))  # of close knots much larger than of others
+    return int(np.sum(np.linalg.eigvalsh(roughness / size / size[:, None]) <= 1e-13))
 
 
 def choose_weight(
@@ -170,12 +173,12 @@ def _weighed(
     inverse = np.linalg.inv(root)
     half = inverse @ roughness @ inverse.T
     bent, turn = np.linalg.eigh((half + half.T) / 2)
-    bent = np.maximum(bent, 0.0)
+    bent[:straight] = 0.0  # else rounding would decide among the weights of a curve that is not bent at all
     part = (turn.T @ (inverse @ moment)) ** 2
     weight = balance * np.exp(np.linspace(np.log(LOWEST), np.log(HIGHEST), 73))
     bottom = np.maximum(1.0 + (weight - floor)[:, None] * bent, 1e-12)
     squares = np.maximum(energy - (part / bottom).sum(axis=1), 1e-14 * energy + 1e-300)
-    score = -freedom_left * np.log(squares) - np.log(bottom).sum(axis=1) + (size - straight) * np.log(weight)
+    score = -freedom_left * np.log(squares) - np.log(bottom).sum(axis=1) + (size - straight - TILT) * np.log(weight)
     best = int(np.argmax(score))
     chosen = float(weight[best])
     if 0 < best < weight.size - 1:  # the top of the parabola through three points

@@ -122,7 +122,8 @@ class Problem:
         mean[:2], sd[:2] = [np.log(0.2), 0.0], [1.2, 0.8]
         sd[2] = max((self.upper[2] - self.lower[2]) / 2.0, 1e-5)
         scale = self.setup.scale_nm
-        sd[list(self.baselines)] = 0.5 * scale
+        at = slice(self.baselines.start, self.baselines.stop)
+        mean[at], sd[at] = self.setup.rests_nm or (0.0, 0.5 * scale)
         sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.grid.starts.size)
         mean[self.coefficients] = self.setup.curve_nm
         precision = np.diag(1.0 / sd**2)

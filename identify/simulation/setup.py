@@ -57,6 +57,8 @@ class Setup:
         Angle at which the curve holds as it stands, rad (`Scene.reference_rad`).
     angle_range_rad : tuple of float or None
         Smallest and largest angle that was fitted, rad.
+    rests_nm : tuple of ndarray, or None
+        Zero of each part as its rests show it, as the target is given, and its sd; None where they say nothing.
     states : mapping of str to float
         By effect id, where its slow state begins; 0 (rested) where there is none.
     """
@@ -76,6 +78,7 @@ class Setup:
     curve_nm: np.ndarray | float = 0.0
     reference_rad: float | None = None
     angle_range_rad: tuple[float, float] | None = None
+    rests_nm: tuple[np.ndarray, np.ndarray] | None = None
     states: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
