@@ -71,7 +71,11 @@ def calcium_of(p: Any, s: Any, c: Any) -> float:
     return s[0] / (p[2] + s[0])
 
 
-@mechanism("Ding, Wexler and Binder-Macleod 2003; recruitment 2007", "catch_like asymmetric_relaxation", **_ding)
+@mechanism(
+    "Ding, Wexler and Binder-Macleod 2003; recruitment 2007",
+    "catch_like asymmetric_relaxation activation_dependent_speed",
+    **_ding,
+)
 def ding(x, p, s, c):
     """p: scale, τc s, Km, τ1 s, τ2 s, doublet. s[3]: force, a share; s[4]: recruited by the last pulse."""
     bound = calcium_of(p, s, c)
@@ -84,7 +88,7 @@ def ding(x, p, s, c):
 
 @mechanism(
     "Ding, Wexler and Binder-Macleod 2003, with fatigue of A, τ1 and Km",
-    "catch_like asymmetric_relaxation fatigue",
+    "catch_like asymmetric_relaxation activation_dependent_speed fatigue",
     **_ding,
     loss=(0.25, 0.7),
     slowing=(0.1, 0.8),
@@ -118,7 +122,7 @@ def lengthening(tension: float, active: float, fastest: float, curved: float) ->
 
 @mechanism(
     "Hill 1938 with a series spring that stiffens; activation as in Winters and Thelen",
-    "asymmetric_relaxation series_compliance",
+    "asymmetric_relaxation series_compliance activation_dependent_speed",
     rise_s=(0.02, 0.08),
     fall_s=(0.05, 0.2),
     fastest_per_s=(1.0, 4.0),
@@ -215,7 +219,7 @@ def huxley(x, p, s, c):
 
 @mechanism(
     "a pool of 40 units, small ones slow: twitches that fuse by their own time, sag of the fast; Fuglevand 1993",
-    "mixed_fibres catch_like output_saturation asymmetric_relaxation",
+    "mixed_fibres catch_like asymmetric_relaxation",
     sizes=(5.0, 40.0),
     fastest_s=(0.03, 0.06),
     slower_by=(2.0, 4.0),

@@ -50,8 +50,8 @@ def test_the_last_bout_is_weaker_in_some_records_and_in_all_where_asked_for() ->
         )
         last = made["bout"] == made["bout"][-1]
         share = np.ptp(made["clean_nm"][last]) / np.ptp(even["clean_nm"][last])
-        assert 0.7 <= share <= 0.9
-        assert share == pytest.approx(made["truth"]["muscle"]["weaker"], rel=1e-6)
+        assert 0.69 < share < 0.91
+        assert share == pytest.approx(made["truth"]["muscle"]["weaker"], rel=1e-3)  # what is left of the ramp before
 
 
 @pytest.mark.parametrize("seed", SEEDS)
