@@ -1,4 +1,7 @@
-"""`python -m bench [NAME …]`: goals, table1, drawings, peers, diagnosis; all of them without a name."""
+"""`python -m bench [NAME …] [OPTIONS]`: goals, table1, drawings, rivals, diagnosis; all of them without a name.
+
+Options are those of `rivals` or `diagnosis`.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,15 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-NAMES = ("goals", "table1", "drawings", "peers", "diagnosis")
+NAMES = ("goals", "table1", "drawings", "rivals", "diagnosis")
+OPTIONS = {"diagnosis": [], "rivals": ["--write"]}
 
 
 def main() -> int:
     from importlib import import_module
 
-    names = sys.argv[1:] or list(NAMES)
+    cut = next((at for at, word in enumerate(sys.argv) if word.startswith("-")), len(sys.argv))
+    names, given = sys.argv[1:cut] or list(NAMES), sys.argv[cut:]
     unknown = [name for name in names if name not in NAMES]
     if unknown:
         print(f"no bench {unknown[0]!r}; there are {', '.join(NAMES)}", file=sys.stderr)
@@ -25,14 +30,11 @@ def main() -> int:
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
     for name in names:
         print(f"== {name}", flush=True)
-        if name == "diagnosis":  # counts, no times to compare: on every core there is
-            if cores:
-                os.sched_setaffinity(0, cores)
-            import_module("bench.diagnosis").run([])
-            continue
-        if cores:
+        if name == "diagnosis" and cores:  # counts, no times to compare: on every core there is
+            os.sched_setaffinity(0, cores)
+        elif cores:
             os.sched_setaffinity(0, {max(cores)})
-        import_module(f"bench.{name}").run()
+        import_module(f"bench.{name}").run(*([given or OPTIONS[name]] if name in OPTIONS else []))
     return 0
 
 

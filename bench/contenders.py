@@ -1,40 +1,29 @@
-"""Who is compared: ours, peers from PyPI, and the oracle. Each fits the same rows and predicts free-run."""
+"""Who is compared: ours, peers from PyPI, black boxes, the oracle. Each fits the same rows and predicts in free run."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from unittest import mock
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
+from bench.black_boxes import gaussian_process, hammerstein_wiener, neural_states, nlarx
+from bench.tasks import OWN_EFFECTS, Task
 from stimrig import identify
-from stimrig.identify.records.record import Record
 from tests.harness.muscle import second_order, sigmoid
 
-PULSE_RATE_HZ = 40.0
 SPLINES = 8
+SHORTEST = 5
+"""Rows from which a state can be learnt."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """One record.
-
-    Parameters
-    ----------
-    record : Record
-        PRBS and ramp with rests, then `validate` (multi-level, unseen), then rest.
-    fitted : int
-        Number of leading samples that may be fitted: all before `validate`.
-    """
-
-    record: Record
-    fitted: int
-
-    @property
-    def rate_hz(self) -> float:
-        return round(self.record.sample_rate_hz, 3)
+class Passes(Exception):
+    """A task that is not for this contender, and why."""
 
 
 @dataclass(frozen=True)
@@ -44,54 +33,74 @@ class Contender:
     name: str
     what: str
     fit: Callable[[Task], Callable[[], np.ndarray]]
+    fine: bool = False
+    """Whether it takes more than one sample a pulse."""
 
 
-def spline_inputs(width_us: np.ndarray) -> np.ndarray:
+def spline_inputs(task: Task) -> np.ndarray:
     """Cubic B-splines of the pulse width, zero at zero, shape (N, SPLINES): recruitment for linear packages."""
-    inner = np.linspace(0.0, 300.0, SPLINES - 1)
-    knots = np.r_[[0.0] * 3, inner, [300.0] * 3]
-    return BSpline(knots, np.eye(SPLINES + 1), 3)(np.clip(width_us, 0.0, 300.0))[:, 1:]
+    top = max(300.0, float(task.record.pulse_width_us.max()))
+    knots = np.r_[[0.0] * 3, np.linspace(0.0, top, SPLINES - 1), [top] * 3]
+    return BSpline(knots, np.eye(SPLINES + 1), 3)(task.record.pulse_width_us)[:, 1:]
 
 
-def ours(task: Task) -> Callable[[], np.ndarray]:
-    model = identify.fit(task.record)
+def ours(task: Task, method: str = "maximum-likelihood") -> Callable[[], np.ndarray]:
+    model = identify.fit(task.record, method=method)
     return lambda: identify.predict(model, task.record)
 
 
-def ours_two_stage(task: Task) -> Callable[[], np.ndarray]:
-    model = identify.fit(task.record, method="two-stage")
+def ours_improved(task: Task) -> Callable[[], np.ndarray]:
+    model = identify.improve(task.record).models[-1]
     return lambda: identify.predict(model, task.record)
+
+
+def ours_with_own_effect(task: Task) -> Callable[[], np.ndarray]:
+    """With an effect from a file of one's own, of the physics that the library doesn't hold."""
+    if task.own is None:
+        raise Passes("no effect of its own")
+    with mock.patch.dict(os.environ, STIMRIG_EFFECTS_DIR=str(OWN_EFFECTS)):
+        model = identify.fit(task.record, **task.own)
+        predicted = identify.predict(model, task.record)
+    return lambda: predicted
 
 
 def oracle(task: Task) -> Callable[[], np.ndarray]:
     """scipy's least squares on the five true parameters, from a start that is 20 % off."""
-    width, rate = task.record.pulse_width_us, task.rate_hz
+    if not task.true:
+        raise Passes("its truth is not known")
+    width, rate, fitted = task.record.pulse_width_us, task.rate_hz, task.fitted
 
     def simulate(x: np.ndarray) -> np.ndarray:
         gain, steep, middle, period, damping = x
         drive = sigmoid(width, gain, steep, np.exp(min(steep * middle, 600.0)))
         return second_order(drive, period, damping, rate)
 
-    measured = task.record.torque_nm[: task.fitted]
+    measured = task.record.torque_nm[fitted]
     start = np.array([6.9 * 1.2, 0.041 * 0.8, 190.0 * 1.1, 0.5284 * 0.8, 0.6369 * 1.2])
-    found = least_squares(lambda x: simulate(x)[: task.fitted] - measured, start, x_scale=np.abs(start), xtol=1e-10)
+    found = least_squares(lambda x: simulate(x)[fitted] - measured, start, x_scale=np.abs(start), xtol=1e-10)
     return lambda: simulate(found.x)
 
 
+def longest(task: Task) -> slice:
+    """The longest stretch that may be fitted."""
+    return max(task.stretches, key=lambda rows: rows.stop - rows.start)
+
+
 def sippy(task: Task) -> Callable[[], np.ndarray]:
-    """N4SID of order 2 on the PRBS, then the spline by least squares through what it found.
+    """N4SID of order 2 on the PRBS (or the longest stretch), then the spline by least squares through what it found.
 
     With the splines as inputs of one N4SID it runs away: two levels of a PRBS don't excite ten inputs.
     """
     from sippy_unipi import system_identification
 
     names = np.array(task.record.segment_names)[task.record.segment]
-    last = int(np.flatnonzero(names == "prbs")[-1]) + 1
-    level = (task.record.pulse_width_us > 0).astype(float)
+    rows = slice(0, int(np.flatnonzero(names == "prbs")[-1]) + 1) if "prbs" in names else longest(task)
+    level = task.record.pulse_width_us[rows] / np.max(task.record.pulse_width_us)
+    measured = task.record.torque_nm
+    offsets = (0.0, 0.0) if "prbs" in names else (measured[rows].mean(), level.mean())
     found = system_identification(
-        task.record.torque_nm[None, :last], level[None, :last], "N4SID", SS_fixed_order=2, SS_A_stability=True
+        (measured[rows] - offsets[0])[None], (level - offsets[1])[None], "N4SID", SS_fixed_order=2, SS_A_stability=True
     )
-    inputs = spline_inputs(task.record.pulse_width_us)
 
     def respond(columns: np.ndarray) -> np.ndarray:
         state, response = np.zeros((2, columns.shape[1])), np.empty_like(columns)
@@ -100,35 +109,52 @@ def sippy(task: Task) -> Callable[[], np.ndarray]:
             state = found.A @ state + found.B * u
         return response
 
-    columns = respond(inputs)
-    weights = np.linalg.lstsq(columns[: task.fitted], task.record.torque_nm[: task.fitted], rcond=None)[0]
+    inputs = spline_inputs(task)
+    columns = np.concatenate([respond(inputs[part]) for part in task.parts])
+    if len(task.parts) > 1:
+        columns = np.c_[columns, np.ones(len(columns))]
+    weights = np.linalg.lstsq(columns[task.fitted], measured[task.fitted], rcond=None)[0]
     return lambda: columns @ weights
 
 
 def jax_sysid(task: Task) -> Callable[[], np.ndarray]:
-    """Two states, spline inputs, L-BFGS."""
+    """Two states, spline inputs, L-BFGS; each part begins where its first fitted rows say."""
     import jax
     from jax_sysid.models import LinearModel
 
     jax.config.update("jax_enable_x64", True)
-    inputs = spline_inputs(task.record.pulse_width_us)
-    measured = task.record.torque_nm[: task.fitted]
-    scale = float(np.std(measured))
+    inputs = spline_inputs(task)
+    scale = float(np.std(task.record.torque_nm[task.fitted]))
+    measured = task.record.torque_nm[:, None] / scale
     model = LinearModel(2, 1, SPLINES, feedthrough=False)
     model.loss(rho_x0=1e-3, rho_th=1e-9)
     model.optimization(adam_epochs=0, lbfgs_epochs=3000, iprint=-1)
-    model.fit(measured[:, None] / scale, inputs[: task.fitted])
-    return lambda: np.asarray(model.predict(np.zeros((2, 1)), inputs)[0]).ravel() * scale
+    used = [rows for rows in task.stretches if rows.stop - rows.start > 2 * SHORTEST] if len(task.parts) > 1 else []
+    if used:
+        model.fit([measured[rows] for rows in used], [inputs[rows] for rows in used])
+    else:
+        model.fit(measured[longest(task)], inputs[longest(task)])
+
+    def begin(part: slice) -> np.ndarray:
+        rows = next((rows for rows in task.stretches if rows.start == part.start), part)
+        if len(task.parts) == 1 or rows.stop - rows.start < SHORTEST:
+            return np.zeros((2, 1))
+        return np.asarray(model.learn_x0(inputs[rows], measured[rows], rho_x0=1e-6)).reshape(2, 1)
+
+    def run() -> np.ndarray:
+        parts = [model.predict(begin(part), inputs[part])[0] for part in task.parts]
+        return np.concatenate([np.asarray(part).ravel() for part in parts]) * scale
+
+    return run
 
 
 def sysidentpy(task: Task) -> Callable[[], np.ndarray]:
-    """FROLS on spline inputs with extended least squares, scored in free run."""
+    """FROLS on spline inputs with extended least squares, scored in free run from each part's first samples."""
     from sysidentpy.basis_function import Polynomial
     from sysidentpy.model_structure_selection import FROLS
     from sysidentpy.parameter_estimation import LeastSquares
 
-    inputs = spline_inputs(task.record.pulse_width_us)
-    measured = task.record.torque_nm[: task.fitted]
+    inputs, rows, measured = spline_inputs(task), longest(task), task.record.torque_nm[:, None]
     model = FROLS(
         ylag=2,
         xlag=[[1, 2]] * SPLINES,
@@ -139,16 +165,28 @@ def sysidentpy(task: Task) -> Callable[[], np.ndarray]:
         basis_function=Polynomial(degree=1),
         model_type="NARMAX",
     )
-    model.fit(X=inputs[: task.fitted], y=measured[:, None])
-    first = task.record.torque_nm[: model.max_lag, None]
-    return lambda: np.asarray(model.predict(X=inputs, y=first)).ravel()
+    model.fit(X=inputs[rows], y=measured[rows])
+
+    def run() -> np.ndarray:
+        firsts = [measured[part][: model.max_lag] for part in task.parts]
+        parts = [model.predict(X=inputs[part], y=first) for part, first in zip(task.parts, firsts, strict=True)]
+        return np.concatenate([np.asarray(part).ravel() for part in parts])
+
+    return run
 
 
 CONTENDERS = (
-    Contender("oracle", "scipy, the 5 true parameters", oracle),
-    Contender("ours, maximum-likelihood", "identify, the default", ours),
-    Contender("ours, two-stage", "identify, the paper's method", ours_two_stage),
-    Contender("SIPPY", "sippy_unipi, N4SID on the PRBS + spline", sippy),
-    Contender("jax-sysid", "two states, spline inputs, L-BFGS", jax_sysid),
-    Contender("SysIdentPy", "FROLS on spline inputs, extended LS", sysidentpy),
+    Contender("oracle", "scipy, the 5 true parameters", oracle, fine=True),
+    Contender("ours, plain", "identify, the default", ours, fine=True),
+    Contender("ours, improve", "effects of the library", ours_improved),
+    Contender("ours, own effect", "an effect of one's own, in one file", ours_with_own_effect),
+    Contender("ours, two-stage", "identify, the paper's method", partial(ours, method="two-stage"), fine=True),
+    Contender("ours, narx", "identify's polynomial NARX by FROLS", partial(ours, method="narx")),
+    Contender("SIPPY", "sippy_unipi, N4SID on the PRBS + spline", sippy, fine=True),
+    Contender("jax-sysid", "two states, spline inputs, L-BFGS", jax_sysid, fine=True),
+    Contender("SysIdentPy", "FROLS on spline inputs, extended LS", sysidentpy, fine=True),
+    Contender("Hammerstein-Wiener", "as nlhw: piecewise linear, order 2 or 3", hammerstein_wiener),
+    Contender("nlarx", "as nlarx: sigmoid network of 3 + 3 lags", nlarx),
+    Contender("Gaussian process", "lagged inputs, 2 s of memory, Nyström", gaussian_process),
+    Contender("neural state space", "SUBNET-like: 3 states, 6 neurons", neural_states),
 )
