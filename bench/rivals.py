@@ -94,7 +94,8 @@ def document(seed: int, chosen: Sequence[Contender], rows: Sequence[Row]) -> str
 INTRO = """One run, one core, the same records. Root mean square in free run on rows that nobody fitted, and the seconds
 of one fit. Of simulated muscles it counts in standard deviations of the white noise, which is in the measured torque: 1
 is all that can be predicted. The paper's muscle: PRBS of 15.9 s and ramp of 10 s with rests, then a multi-level input.
-The emulator's: a test of 47 s, with nothing or one thing hidden. Frogs: the last tetanus of an animal from those before
+The emulator's: a test of 47 s, with nothing or one thing hidden, or of a muscle of other physics. As of an arm: the
+last of four equal ramps, in errors of the mean of the others. Frogs: the last tetanus of an animal from those before
 it. Cascaded tanks: the second run, from its 51st sample on (published: 0.191 V grey-box, 0.306 V CT-SUBNET, 0.396 V
 GRU). Coupled drives: 200 samples of each run after 300 that were fitted (published, in another split: 0.115 and 0.074
 ticks/s)."""

@@ -16,6 +16,10 @@ from typing import Any
 import numpy as np
 
 from bench.measured import benchmarks, frogs
+from bench.strange import repeated
+from stimrig.hardware_sim.bout_records import record_of_bouts
+from stimrig.hardware_sim.hidden_records import generate
+from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify import paper
 from stimrig.identify.records.record import HELD_OUT, Part, Record
 from tests.harness.carried_sessions import as_record
@@ -105,10 +109,29 @@ def papers(rate_hz: float, noise_nm: float, seed: int) -> Task:
 
 def emulated(effect: str | None, seed: int) -> Task:
     """A muscle of the emulator with something hidden, or nothing."""
-    from stimrig.hardware_sim.hidden_records import generate
-
     made = generate(effect, "middle", seed, rate_hz=RATE_HZ)
     return Task(effect or "nothing hidden", as_record(made), scale=made["truth"]["noise"]["sd_nm"])
+
+
+def thinned(made: dict[str, Any]) -> dict[str, Any]:
+    """One sample a pulse of a generated record."""
+    each = round((len(made["time_s"]) - 1) / float(made["time_s"][-1] - made["time_s"][0]) / RATE_HZ)
+    rows = {name: made[name][::each] for name in ("time_s", "pulse_width_us", "torque_nm", "segment")}
+    return made | rows | ({"bout": made["bout"][::each]} if "bout" in made else {})
+
+
+def of_physics(seed: int) -> Task:
+    """A muscle of other physics, with white noise alone."""
+    made = thinned(record_of_physics("physics", seed, disturbed=()))
+    return Task(f"physics: {made['truth']['kind']}", as_record(made), scale=made["truth"]["noise_sd_nm"])
+
+
+def of_bouts(seed: int) -> Task:
+    """A record as arms give them: its last ramp, in errors of the mean of the other ramps."""
+    made = thinned(record_of_bouts(seed))
+    rows, repetition = repeated(made)
+    off = float(np.sqrt(np.mean((made["torque_nm"][rows] - repetition) ** 2)))
+    return Task("as of an arm", as_record(made), unit="× repetition", scale=off)
 
 
 def joined(name: str, runs: Sequence[benchmarks.Run], labels: Sequence[str], rate_hz: float, **others: Any) -> Task:
@@ -155,8 +178,12 @@ def makers(seed: int, data: Path | None, frogs_taken: int = 2) -> Iterator[tuple
     """Name and maker of each task, in the order of the table."""
     yield "paper's muscle, 40 Hz", partial(papers, 40.0, 0.02, seed)
     yield "paper's muscle, 1600 Hz", partial(papers, 1600.0, 0.02, seed)
-    for effect in (None, "fatigue", "asymmetric_relaxation", "series_compliance", "pulse_count_memory"):
-        yield effect or "nothing hidden", partial(emulated, effect, seed % 1000 + 1000)
+    seed = seed % 1000 + 1000
+    for effect in (None, "fatigue", "series_compliance", "pulse_count_memory"):
+        yield effect or "nothing hidden", partial(emulated, effect, seed)
+    for more in range(3):
+        yield f"physics {more + 1}", partial(of_physics, seed + more)
+    yield "as of an arm", partial(of_bouts, seed)
     for number in range(frogs_taken):
         yield f"frog {number + 1}", partial(frog, data, number)
     yield "cascaded tanks", partial(tanks, data)
