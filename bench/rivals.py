@@ -21,6 +21,7 @@ from bench.common import RESULTS, parser, table, written_by
 from bench.contenders import CONTENDERS, Contender, Passes
 from bench.measured import Absent
 from bench.tasks import Task, makers
+from stimrig.identify.diagnosis import side_by_side
 from stimrig.identify.errors import BadRequest, IdentifyError
 
 SEED = 90_001
@@ -108,6 +109,7 @@ boxes have fixed settings and choose on fitted rows alone; who tunes them for on
 def run(arguments: Sequence[str] | None = None) -> None:
     """Measure, and print the table."""
     made = parser(__doc__)
+    made.prog = "python -m bench rivals"
     made.add_argument("--data", type=Path, help="folder of local copies, see bench/measured")
     made.add_argument("--only", default="", help="words of tasks or contenders, separated by commas")
     made.add_argument("--budget", type=float, default=BUDGET_S, help="s in which a box looks for better starts")
@@ -115,7 +117,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
     made.add_argument("--write", action="store_true", help=f"write docs/results/{TARGET.name}")
     options = made.parse_args(arguments)
     warnings.filterwarnings("ignore")
-    black_boxes.BUDGET_S = options.budget
+    black_boxes.BUDGET_S, side_by_side.WORKERS = options.budget, 1
     text = document(options.seed, *measure(options.seed, options.data, [w for w in options.only.split(",") if w]))
     print(text)
     if options.write:
