@@ -14,6 +14,7 @@ from stimrig.identify.errors import BadModel
 from stimrig.identify.json_text import BadJson, json_value, parse
 from stimrig.identify.recruitment import Curve, basis_from_dict, landmarks
 from stimrig.identify.summary import Sheet, Summarised, estimate, fit_words, held_out_label, quantity
+from stimrig.identify.yardstick import repetition_words
 
 if TYPE_CHECKING:
     from stimrig.identify.records.record import Record
@@ -338,6 +339,7 @@ def _words(model: Model) -> Sheet:
         ("fit", fit_words(fit)),
         (held_out_label(fit), fit_words(fit, "held_out_")),
         ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
+        ("repetition", repetition_words(fit)),
         ("dynamics", _dynamics(model)),
         ("recruitment", f"largest {largest}, at {quantity(top_us, 'µs')}"),
         ("baseline", estimate(model.baseline_nm, _sd(model, "baseline_nm"), "N·m")),

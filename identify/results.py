@@ -14,6 +14,7 @@ from stimrig.identify.caution import caution
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
 from stimrig.identify.summary import Sheet, Summarised, both_words, estimate, fit_words, probability, quantity, torque
+from stimrig.identify.yardstick import repetition_words
 
 Row = Mapping[str, Any]
 VERDICTS = {
@@ -66,6 +67,8 @@ class Comparison(Result):
         Number of rows.
     noise_sd_nm : float
         White measurement noise of a sample, N·m.
+    repetition : dict
+        What repeats in the record, and how much of that the model explains: see `identify.estimation.repetition`.
     fitted : FitStatistics
         The same for rows that may be fitted.
     held_out : FitStatistics or None
@@ -94,6 +97,7 @@ class Comparison(Result):
     excess_rms_nm: float
     samples: int
     noise_sd_nm: float
+    repetition: Row
     fitted: FitStatistics
     held_out: FitStatistics | None
     by: Mapping[str, Sequence[Row]]
@@ -112,6 +116,7 @@ class Comparison(Result):
             ("fitted rows", _figures(self.fitted)),
             ("held out", "no rows of `validate`" if self.held_out is None else _figures(self.held_out)),
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
+            ("repetition", repetition_words(vars(self))),
             ("residual", f"not noise: correlated with {', '.join(alarms)}" if alarms else "looks like noise"),
         ]
         rows += _listed("worst place", [row["text"] for row in self.where[:FEW]])
@@ -179,6 +184,7 @@ class Diagnosis(Result):
         slow = quantity(self.slow_noise.get("sd_nm"), "N·m")
         rows = [
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')} white, {slow} slow, sd"),
+            ("repetition", repetition_words(self.base)),
             ("the model", both_words(self.base)),
             *[(str(row["effect"]), _read_row(row)) for row in self.missing],
         ]
@@ -207,7 +213,7 @@ class Improvement(Result):
         As in `Diagnosis`, for the first model, before effects were added.
     steps : tuple of dict
         `added` (None in the first), `fit_percent`, `rms_nm`, `held_out_rms_nm`, `held_out_fit_percent`,
-        `ceiling_percent`, `model_id`, `reason`.
+        `ceiling_percent`, `repetition`, `model_id`, `reason`.
     models : tuple of Model
         One per step; the last one has all added effects.
     refused : tuple of dict
@@ -227,6 +233,7 @@ class Improvement(Result):
         ]
         rows += [
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
+            ("repetition", repetition_words(self.steps[-1])),
             ("at first", VERDICTS.get(self.verdict, self.verdict)),
         ]
         rows += _listed("refused", [f"{row['effect']}: {row['reason']}" for row in self.refused[:FEW]])

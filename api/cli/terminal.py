@@ -254,6 +254,13 @@ def carried_lines(found: Mapping[str, Any] | None) -> list[str]:
     return [f"{'' if number else 'carried over':15}{line}" for number, line in enumerate(lines)]
 
 
+def repetition_lines(fit: Mapping[str, Any]) -> list[str]:
+    """What repeats in the record, a line for each sentence; nothing where a model is of an older version."""
+    from stimrig.identify.yardstick import repetition_sentences
+
+    return [f"{'' if number else 'repetition':15}{line}" for number, line in enumerate(repetition_sentences(fit))]
+
+
 def model_report(document: dict[str, Any]) -> list[str]:
     """What a person reads off a model."""
     from stimrig.api.models import stored_model
@@ -270,6 +277,7 @@ def model_report(document: dict[str, Any]) -> list[str]:
         if fit["held_out_rms_nm"] is None
         else f"held out       {in_turn}{percent(fit['held_out_fit_percent'])}, "
         f"rms {number(fit['held_out_rms_nm'], 4)} N·m",
+        *repetition_lines(document.get("fit") or {}),
     ]
     if dynamics["time_constant_s"] is not None:
         lines.append(

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from stimrig.api.effect_words import fact_of
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _
+from stimrig.identify.yardstick import repetition_sentences
 
 if TYPE_CHECKING:
     from stimrig.api.store.tables import Model
@@ -62,6 +63,13 @@ FIT = (
     "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
     "rms_nm", "held_out_rms_nm", "held_out_by", "noise_sd_nm",
 )  # fmt: skip
+
+
+def repetition(document: dict[str, Any]) -> dict[str, Any]:
+    """What repeats in the record of a MODEL.json, with `sentences`; None for each where it is of an older version."""
+    fit = document.get("fit") or {}
+    found = fit.get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
+    return {**found, "sentences": repetition_sentences(fit)}
 
 
 def figures(document: dict[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ places, named by segment, pulse width and direction.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,11 +17,13 @@ from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
 from stimrig.identify.estimation.quality import range_warnings
-from stimrig.identify.estimation.samples import inspect
+from stimrig.identify.estimation.repetition import repetition
+from stimrig.identify.estimation.samples import block_means, inspect
 from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Comparison, FitStatistics
+from stimrig.identify.yardstick import repetition_sentences
 
 POINTS = 4000
 """Largest number of points of a plotted series."""
@@ -64,10 +67,13 @@ def compare(model: Model, record: Record) -> Comparison:
     whole = _figures(record, predicted, noise, counted)
     held_out = _figures(record, predicted, noise, held) if held.any() else None
     said = [text for text in (_left_out(grid), raw.readings.words if raw.readings else "") if text]
+    clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
+    again = {"repetition": repetition(clean, block_means(grid, residual), grid.fitted)}
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
         noise_sd_nm=noise,
+        **again,
         fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
         by=_error_shares(record, residual, noise, counted),
@@ -75,7 +81,7 @@ def compare(model: Model, record: Record) -> Comparison:
         where=tuple(places),
         left_out=_left_out(grid),
         series=_series(model, record, predicted, noise),
-        plain=(*_plain(whole, held_out, noise, tests, places), *said, *outside),
+        plain=(*_plain(whole, held_out, noise, tests, places), *repetition_sentences(again), *said, *outside),
     )
 
 

@@ -17,7 +17,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Improvement
 
-COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent")
+COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent", "repetition")
 
 
 def improve(

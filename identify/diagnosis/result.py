@@ -23,7 +23,7 @@ MOST_PARAMETERS = 24
 """The wave of a tremor has hundreds."""
 STATISTICS = (
     "fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent",
-    "held_out_by",
+    "held_out_by", "repetition",
 )  # fmt: skip
 
 

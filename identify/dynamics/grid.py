@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from stimrig.identify.dynamics.repeats import find_repeats
 from stimrig.identify.dynamics.second_order import CUBIC, Core, curve_weights
 from stimrig.identify.dynamics.states import boundary_states, mean_weights, read_at, read_means
 from stimrig.identify.errors import BadRecord
@@ -120,8 +121,20 @@ class Grid:
         An interval with fewer than half of its samples (at an edge or a gap) is left out, since its mean is noisier. So
         is an interval in which the stimulation is not known.
         """
+        return self.comparable & ~self.held_out
+
+    @cached_property
+    def comparable(self) -> np.ndarray:
+        """bool, shape (K,): intervals whose stimulation and mean torque are known; of `validate`, too."""
         usual = float(np.median(self.count[self.count > 0])) if np.any(self.count) else 1.0
-        return ~self.held_out & ~self.doubted & (self.count > 0) & (2 * self.count >= usual)
+        return ~self.doubted & (self.count > 0) & (2 * self.count >= usual)
+
+    @cached_property
+    def repeats(self) -> np.ndarray:
+        """int, shape (K,): the same number for intervals with the same input; -1 where it did not repeat."""
+        known = self.comparable.copy()
+        known[self.starts] = False
+        return find_repeats(self.pulse_width_us, known, round(FORGOTTEN_S / self.step_s))
 
     @cached_property
     def counted(self) -> np.ndarray:

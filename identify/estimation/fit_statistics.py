@@ -9,6 +9,8 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted, predict_fitted
+from stimrig.identify.estimation.repetition import repetition
+from stimrig.identify.estimation.samples import block_means
 from stimrig.identify.noise import whitened
 from stimrig.identify.records.readings import contrasts
 
@@ -65,9 +67,11 @@ def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: 
     residual = grid.record.torque_nm - predicted_nm
     used = residual[rows]
     plain = float(np.sqrt(used @ used / max(used.size - freedom, 1.0)))
-    at = slice(None) if grid.readings is None else grid.readings.at
-    jump = np.diff(residual, 2) / np.sqrt(6.0) if grid.readings is None else contrasts(at, residual[at], 2)
-    known = rows[at]
+    if grid.readings is None:
+        jump, known = np.diff(residual, 2) / np.sqrt(6.0), rows
+    else:
+        at = grid.readings.at
+        jump, known = contrasts(at, residual[at], 2), rows[at]
     jump = jump[known[2:] & known[1:-1] & known[:-2]]
     if white and abs(block_sd_nm * np.sqrt(grid.readings_in(grid.fitted)) / max(plain, 1e-300) - 1.0) < 0.2:
         return plain
@@ -142,7 +146,7 @@ def fit_statistics(
         result |= figures(measured[held], left_out[held], float(np.hypot(sd_nm, unforeseen)), "held_out_")
         result |= {"held_out_by": by, "held_out_samples": int(held.sum())}
         result |= {"unforeseen_nm": unforeseen} if unforeseen > 0.0 else {}
-    return result
+    return result | {"repetition": repetition(grid, block_means(grid, measured - left_out), rows)}
 
 
 def segment_statistics(grid: Grid, predicted_nm: np.ndarray, sd_nm: float) -> list[dict[str, Any]]:

@@ -5,7 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli.terminal import ColumnMap, HeldModel, Json, SeveralData, load_held, number, percent, say, say_json
+from stimrig.api.cli.terminal import (
+    ColumnMap,
+    HeldModel,
+    Json,
+    SeveralData,
+    load_held,
+    number,
+    percent,
+    repetition_lines,
+    say,
+    say_json,
+)
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.structure import in_words, worded
 
@@ -47,6 +58,7 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
         "",
         f"structure      {in_words(found['structure'])}",
         f"noise          {number(found['noise_sd_nm'], 4)} N·m",
+        *repetition_lines(base),
         f"the model      fit {percent(base.get('fit_percent'))}, rms {number(base.get('rms_nm'), 4)} N·m; "
         f"{held_out_label(base)} {percent(base.get('held_out_fit_percent'))}, "
         f"rms {number(base.get('held_out_rms_nm'), 4)} N·m",

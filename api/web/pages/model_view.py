@@ -64,6 +64,7 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
         "document": document,
         "recruitment": stored_model.recruitment(document),
         "dynamics": stored_model.dynamics(document),
+        "repetition": stored_model.repetition(document),
         "validity": stored_model.validity(document),
         "warnings": await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
         "now_utc": context.clock.utc(),

@@ -44,6 +44,7 @@ def comparison_html(
         effects=[effect["id"] for effect in document.get("effects") or []],
         recruitment=stored_model.recruitment(document),
         dynamics=stored_model.dynamics(document),
+        repetition=stored_model.repetition(document),
         test=test,
         figures={
             **model_charts.model_figures(document, curves, comparison),

@@ -1,0 +1,113 @@
+"""Parts of a record that had the same input: the same pulse widths in the same order, wherever they stand.
+
+Widths alone decide, to a microsecond, and a pulse may come one sooner or later. A muscle still shows what came before:
+the first 1.5 s of a part that repeats are the approach to the same state and do not count, nor does rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+SAME_US = 1.0 + 1e-6
+"""Widths that differ by less are the same, but for rounding to whole µs."""
+ALIKE = 0.05
+"""Mean difference of the widths of two repeats, as a share of the largest, at most."""
+APART = 10
+"""Of the same two parts shifted by fewer intervals only the best alignment counts."""
+MOST_ROWS = 12_000
+"""Only so many of the last intervals are looked at (5 min): time grows with the square."""
+MOST_RUNS = 20_000
+
+
+def find_repeats(width_us: np.ndarray, known: np.ndarray, memory: int) -> np.ndarray:
+    """A number for each interval, the same for those with the same input, shape (K,); -1 where it did not repeat.
+
+    Parameters
+    ----------
+    width_us : ndarray, shape (K,)
+        Width held in each interval, µs.
+    known : ndarray of bool, shape (K,)
+        Intervals whose stimulation and torque are known, and that follow on the one before.
+    memory : int
+        Intervals after which the muscle has forgotten.
+    """
+    first = max(width_us.size - MOST_ROWS, 0)
+    width = np.ascontiguousarray(width_us[first:])
+    found, size = equal_runs(width, known[first:], memory, np.zeros((MOST_RUNS, 3), np.int64))
+    worked = np.convolve(width > 0.0, np.ones(memory))[: width.size] > 0.5
+    rows = np.arange(width.size)
+    label, touched = rows.copy(), np.zeros(width.size, bool)
+    for start, stop, lag in _shared(width, found[:size], memory):
+        # Parts that follow one another, each the repeat of the last: one after the other.
+        for begin in range(start + memory, stop, lag):
+            one = rows[begin : min(begin + lag, stop)]
+            one = one[worked[one]]
+            touched[one] = touched[one + lag] = True
+            low, high = np.sort([label[one], label[one + lag]], axis=0)
+            far = high - low >= APART
+            same = rows.copy()
+            same[high[far]] = low[far]
+            label = same[same[label]]
+    return np.r_[np.full(first, -1), np.where(touched & ~_crowded(label, touched), label, -1)]
+
+
+def _crowded(label: np.ndarray, touched: np.ndarray) -> np.ndarray:
+    """bool, shape (K,): intervals of a group that has two neighbours, which no alignment gives."""
+    order = np.lexsort((np.arange(label.size), label))
+    order = order[touched[order]]
+    near = (np.diff(label[order]) == 0) & (np.diff(order) < APART)
+    return np.isin(label, label[order][1:][near])
+
+
+def _shared(width: np.ndarray, found: np.ndarray, memory: int) -> list[tuple[int, int, int]]:
+    """Start, stop and lag of the runs that count, the best first."""
+    limit = ALIKE * float(width.max(initial=0.0))
+    ranked = []
+    for start, stop, lag in found.tolist():
+        own = width[start:stop]
+        apart = float(np.mean(np.abs(own - width[start + lag : stop + lag])))
+        if float(own.max() - own.min()) > 2.0 * SAME_US and apart <= limit:
+            ranked.append((apart, start - stop, start, stop, lag))
+    kept: list[tuple[int, int, int]] = []
+    for _, _, start, stop, lag in sorted(ranked):
+        beside = (other for other in kept if abs(other[2] - lag) < APART)
+        if not any(start < other[1] - memory and other[0] + memory < stop for other in beside):
+            kept.append((start, stop, lag))
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def _same(width, known, i, j):  # pragma: no cover
+    if not (known[i] and known[j]):
+        return False
+    own = width[i]
+    if abs(own - width[j]) <= SAME_US or abs(own - width[j - 1]) <= SAME_US:
+        return True
+    return j + 1 < width.size and abs(own - width[j + 1]) <= SAME_US
+
+
+@njit(cache=True, nogil=True)
+def equal_runs(width, known, memory, found):  # pragma: no cover
+    """Start, stop and lag of every run of equal widths of at least twice the memory, and how many there are.
+
+    A window is looked at from its end, so that a difference there leaves all of it out.
+    """
+    size, count, least = width.size, 0, 2 * memory
+    for lag in range(memory, size - least):
+        start = 0
+        while start + least <= size - lag:
+            i = start + least - 1
+            while i >= start and _same(width, known, i, i + lag):
+                i -= 1
+            if i >= start:
+                start = i + 1
+                continue
+            stop = start + least
+            while stop < size - lag and _same(width, known, stop, stop + lag):
+                stop += 1
+            if count < found.shape[0]:
+                found[count, 0], found[count, 1], found[count, 2] = start, stop, lag
+                count += 1
+            start = stop + 1
+    return found, count

@@ -1,0 +1,108 @@
+"""The yardstick of repetition: what a record says cannot be better, since the same input did not give the same torque.
+
+Where the same pulse widths came several times (`dynamics/repeats.py`) the torque's variance between the repeats is what
+no model can take away whose output follows from the pulse widths of the last seconds. It holds noise, a wandering zero
+and the muscle's own whims; and slow changes such as fatigue, of which a model with an effect may explain a part. Where
+nothing repeats, the residual at rest stands for it, as an estimate: what varies only at work is not in it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.records.record import FORGOTTEN_S
+
+EXACT, ESTIMATE = "exact repeats", "estimate"
+LEAST_S = 1.0
+"""Less time, in which the same input came again or in which the muscle rests, tells nothing."""
+LEAST_SHARE = 0.1
+"""If less than this share of the variance repeats, a share of it says nothing."""
+UNKNOWN: dict[str, Any] = dict.fromkeys(
+    ("found_by", "repeats", "seconds", "rms_nm", "model_rms_nm", "explained_percent", "held_out_rms_nm",
+     "held_out_model_rms_nm")
+)  # fmt: skip
+
+
+def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
+    """What repeats in a record, and how much of that a model explains.
+
+    All values are of means over pulse intervals. With torque y of an interval of a group of n with the same input, the
+    between-repeat variance is s² = Σ (y - mean of its group)² / Σ (n - 1), the sums over all intervals and groups. A
+    plain repetition predicts an interval of `validate` as the mean of the others of its group: from n - 1 of them it
+    errs by √(1 + 1/(n-1)) s, if all vary alike. `explained_percent` is 100 (1 - (e² - s²) / v), between 0 and 100: e is
+    the model's error, v the variance that repeats: that of the groups' means, less s²/n for their own error. Of
+    `validate` alone if enough of it repeats. In an estimate v is the variance of the torque less s².
+
+    Parameters
+    ----------
+    grid : Grid
+        The record.
+    error_nm : ndarray, shape (K,)
+        Measured minus predicted, N·m; of fitted intervals as predicted when they were left out of the fit, if known.
+    rows : ndarray of bool, shape (K,)
+        Intervals that were fitted.
+
+    Returns
+    -------
+    dict
+        `found_by` ("exact repeats", "estimate" or None), `repeats` (how often the same input came, in the mean),
+        `seconds` (time that counts), `rms_nm` (between repeats), `model_rms_nm` and `explained_percent` there,
+        `held_out_rms_nm` (a plain repetition on `validate`) and `held_out_model_rms_nm` (the model on the same
+        intervals). None where it is not known.
+    """
+    usable = grid.comparable & (rows | grid.held_out)
+    least = LEAST_S / grid.step_s
+    group, size = _groups(np.where(usable, grid.repeats, -1))
+    at = np.flatnonzero(group >= 0)
+    if at.size - size.size >= least:
+        torque = grid.torque_nm[at]
+        mean = np.bincount(group[at], torque) / size
+        variance = float(np.sum((torque - mean[group[at]]) ** 2)) / (at.size - size.size)
+        found = UNKNOWN | {"found_by": EXACT, "repeats": at.size / size.size}
+        at = _unseen(grid, at, least)
+        repeating = float(np.var(mean[group[at]]) - variance * np.mean(1.0 / size[group[at]]))
+        found |= _plain_repetition(grid, error_nm, group, least)
+    else:
+        memory = round(FORGOTTEN_S / grid.step_s)
+        rests = usable & ~grid.held_out & (np.convolve(grid.pulse_width_us > 0, np.ones(memory))[: grid.size] < 0.5)
+        at = _unseen(grid, np.flatnonzero(usable & ~rests), least)
+        if rests.sum() < least or not at.size:
+            return dict(UNKNOWN)
+        variance, found = float(np.var(error_nm[rests])), UNKNOWN | {"found_by": ESTIMATE}
+        repeating = float(np.var(grid.torque_nm[at])) - variance
+    model = float(np.mean(error_nm[at] ** 2))
+    if repeating > LEAST_SHARE * float(np.var(grid.torque_nm[at])):
+        share = 1.0 - (model - variance) / repeating
+        found["explained_percent"] = 100.0 * float(np.clip(share, 0.0, 1.0))
+    return found | {"seconds": at.size * grid.step_s, "rms_nm": variance**0.5, "model_rms_nm": model**0.5}
+
+
+def _groups(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The groups of at least two intervals, numbered from 0 (shape (K,), else -1), and their sizes."""
+    labels, place, size = np.unique(label, return_inverse=True, return_counts=True)
+    kept = (labels >= 0) & (size > 1)
+    return np.where(kept, np.cumsum(kept) - 1, -1)[place], size[kept]
+
+
+def _unseen(grid: Grid, at: np.ndarray, least: float) -> np.ndarray:
+    """Those of some intervals that are in `validate`, if there are enough; else all."""
+    unseen = at[grid.held_out[at]]
+    return unseen if unseen.size >= least else at
+
+
+def _plain_repetition(grid: Grid, error_nm: np.ndarray, group: np.ndarray, least: float) -> dict[str, float]:
+    """The error on `validate` of the mean of the repeats elsewhere, and the model's on the same intervals."""
+    seen, unseen = (np.flatnonzero((group >= 0) & (grid.held_out == held)) for held in (False, True))
+    count = np.bincount(group[seen], minlength=int(group.max()) + 1)
+    mean = np.bincount(group[seen], grid.torque_nm[seen], count.size) / np.maximum(count, 1)
+    unseen = unseen[count[group[unseen]] > 0]
+    if unseen.size < least:
+        return {}
+    plain = grid.torque_nm[unseen] - mean[group[unseen]]
+    return {
+        "held_out_rms_nm": float(np.sqrt(np.mean(plain**2))),
+        "held_out_model_rms_nm": float(np.sqrt(np.mean(error_nm[unseen] ** 2))),
+    }
