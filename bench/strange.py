@@ -6,18 +6,20 @@ Seeds 0 to 99 were developed on; report on seeds from 1000. Of `sealed` only sum
 learn what is in it. Errors are over the noise's standard deviation, on a second record of the muscle that no fit was
 given, tared on its first rest; those of arms over the error of plain repetition, the mean of the other ramps.
 
-`--nudge` does everything again with every torque × (1 + 1e-9), `--processor` in a process of its own with the
-arithmetic of another processor, and both compare.
+`--nudge` fits and improves again with every torque × (1 + 1e-9), `--processor` in a process of its own with the
+arithmetic of another processor, and both compare. `--no-names` leaves out `diagnose`, half of the time; then no name
+counts as untrue. `--only-plain` leaves out `improve`, too, and takes a second a record.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
@@ -49,9 +51,10 @@ def rms(values: np.ndarray) -> float:
 
 
 def make(kind: str, seed: int) -> dict[str, Any]:
-    """A record of the set, with `true`: names that are no mistake."""
+    """A record of the set, with `kind`, and `true`: names that are no mistake."""
     made = record_of_bouts(seed) if kind == "arms" else record_of_physics(kind, seed)
     made["true"] = TRUE_OF_ARMS if kind == "arms" else set(made["truth"]["true"])
+    made["kind"] = made["truth"].get("kind", kind)
     return made
 
 
@@ -73,29 +76,30 @@ def repeated(made: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     return bouts[0][:count], np.mean([made["torque_nm"][rows[:count]] for rows in bouts[1:]], axis=0)
 
 
-def look(kind: str, seed: int, factor: float = 1.0, names: bool = False) -> dict[str, Any]:
-    """One record: its plain fit, what `improve` adds, and, where asked for, what `diagnose` names."""
+def look(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
+    """One record: its plain fit and, of `improve` and `diagnose`, what is in `steps`."""
     workers.WORKERS = 1
-    made = make(kind, seed)
-    record = as_record(made | {"torque_nm": made["torque_nm"] * factor})
+    record = as_record(made)
     began = time.perf_counter()
     plain = identify.fit(record)
-    improved = identify.improve(record)
+    improved = identify.improve(record) if "improve" in steps else None
     seconds = time.perf_counter() - began
-    named = {row["effect"]: row["probability"] for row in identify.diagnose(record).missing} if names else {}
+    named = (
+        {row["effect"]: row["probability"] for row in identify.diagnose(record).missing} if "diagnose" in steps else {}
+    )
     every = max(round(record.sample_rate_hz / record.pulse_rate_hz), 1)
-    own_nm = identify.predict(plain, record) / factor
+    own_nm = identify.predict(plain, record)
     fitted = made["segment"] != "validate"
     return {
-        "seed": seed,
-        "kind": made["truth"].get("kind", kind),
+        "seed": made["truth"]["seed"],
+        "kind": made["kind"],
         "disturbed": made["truth"].get("disturbed", []),
-        "plain": score(made | {"torque_nm": made["torque_nm"] * factor}, plain),
-        "improved": score(made | {"torque_nm": made["torque_nm"] * factor}, improved.models[-1]),
-        "added": [step["added"] for step in improved.steps if step["added"]],
+        "plain": score(made, plain),
+        "improved": score(made, improved.models[-1] if improved else plain),
+        "added": [step["added"] for step in (improved.steps if improved else ()) if step["added"]],
         "named": named,
         "untrue": [name for name, sure in named.items() if sure >= SURE and name not in made["true"]],
-        "verdict": improved.verdict,
+        "verdict": improved.verdict if improved else "",
         "phi": plain.noise.ar1,
         "white_nm": plain.noise.white_sd_nm,
         "seconds": seconds,
@@ -104,13 +108,17 @@ def look(kind: str, seed: int, factor: float = 1.0, names: bool = False) -> dict
     }
 
 
-def elsewhere(kind: str, seed: int) -> dict[str, Any]:
-    """The same in a process of its own, with another processor's arithmetic."""
-    command = [sys.executable, "-m", "bench.strange", "--set", kind, "--seeds", str(seed), "--bare"]
-    done = subprocess.run(
-        command, env=os.environ | OTHER_PROCESSOR, capture_output=True, text=True, check=True, cwd=ROOT
-    )
+def elsewhere(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
+    """The same record, to the last bit, in a process of its own with another processor's arithmetic."""
+    command = [sys.executable, "-c", "from bench.strange import answer; answer()"]
+    environment = os.environ | OTHER_PROCESSOR
+    done = subprocess.run(command, input=pickle.dumps((made, steps)), env=environment, stdout=-1, check=True, cwd=ROOT)
     return json.loads(done.stdout)
+
+
+def answer() -> None:
+    """What `elsewhere` asks for: a record on standard input, its row on standard output."""
+    print(json.dumps(look(*pickle.load(sys.stdin.buffer)), default=float))
 
 
 def moved(row: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
@@ -119,14 +127,16 @@ def moved(row: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     return {"moved": shift, "other": sorted(row["added"]) != sorted(other["added"]), "added": other["added"]}
 
 
-def compared(job: tuple[str, int, bool, bool, bool]) -> dict[str, Any]:
-    """One record, and again where that is asked for."""
-    kind, seed, names, nudge, processor = job
-    row = look(kind, seed, names=names)
-    if nudge:
-        row["nudge"] = moved(row, look(kind, seed, NUDGE))
-    if processor:
-        row["processor"] = moved(row, elsewhere(kind, seed))
+def compared(job: tuple[str, int, Collection[str], Collection[str]]) -> dict[str, Any]:
+    """One record, and `again` with a nudge or by another processor."""
+    kind, seed, steps, again = job
+    made = make(kind, seed)
+    row = look(made, steps)
+    once_more = [step for step in steps if step != "diagnose"]
+    if "nudge" in again:
+        row["nudge"] = moved(row, look(made | {"torque_nm": made["torque_nm"] * NUDGE}, once_more))
+    if "processor" in again:
+        row["processor"] = moved(row, elsewhere(made, once_more))
     del row["own_nm"]
     if kind == "sealed":  # names and physics would tell what is in it
         row |= {"kind": "", "added": len(row["added"]), "named": {}, "untrue": ["?" for _ in row["untrue"]]}
@@ -184,13 +194,12 @@ def main() -> None:
     made.add_argument("--nudge", action="store_true", help="again with every torque × (1 + 1e-9)")
     made.add_argument("--processor", action="store_true", help="again with another processor's arithmetic")
     made.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")
+    made.add_argument("--only-plain", action="store_true", help="without `improve`, too")
     made.add_argument("--jobs", type=int, default=1, help="processes")
-    made.add_argument("--bare", action="store_true", help="print one record's row as JSON and nothing else")
     asked = made.parse_args()
-    if asked.bare:
-        print(json.dumps(look(asked.set, asked.seeds.start), default=float))
-        return
-    jobs = [(asked.set, seed, not asked.no_names, asked.nudge, asked.processor) for seed in asked.seeds]
+    steps = () if asked.only_plain else ("improve",) if asked.no_names else ("improve", "diagnose")
+    again = [name for name in ("nudge", "processor") if getattr(asked, name)]
+    jobs = [(asked.set, seed, steps, again) for seed in asked.seeds]
     found = in_processes(compared, jobs, asked.jobs) if asked.jobs > 1 else map(compared, jobs)
     rows = []
     if asked.set != "sealed":
