@@ -1,6 +1,6 @@
 """What is learnt of muscles that no library holds, and of records as they are: error on what no fit was given.
 
-    python -m bench.strange --set physics|further|arms|sealed|plain --seeds 1000:1004 [--nudge] [--processor]
+    python -m bench.strange --set physics|further|arms|idle|sealed|plain --seeds 1000:1004 [--nudge] [--processor]
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. Of `sealed` only sums are told: nobody who tunes should
 learn what is in it. Errors are over the noise's standard deviation, on a second record of the muscle that no fit was
@@ -26,7 +26,7 @@ import numpy as np
 
 from bench.common import ROOT, in_processes, keep, line, parser, table
 from stimrig import identify
-from stimrig.hardware_sim.bout_records import record_of_bouts
+from stimrig.hardware_sim.bout_records import Peculiar, record_of_bouts
 from stimrig.hardware_sim.physics_records import DISTURBED, SETS, record_of_physics
 from stimrig.identify.diagnosis import side_by_side as workers
 from tests.harness.carried_sessions import as_record
@@ -40,6 +40,8 @@ OTHER_PROCESSOR = {
 SURE = 0.9
 """Probability from which a name counts as told for sure."""
 WORSE, CLOSE, MOVES = 1.02, 1.3, 0.01
+ARMS = ("arms", "idle")
+"""Records of bouts; the stimulator of `idle` goes on below threshold between them."""
 TRUE_OF_ARMS = {"mixed_fibres", "baseline_drift"}
 REST_S = 1.9
 HEADS = ("record", "plain", "improved", "added", "names and probabilities", "verdict", "seconds")
@@ -52,8 +54,8 @@ def rms(values: np.ndarray) -> float:
 
 def make(kind: str, seed: int) -> dict[str, Any]:
     """A record of the set, with `kind`, and `true`: names that are no mistake."""
-    made = record_of_bouts(seed) if kind == "arms" else record_of_physics(kind, seed)
-    made["true"] = TRUE_OF_ARMS if kind == "arms" else set(made["truth"]["true"])
+    made = record_of_bouts(seed, Peculiar(idle=kind == "idle")) if kind in ARMS else record_of_physics(kind, seed)
+    made["true"] = TRUE_OF_ARMS if kind in ARMS else set(made["truth"]["true"])
     made["kind"] = made["truth"].get("kind", kind)
     return made
 
@@ -146,13 +148,13 @@ def compared(job: tuple[str, int, Collection[str], Collection[str]]) -> dict[str
 def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     """The summary."""
     plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
-    unit = "plain repetition" if kind == "arms" else "noise"
+    unit = "plain repetition" if kind in ARMS else "noise"
     yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
     yield f"improved better by 10 % and more: {np.sum(improved <= 0.9 * plain)} of {len(rows)}"
     yield f"records with a name that is untrue with {SURE} and more: {sum(bool(row['untrue']) for row in rows)}"
-    if kind == "arms":
+    if kind in ARMS:
         held = sum(row["phi"] > 0.985 for row in rows), sum(row["phi"] > 0.9939 for row in rows)
         yield f"plain repetition worse than plain by over 2 %: {np.sum(plain * WORSE < 1.0)} of {len(rows)}"
         yield f"slow noise's φ above 0.985 in {held[0]}, at 0.994 in {held[1]}"
@@ -190,7 +192,7 @@ def cells(row: dict[str, Any]) -> list[str]:
 def main() -> None:
     """Make, fit, improve, tell."""
     made = parser(__doc__, "1000:1004")
-    made.add_argument("--set", choices=[*SETS, "arms"], required=True)
+    made.add_argument("--set", choices=[*SETS, *ARMS], required=True)
     made.add_argument("--nudge", action="store_true", help="again with every torque × (1 + 1e-9)")
     made.add_argument("--processor", action="store_true", help="again with another processor's arithmetic")
     made.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")

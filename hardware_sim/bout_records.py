@@ -30,7 +30,7 @@ QUICK_SHARE = (0.35, 0.65)
 SPREAD_NM = (0.03, 1.0)
 """Standard deviation of the torque that stimulation makes: as small as on arms."""
 READ_HZ = (20.0, 45.0)
-RAMPS = 4
+RAMPS, IDLE_US = 4, 20.0
 BOUT_VARIES, LATER_US = 0.05, 1.0
 """Between bouts: a factor's standard deviation, and by how many µs the threshold moves."""
 WEAKER = (0.7, 0.9)
@@ -56,6 +56,9 @@ class Peculiar:
         The quick way and the slow one; otherwise one way of second order with the time constant between them.
     varied : bool
         Every bout has its own strength (5 %) and threshold (1 µs).
+    idle : bool
+        Between bouts pulses go on below threshold, so that no row of the record has a width of 0. Not in the records
+        that are otherwise made: then nothing but these rows tells zero from plateau.
     """
 
     held: bool = True
@@ -64,6 +67,7 @@ class Peculiar:
     weaker: bool | None = None
     two_ways: bool = True
     varied: bool = True
+    idle: bool = False
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,7 @@ def record_of_bouts(seed: int, peculiar: Peculiar | None = None) -> dict[str, An
     rate_hz = int(rng.choice(RATES_HZ))
     largest_us = int(rng.integers(200, 401))
     bouts = draw_bouts(rng_of(seed, "bouts", "design"), float(largest_us))
+    sent_us = np.where(bouts.width_us > 0.0, bouts.width_us, IDLE_US if peculiar.idle else 0.0)
     repeated = rate_hz // PULSES_PER_S
     clean_nm, muscle = _muscle_nm(seed, peculiar, bouts, largest_us, rate_hz)
     working = np.repeat(bouts.width_us > 0.0, repeated)
@@ -108,7 +113,7 @@ def record_of_bouts(seed: int, peculiar: Peculiar | None = None) -> dict[str, An
         reading_nm, sensor["read_hz"] = _held(rng_of(seed, "bouts", "converter"), reading_nm, rate_hz)
     return {
         "time_s": np.arange(clean_nm.size) / rate_hz,
-        "pulse_width_us": np.repeat(bouts.width_us, repeated),
+        "pulse_width_us": np.repeat(sent_us, repeated),
         "torque_nm": reading_nm,
         "segment": np.repeat(bouts.segment, repeated),
         "bout": np.repeat(bouts.bout, repeated),

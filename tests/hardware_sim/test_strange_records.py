@@ -65,6 +65,12 @@ def test_the_last_of_four_equal_ramps_is_unseen(seed: int) -> None:
     assert {"twitch", "bout", "prbs", "ramp"} <= set(made["segment"])
 
 
+def test_an_idle_stimulator_changes_no_torque() -> None:
+    made, idle = record_of_bouts(0), record_of_bouts(0, Peculiar(idle=True))
+    assert np.min(made["pulse_width_us"]) == 0.0 < np.min(idle["pulse_width_us"])
+    assert np.array_equal(made["torque_nm"], idle["torque_nm"])
+
+
 def test_twitches_look_fast_and_ramps_slow() -> None:
     """The slow way is 2.7 times as slow as the quick one or slower, and either carries a third and more."""
     for seed in SEEDS:
