@@ -34,11 +34,12 @@ def find_repeats(width_us: np.ndarray, known: np.ndarray, memory: int) -> np.nda
     """
     first = max(width_us.size - MOST_ROWS, 0)
     width = np.ascontiguousarray(width_us[first:])
-    found, size = equal_runs(width, known[first:], memory, np.zeros((MOST_RUNS, 3), np.int64))
+    limit = ALIKE * float(width.max(initial=0.0))
+    found, size = equal_runs(width, known[first:], memory, limit, np.empty((MOST_RUNS, 4)))
     worked = np.convolve(width > 0.0, np.ones(memory))[: width.size] > 0.5
     rows = np.arange(width.size)
     label, touched = rows.copy(), np.zeros(width.size, bool)
-    for start, stop, lag in _shared(width, found[:size], memory):
+    for start, stop, lag in _best(found[:size], memory):
         # Parts that follow one another, each the repeat of the last: one after the other.
         for begin in range(start + memory, stop, lag):
             one = rows[begin : min(begin + lag, stop)]
@@ -60,17 +61,11 @@ def _crowded(label: np.ndarray, touched: np.ndarray) -> np.ndarray:
     return np.isin(label, label[order][1:][near])
 
 
-def _shared(width: np.ndarray, found: np.ndarray, memory: int) -> list[tuple[int, int, int]]:
-    """Start, stop and lag of the runs that count, the best first."""
-    limit = ALIKE * float(width.max(initial=0.0))
-    ranked = []
-    for start, stop, lag in found.tolist():
-        own = width[start:stop]
-        apart = float(np.mean(np.abs(own - width[start + lag : stop + lag])))
-        if float(own.max() - own.min()) > 2.0 * SAME_US and apart <= limit:
-            ranked.append((apart, start - stop, start, stop, lag))
+def _best(found: np.ndarray, memory: int) -> list[tuple[int, int, int]]:
+    """Start, stop and lag of the runs that count: of several alignments of the same two parts the closest."""
     kept: list[tuple[int, int, int]] = []
-    for _, _, start, stop, lag in sorted(ranked):
+    order = np.lexsort((found[:, 0] - found[:, 1], found[:, 3]))
+    for start, stop, lag in found[order, :3].astype(np.int64).tolist():
         beside = (other for other in kept if abs(other[2] - lag) < APART)
         if not any(start < other[1] - memory and other[0] + memory < stop for other in beside):
             kept.append((start, stop, lag))
@@ -88,26 +83,42 @@ def _same(width, known, i, j):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def equal_runs(width, known, memory, found):  # pragma: no cover
-    """Start, stop and lag of every run of equal widths of at least twice the memory, and how many there are.
+def equal_runs(width, known, memory, limit, found):  # pragma: no cover
+    """Start, stop, lag and mean difference of every run of equal widths of at least twice the memory; their number.
 
-    A window is looked at from its end, so that a difference there leaves all of it out.
+    A run that is level throughout repeats nothing. A window is looked at from its end, so that a difference there
+    leaves all of it out, and what is level in both places is passed over in one step.
     """
     size, count, least = width.size, 0, 2 * memory
+    begin, end = np.arange(size), np.arange(size) + 1
+    for i in range(1, size):
+        if known[i] and known[i - 1] and width[i] == width[i - 1]:
+            begin[i] = begin[i - 1]
+    for i in range(size - 2, -1, -1):
+        if begin[i + 1] == begin[i]:
+            end[i] = end[i + 1]
     for lag in range(memory, size - least):
         start = 0
         while start + least <= size - lag:
             i = start + least - 1
             while i >= start and _same(width, known, i, i + lag):
-                i -= 1
+                level = abs(width[i] - width[i + lag]) <= SAME_US
+                i = (max(begin[i], begin[i + lag] - lag) if level else i) - 1
             if i >= start:
                 start = i + 1
                 continue
             stop = start + least
             while stop < size - lag and _same(width, known, stop, stop + lag):
-                stop += 1
-            if count < found.shape[0]:
-                found[count, 0], found[count, 1], found[count, 2] = start, stop, lag
-                count += 1
+                level = abs(width[stop] - width[stop + lag]) <= SAME_US
+                stop = min(end[stop], end[stop + lag] - lag) if level else stop + 1
+            if begin[stop - 1] > start and count < found.shape[0]:
+                apart, low, high = 0.0, width[start], width[start]
+                for i in range(start, stop):
+                    apart += abs(width[i] - width[i + lag])
+                    low, high = min(low, width[i]), max(high, width[i])
+                if high - low > 2.0 * SAME_US and apart <= limit * (stop - start):
+                    found[count, 0], found[count, 1], found[count, 2] = start, stop, lag
+                    found[count, 3] = apart / (stop - start)
+                    count += 1
             start = stop + 1
     return found, count
