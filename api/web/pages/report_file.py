@@ -12,6 +12,7 @@ from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.models import explanation, stored_model
 from stimrig.api.web.pages.environment import HERE, environment
 from stimrig.api.web.pages.static import packaged
+from stimrig.identify.yardstick import repetition_sentences
 
 
 def comparison_html(
@@ -91,7 +92,13 @@ def improvement_html(
         shown = places if explanation.noisy(after) else []
         drawn["residual-after"] = diagnosis_charts.residual(after, segments or [], shown)
     return _page(
-        "report_improve.html", title=f"{name}: what was missing", found=found, rows=rows, why=view, figures=drawn
+        "report_improve.html",
+        title=f"{name}: what was missing",
+        found=found,
+        rows=rows,
+        why=view,
+        figures=drawn,
+        repetition=repetition_sentences(found["steps"][-1]),
     )
 
 

@@ -96,6 +96,9 @@ class By(Document):
     frequency: list[Part]
 
 
+REPETITION = "what repeats in the recording, and how much of that the model explains; null: from an older version"
+
+
 class ComparisonOut(Document):
     """Measurement against the model's free run."""
 
@@ -103,6 +106,7 @@ class ComparisonOut(Document):
     ceiling_percent: float | None
     rms_nm: float | None
     noise_sd_nm: float | None
+    repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
     by: By | None = None
     where: list[Place] = Field([])
     series: dict[str, list[JsonValue] | float | str | None] = Field(
@@ -143,6 +147,7 @@ class FiguresOut(Document):
     held_out_fit_percent: float | None = Field(None, description="best-fit of held-out rows, %")
     rms_nm: float | None = Field(None, description="N·m")
     held_out_rms_nm: float | None = Field(None, description="N·m")
+    repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
 
 
 class StepOut(FiguresOut):
