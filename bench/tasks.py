@@ -48,8 +48,8 @@ class Task:
         One of that unit, in the record's torque.
     true : bool
         Whether it is the paper's muscle, with its five parameters.
-    own : dict
-        Options of `fit` with an effect of `OWN_EFFECTS`, where there is one for it.
+    own : tuple of dict
+        Options of `fit` with an effect of `OWN_EFFECTS`, where there is one for it: the fitted rows choose among them.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Task:
     unit: str = "× noise"
     scale: float = 1.0
     true: bool = False
-    own: dict[str, Any] | None = None
+    own: tuple[dict[str, Any], ...] = ()
 
     @property
     def rate_hz(self) -> float:
@@ -152,10 +152,11 @@ def last_unseen(runs: Sequence[benchmarks.Run], shown: int) -> list[str]:
 def tanks(data: Path | None) -> Task:
     """Cascaded tanks. A sample, 4 s, stands for a pulse interval, and the pump's voltage for a width.
 
-    By Bernoulli's law the level at rest goes with the square of the inflow: the curve of the physics is of order two.
+    By Bernoulli's law the level at rest goes with the square of the inflow, as far as the pump gives what it is told.
     """
     runs = [(50.0 * u, y) for u, y in benchmarks.tanks(data)]
-    own = {"effects": ["overflowing_tanks"], "recruitment": "power-series", "power": 2}
+    curves = ({"recruitment": "power-series", "power": 2}, {"recruitment": "power-series", "power": 3}, {})
+    own = tuple({"effects": ["overflowing_tanks"]} | curve for curve in curves)
     return joined("cascaded tanks", runs, last_unseen(runs, SHOWN), RATE_HZ, unit="V", own=own)
 
 

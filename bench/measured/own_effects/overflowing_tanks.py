@@ -17,12 +17,12 @@ STEPS = 4
 def fill(aim, values, begins, step_s):
     level = np.empty_like(aim)
     for m in range(aim.shape[0]):
-        first_s, second_s, brim_1, brim_2, spilt, bottom, begin_1, begin_2 = values[m]
+        first_s, second_s, brim_1, brim_2, spilt, begin_1, begin_2 = values[m]
         a = b = 0.0
         for k in range(aim.shape[1]):
             if begins[k]:
                 a, b = begin_1, begin_2
-            inflow, total = np.sqrt(max(aim[m, k] - bottom, 0.0)), 0.0
+            inflow, total = np.sqrt(max(aim[m, k], 0.0)), 0.0
             for _ in range(STEPS):
                 between = np.sqrt(a)
                 a += step_s / STEPS * (inflow - between) / first_s
@@ -31,7 +31,7 @@ def fill(aim, values, begins, step_s):
                 b += step_s / STEPS * (between + spilt * over - np.sqrt(b)) / second_s
                 b = max(min(b, brim_2), 0.0)
                 total += b / STEPS
-            level[m, k] = total + bottom
+            level[m, k] = total
     return level
 
 
@@ -50,18 +50,15 @@ PARAMETERS = (
     Parameter("brim_1", "1", 0.2, 2.0, np.inf, (1.0,), about="level at which the first runs over"),
     Parameter("brim_2", "1", 0.2, 2.0, np.inf, (1.0,), about="the second"),
     Parameter("spilt", "1", 0.0, 1.0, 0.0, (0.2,), about="share of what runs over that falls into the second"),
-    Parameter("bottom", "1", -0.5, 0.9, 0.0, (0.0,), about="level of the holes above the sensor's zero"),
     Parameter("begin_1", "1", 0.0, 1.5, 0.0, (0.5,), about="first level at a begin"),
     Parameter("begin_2", "1", 0.0, 1.5, 0.0, (0.5,), about="second level at a begin"),
 )
 
 
-def start(bottom: float, first_s: float, brim: float) -> dict[str, float]:
+def start(first_s: float, brim: float) -> dict[str, float]:
     """Dynamics of the model itself quick, so that the tanks are the slow ones."""
-    begins = {"begin_1": 0.5 * (1 - bottom), "begin_2": 0.5 * (1 - bottom)}
-    quick = {"base.time_constant_s": 0.02, "base.damping": 1.0}
-    own = {"first_s": first_s, "second_s": 0.5, "brim_1": brim, "brim_2": brim, "spilt": 0.2, "bottom": bottom}
-    return own | begins | quick
+    own = {"first_s": first_s, "second_s": 0.5, "brim_1": brim, "brim_2": brim, "spilt": 0.2}
+    return own | {"begin_1": 0.4, "begin_2": 0.4, "base.time_constant_s": 0.02, "base.damping": 1.0}
 
 
 EFFECT = Effect(
@@ -75,7 +72,7 @@ EFFECT = Effect(
             PARAMETERS,
             tanks,
             batched=True,
-            restarts=(start(0.0, 0.5, 1.0), start(0.4, 0.5, 1.0), start(0.4, 0.5, 0.6), start(0.4, 1.0, 1.0)),
+            restarts=tuple(start(first_s, brim) for first_s in (0.5, 1.0) for brim in (0.6, 1.0)),
         ),
     ),
     signature="Slower at high levels, and cut off there; quick again as soon as the inflow falls.",
