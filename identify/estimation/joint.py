@@ -138,7 +138,7 @@ class Fitted:
             if not effect.predictable:
                 left = problem.at_samples(self.theta) - problem.at_samples(self.theta, frozenset([effect.id]))
                 mean = 0.0 if effect.sporadic else float(np.mean(left[rows]))
-                found[effect.id] = mean, float(np.sqrt(np.mean((left[rows] - mean) ** 2)))
+                found[effect.id] = mean, float(np.sqrt(np.mean(left[rows] ** 2)))
         return found
 
     @cached_property

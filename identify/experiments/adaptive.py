@@ -11,7 +11,7 @@ a known person, or on two usual muscles for a new one. The worse of the two coun
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -21,9 +21,11 @@ from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest, IdentifyError
 from stimrig.identify.estimation.averaged import averaged
+from stimrig.identify.estimation.disturbance import disturbed, unsure
 from stimrig.identify.estimation.earlier import Change, Earlier
+from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.residual_tests import residual_tests
-from stimrig.identify.estimation.samples import prepare
+from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.estimation.short_record import Short, fit_short
 from stimrig.identify.experiments.designs import Piece, Segment, pieces
 from stimrig.identify.experiments.knowledge import Foresight, Knowledge, Target, knowledge
@@ -40,6 +42,8 @@ ALARM = 1e-3
 """P-value of a residual test below which the structure fits badly; each test is asked about ten times in one test."""
 EXCESS = 1.5
 """A residual larger than this many times the samples' noise is none of noise."""
+ROUNDS = 3
+"""How often a disturbance is looked for and taken off, each time beside a better fit of the muscle."""
 SETTLED_S = 4.0
 """No structure is judged before this, and so nothing is known well enough."""
 SECOND_COST = 2.0
@@ -129,9 +133,9 @@ def decide(
     if record is None or record.time_s[-1] - record.time_s[0] < LEAST_S:
         return _opening(largest_us, pulse_rate_hz, left_s, left_nm_s, last)
     try:
-        grid, _ = prepare(record)
+        grid, raw = prepare(record)
         with np.errstate(all="ignore"):
-            short, wrong = _fitted(grid, last, before.short if before else None)
+            short, wrong = _fitted(grid, raw, last, before.short if before else None)
     except (np.linalg.LinAlgError, IdentifyError) as error:
         return Decision("misfit", words=f"No model can be fitted ({error}). The rest of the fixed test is played.")
     known = knowledge(short)
@@ -160,29 +164,44 @@ def _opening(largest_us: float, rate: float, left_s: float, left_nm_s: float, la
     return Decision("next", (Piece("opening", widths).segment(1),), "A first look at the whole range.", None, dose)
 
 
-def _fitted(grid: Grid, last: Earlier | None, before: Short | None) -> tuple[Short, str | None]:
-    """The fit, and why it does not describe the record; with more knots where the usual number leaves a residual."""
+def _fitted(grid: Grid, raw: Raw, last: Earlier | None, before: Short | None) -> tuple[Short, str | None]:
+    """The fit, and why it does not describe the record; with more knots where the usual number leaves a residual, then
+    without what no pulse causes."""
     fine = before is not None and before.basis.knots_us.size > KNOTS
     short = fit_short(grid, grid.fitted, last=last, before=before, fine=fine)
     wrong = _misfit(short)
     if wrong and not fine:
         short = fit_short(grid, grid.fitted, last=last, before=short, fine=True)
         wrong = _misfit(short)
+    mains_hz = None if raw.hum is None else raw.hum["frequency_hz"]
+    for _ in range(ROUNDS if wrong and _finite(short) else 0):
+        beside, added_nm = disturbed(short, short.grid.mean_noise_nm(short.rows), mains_hz)
+        grid = replace(grid, torque_nm=grid.torque_nm - added_nm)
+        short = fit_short(grid, grid.fitted, last=last, before=short, fine=True)
+        if _left(beside, short.grid.mean_noise_nm(short.rows)) is None:
+            return unsure(short, beside), None
     return short, wrong
+
+
+def _finite(short: Short) -> bool:
+    return bool(np.all(np.isfinite(short.coefficients_nm)) and np.all(np.isfinite(short.dynamics)))
 
 
 def _misfit(short: Short) -> str | None:
     """Why the structure does not describe the record; None if it does, or if it is too early to say."""
-    if not np.all(np.isfinite(short.coefficients_nm)) or not np.all(np.isfinite(short.dynamics)):
+    if not _finite(short):
         return "The estimate is not finite."
-    if not _settled(short):
-        return None
-    white = short.grid.mean_noise_nm(short.rows)
-    own = float(np.sqrt(np.mean(short.residual_nm[short.rows] ** 2)))
+    return (
+        _left(averaged(short, mean_of_draws=False), short.grid.mean_noise_nm(short.rows)) if _settled(short) else None
+    )
+
+
+def _left(fitted: Fitted, white_nm: float) -> str | None:
+    """Why what a fit leaves is more than noise; None if it is not."""
+    own, white = fitted.rms_nm, white_nm
     if own > EXCESS * white:
         return f"The structure leaves {own:.2g} N·m where the noise is {white:.2g} N·m."
-    tests = residual_tests(averaged(short, mean_of_draws=False))
-    failed = [name for name, test in tests.items() if test["p_value"] < ALARM]
+    failed = [name for name, test in residual_tests(fitted).items() if test["p_value"] < ALARM]
     return f"The residual is not noise ({' and '.join(failed)})." if failed else None
 
 

@@ -82,8 +82,9 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
 
 
 def unforeseen(model: Muscle) -> dict[str, tuple[float, float]]:
-    """What cannot be foreseen on another record, by effect: the mean that stays there as a zero, and the root mean
-    square about it, in the fitted rows of its own record, N·m; 0 and 0 where an older version did not say."""
+    """What cannot be foreseen on another record, by effect: its mean in the fitted rows of its own, which stays as a
+    zero, and its root mean square there (a zero may also be where it began), N·m; 0 where an older version is silent.
+    """
     told = {e["id"]: e.get("unforeseen", {}) for e in model.effects if not find_effect(e["id"]).predictable}
     return {effect: (said.get("mean_nm", 0.0), said.get("rms_nm", 0.0)) for effect, said in told.items()}
 

@@ -103,6 +103,30 @@ def test_a_structure_that_fits_badly_is_never_enough():
     assert "rest of the fixed test" in made.decision.words
 
 
+def wandering(seed: int) -> np.ndarray:
+    """A zero that warms up and a breath of a fifth of a hertz, at 400 Hz, N·m."""
+    time_s = np.arange(16_000) / 400.0
+    breath_nm = 0.15 * np.sin(2.0 * np.pi * 0.2 * time_s + seed) ** 3
+    return breath_nm + 0.3 * -np.expm1(-time_s / 15.0)
+
+
+@pytest.mark.slow
+def test_breath_and_a_moving_zero_are_no_misfit_and_their_doubt_is_in_the_bands():
+    muscle = sigmoid(51_011)
+    made = play(muscle, noise(51_011) + wandering(1), Target(), left_s=25.0, left_nm_s=1e3)
+    known = made.decision.knowledge
+    assert made.decision.kind in ("enough", "spent") and known is not None
+    assert np.all(np.abs(muscle.curve(known.curve.at) / known.plateau_nm - known.curve.value) <= known.curve.half)
+    assert np.all(np.abs(muscle.step(known.step.at) - known.step.value) <= known.step.half)
+
+
+@pytest.mark.slow
+def test_a_misfit_beside_a_disturbance_is_still_one():
+    disturbed = noise(51_006) + wandering(2)
+    made = play(Tiring(), disturbed, Target(5.0, 5.0), left_s=30.0, left_nm_s=1e3, rate_hz=200.0)
+    assert made.decision.kind == "misfit"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("run_away", [lambda t: 0.02 * np.exp(2.0 * t), lambda t: 3.0 * np.sin(20.0 * t)])
 def test_torque_that_runs_away_is_never_enough(run_away):
