@@ -124,6 +124,9 @@ QUIET = 0.0015
 """If the noise of a sample is below this share of the torque's range, the spline gets more knots: its error at a bend
 would be visible."""
 
+SUDDEN = 150.0
+"""If what slow noise cannot foresee of a pilot's residual is so many times the noise, the torque jumps by itself."""
+
 
 def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Solution:
     """A first fit with few knots, from the best of several starting values of the time constant.
@@ -165,13 +168,21 @@ def designed(first: Solution, count: int | None = None) -> tuple[Projection, Sec
     return replace(old, basis=basis, roughness=roughness), first.linear
 
 
+def _is_quiet(first: Solution) -> bool:
+    """Whether the noise is so small that few knots would show, and is what limits the fit: not jumps, as of an arm."""
+    noise_nm = first.projection.grid.noise_sd_nm
+    if not 0.0 < noise_nm < QUIET * first.projection.range_nm:
+        return False
+    ar1 = ar1_or_white(first.residual_nm, first.projection.stretches)[0]
+    return bool(np.sqrt(first.whitened_variance(ar1)) < SUDDEN * noise_nm)
+
+
 def estimate(
     grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: float | None = None
 ) -> tuple[Solution, float]:
     """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
     first = pilot_solution(grid, rows, delay_s)
-    quiet = 0.0 < grid.noise_sd_nm < QUIET * float(np.ptp(grid.torque_nm[rows]))
-    projection, start = designed(first, QUIET_KNOTS if knots is None and quiet else knots)
+    projection, start = designed(first, QUIET_KNOTS if knots is None and _is_quiet(first) else knots)
     solution = search(projection, start, variance=first.variance)
     ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
     if delta_bic > 0 and knots is None and projection.basis.size < KNOTS:
