@@ -7,11 +7,13 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 
 RELAXED_S = 1.0
-"""So long after its last pulse a muscle has relaxed; where no rest is that long, half of the longest is taken."""
+"""So long after its last pulse a muscle has relaxed; where no rest is twice as long, half of the longest is taken."""
 SLOW_S = 0.2
 """Time constant of a slow muscle: what it may still pull that long after its last pulse widens the zero's sd."""
 LEAST_SHARE = 0.05
 """The zero is not taken as better known than this share of the torque's range: a residual state may hold it up."""
+IDLE_SHARE = 0.1
+"""Pulses of this share of the largest width are as good as none, where a record has no rest without pulses."""
 
 
 def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -32,10 +34,13 @@ def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     level_nm, sd_nm : ndarray, shape (B,)
         N·m, of each part.
     """
-    since_s = grid.step_s * _since_pulse(grid)
+    for strongest_us in (0.0, IDLE_SHARE * float(np.max(grid.pulse_width_us))):
+        since_s = grid.step_s * _since_pulse(grid, strongest_us)
+        if np.max(since_s[rows]) >= 2.0 * RELAXED_S:
+            break
     found = [_level(grid.torque_nm, since_s, rows & (grid.part == part)) for part in range(grid.begins.size)]
     known = [pair for pair in found if pair is not None]
-    level_nm, sd_nm = np.array([pair if pair is not None else known[0] for pair in found]).T
+    level_nm, sd_nm = np.array([pair or known[0] for pair in found]).T
     return level_nm, sd_nm
 
 
@@ -43,7 +48,7 @@ def _level(torque_nm: np.ndarray, since_s: np.ndarray, rows: np.ndarray) -> tupl
     if not rows.any():
         return None
     relaxed_s = min(RELAXED_S, 0.5 * float(since_s[rows].max()))
-    own_nm = torque_nm[rows & (since_s >= relaxed_s) & (since_s > 0.0 if relaxed_s > 0.0 else True)]
+    own_nm = torque_nm[rows & (since_s >= relaxed_s)]
     level_nm = float(np.median(own_nm))
     low_nm, high_nm = np.percentile(torque_nm[rows], (0.5, 99.5))
     scatter_nm = 1.4826 * float(np.median(np.abs(own_nm - level_nm)))
@@ -51,9 +56,9 @@ def _level(torque_nm: np.ndarray, since_s: np.ndarray, rows: np.ndarray) -> tupl
     return level_nm, max(float(np.hypot(scatter_nm, share * (high_nm - low_nm))), 1e-9)
 
 
-def _since_pulse(grid: Grid) -> np.ndarray:
-    """Intervals without a pulse up to each, itself included; counted anew where a part or a known state begins."""
+def _since_pulse(grid: Grid, strongest_us: float) -> np.ndarray:
+    """Intervals without a stronger pulse up to each, itself included; anew where a part or a known state begins."""
     at = np.arange(grid.size)
-    last = np.where(grid.pulse_width_us > 0.0, at, -1)
+    last = np.where(grid.pulse_width_us > strongest_us, at, -1)
     last[grid.starts] = np.maximum(last[grid.starts], grid.starts - 1)
     return at - np.maximum.accumulate(last)
