@@ -41,6 +41,7 @@ SLOW = (
             "invariance",
             "moving_joint",
             "renewed_curve",
+            "same_record",
             "tracked_states",
             "tracking",
             "uncertainty",
