@@ -76,7 +76,7 @@ def measure(seed: int, data: Path | None, only: Sequence[str]) -> tuple[list[Con
             continue
         rows.append([task.name, task.unit])
         for contender in chosen:
-            rows[-1].append(one(contender, task, warm=len(rows) == 1))
+            rows[-1].append(one(contender, task, warm=len(rows) == 1 and black_boxes.BUDGET_S > 0))
             print(f"{task.name}, {contender.name}: {rows[-1][-1]} ({task.unit})", flush=True)
     return chosen, rows
 
@@ -112,7 +112,9 @@ def run(arguments: Sequence[str] | None = None) -> None:
     made.prog = "python -m bench rivals"
     made.add_argument("--data", type=Path, help="folder of local copies, see bench/measured")
     made.add_argument("--only", default="", help="words of tasks or contenders, separated by commas")
-    made.add_argument("--budget", type=float, default=BUDGET_S, help="s in which a box looks for better starts")
+    made.add_argument(
+        "--budget", type=float, default=BUDGET_S, help="s in which a box looks for better starts; 0: one, cold"
+    )
     made.add_argument("--seed", type=int, default=SEED)
     made.add_argument("--write", action="store_true", help=f"write docs/results/{TARGET.name}")
     options = made.parse_args(arguments)
