@@ -35,6 +35,7 @@ from stimrig.identify.estimation.effect_fit import (
 )
 from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
+from stimrig.identify.estimation.left_out import Difference, LeftOut, difference, leave_out
 from stimrig.identify.estimation.plain import fit_plain, knows_joint, renewed_curve
 from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.noise import NoiseLevel
@@ -68,6 +69,8 @@ class EffectSearch:
     chain: list[Fitted] = field(default_factory=list)  # the base and what was detected, then one effect more each time
     added: list[str] = field(default_factory=list)  # effects, in order
     margins: list[float] = field(default_factory=list)  # log evidence required in each round
+    left_out: list[LeftOut] = field(default_factory=list)  # what each model of the chain predicts on left-out blocks
+    refused: dict[str, Difference] = field(default_factory=dict)  # likely effects that predict left-out blocks no better
     free_gain: list[float] = field(default_factory=list)  # log evidence for a gain that varies without a law
     losses: dict[str, float] = field(default_factory=dict)  # log evidence lost without each effect, if of several
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # intervals in which the muscle rests
@@ -83,10 +86,11 @@ class EffectSearch:
         """The model with all effects found."""
         return self.chain[-1]
 
-    def append(self, fitted: Fitted, effect: str = "") -> None:
+    def append(self, fitted: Fitted, effect: str = "", unseen: LeftOut | None = None) -> None:
         """One model more, with an effect more than the last."""
         self.added += [effect] if effect else []
         self.chain.append(fitted)
+        self.left_out.append(unseen or leave_out(fitted))
         self.residuals.append(residual_structure(fitted, self.quiet))
 
 
@@ -133,7 +137,7 @@ def search_effects(
         best = _best_of_round(search, progress or silent, number)
         if best is None:
             break
-        search.append(best.fitted, best.effect.id)
+        search.append(best[0].fitted, best[0].effect.id, best[1])
         if number:
             _exchange(search)
     if len(search.added) > 1:
@@ -153,8 +157,8 @@ def _add_detected(search: EffectSearch) -> Fitted:
     return base
 
 
-def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> Candidate | None:
-    """The best candidate of a round; None if none gains enough."""
+def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tuple[Candidate, LeftOut] | None:
+    """The likeliest candidate of a round that predicts left-out blocks better; None if none does."""
     before = search.rounds[0] if search.rounds else []
     tried = _scan(search.last, lambda done, text: progress(0.1 + 0.3 * number + 0.3 * done, text), before)
     candidates = sorted((_discounted(search, c) for c in tried), key=lambda c: -c.gain)
@@ -162,7 +166,21 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> Can
     free_gain = try_effect(FREE_GAIN, search.last)
     search.free_gain.append(free_gain.gain if free_gain else 0.0)
     search.margins.append(_margin(search, len(search.added)))
-    return next((c for c in candidates if c.gain >= _margin(search, len(search.added), c)), None)
+    search.refused = {}
+    for candidate in candidates[: thresholds.JUDGED]:
+        if candidate.gain < search.margins[-1]:
+            break
+        unseen = leave_out(candidate.fitted)
+        seen = difference(search.left_out[-1], unseen)
+        if predicts_better(candidate.effect, seen):
+            return candidate, unseen
+        search.refused[candidate.effect.id] = seen
+    return None
+
+
+def predicts_better(effect: Effect, seen: Difference) -> bool:
+    """Whether left-out blocks speak for an effect; of one that cannot be foreseen: whether they do not speak against it."""
+    return seen.errors >= (thresholds.NO_WORSE if effect.sporadic else thresholds.BETTER)
 
 
 # ---- one round: every effect of the library tried on a model -----------------------------------------------------
@@ -255,38 +273,9 @@ def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
     return replace(candidate, gain=weight * candidate.gain)
 
 
-def _margin(search: EffectSearch, number: int, candidate: Candidate | None = None) -> float:
-    """Log evidence that an effect must gain in a round: more where it may only repair the first one's inexact form."""
-    if not number and not search.held:
-        return FIRST_MARGIN
-    share = thresholds.NEXT_SHARE if candidate is None else _required_share(search, candidate)
-    return max(thresholds.NEXT_MARGIN, share * _first_gain(search))
-
-
-def _first_gain(search: EffectSearch) -> float:
-    """Log evidence gained by the first effect, or by those of the structure; 0 for a narrow band, which is noise."""
-    if search.held:
-        band = any(find_effect(name).band for name in search.held)
-        return 0.0 if band else search.base.log_evidence - search.plain.log_evidence
-    first = search.rounds[0][0]
-    return 0.0 if first.effect.band else first.gain
-
-
-def _required_share(search: EffectSearch, candidate: Candidate) -> float:
-    """Share of the first effect's gain that a further effect must gain."""
-    effect, stage = candidate.effect, candidate.form.stage
-    if effect.sporadic:
-        return thresholds.UNPREDICTABLE_SHARE
-    if stage == "additive":
-        return 0.5 * thresholds.CONFIRMED_SHARE
-    if stage in ("gain", "pulse_width") and search.free_gain[-1] > thresholds.FREE_GAIN_CONFIRMS * candidate.gain:
-        return thresholds.CONFIRMED_SHARE
-    for name, own in search.last.effects:
-        both_dynamic = own.stage in thresholds.DYNAMIC and stage in thresholds.DYNAMIC
-        alike = both_dynamic or name in effect.resembles or effect.id in find_effect(name).resembles
-        if alike and name not in search.detected:
-            return thresholds.SIMILAR_SHARE
-    return thresholds.NEXT_SHARE
+def _margin(search: EffectSearch, number: int) -> float:
+    """Log evidence that an effect must gain in a round."""
+    return thresholds.NEXT_MARGIN if number or search.held else FIRST_MARGIN
 
 
 def _exhausted(search: EffectSearch) -> bool:
@@ -294,8 +283,7 @@ def _exhausted(search: EffectSearch) -> bool:
     left, last = search.residuals[-1], search.last
     if last.noise.ar1 > thresholds.SLOWEST_AR1 and left.slow_nm > left.white_nm:
         return False  # such slow noise may be a drift: the rests cannot tell how small the residual could be
-    least = max(thresholds.NEXT_MARGIN, thresholds.CONFIRMED_SHARE * _first_gain(search))
-    return left.ideal - last.log_likelihood < least and left.ratio < least
+    return left.ideal - last.log_likelihood < thresholds.NEXT_MARGIN and left.ratio < thresholds.NEXT_MARGIN
 
 
 def prior(effect: Effect) -> float:
@@ -334,6 +322,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
     wanted, tried = search.added, search.rounds[: len(search.added)]
     search.added, search.chain, search.residuals = [], search.chain[:1], search.residuals[:1]
     search.rounds, search.margins, search.free_gain = [], [], search.free_gain[: len(wanted)]
+    search.left_out = search.left_out[:1]
     for number, effect in enumerate(wanted):
         before, described = search.last, find_effect(effect)
         fitted = last if number == len(wanted) - 1 else _part(last, before, [*effect_names(before), effect])
@@ -341,14 +330,16 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
         gain = fitted.log_evidence - before.log_evidence + described.prior - (BAND_COST if described.band else 0.0)
         own = dict(fitted.effects).get(effect, described.forms[0])
         found = _discounted(search, Candidate(described, own, fitted, gain, known | {own.name: gain}))
-        if fitted is last and found.gain < _margin(search, number, found):
+        unseen = leave_out(fitted)
+        seen = difference(search.left_out[-1], unseen)
+        if found.gain < _margin(search, number) or not predicts_better(described, seen):
             return  # beside the other effects it no longer gains enough
         # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
         most = found.gain - (won if number == index else 0.0)
         rivals = [replace(c, gain=min(c.gain, most)) for c in tried[number] if c.effect.id != effect]
         search.rounds.append(sorted([found, *rivals], key=lambda c: -c.gain))
         search.margins.append(_margin(search, number))
-        search.append(fitted, effect)
+        search.append(fitted, effect, unseen)
 
 
 def _part(last: Fitted, before: Fitted, kept: list[str]) -> Fitted:

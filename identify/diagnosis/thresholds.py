@@ -14,16 +14,12 @@ FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
 """Log evidence that every further effect must gain, at least."""
-NEXT_SHARE = 0.12
-"""A further effect must also gain this share of what the first effect gained."""
-SIMILAR_SHARE = 0.25
-"""The same if it resembles the first one, or both change the dynamics: one effect in an inexact form looks like two."""
-CONFIRMED_SHARE = 0.03
-"""The same if something confirms it: rests confirm a drift of the zero, a gain without a law confirms a slow gain."""
-FREE_GAIN_CONFIRMS = 0.4
-"""A gain without a law confirms a slow gain if it finds this share of its log evidence."""
-UNPREDICTABLE_SHARE = 0.4
-"""The same for sporadic effects: they can repair any error, so more is required."""
+JUDGED = 4
+"""So many candidates of a round, the likeliest first, are judged by left-out blocks."""
+BETTER = 2.0
+"""Standard errors by which the error on left-out blocks must fall with an effect."""
+NO_WORSE = -1.0
+"""The same for effects that cannot be foreseen: they need not predict, but they must not spoil what the muscle does."""
 EFFORT_WEIGHT = 0.92
 """Weight of the evidence for efforts. Where a law explains as much, the law is preferred, since it can be tested."""
 EFFORT_WEIGHT_ONLY_AT_WORK = 0.85

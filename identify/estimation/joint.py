@@ -161,6 +161,7 @@ def solve(
     most: int = 20,
     tolerance: float = 0.02,
     floor: float | None = None,
+    profiled: bool = True,
 ) -> Fitted:
     """Find the most probable parameters, from a start.
 
@@ -178,8 +179,10 @@ def solve(
         Stop when the log posterior rises by less.
     floor : float or None
         Stop after the first step if this log evidence is out of reach.
+    profiled : bool
+        Whether the noise is estimated at each step; else it stays as given.
     """
-    start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True)
+    start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
     assert start is not None
 
     def trials(at: _Point, step: int, damping: float) -> Trial[_Point] | None:
@@ -197,7 +200,7 @@ def solve(
         def trial(damping: float) -> _Point:
             moved = change if damping == first else _step(at, damping)[0]
             there = np.clip(at.theta + moved, problem.lower, problem.upper)
-            return _at(problem, there, at.noise) or replace(at, value=-np.inf)
+            return _at(problem, there, at.noise, profiled=profiled) or replace(at, value=-np.inf)
 
         return trial
 
@@ -251,12 +254,18 @@ class _Point:
         return self.value - 0.5 * (float(np.linalg.slogdet(self.hessian)[1]) - self.problem.prior_log_det)
 
 
-def _at(problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = False) -> _Point | None:
+def _at(
+    problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = False, profiled: bool = True
+) -> _Point | None:
     mean, slopes = problem.run(theta, derivatives=True)
     if slopes is None or not np.all(np.isfinite(mean)):
         return None
     residual = problem.setup.target_nm - mean
-    level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
+    if profiled:
+        level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
+    else:
+        white = problem.setup.whitened(residual[None, :], noise)
+        level, log_likelihood = noise, -0.5 * float(np.sum(white**2))
     return _Point(problem, theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
 
 

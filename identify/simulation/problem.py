@@ -147,11 +147,16 @@ class Problem:
 
     # ---- simulation ----
 
-    def run(self, theta: np.ndarray, *, derivatives: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
-        """Predicted interval means, N·m, shape (K,), and derivatives, shape (P, K), per unit of `theta`."""
+    def run(
+        self, theta: np.ndarray, *, derivatives: bool = False, skip: frozenset[str] = frozenset()
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Predicted interval means, N·m, shape (K,), and derivatives, shape (P, K), per unit of `theta`.
+
+        Additive effects in `skip` are left out.
+        """
         stages = _StagePass(self, theta, derivatives)
         mean = stages.read(*stages.to_boundaries())
-        mean = stages.add(mean)
+        mean = stages.add(mean, skip=skip)
         mean = stages.sense(mean)
         if not derivatives:
             return mean[0], None

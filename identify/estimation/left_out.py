@@ -1,0 +1,188 @@
+"""Left-out blocks: what a model predicts, in free run, on parts of its record that its fit has not seen.
+
+Likelihood takes a candidate for true: on thousands of correlated rows a wrong but flexible equation wins. The error on
+blocks that are left out asks less: whether the candidate predicts better (Vehtari, Gelman and Gabry 2017 on the
+difference and its standard error; Roberts and others 2017 on blocks in place of rows).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation.joint import Fitted, gram, solve
+from stimrig.identify.records.record import FORGOTTEN_S
+from stimrig.identify.simulation.problem import Problem
+
+APART_S = 1.0
+"""A pause that separates two bouts of stimulation; the zeros of a PRBS are shorter."""
+ENOUGH_BOUTS = 8
+"""So many bouts are a block each; of fewer, long ones are cut."""
+PIECES, LEAST_S = 10, 2.0
+"""Blocks that a record of few bouts is cut into, and their least length, s."""
+START_S = 0.3
+"""Rows after a start that stay in the fit: they alone tell the state that the record begins with."""
+NEAR = 0.02
+"""A width farther than this (share of the largest) from every width of the fit lies on a guessed part of the curve."""
+LEAST_ROWS = 20
+"""A block with fewer rows to judge by is not counted."""
+TRUSTED = 0.5
+"""A step in a straight line is trusted where it gains this share of what it promised."""
+STEPS = 6
+SLACK = 0.05
+"""Log posterior that a step may fall short of its promise by."""
+FLOOR_SHARE = 0.0015
+"""Share of the largest torque below which an error does not matter."""
+
+
+def blocks(grid: Grid, rows: np.ndarray) -> np.ndarray:
+    """The number of each interval's block, shape (K,); -1 where `rows` is false.
+
+    Whole bouts of stimulation, each with the rest after it; where there are few, pieces of them. They depend on the
+    pulses alone, so that all models of a record share them.
+    """
+    at = np.flatnonzero(rows & (grid.pulse_width_us > 0))
+    later = at[1:][np.diff(at) > APART_S / grid.step_s]
+    edges = np.unique(np.r_[0, later, grid.begins, grid.size])
+    if later.size + 1 < ENOUGH_BOUTS:
+        edges = _cut(edges, np.r_[0, np.cumsum(rows)], LEAST_S / grid.step_s)
+    return np.where(rows, np.searchsorted(edges, np.arange(grid.size), side="right") - 1, -1)
+
+
+def _cut(edges: np.ndarray, count: np.ndarray, least: float) -> np.ndarray:
+    """Bouts cut into pieces of about equal numbers of rows."""
+    piece = max(count[-1] / PIECES, least)
+    found = [edges]
+    for start, stop in pairwise(edges):
+        pieces = max(round((count[stop] - count[start]) / piece), 1)
+        inner = count[start] + (count[stop] - count[start]) * np.arange(1, pieces) / pieces
+        found.append(np.searchsorted(count, inner))
+    return np.unique(np.concatenate(found))
+
+
+def near_widths(grid: Grid, seen: np.ndarray) -> np.ndarray:
+    """bool, shape (K,): intervals whose width, and all within the muscle's memory before, are near those of `seen`."""
+    widths = np.unique(grid.pulse_width_us[seen])
+    if widths.size < 2:
+        return np.zeros(grid.size, bool)
+    after = np.clip(np.searchsorted(widths, grid.pulse_width_us), 1, widths.size - 1)
+    away = np.minimum(np.abs(grid.pulse_width_us - widths[after]), np.abs(grid.pulse_width_us - widths[after - 1]))
+    memory = np.ones(round(FORGOTTEN_S / grid.step_s))
+    return np.convolve(away > NEAR * float(widths[-1]), memory)[: grid.size] < 0.5
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What a model predicts on left-out blocks.
+
+    Parameters
+    ----------
+    error_nm : ndarray, shape (K,)
+        Measured minus predicted where the block of the interval was left out, N·m; NaN where nothing can be judged.
+    block : ndarray of int, shape (K,)
+        As `blocks` gives it.
+    floor_nm : float
+        Error below which a difference does not matter: that of white noise, N·m.
+    """
+
+    error_nm: np.ndarray
+    block: np.ndarray
+    floor_nm: float
+
+    @cached_property
+    def rms_nm(self) -> float:
+        """Over all blocks, N·m; NaN if none can be judged."""
+        known = self.error_nm[np.isfinite(self.error_nm)]
+        return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+
+def leave_out(fitted: Fitted) -> LeftOut:
+    """The free-run error of a model on each block of its fitted rows, with all parameters found without that block.
+
+    The noise is that of the whole fit. Rows are judged where their widths were seen in the rest of the record.
+    """
+    setup = fitted.problem.setup
+    grid = setup.grid
+    block = blocks(grid, setup.fitted)
+    opening = np.zeros(grid.size, bool)
+    for start in grid.starts:
+        opening[start : start + round(START_S / grid.step_s)] = True
+    error = np.full(grid.size, np.nan)
+    unforeseen = frozenset(effect for effect, _ in fitted.effects if find_effect(effect).sporadic)
+    for number in np.unique(block[block >= 0]):
+        out = (block == number) & ~opening
+        kept = setup.fitted & ~out
+        judged = out & near_widths(grid, kept)
+        if judged.sum() < LEAST_ROWS:
+            continue
+        theta = _refitted(fitted, kept)
+        error[judged] = (setup.target_nm - fitted.problem.run(theta, skip=unforeseen)[0])[judged]
+    floor = max(grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm)
+    return LeftOut(error, block, float(floor))
+
+
+def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
+    """The most probable parameters on some of the fitted rows: one Gauss-Newton step, or more where it is too long."""
+    problem, setup = fitted.problem, fitted.problem.setup
+    own = Problem(setup.with_(fitted=kept), fitted.effects)
+    residual = np.where(setup.fitted, fitted.residual_nm, 0.0)
+    products = gram(own.setup.whitened(np.vstack([residual, fitted.slopes]), fitted.noise))
+    mean, precision = problem.prior
+    away = fitted.theta - mean
+    gradient, hessian = products[0, 1:] - precision @ away, products[1:, 1:] + precision
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    scaled = hessian * scale[:, None] * scale[None, :] + 1e-9 * np.eye(scale.size)
+    step = scale * np.linalg.solve(scaled, scale * gradient)
+    theta = np.clip(fitted.theta + step, problem.lower, problem.upper)
+    left = setup.target_nm - problem.run(theta)[0]
+    white = own.setup.whitened(np.where(kept, left, 0.0)[None, :], fitted.noise)[0]
+    there = theta - mean
+    before = 0.5 * float(products[0, 0]) + 0.5 * float(away @ precision @ away)
+    after = 0.5 * float(white @ white) + 0.5 * float(there @ precision @ there)
+    if before - after >= TRUSTED * 0.5 * float(gradient @ step) - SLACK:
+        return theta
+    return solve(own, fitted.theta, fitted.noise, most=STEPS, profiled=False).theta
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much better one model predicts left-out blocks than another.
+
+    Parameters
+    ----------
+    gain : float
+        Mean over blocks of the logarithm of the ratio of errors; above 0: the second model is better.
+    sd : float
+        Its standard error over blocks.
+    blocks : int
+        Number of blocks.
+    """
+
+    gain: float
+    sd: float
+    blocks: int
+
+    @property
+    def errors(self) -> float:
+        """The gain in standard errors; 0 where two blocks or fewer tell nothing."""
+        return self.gain / max(self.sd, 1e-9) if self.blocks > 2 else 0.0
+
+
+def difference(before: LeftOut, after: LeftOut) -> Difference:
+    """Compare two models of one record, block by block."""
+    ratios = []
+    floor = before.floor_nm**2
+    for number in np.unique(before.block[before.block >= 0]):
+        own = (before.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
+        if own.any():
+            old, new = (np.mean(model.error_nm[own] ** 2) + floor for model in (before, after))
+            ratios.append(0.5 * np.log(old / new))
+    found = np.array(ratios)
+    if found.size < 2:
+        return Difference(float(found.sum()), float("inf"), found.size)
+    return Difference(float(found.mean()), float(np.std(found, ddof=1) / np.sqrt(found.size)), found.size)
