@@ -5,7 +5,7 @@ parameters, and other effects can be compared beside it. It is a stochastic osci
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -35,6 +35,8 @@ class NoiseLevel:
         Of a narrow band: angle per step, rad, decay factor per step, and share of the variance (0: no band).
     slowest, fastest : float
         Bounds of the angle, rad.
+    held : bool
+        Whether it is white whatever the residual looks like: all of a wrong structure's error counts then.
     """
 
     ar1: float
@@ -45,6 +47,7 @@ class NoiseLevel:
     band: float = 0.0
     slowest: float = 0.02
     fastest: float = 2.6
+    held: bool = False
 
     @property
     def at_bound(self) -> bool:
@@ -57,10 +60,18 @@ class NoiseLevel:
         return self.band <= 0.0 and min(self.share, 1.0) * self.ar1 < 0.05
 
 
+WHITE = NoiseLevel(0.0, 0.0, 1.0, held=True)
+"""The noise that is held white, of whatever size."""
+
+
 def profile(
     residual: np.ndarray, stretches: Stretches, near: NoiseLevel, wide: bool = True
 ) -> tuple[NoiseLevel, float]:
     """The most likely noise of the same kind as `near`, and its log-likelihood; searched over a `wide` range or not."""
+    if near.held:
+        own = np.concatenate([residual[start:stop] for start, stop in zip(*stretches, strict=True)])
+        sd = max(float(np.sqrt(np.mean(own**2))), 1e-9)
+        return replace(near, sd_nm=sd), -0.5 * own.size * (np.log(2 * np.pi * sd * sd) + 1.0)
     if near.band <= 0.0:
         ar1, share, sd, log_likelihood = profile_noise(residual, *stretches, near.ar1, near.share, wide)
         return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from stimrig.identify.diagnosis.residual import held_out_rise, quiet_rows, residual_structure
+from stimrig.identify.diagnosis.residual import quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.search import Progress, prior, silent, without_effect
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
 from stimrig.identify.effects import Effect, find_effect, registry
@@ -200,7 +200,7 @@ def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted
 
 def rise(before: Fitted, after: Fitted) -> Reason | None:
     """The error on held-out rows as a reason if it rises; else None."""
-    errors = held_out_rise(before, after)
+    errors = vetoed(before, after)
     if errors is None:
         return None
     text = f"The error on held-out rows rises from {errors[0]:.3g} to {errors[1]:.3g} N·m."

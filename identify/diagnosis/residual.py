@@ -6,20 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stimrig.identify.diagnosis.thresholds import (
-    FORM_ERROR,
-    HELD_OUT_RISE,
-    LEAST_HELD_OUT_ROWS,
-    NEAR,
-    QUIET,
-    STRUCTURE,
-    STRUCTURE_SHARE,
-)
-from stimrig.identify.dynamics.grid import Grid, ends_of, runs
+from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.diagnosis.thresholds import FORM_ERROR, LEAST_HELD_OUT_ROWS, QUIET, STRUCTURE, STRUCTURE_SHARE
+from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.left_out import difference, hold_out
 from stimrig.identify.noise import band_part, profile_noise
-from stimrig.identify.records.record import FORGOTTEN_S
 
 MEDIAN = 0.6745
 """Median of the size of normal errors over their standard deviation."""
@@ -146,9 +139,7 @@ def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | No
         A model that this one is compared with.
     """
     setup = fitted.problem.setup
-    grid = setup.grid
-    rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
-    rows &= _covered(grid, setup.fitted)
+    rows = np.isfinite(hold_out(fitted).error_nm)
     if rows.sum() < LEAST_HELD_OUT_ROWS or fitted.noise.band > 0.0:
         return None
     residual = fitted.residual_nm[rows]
@@ -162,22 +153,13 @@ def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | No
     return HeldOutError(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
 
 
-def held_out_rise(before: Fitted, after: Fitted) -> tuple[float, float] | None:
-    """Errors on held-out rows without and with an effect, N·m, if they rise and so speak against it; else None."""
-    old, new = held_out_error(before, beside=after), held_out_error(after)
-    if old is None or new is None or new.rms_nm <= HELD_OUT_RISE * max(old.rms_nm, new.allowed_nm):
+def vetoed(before: Fitted, after: Fitted) -> tuple[float, float] | None:
+    """Errors on held-out rows without and with an effect, N·m, where these rows speak against it; else None.
+
+    They speak against it where the error rises, and by more than its standard error over pieces of the rows. They
+    never speak for one.
+    """
+    old, new = hold_out(before), hold_out(after)
+    if difference(old, new).errors > thresholds.VETO or not new.rms_nm > thresholds.RISE * old.rms_nm:
         return None
     return old.rms_nm, new.rms_nm
-
-
-def _covered(grid: Grid, fitted: np.ndarray) -> np.ndarray:
-    """bool, shape (K,): intervals whose width, and all widths within the muscle's memory before, are near fitted
-    ones."""
-    widths = np.unique(grid.pulse_width_us[fitted])
-    if widths.size < 2:
-        return np.zeros(grid.size, bool)
-    after = np.clip(np.searchsorted(widths, grid.pulse_width_us), 1, widths.size - 1)
-    near = np.minimum(np.abs(grid.pulse_width_us - widths[after]), np.abs(grid.pulse_width_us - widths[after - 1]))
-    strange = near > NEAR * float(widths[-1])
-    memory = round(FORGOTTEN_S / grid.step_s)
-    return np.convolve(strange, np.ones(memory))[: grid.size] < 0.5

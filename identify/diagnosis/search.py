@@ -14,9 +14,9 @@ import numpy as np
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import (
     ResidualStructure,
-    held_out_rise,
     quiet_rows,
     residual_structure,
+    vetoed,
 )
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
@@ -70,7 +70,7 @@ class EffectSearch:
     added: list[str] = field(default_factory=list)  # effects, in order
     margins: list[float] = field(default_factory=list)  # log evidence required in each round
     left_out: list[LeftOut] = field(default_factory=list)  # what each model of the chain predicts on left-out blocks
-    refused: dict[str, Difference] = field(default_factory=dict)  # likely effects that predict left-out blocks no better
+    refused: dict[str, Difference] = field(default_factory=dict)  # likely, but no better on left-out blocks
     free_gain: list[float] = field(default_factory=list)  # log evidence for a gain that varies without a law
     losses: dict[str, float] = field(default_factory=dict)  # log evidence lost without each effect, if of several
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # intervals in which the muscle rests
@@ -166,21 +166,34 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     free_gain = try_effect(FREE_GAIN, search.last)
     search.free_gain.append(free_gain.gain if free_gain else 0.0)
     search.margins.append(_margin(search, len(search.added)))
-    search.refused = {}
-    for candidate in candidates[: thresholds.JUDGED]:
-        if candidate.gain < search.margins[-1]:
-            break
+    search.refused, able = {}, []
+    for candidate in [c for c in candidates if c.gain >= search.margins[-1]][: thresholds.JUDGED]:
         unseen = leave_out(candidate.fitted)
         seen = difference(search.left_out[-1], unseen)
-        if predicts_better(candidate.effect, seen):
-            return candidate, unseen
-        search.refused[candidate.effect.id] = seen
-    return None
+        if not predicts_better(candidate.effect, seen):
+            search.refused[candidate.effect.id] = seen
+            continue
+        able.append((seen.gain, candidate, unseen))
+        if not search.last.distrusted:
+            break
+    if not able:
+        return None
+    _, candidate, unseen = max(able, key=lambda one: one[0])
+    free = released(candidate.fitted)
+    return (candidate, unseen) if free is candidate.fitted else (replace(candidate, fitted=free), leave_out(free))
 
 
 def predicts_better(effect: Effect, seen: Difference) -> bool:
-    """Whether left-out blocks speak for an effect; of one that cannot be foreseen: whether they do not speak against it."""
+    """Whether left-out blocks speak for an effect; of a sporadic one: whether they do not speak against it."""
     return seen.errors >= (thresholds.NO_WORSE if effect.sporadic else thresholds.BETTER)
+
+
+def released(fitted: Fitted) -> Fitted:
+    """The model with its noise no longer held white, where its likelihood can then be trusted."""
+    if not fitted.noise.held:
+        return fitted
+    free = solve(fitted.problem, fitted.theta, NoiseLevel(0.5, 0.5, fitted.noise.sd_nm))
+    return fitted if free.distrusted else free
 
 
 # ---- one round: every effect of the library tried on a model -----------------------------------------------------
@@ -390,7 +403,7 @@ def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
     """The steps up to the first that raises the error on held-out rows, and the effect refused for that reason."""
     row = steps(search)
     for number in range(1 + len(search.detected), len(row)):
-        errors = held_out_rise(row[number - 1].fitted, row[number].fitted)
+        errors = vetoed(row[number - 1].fitted, row[number].fitted)
         if errors is not None:
             reason = f"The error on held-out rows would rise from {errors[0]:.3g} to {errors[1]:.3g} N·m."
             return row[:number], [{"effect": row[number].added, "log_evidence_gain": None, "reason": reason}]

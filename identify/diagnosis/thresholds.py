@@ -64,8 +64,11 @@ HELD_OUT_RATIO = 2.5
 """Error on held-out rows, divided by what is allowed there, above which structure may be left."""
 HELD_OUT_SHARE = 0.5
 """The same as a share of the plain structure's error there: a law close to the true one takes most of it, not all."""
-HELD_OUT_RISE = 1.1
-"""If the error on held-out rows rises by this factor, it speaks against the effect, and `improve` stops there."""
+VETO, RISE = -1.0, 1.02
+"""Standard errors from which, and the factor by which, the error on held-out rows must rise to speak against an effect:
+`improve` stops there."""
+REFUSED = 20.0
+"""Log evidence from which something is there that no effect can predict, if left-out blocks refuse what explains it."""
 DOUBTED = 0.45
 """Largest probability of an effect that something speaks against."""
 LONGEST_HELD_S = 0.05
@@ -76,8 +79,6 @@ CLOSE = 0.8
 """An effect that resembles the best one is named beside it from this share of its gain."""
 RIVAL = 0.04
 """Probability from which an effect is named as one that this record cannot tell from the best."""
-NEAR = 0.02
-"""A width farther than this (share of the largest) from every fitted width lies on a guessed part of the curve."""
 FORM_ERROR = 0.01
 """Error, as a share of the largest torque, that a curve of few knots may leave on held-out rows without any effect."""
 FORM_ERROR_WITH_EFFECTS = 0.003

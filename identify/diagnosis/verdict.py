@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, held_out_rise
+from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, vetoed
 from stimrig.identify.diagnosis.search import EffectSearch, seen_at_rest
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import Candidate
@@ -109,7 +109,7 @@ def judge(search: EffectSearch) -> Verdict:
         found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in search.added[:number] if e in found)])
         if _only_at_work(search, number):
             found[effect] = min(found[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
-        if held_out_rise(search.chain[number], search.chain[number + 1]) is not None:
+        if vetoed(search.chain[number], search.chain[number + 1]) is not None:
             found[effect] = min(found[effect], thresholds.DOUBTED)
             notes.append(f"{find_effect(effect).name}: it raises the error on held-out rows.")
     structure = left.ratio
@@ -129,7 +129,8 @@ def judge(search: EffectSearch) -> Verdict:
         elif search.added and find_effect(search.added[0]).sporadic:
             strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
     else:
-        strange = strange or left.left
+        refused = max((c.gain for c in search.rounds[-1] if c.effect.id in search.refused), default=0.0)
+        strange = strange or left.left or (refused > thresholds.REFUSED and not last.distrusted)
     # Naming an effect claims more than naming none, so less error is allowed.
     form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR
     before, after = (held_out_error(fitted, form, last) for fitted in (first, last))

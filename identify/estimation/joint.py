@@ -270,8 +270,13 @@ def _at(
 
 
 def _step(at: _Point, damping: float) -> tuple[np.ndarray, float]:
+    return newton_step(at.problem, at.theta, at.gradient, at.hessian, damping)
+
+
+def newton_step(
+    problem: Problem, theta: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float
+) -> tuple[np.ndarray, float]:
     """Damped Newton step, and the factor by which it was shortened. Parameters at a bound do not leave it."""
-    problem, theta, gradient, hessian = at.problem, at.theta, at.gradient, at.hessian
     stuck = ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
     for chosen in problem.chosen:
         stuck[chosen.places.start : chosen.places.stop] |= chosen.form.fixed

@@ -15,7 +15,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.joint import Fitted, gram, solve
+from stimrig.identify.estimation.joint import Fitted, gram, newton_step, solve
 from stimrig.identify.records.record import FORGOTTEN_S
 from stimrig.identify.simulation.problem import Problem
 
@@ -31,27 +31,39 @@ NEAR = 0.02
 """A width farther than this (share of the largest) from every width of the fit lies on a guessed part of the curve."""
 LEAST_ROWS = 20
 """A block with fewer rows to judge by is not counted."""
-TRUSTED = 0.5
-"""A step in a straight line is trusted where it gains this share of what it promised."""
-STEPS = 6
+SHORTER = (1.0, 0.5)
+TRUSTED = 0.25
+"""A step, or its half, is trusted where it gains this share of what it promised; else a search of so many steps is
+made."""
+STEPS = 4
+RIDGE = 1e-9
+"""Share added to the curvature of each parameter, for those that only the left-out block tells of."""
 SLACK = 0.05
 """Log posterior that a step may fall short of its promise by."""
 FLOOR_SHARE = 0.0015
 """Share of the largest torque below which an error does not matter."""
 
 
+def bouts(grid: Grid) -> np.ndarray:
+    """The number of the bout of stimulation that each interval belongs to, with the rest after it, shape (K,)."""
+    at = np.flatnonzero(grid.pulse_width_us > 0)
+    later = at[1:][np.diff(at) > APART_S / grid.step_s]
+    turns = np.flatnonzero(np.diff(grid.held_out)) + 1
+    return np.searchsorted(np.unique(np.r_[later, turns, grid.begins]), np.arange(grid.size), side="right")
+
+
 def blocks(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """The number of each interval's block, shape (K,); -1 where `rows` is false.
 
-    Whole bouts of stimulation, each with the rest after it; where there are few, pieces of them. They depend on the
-    pulses alone, so that all models of a record share them.
+    Whole bouts; where there are few, pieces of them. They depend on the pulses alone, so that all models of a record
+    share them.
     """
-    at = np.flatnonzero(rows & (grid.pulse_width_us > 0))
-    later = at[1:][np.diff(at) > APART_S / grid.step_s]
-    edges = np.unique(np.r_[0, later, grid.begins, grid.size])
-    if later.size + 1 < ENOUGH_BOUTS:
+    bout = bouts(grid)
+    if np.unique(bout[rows]).size < ENOUGH_BOUTS:
+        edges = np.r_[0, np.flatnonzero(np.diff(bout)) + 1, grid.size]
         edges = _cut(edges, np.r_[0, np.cumsum(rows)], LEAST_S / grid.step_s)
-    return np.where(rows, np.searchsorted(edges, np.arange(grid.size), side="right") - 1, -1)
+        bout = np.searchsorted(edges, np.arange(grid.size), side="right")
+    return np.where(rows, bout, -1)
 
 
 def _cut(edges: np.ndarray, count: np.ndarray, least: float) -> np.ndarray:
@@ -101,19 +113,26 @@ class LeftOut:
         return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
-def leave_out(fitted: Fitted) -> LeftOut:
+def leave_out(fitted: Fitted, block: np.ndarray | None = None) -> LeftOut:
     """The free-run error of a model on each block of its fitted rows, with all parameters found without that block.
 
     The noise is that of the whole fit. Rows are judged where their widths were seen in the rest of the record.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The model.
+    block : ndarray of int, shape (K,), optional
+        The block of each interval, -1 for none; as `blocks` gives it by default.
     """
     setup = fitted.problem.setup
     grid = setup.grid
-    block = blocks(grid, setup.fitted)
+    block = blocks(grid, setup.fitted) if block is None else block
     opening = np.zeros(grid.size, bool)
     for start in grid.starts:
         opening[start : start + round(START_S / grid.step_s)] = True
     error = np.full(grid.size, np.nan)
-    unforeseen = frozenset(effect for effect, _ in fitted.effects if find_effect(effect).sporadic)
+    sporadic = _sporadic(fitted)
     for number in np.unique(block[block >= 0]):
         out = (block == number) & ~opening
         kept = setup.fitted & ~out
@@ -121,9 +140,30 @@ def leave_out(fitted: Fitted) -> LeftOut:
         if judged.sum() < LEAST_ROWS:
             continue
         theta = _refitted(fitted, kept)
-        error[judged] = (setup.target_nm - fitted.problem.run(theta, skip=unforeseen)[0])[judged]
-    floor = max(grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm)
-    return LeftOut(error, block, float(floor))
+        error[judged] = (setup.target_nm - fitted.problem.run(theta, skip=sporadic)[0])[judged]
+    return LeftOut(error, block, _floor_nm(fitted))
+
+
+def hold_out(fitted: Fitted) -> LeftOut:
+    """The same on rows of `validate`, which no fit has seen, in pieces of `LEAST_S`."""
+    setup = fitted.problem.setup
+    grid = setup.grid
+    rows = grid.held_out & ~grid.doubted & (2 * grid.count >= np.median(grid.count[setup.fitted]))
+    judged = rows & near_widths(grid, setup.fitted)
+    mean = fitted.problem.run(fitted.theta, skip=_sporadic(fitted))[0]
+    piece = np.cumsum(rows) // max(round(LEAST_S / grid.step_s), 1)
+    error = np.where(judged, setup.target_nm - mean, np.nan)
+    return LeftOut(error, np.where(rows, piece, -1), _floor_nm(fitted))
+
+
+def _sporadic(fitted: Fitted) -> frozenset[str]:
+    """Effects that nothing foretells: a block that is left out shows none of them."""
+    return frozenset(effect for effect, _ in fitted.effects if find_effect(effect).sporadic)
+
+
+def _floor_nm(fitted: Fitted) -> float:
+    setup = fitted.problem.setup
+    return max(setup.grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm)
 
 
 def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
@@ -135,17 +175,15 @@ def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
     mean, precision = problem.prior
     away = fitted.theta - mean
     gradient, hessian = products[0, 1:] - precision @ away, products[1:, 1:] + precision
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    scaled = hessian * scale[:, None] * scale[None, :] + 1e-9 * np.eye(scale.size)
-    step = scale * np.linalg.solve(scaled, scale * gradient)
-    theta = np.clip(fitted.theta + step, problem.lower, problem.upper)
-    left = setup.target_nm - problem.run(theta)[0]
-    white = own.setup.whitened(np.where(kept, left, 0.0)[None, :], fitted.noise)[0]
-    there = theta - mean
-    before = 0.5 * float(products[0, 0]) + 0.5 * float(away @ precision @ away)
-    after = 0.5 * float(white @ white) + 0.5 * float(there @ precision @ there)
-    if before - after >= TRUSTED * 0.5 * float(gradient @ step) - SLACK:
-        return theta
+    step = newton_step(problem, fitted.theta, gradient, hessian, RIDGE)[0]
+    before = float(products[0, 0]) + float(away @ precision @ away)
+    for factor in SHORTER:
+        theta = np.clip(fitted.theta + factor * step, problem.lower, problem.upper)
+        left = np.where(kept, setup.target_nm - problem.run(theta)[0], 0.0)
+        white, there = own.setup.whitened(left[None, :], fitted.noise)[0], theta - mean
+        gained = before - float(white @ white) - float(there @ precision @ there)
+        if gained >= TRUSTED * factor * float(gradient @ step) - SLACK:
+            return theta
     return solve(own, fitted.theta, fitted.noise, most=STEPS, profiled=False).theta
 
 
@@ -174,11 +212,10 @@ class Difference:
 
 
 def difference(before: LeftOut, after: LeftOut) -> Difference:
-    """Compare two models of one record, block by block."""
-    ratios = []
-    floor = before.floor_nm**2
-    for number in np.unique(before.block[before.block >= 0]):
-        own = (before.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
+    """Compare two models of one record, block by block of the second."""
+    ratios, floor = [], before.floor_nm**2
+    for number in np.unique(after.block[after.block >= 0]):
+        own = (after.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
         if own.any():
             old, new = (np.mean(model.error_nm[own] ** 2) + floor for model in (before, after))
             ratios.append(0.5 * np.log(old / new))

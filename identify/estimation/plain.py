@@ -15,6 +15,7 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.effects import depend_on_joint
 from stimrig.identify.errors import NotIdentifiable
+from stimrig.identify.estimation.candidates import chosen
 from stimrig.identify.estimation.joint import Fitted, gram, solve
 from stimrig.identify.estimation.projection import (
     Projection,
@@ -28,7 +29,7 @@ from stimrig.identify.estimation.projection import (
 )
 from stimrig.identify.estimation.rests import rest_levels
 from stimrig.identify.estimation.samples import white_noise
-from stimrig.identify.noise import NoiseLevel
+from stimrig.identify.noise import WHITE, NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import (
@@ -178,9 +179,9 @@ def _is_quiet(first: Solution) -> bool:
 
 
 def estimate(
-    grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: float | None = None
+    grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: float | None = None, white: bool = False
 ) -> tuple[Solution, float]:
-    """The solution, and the evidence for AR(1) over white noise (ΔBIC)."""
+    """The solution, and the evidence for AR(1) over white noise (ΔBIC); `white`: the noise is white, all the same."""
     first = pilot_solution(grid, rows, delay_s)
     projection, start = designed(first, QUIET_KNOTS if knots is None and _is_quiet(first) else knots)
     solution = search(projection, start, variance=first.variance)
@@ -192,7 +193,7 @@ def estimate(
         ar1, delta_bic = ar1_or_white(solution.residual_nm, projection.stretches)
     # Without noise the residual is rounding and the spline's own error, which need no noise model.
     still = solution.variance < (ROUNDING * float(np.ptp(projection.target[rows]))) ** 2
-    for _ in range(0 if still else 3):
+    for _ in range(0 if still or white else 3):
         if delta_bic <= 0:
             break
         solution = search(projection, solution.linear, ar1=ar1, variance=solution.whitened_variance(ar1))
@@ -216,13 +217,18 @@ def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
     Knots and smoothness of the recruitment curve are chosen here. They are not changed while effects are tried; once
     that is over, those of a joint that moves may be chosen again (`renewed_curve`).
     """
-    return to_fitted(estimate(grid, still_rows(grid, rows))[0], rows)
+
+    def fit(own: np.ndarray, white: bool) -> Fitted:
+        return to_fitted(estimate(grid, still_rows(grid, own), white=white)[0], own, white=white)
+
+    return chosen(grid, rows, fit(rows, False), fit)
 
 
-def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20) -> Fitted:
+def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20, white: bool = False) -> Fitted:
     """The solution of the joint problem on some rows, with white and slow noise, started from a projected solution.
 
-    The projected solution may be of fewer rows, where the joint moves in the others: see `still_rows`.
+    The projected solution may be of fewer rows, where the joint moves in the others: see `still_rows`. `white`: the
+    noise is held white.
     """
     solution = _fill_zeros(solution, rows)
     setup = setup_of(solution, rows)
@@ -234,7 +240,7 @@ def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20) -> Fitted:
     values[list(problem.baselines)] = setup.to_muscle(solution.coefficients[size : size + parts])
     values[list(problem.initials)] = setup.sign * solution.coefficients[size + parts :]
     values[problem.coefficients] = setup.sign * solution.coefficients[:size]
-    noise = NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
+    noise = WHITE if white else NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
     fitted = solve(problem, problem.from_physical(values), noise, most=most)
     values = fitted.physical
     quick_s, slow_s = 0.5 * values[0] / values[1], 2.0 * values[0] * values[1]

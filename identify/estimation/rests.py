@@ -35,7 +35,7 @@ def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         N·m, of each part.
     """
     for strongest_us in (0.0, IDLE_SHARE * float(np.max(grid.pulse_width_us))):
-        since_s = grid.step_s * _since_pulse(grid, strongest_us)
+        since_s = grid.step_s * since_pulse(grid, strongest_us)
         if np.max(since_s[rows]) >= 2.0 * RELAXED_S:
             break
     found = [_level(grid.torque_nm, since_s, rows & (grid.part == part)) for part in range(grid.begins.size)]
@@ -56,7 +56,7 @@ def _level(torque_nm: np.ndarray, since_s: np.ndarray, rows: np.ndarray) -> tupl
     return level_nm, max(float(np.hypot(scatter_nm, share * (high_nm - low_nm))), 1e-9)
 
 
-def _since_pulse(grid: Grid, strongest_us: float) -> np.ndarray:
+def since_pulse(grid: Grid, strongest_us: float = 0.0) -> np.ndarray:
     """Intervals without a stronger pulse up to each, itself included; anew where a part or a known state begins."""
     at = np.arange(grid.size)
     last = np.where(grid.pulse_width_us > strongest_us, at, -1)

@@ -16,6 +16,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
 from stimrig.identify.errors import BadRequest
+from stimrig.identify.estimation.candidates import chosen
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import estimate, still_rows, to_fitted
@@ -145,7 +146,11 @@ class MaximumLikelihood:
             return near_sigmoid(grid, rows, options)
         delay_s = float(options["delay_s"]) if "delay_s" in options else None
         knots = int(options["knots"]) if "knots" in options else None
-        solution, _ = estimate(grid, still_rows(grid, rows), knots, delay_s)
+
+        def solved(own: np.ndarray, white: bool) -> Solution:
+            return estimate(grid, still_rows(grid, own), knots, delay_s, white)[0]
+
+        solution = solved(rows, False)
         kind = str(options.get("recruitment", "spline"))
         if kind == "power-series":
             solution, reason = power_series(solution, int(options["power"]) if "power" in options else None)
@@ -162,7 +167,10 @@ class MaximumLikelihood:
             )
         if flag(options.get("monotone", False), "monotone"):
             return to_fitted(monotone(solution), rows, most=0), [reason, "recruitment constrained to be monotone"]
-        return to_fitted(solution, rows, most=20 if kind == "spline" else 0), [reason]
+        if kind != "spline":
+            return to_fitted(solution, rows, most=0), [reason]
+        known = to_fitted(solution, rows)
+        return chosen(grid, rows, known, lambda own, white: to_fitted(solved(own, white), own, white=white)), [reason]
 
 
 METHOD = MaximumLikelihood()

@@ -1,0 +1,91 @@
+"""Which rows count, and which noise: candidates like structures, between which left-out blocks choose.
+
+Likelihood with slow noise is efficient where the structure is right. Where it is wrong, the slow noise takes up what
+the structure leaves, and the dynamics follow increments alone. White noise asks for the free run itself; and rows of
+the kind that shall be predicted ask for no more than that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.left_out import bouts, difference, leave_out, near_widths
+from stimrig.identify.estimation.rests import since_pulse
+from stimrig.identify.records.record import FORGOTTEN_S
+
+Fit = Callable[[np.ndarray, bool], Fitted]
+"""A fit of the plain structure to some rows, with noise that is held white or not."""
+
+BETTER = 1.0
+"""Standard errors by which a candidate must predict left-out blocks better: where they cannot tell, the usual stays."""
+SMOOTH = 0.1
+"""Share of the largest width by which pulses follow one another where the width moves smoothly."""
+LONG_S = 1.0
+"""Stimulation of a bout, s, from which its kind is known."""
+LEAST_BOUTS = 3
+COVERED = 0.95
+"""Share of the rows to be predicted whose widths must be seen in bouts of their kind."""
+
+
+def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
+    """The plain fit with the noise and the rows that predict best.
+
+    Parameters
+    ----------
+    grid : Grid
+        The record.
+    rows : ndarray of bool, shape (K,)
+        Rows that may be fitted.
+    best : Fitted
+        The plain fit to all of them, with slow noise. It stays where nothing speaks against its likelihood.
+    fit : callable
+        Fits the plain structure to some rows, with noise held white or not.
+    """
+    if not best.distrusted:
+        return best
+    best = _better(best, fit(rows, True))
+    own = alike_rows(grid, rows)
+    if own is not None:
+        for white in (False, True):
+            best = _better(best, fit(own, white))
+    return best
+
+
+def _better(before: Fitted, after: Fitted) -> Fitted:
+    """The second fit where it predicts the blocks of its rows better, else the first."""
+    old = leave_out(before)
+    new = leave_out(after, np.where(after.problem.setup.fitted, old.block, -1))
+    return after if difference(old, new).errors >= BETTER else before
+
+
+def alike_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
+    """The rows of bouts like those of `validate`, with all rests, shape (K,); None where there are few, or no others.
+
+    The pulses of `validate` are known; its torque is not looked at.
+    """
+    if not grid.held_out.any():
+        return None
+    number = bouts(grid)
+    kinds = {bout: _smooth(grid, number == bout) for bout in np.unique(number)}
+    wanted = {kinds[bout] for bout in np.unique(number[grid.held_out])} - {None}
+    if len(wanted) != 1:
+        return None
+    alike = [bout for bout, kind in kinds.items() if kind in wanted and np.any(rows & (number == bout))]
+    own = rows & np.isin(number, alike)
+    ahead = grid.held_out & (grid.pulse_width_us > 0)
+    if len(alike) < LEAST_BOUTS or own.sum() == rows.sum() or np.mean(near_widths(grid, own)[ahead]) < COVERED:
+        return None
+    return own | (rows & (grid.step_s * since_pulse(grid) >= FORGOTTEN_S))
+
+
+def _smooth(grid: Grid, own: np.ndarray) -> bool | None:
+    """Whether the width of a bout moves smoothly, as in a ramp, not in jumps; None of a bout too short to tell."""
+    widths_us = grid.pulse_width_us[own]
+    steps_us = np.abs(np.diff(widths_us[np.flatnonzero(widths_us)]))
+    if steps_us.size * grid.step_s < LONG_S:
+        return None
+    return bool(np.percentile(steps_us, 95) < SMOOTH * float(np.max(grid.pulse_width_us)))
