@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from stimrig.identify.diagnosis import structure_of
 from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful, search_effects
 from stimrig.identify.diagnosis.verdict import judge
@@ -12,6 +14,7 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.fit_statistics import evaluate
+from stimrig.identify.estimation.left_out import Difference, difference
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
@@ -99,7 +102,19 @@ def _reason(search: EffectSearch, step: Step) -> str:
         return "The samples show it directly, before any fit."
     number = search.added.index(step.added)
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
-    return f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
+    seen = difference(search.left_out[number], search.left_out[number + 1])
+    return (
+        f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required. On parts of the record "
+        f"that were left out of the fit, {_change(seen)}."
+    )
+
+
+def _change(seen: Difference) -> str:
+    """By how much the error on left-out parts changes, with its standard error, in words."""
+    percent = 100.0 * (1.0 - np.exp(-seen.gain))
+    return (
+        f"the error {'falls' if percent >= 0 else 'rises'} by {abs(percent):.0f} % ({seen.errors:+.1f} standard errors)"
+    )
 
 
 def refused(search: EffectSearch) -> list[dict[str, Any]]:
@@ -113,7 +128,9 @@ def refused(search: EffectSearch) -> list[dict[str, Any]]:
     for candidate in search.rounds[number]:
         if candidate.effect.id in present:
             continue
-        if candidate.gain <= 0.0:
+        if candidate.refused is not None:
+            reason = f"On parts of the record that were left out of the fit, {_change(candidate.refused)}."
+        elif candidate.gain <= 0.0:
             reason = f"The evidence is against it: log evidence changes by {candidate.gain:+.1f}."
         elif candidate.gain < margin:
             reason = (

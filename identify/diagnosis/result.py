@@ -107,7 +107,7 @@ def _close(search: EffectSearch, effect: str) -> set[str]:
     if effect not in search.added:
         return set()
     round_ = search.rounds[search.added.index(effect)]
-    gains = {c.effect.id: c.gain for c in round_}
+    gains = {c.effect.id: c.gain for c in round_ if c.refused is None}
     alike = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(find_effect(effect).resembles)
     return {name for name in alike if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
 

@@ -70,7 +70,6 @@ class EffectSearch:
     added: list[str] = field(default_factory=list)  # effects, in order
     margins: list[float] = field(default_factory=list)  # log evidence required in each round
     left_out: list[LeftOut] = field(default_factory=list)  # what each model of the chain predicts on left-out blocks
-    refused: dict[str, Difference] = field(default_factory=dict)  # likely, but no better on left-out blocks
     free_gain: list[float] = field(default_factory=list)  # log evidence for a gain that varies without a law
     losses: dict[str, float] = field(default_factory=dict)  # log evidence lost without each effect, if of several
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # intervals in which the muscle rests
@@ -166,12 +165,14 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     free_gain = try_effect(FREE_GAIN, search.last)
     search.free_gain.append(free_gain.gain if free_gain else 0.0)
     search.margins.append(_margin(search, len(search.added)))
-    search.refused, able = {}, []
-    for candidate in [c for c in candidates if c.gain >= search.margins[-1]][: thresholds.JUDGED]:
+    able = []
+    for place, candidate in enumerate(candidates[: thresholds.JUDGED]):
+        if candidate.gain < search.margins[-1]:
+            break
         unseen = leave_out(candidate.fitted)
         seen = difference(search.left_out[-1], unseen)
-        if not predicts_better(candidate.effect, seen):
-            search.refused[candidate.effect.id] = seen
+        if not allowed(candidate.effect, seen):
+            candidates[place] = replace(candidate, refused=seen)
             continue
         able.append((seen.gain, candidate, unseen))
         if not search.last.distrusted:
@@ -183,9 +184,12 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     return (candidate, unseen) if free is candidate.fitted else (replace(candidate, fitted=free), leave_out(free))
 
 
-def predicts_better(effect: Effect, seen: Difference) -> bool:
-    """Whether left-out blocks speak for an effect; of a sporadic one: whether they do not speak against it."""
-    return seen.errors >= (thresholds.NO_WORSE if effect.sporadic else thresholds.BETTER)
+def allowed(effect: Effect, seen: Difference) -> bool:
+    """Whether left-out blocks speak for an effect; of one that cannot be foreseen: whether they do not object.
+
+    A narrow band of noise is not judged by them: it changes no prediction.
+    """
+    return effect.band or seen.errors >= (thresholds.BETTER if effect.predictable else thresholds.NO_WORSE)
 
 
 def released(fitted: Fitted) -> Fitted:
@@ -345,7 +349,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
         found = _discounted(search, Candidate(described, own, fitted, gain, known | {own.name: gain}))
         unseen = leave_out(fitted)
         seen = difference(search.left_out[-1], unseen)
-        if found.gain < _margin(search, number) or not predicts_better(described, seen):
+        if found.gain < _margin(search, number) or not allowed(described, seen):
             return  # beside the other effects it no longer gains enough
         # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
         most = found.gain - (won if number == index else 0.0)

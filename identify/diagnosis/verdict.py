@@ -101,10 +101,9 @@ def judge(search: EffectSearch) -> Verdict:
     notes = [] if readings is None else [readings.words]
     found: dict[str, float] = dict.fromkeys(search.detected, 0.99)
     rivals: dict[str, dict[str, float]] = {}
+    rounds = [[c for c in tried if c.refused is None] for tried in search.rounds]
     for number, effect in enumerate(search.added):
-        rivals[effect] = shares(
-            [c for c in search.rounds[number] if c.effect.id == effect or c.effect.id not in search.added]
-        )
+        rivals[effect] = shares([c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added])
         # A later effect is at most as probable as those before it.
         found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in search.added[:number] if e in found)])
         if _only_at_work(search, number):
@@ -129,7 +128,7 @@ def judge(search: EffectSearch) -> Verdict:
         elif search.added and find_effect(search.added[0]).sporadic:
             strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
     else:
-        refused = max((c.gain for c in search.rounds[-1] if c.effect.id in search.refused), default=0.0)
+        refused = max((c.gain for tried in search.rounds for c in tried if c.refused), default=0.0)
         strange = strange or left.left or (refused > thresholds.REFUSED and not last.distrusted)
     # Naming an effect claims more than naming none, so less error is allowed.
     form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR

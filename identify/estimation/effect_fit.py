@@ -11,6 +11,7 @@ from stimrig.identify.effects import find_effect, registry
 from stimrig.identify.effects.base import STAGES, Effect, Form, Scene
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
+from stimrig.identify.estimation.left_out import Difference
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.noise import find_band
@@ -43,6 +44,8 @@ class Candidate:
         Log evidence gained over the model without it, with the effect's prior odds.
     forms : dict
         Gain by form.
+    refused : Difference or None
+        What left-out blocks say, where they refuse it; None of one that they were not asked about, or that they allow.
     """
 
     effect: Effect
@@ -50,6 +53,7 @@ class Candidate:
     fitted: Fitted
     gain: float
     forms: dict[str, float]
+    refused: Difference | None = None
 
 
 def try_effect(

@@ -16,6 +16,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted, gram, newton_step, solve
+from stimrig.identify.estimation.rests import since_pulse
 from stimrig.identify.records.record import FORGOTTEN_S
 from stimrig.identify.simulation.problem import Problem
 
@@ -38,6 +39,8 @@ made."""
 STEPS = 4
 RIDGE = 1e-9
 """Share added to the curvature of each parameter, for those that only the left-out block tells of."""
+ZERO_SD = 2.0
+"""Standard deviations of the zero at rest within which the mean error of a block may be its zero."""
 SLACK = 0.05
 """Log posterior that a step may fall short of its promise by."""
 FLOOR_SHARE = 0.0015
@@ -100,11 +103,20 @@ class LeftOut:
         As `blocks` gives it.
     floor_nm : float
         Error below which a difference does not matter: that of white noise, N·m.
+    wander_nm : float
+        Scatter of the torque at rest. A block's mean error is no fault of the model as far as its zero explains it.
     """
 
     error_nm: np.ndarray
     block: np.ndarray
     floor_nm: float
+    wander_nm: float = 0.0
+
+    def square(self, own: np.ndarray) -> float:
+        """Mean square error of some intervals of one block about their zero, with the floor, N²m²."""
+        error_nm = self.error_nm[own]
+        zero_nm = np.clip(error_nm.mean(), -ZERO_SD * self.wander_nm, ZERO_SD * self.wander_nm)
+        return float(np.mean((error_nm - zero_nm) ** 2)) + self.floor_nm**2
 
     @cached_property
     def rms_nm(self) -> float:
@@ -141,7 +153,7 @@ def leave_out(fitted: Fitted, block: np.ndarray | None = None) -> LeftOut:
             continue
         theta = _refitted(fitted, kept)
         error[judged] = (setup.target_nm - fitted.problem.run(theta, skip=sporadic)[0])[judged]
-    return LeftOut(error, block, _floor_nm(fitted))
+    return LeftOut(error, block, *_allowed_nm(fitted))
 
 
 def hold_out(fitted: Fitted) -> LeftOut:
@@ -153,7 +165,7 @@ def hold_out(fitted: Fitted) -> LeftOut:
     mean = fitted.problem.run(fitted.theta, skip=_sporadic(fitted))[0]
     piece = np.cumsum(rows) // max(round(LEAST_S / grid.step_s), 1)
     error = np.where(judged, setup.target_nm - mean, np.nan)
-    return LeftOut(error, np.where(rows, piece, -1), _floor_nm(fitted))
+    return LeftOut(error, np.where(rows, piece, -1), *_allowed_nm(fitted))
 
 
 def _sporadic(fitted: Fitted) -> frozenset[str]:
@@ -161,9 +173,13 @@ def _sporadic(fitted: Fitted) -> frozenset[str]:
     return frozenset(effect for effect, _ in fitted.effects if find_effect(effect).sporadic)
 
 
-def _floor_nm(fitted: Fitted) -> float:
+def _allowed_nm(fitted: Fitted) -> tuple[float, float]:
+    """Error that does not matter, and scatter of the torque at rest, N·m."""
     setup = fitted.problem.setup
-    return max(setup.grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm)
+    grid = setup.grid
+    still = setup.target_nm[setup.fitted & (grid.step_s * since_pulse(grid) >= FORGOTTEN_S)]
+    wander = 1.4826 * float(np.median(np.abs(still - np.median(still)))) if still.size else 0.0
+    return max(grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm), wander
 
 
 def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
@@ -213,12 +229,11 @@ class Difference:
 
 def difference(before: LeftOut, after: LeftOut) -> Difference:
     """Compare two models of one record, block by block of the second."""
-    ratios, floor = [], before.floor_nm**2
+    ratios = []
     for number in np.unique(after.block[after.block >= 0]):
         own = (after.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
         if own.any():
-            old, new = (np.mean(model.error_nm[own] ** 2) + floor for model in (before, after))
-            ratios.append(0.5 * np.log(old / new))
+            ratios.append(0.5 * np.log(before.square(own) / after.square(own)))
     found = np.array(ratios)
     if found.size < 2:
         return Difference(float(found.sum()), float("inf"), found.size)
