@@ -171,7 +171,7 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
             break
         unseen = leave_out(candidate.fitted)
         seen = difference(search.left_out[-1], unseen)
-        if not allowed(candidate.effect, seen):
+        if not allowed(search, candidate, seen):
             candidates[place] = replace(candidate, refused=seen)
             continue
         able.append((seen.gain, candidate, unseen))
@@ -180,16 +180,31 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     if not able:
         return None
     _, candidate, unseen = max(able, key=lambda one: one[0])
+    # Where the likelihood decides nothing, one that is likelier is a rival, not more.
+    candidates[:] = [replace(one, gain=min(one.gain, candidate.gain)) for one in candidates]
     free = released(candidate.fitted)
     return (candidate, unseen) if free is candidate.fitted else (replace(candidate, fitted=free), leave_out(free))
 
 
-def allowed(effect: Effect, seen: Difference) -> bool:
+def allowed(search: EffectSearch, candidate: Candidate, seen: Difference) -> bool:
     """Whether left-out blocks speak for an effect; of one that cannot be foreseen: whether they do not object.
 
-    A narrow band of noise is not judged by them: it changes no prediction.
+    More is asked of an effect that may only repair the inexact form of one that is there. A narrow band of noise is
+    not judged by blocks: it changes no prediction.
     """
-    return effect.band or seen.errors >= (thresholds.BETTER if effect.predictable else thresholds.NO_WORSE)
+    effect, dynamic = candidate.effect, candidate.form.stage in thresholds.DYNAMIC
+    if effect.band:
+        return True
+    if not effect.predictable:
+        return seen.errors >= thresholds.NO_WORSE
+    alike = any(
+        (dynamic and own.stage in thresholds.DYNAMIC)
+        or name in effect.resembles
+        or effect.id in find_effect(name).resembles
+        for name, own in search.last.effects
+        if name not in search.detected
+    )
+    return seen.errors >= (thresholds.BETTER_THAN_ALIKE if alike else thresholds.BETTER)
 
 
 def released(fitted: Fitted) -> Fitted:
@@ -349,7 +364,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
         found = _discounted(search, Candidate(described, own, fitted, gain, known | {own.name: gain}))
         unseen = leave_out(fitted)
         seen = difference(search.left_out[-1], unseen)
-        if found.gain < _margin(search, number) or not allowed(described, seen):
+        if found.gain < _margin(search, number) or not allowed(search, found, seen):
             return  # beside the other effects it no longer gains enough
         # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
         most = found.gain - (won if number == index else 0.0)

@@ -18,6 +18,9 @@ JUDGED = 4
 """So many candidates of a round, the likeliest first, are judged by left-out blocks."""
 BETTER = 2.0
 """Standard errors by which the error on left-out blocks must fall with an effect."""
+BETTER_THAN_ALIKE = 3.0
+"""The same if it resembles an effect that is there, or both change the dynamics: one effect in an inexact form looks
+like two."""
 NO_WORSE = -1.0
 """The same for effects that cannot be foreseen: they need not predict, but they must not spoil what the muscle does."""
 EFFORT_WEIGHT = 0.92
