@@ -41,6 +41,10 @@ RIDGE = 1e-9
 """Share added to the curvature of each parameter, for those that only the left-out block tells of."""
 ZERO_SD = 2.0
 """Standard deviations of the zero at rest within which the mean error of a block may be its zero."""
+LEAST_WEIGHT = 0.01
+"""Weight of a block in which both models err no more than white noise."""
+LEAST_BLOCKS = 1.5
+"""Number of telling blocks below which nothing is concluded."""
 SLACK = 0.05
 """Log posterior that a step may fall short of its promise by."""
 FLOOR_SHARE = 0.0015
@@ -113,10 +117,10 @@ class LeftOut:
     wander_nm: float = 0.0
 
     def square(self, own: np.ndarray) -> float:
-        """Mean square error of some intervals of one block about their zero, with the floor, N²m²."""
+        """Mean square error of some intervals of one block about their zero, N²m²."""
         error_nm = self.error_nm[own]
         zero_nm = np.clip(error_nm.mean(), -ZERO_SD * self.wander_nm, ZERO_SD * self.wander_nm)
-        return float(np.mean((error_nm - zero_nm) ** 2)) + self.floor_nm**2
+        return float(np.mean((error_nm - zero_nm) ** 2))
 
     @cached_property
     def rms_nm(self) -> float:
@@ -213,28 +217,37 @@ class Difference:
         Mean over blocks of the logarithm of the ratio of errors; above 0: the second model is better.
     sd : float
         Its standard error over blocks.
-    blocks : int
-        Number of blocks.
+    blocks : float
+        Number of blocks that tell something.
     """
 
     gain: float
     sd: float
-    blocks: int
+    blocks: float
 
     @property
     def errors(self) -> float:
-        """The gain in standard errors; 0 where two blocks or fewer tell nothing."""
-        return self.gain / max(self.sd, 1e-9) if self.blocks > 2 else 0.0
+        """The gain in standard errors; 0 where hardly more than one block tells anything."""
+        return self.gain / max(self.sd, 1e-9) if self.blocks > LEAST_BLOCKS else 0.0
 
 
 def difference(before: LeftOut, after: LeftOut) -> Difference:
-    """Compare two models of one record, block by block of the second."""
-    ratios = []
+    """Compare two models of one record, block by block of the second.
+
+    A block in which both err by no more than white noise tells nothing: each block weighs as the share of the larger
+    error that is not white noise.
+    """
+    pairs, noise = [], before.floor_nm**2
     for number in np.unique(after.block[after.block >= 0]):
         own = (after.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
         if own.any():
-            ratios.append(0.5 * np.log(before.square(own) / after.square(own)))
-    found = np.array(ratios)
-    if found.size < 2:
-        return Difference(float(found.sum()), float("inf"), found.size)
-    return Difference(float(found.mean()), float(np.std(found, ddof=1) / np.sqrt(found.size)), found.size)
+            pairs.append((before.square(own), after.square(own)))
+    if not pairs:
+        return Difference(0.0, float("inf"), 0.0)
+    old, new = np.array(pairs).T
+    weight = np.maximum(1.0 - noise / np.maximum(np.maximum(old, new), 1e-300), LEAST_WEIGHT)
+    ratio = 0.5 * np.log((old + noise) / (new + noise))
+    gain = float(weight @ ratio / weight.sum())
+    told = float(weight.sum() ** 2 / (weight @ weight))
+    sd = float(np.sqrt(np.sum((weight * (ratio - gain)) ** 2)) / weight.sum())
+    return Difference(gain, sd * np.sqrt(told / max(told - 1.0, 1e-9)), told)

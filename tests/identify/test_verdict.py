@@ -59,7 +59,7 @@ class Made:
             rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=[0.0], residuals=[self.left()],
         )  # fmt: skip
         monkeypatch.setattr(verdict, "seen_at_rest", self._seen_at_rest)
-        monkeypatch.setattr(verdict, "held_out_rise", self._rise)
+        monkeypatch.setattr(verdict, "vetoed", self._rise)
         monkeypatch.setattr(verdict, "held_out_error", self._unseen)
 
     def left(
