@@ -103,18 +103,16 @@ def _reason(search: EffectSearch, step: Step) -> str:
     number = search.added.index(step.added)
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
     seen = difference(search.left_out[number], search.left_out[number + 1])
-    return (
-        f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required. On parts of the record "
-        f"that were left out of the fit, {_change(seen)}."
-    )
+    reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
+    return f"{reason} {_left_out(seen)}"
 
 
-def _change(seen: Difference) -> str:
-    """By how much the error on left-out parts changes, with its standard error, in words."""
-    percent = 100.0 * (1.0 - np.exp(-seen.gain))
-    return (
-        f"the error {'falls' if percent >= 0 else 'rises'} by {abs(percent):.0f} % ({seen.errors:+.1f} standard errors)"
-    )
+def _left_out(seen: Difference) -> str:
+    """What the error on left-out parts says of an effect, in words."""
+    percent, errors = 100.0 * abs(1.0 - np.exp(-seen.gain)), abs(seen.errors)
+    if seen.gain < 0.0:
+        return f"On parts of the record left out of the fit the error rises by {percent:.0f} % ({errors:.1f} sd)."
+    return f"On parts of the record left out of the fit the error falls by {percent:.0f} % ({errors:.1f} sd)."
 
 
 def refused(search: EffectSearch) -> list[dict[str, Any]]:
@@ -129,7 +127,7 @@ def refused(search: EffectSearch) -> list[dict[str, Any]]:
         if candidate.effect.id in present:
             continue
         if candidate.refused is not None:
-            reason = f"On parts of the record that were left out of the fit, {_change(candidate.refused)}."
+            reason = _left_out(candidate.refused)
         elif candidate.gain <= 0.0:
             reason = f"The evidence is against it: log evidence changes by {candidate.gain:+.1f}."
         elif candidate.gain < margin:

@@ -192,19 +192,24 @@ def allowed(search: EffectSearch, candidate: Candidate, seen: Difference) -> boo
     More is asked of an effect that may only repair the inexact form of one that is there. A narrow band of noise is
     not judged by blocks: it changes no prediction.
     """
-    effect, dynamic = candidate.effect, candidate.form.stage in thresholds.DYNAMIC
+    effect = candidate.effect
     if effect.band:
         return True
     if not effect.predictable:
         return seen.errors >= thresholds.NO_WORSE
-    alike = any(
-        (dynamic and own.stage in thresholds.DYNAMIC)
-        or name in effect.resembles
-        or effect.id in find_effect(name).resembles
-        for name, own in search.last.effects
-        if name not in search.detected
-    )
+    alike = resembles_earlier(search.last, candidate.effect, candidate.form.stage, search.detected)
     return seen.errors >= (thresholds.BETTER_THAN_ALIKE if alike else thresholds.BETTER)
+
+
+def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iterable[str]) -> bool:
+    """Whether an effect may only repair the form of one that is there: they resemble, or both change the dynamics."""
+    return any(
+        name in effect.resembles
+        or effect.id in find_effect(name).resembles
+        or (stage in thresholds.DYNAMIC and own.stage in thresholds.DYNAMIC)
+        for name, own in before.effects
+        if name not in detected
+    )
 
 
 def released(fitted: Fitted) -> Fitted:

@@ -29,6 +29,8 @@ EFFORT_WEIGHT_ONLY_AT_WORK = 0.85
 """Weight of the evidence for efforts that do not appear at rest: true efforts do not wait for the stimulation."""
 ONLY_AT_WORK_PROBABILITY = 0.85
 """Largest probability of efforts that do not appear at rest: the stimulation itself may cause them."""
+REPAIR_PROBABILITY = 0.85
+"""Largest probability of an effect that may only repair the inexact form of an earlier one."""
 SEEN_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
 DYNAMIC = {"speed", "branch", "delay", "filter"}

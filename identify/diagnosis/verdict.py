@@ -8,7 +8,7 @@ import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, vetoed
-from stimrig.identify.diagnosis.search import EffectSearch, seen_at_rest
+from stimrig.identify.diagnosis.search import EffectSearch, resembles_earlier, seen_at_rest
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import Candidate
 
@@ -106,6 +106,9 @@ def judge(search: EffectSearch) -> Verdict:
         rivals[effect] = shares([c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added])
         # A later effect is at most as probable as those before it.
         found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in search.added[:number] if e in found)])
+        stage = dict(search.chain[number + 1].effects).get(effect, find_effect(effect).forms[0]).stage
+        if resembles_earlier(search.chain[number], find_effect(effect), stage, search.detected):
+            found[effect] = min(found[effect], thresholds.REPAIR_PROBABILITY)
         if _only_at_work(search, number):
             found[effect] = min(found[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
         if vetoed(search.chain[number], search.chain[number + 1]) is not None:

@@ -125,8 +125,9 @@ QUIET = 0.0015
 """If the noise of a sample is below this share of the torque's range, the spline gets more knots: its error at a bend
 would be visible."""
 
-SUDDEN = 150.0
-"""If what slow noise cannot foresee of a pilot's residual is so many times the noise, the torque jumps by itself."""
+SUDDEN, SUDDEN_SHARE = 150.0, 0.003
+"""If what slow noise cannot foresee of a pilot's residual is so many times the noise, and this share of the torque's
+range, the torque jumps by itself."""
 
 
 def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Solution:
@@ -175,7 +176,8 @@ def _is_quiet(first: Solution) -> bool:
     if not 0.0 < noise_nm < QUIET * first.projection.range_nm:
         return False
     ar1 = ar1_or_white(first.residual_nm, first.projection.stretches)[0]
-    return bool(np.sqrt(first.whitened_variance(ar1)) < SUDDEN * noise_nm)
+    sudden_nm = np.sqrt(first.whitened_variance(ar1))
+    return bool(sudden_nm < max(SUDDEN * noise_nm, SUDDEN_SHARE * first.projection.range_nm))
 
 
 def estimate(

@@ -20,7 +20,7 @@ FIRST, SECOND, EFFORT, TREMOR = "fatigue", "output_saturation", "voluntary_effor
 
 
 def candidate(effect: str, gain: float) -> Any:
-    return SimpleNamespace(effect=find_effect(effect), gain=gain)
+    return SimpleNamespace(effect=find_effect(effect), gain=gain, refused=None)
 
 
 def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters: float) -> Any:
@@ -35,6 +35,7 @@ def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters
     )
     return SimpleNamespace(
         log_likelihood=log_likelihood - 20.0,
+        distrusted=(),
         effects=forms,
         noise=SimpleNamespace(band=band),
         parameters_of=parameters_of,
