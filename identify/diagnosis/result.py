@@ -15,6 +15,7 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters
 from stimrig.identify.estimation.joint import predict_fitted
+from stimrig.identify.estimation.uncertainty import covariance_of
 from stimrig.identify.experiments import Experiment, plan
 from stimrig.identify.results import Diagnosis
 from stimrig.identify.summary import probability, sure
@@ -76,6 +77,7 @@ def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step
     before, after = row[number - 1].statistics, row[number].statistics
     fitted = search.last.written
     index = [e for e, _ in fitted.effects].index(effect)
+    own = describe_parameters(fitted, index, covariance_of(fitted))
     rivals = verdict.rivals.get(effect, {})
     named = _close(search, effect)
     ranked = sorted((name for name in rivals if name and name != effect), key=lambda name: -rivals[name])
@@ -96,7 +98,7 @@ def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step
         "next_experiment_plan": experiment and {k: v for k, v in experiment.to_dict().items() if k != "rivals"},
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
-        "parameters": dict(list(describe_parameters(fitted, index).items())[:MOST_PARAMETERS]),
+        "parameters": dict(list(own.items())[:MOST_PARAMETERS]),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }

@@ -17,17 +17,13 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
-from stimrig.identify.estimation.uncertainty import bands
+from stimrig.identify.estimation.uncertainty import bands, covariance_of, unexplained
 from stimrig.identify.model import Covariance, Model, Noise
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.simulation.joint_surface import Surfaces, joint_tables
 from stimrig.identify.simulation.predict import fingerprint, predict_on
 
 AT_WORK = 0.05
-EASED = 0.98
-"""Share of the penalty that is removed to see how far it holds the curve back."""
-BLOCK_S = 3.0
-"""Longer than a contraction's rise: within a block, what is wrong stays wrong."""
 
 
 def finish(
@@ -51,7 +47,9 @@ def finish(
     known = fitted.problem.size
     written = fitted.written
     problem, values, setup = written.problem, written.physical, written.problem.setup
-    covariance = _covariance(written, known)
+    matrix = covariance_of(written)
+    statistics = statistics | {"unexplained_nm": unexplained(written, matrix)}
+    covariance = _covariance(written, matrix, known)
     torque, rate = setup.sign * values[list(problem.initials)[:2]]
     model = Model(
         method=method_id,
@@ -67,20 +65,19 @@ def finish(
             block_sd_nm=fitted.noise.sd_nm,
             ar1=0.0 if fitted.noise.is_white else fitted.noise.ar1,
         ),
-        effects=tuple(_effect(written, index) for index in range(len(problem.chosen))),
+        effects=tuple(_effect(written, index, matrix) for index in range(len(problem.chosen))),
         fit=statistics,
         residual_tests=tests,
         reasons=tuple(reasons),
         extra=_parts(written),
     )
-    change_nm = _unpenalised_change(fitted)
     model = _named(model, setup.grid)
-    model = model.with_(joint=_joint(model, written, known))
-    model = model.with_(bands=bands(model, change_nm), valid_for=valid_for(model, setup.grid, setup.fitted))
+    model = model.with_(joint=_joint(model, written, matrix[:known, :known]))
+    model = model.with_(bands=bands(model), valid_for=valid_for(model, setup.grid, setup.fitted))
     return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.converged))
 
 
-def _joint(model: Model, fitted: Fitted, known: int) -> dict[str, Any]:
+def _joint(model: Model, fitted: Fitted, matrix: np.ndarray) -> dict[str, Any]:
     """g and h over the angles and velocities of the fitted rows; empty without an angle, or where nothing asks for one.
 
     Rows with less than `AT_WORK` of the largest torque show the passive part alone.
@@ -89,31 +86,10 @@ def _joint(model: Model, fitted: Fitted, known: int) -> dict[str, Any]:
     if grid.angle_rad is None or grid.velocity_rad_s is None or Surfaces.of(model.effects) is None:
         return {}
     assert model.covariance is not None
-    wide = replace(model.covariance, matrix=_clustered_covariance(fitted)[:known, :known])
+    wide = replace(model.covariance, matrix=matrix)
     level = np.abs(model.recruitment(grid.pulse_width_us[rows]))
     at_work = level > AT_WORK * float(level.max())
     return joint_tables(model.effects, wide, grid.angle_rad[rows], grid.velocity_rad_s[rows], at_work)
-
-
-def _clustered_covariance(fitted: Fitted) -> np.ndarray:
-    """Covariance of the parameters, in their units, that also holds what the model has a little wrong, shape (P, P).
-
-    If the model is right, the gradients of the log likelihood by blocks vary as much as the information says. What the
-    model has wrong lasts longer than a sample and makes them vary more (White 1982; Liang and Zeger 1986, clusters).
-    """
-    problem, setup = fitted.problem, fitted.problem.setup
-    white = setup.whitened(np.vstack([fitted.residual_nm, fitted.slopes]), fitted.noise)
-    at = np.concatenate([np.arange(start, stop) for start, stop in zip(*setup.stretches, strict=True)])
-    block = (at * setup.grid.step_s / BLOCK_S).astype(np.int64) + 10**6 * setup.grid.part[at]
-    borders = np.flatnonzero(np.r_[True, block[1:] != block[:-1]])
-    gradients = np.add.reduceat(white[1:] * white[0], borders, axis=1)
-    information = white[1:] @ white[1:].T
-    more = gradients @ gradients.T
-    inverse = np.linalg.pinv(fitted.hessian, hermitian=True)
-    values, vectors = np.linalg.eigh(inverse @ (more - information) @ inverse)
-    wider = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    slope = np.where(problem.log, fitted.physical, 1.0)
-    return (inverse + wider) * slope[:, None] * slope[None, :]
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:
@@ -124,18 +100,6 @@ def _parts(fitted: Fitted) -> dict[str, Any]:
     states = setup.sign * values[list(problem.initials)].reshape(-1, 2)
     baselines = setup.to_record(values[list(problem.baselines)])[setup.grid.part[setup.grid.starts]]
     return {"parts": np.c_[baselines, states].tolist()}
-
-
-def _unpenalised_change(fitted: Fitted) -> np.ndarray:
-    """Change of the recruitment coefficients if most of the penalty were removed, N·m, to first order."""
-    problem = fitted.problem
-    mean, precision = problem.prior
-    at = problem.coefficients
-    eased = np.zeros_like(precision)
-    eased[at, at] = EASED * precision[at, at]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
-    left = (fitted.hessian - eased) * scale[:, None] * scale[None, :] + 1e-9 * np.eye(scale.size)
-    return (scale * np.linalg.solve(left, scale * (eased @ (fitted.theta - mean))))[at]
 
 
 def _named(model: Model, grid: Grid) -> Model:
@@ -153,23 +117,19 @@ def _named(model: Model, grid: Grid) -> Model:
     )
 
 
-def _covariance(fitted: Fitted, known: int) -> Covariance:
-    """Covariance of all estimated parameters, with the record's sign of torque.
-
-    The penalty is a prior, so this is the covariance of the posterior. Averaged over the curve, bands from it contain
-    the truth as often as stated (Nychka 1988).
-    """
+def _covariance(fitted: Fitted, matrix: np.ndarray, known: int) -> Covariance:
+    """Covariance of all estimated parameters, with the record's sign of torque."""
     problem = fitted.problem
     sign = np.ones(known)
     sign[3 : problem.coefficients.stop] = problem.setup.sign
     values = fitted.physical[:known] * sign
     first = problem.baselines.start
     values[first : problem.baselines.stop] += problem.setup.zero_nm
-    matrix = fitted.covariance[:known, :known] * sign[:, None] * sign[None, :]
+    matrix = matrix[:known, :known] * sign[:, None] * sign[None, :]
     return Covariance(problem.names[:known], values, matrix)
 
 
-def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
+def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
     chosen = fitted.problem.chosen[index]
     setup = fitted.problem.setup
     own = fitted.unforeseen.get(chosen.effect)
@@ -179,7 +139,7 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
         "form": chosen.form.name,
         "stage": chosen.form.stage,
         "equation": chosen.form.equation,
-        "parameters": describe_parameters(fitted, index),
+        "parameters": describe_parameters(fitted, index, matrix),
         "settings": {
             "scale_nm": setup.scale_nm,
             "noise_sd_nm": setup.noise_sd_nm,
@@ -191,14 +151,13 @@ def _effect(fitted: Fitted, index: int) -> dict[str, Any]:
     } | ({} if own is None else {"unforeseen": {"mean_nm": own[0], "rms_nm": own[1]}})
 
 
-def describe_parameters(fitted: Fitted, index: int) -> dict[str, dict[str, Any]]:
+def describe_parameters(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, dict[str, Any]]:
     """Value, sd and unit of an effect's parameters by name; with `direction` if the record has the opposite sign.
 
     Torques of an effect are positive in the direction in which the muscle pulls, except those of the sensor, which have
     the sign of the record.
     """
     chosen = fitted.problem.chosen[index]
-    matrix = fitted.covariance
     values = fitted.physical
     turned = fitted.problem.setup.sign < 0 and chosen.form.stage != "sensor"
     return {

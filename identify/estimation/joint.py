@@ -122,13 +122,6 @@ class Fitted:
         return {}
 
     @cached_property
-    def covariance(self) -> np.ndarray:
-        """Covariance of the parameters in their units, shape (P, P)."""
-        inverse = np.linalg.pinv(self.hessian, hermitian=True)
-        slope = np.where(self.problem.log, self.physical, 1.0)
-        return inverse * slope[:, None] * slope[None, :]
-
-    @cached_property
     def unforeseen(self) -> dict[str, tuple[float, float]]:
         """As `stimrig.identify.simulation.predict.unforeseen`."""
         problem, grid = self.problem, self.problem.setup.grid

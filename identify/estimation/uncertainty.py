@@ -13,31 +13,139 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.estimation.fit_statistics import held_out_change
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.rests import RELAXED_S, since_pulse
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Basis
 from stimrig.identify.simulation.predict import same_data, slopes, unforeseen
 
 POINTWISE = 1.959964
-BENT = 2.0
-"""Factor on the change without penalty; the whole band then contains 95 % of 120 development curves."""
+BLOCK_S = 3.0
+"""Longer than a contraction's rise: within a block, what is wrong stays wrong."""
+NEGLIGIBLE = 1e-4
+"""Directions in which a change varies by less than this share of the largest are ignored."""
+SHORT = 8
+"""Rests of no more intervals say nothing of the noise."""
+EASED = 0.995
+"""Share of the penalty that is removed to see how far it holds the curve back."""
 DRAWS = 256
 POINTS = 41
 DYNAMICS = ("time_constant_s", "damping", "delay_s")
 
 
-def bands(model: Model, unpenalised_change_nm: np.ndarray) -> dict[str, Any]:
-    """Bands on both curves, as in MODEL.json; empty if the method gives no covariance.
+def covariance_of(fitted: Fitted) -> np.ndarray:
+    """Covariance of the parameters, in their units, shape (P, P), that holds too where the structure is wrong.
 
-    `unpenalised_change_nm` is the change of the recruitment coefficients if most of the penalty were removed, N·m.
+    The penalty of the curve is a prior, so this begins with the covariance of the posterior: averaged over the curve,
+    bands from it contain the truth as often as stated (Nychka 1988). If the model is right, the gradients of the log
+    likelihood by blocks vary as much as the information says. What the model has wrong lasts longer than a sample and
+    makes them vary more (White 1982; Liang and Zeger 1986, clusters); then that counts, in each direction. And where
+    the penalty holds the curve back, the truth may be as far off as the curve would go without it.
     """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
+    values, vectors = np.linalg.eigh(fitted.hessian * scale[:, None] * scale[None, :])
+    told = values > 1e-14 * values.max()
+    root = scale[:, None] * vectors[:, told] / np.sqrt(values[told])
+    gradients, information = _block_gradients(fitted)
+    values, vectors = np.linalg.eigh(_beyond(root.T @ gradients, root.T @ information @ root))
+    wider, held_back = root @ vectors * np.sqrt(np.maximum(values, 0.0)), _held_back(fitted)
+    slope = np.where(fitted.problem.log, fitted.physical, 1.0)
+    return (root @ root.T + wider @ wider.T + np.outer(held_back, held_back)) * slope[:, None] * slope[None, :]
+
+
+def _beyond(gradients: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """How much more the gradients of blocks, shape (P, B), vary than the information says, shape (P, P).
+
+    A few blocks say little of many directions. So their covariance is drawn towards a multiple of the information, as
+    far as it varies itself from block to block (Ledoit and Wolf 2004).
+    """
+    blocks = gradients.shape[1]
+    few = blocks / max(blocks - 1, 1)
+    found = few * gradients @ gradients.T
+    usual = information * float(np.trace(found) / max(np.trace(information), 1e-300))
+    scatter = few**2 * float(np.sum(np.sum(gradients**2, axis=0) ** 2)) - float(np.sum(found**2)) / blocks
+    share = np.clip(scatter / max(float(np.sum((found - usual) ** 2)), 1e-300), 0.0, 1.0)
+    return share * usual + (1.0 - share) * found - information
+
+
+def _block_gradients(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients of the log likelihood by blocks, shape (P, B), and the information, shape (P, P)."""
+    setup = fitted.problem.setup
+    white = setup.whitened(np.vstack([fitted.residual_nm, fitted.slopes]), fitted.noise)
+    at = np.concatenate([np.arange(start, stop) for start, stop in zip(*setup.stretches, strict=True)])
+    block = (at * setup.grid.step_s / BLOCK_S).astype(np.int64) + 10**6 * setup.grid.part[at]
+    borders = np.flatnonzero(np.r_[True, block[1:] != block[:-1]])
+    return np.add.reduceat(white[1:] * white[0], borders, axis=1), white[1:] @ white[1:].T
+
+
+def _held_back(fitted: Fitted) -> np.ndarray:
+    """How far the penalty may hold the curve back: its coefficients' change without most of it, shape (P,).
+
+    To first order, and as far as it is more than the noise gives a curve that is as smooth as the penalty says.
+    """
+    mean, precision = fitted.problem.prior
+    at, found = fitted.problem.coefficients, np.zeros(fitted.theta.size)
+    prior = np.zeros_like(precision)
+    prior[at, at] = precision[at, at]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
+    both = scale[:, None] * scale[None, :]
+    whole, prior = fitted.hessian * both + 1e-9 * np.eye(scale.size), prior * both
+    eased = np.linalg.inv(whole - EASED * prior)
+    change = (eased @ (EASED * prior @ ((fitted.theta - mean) / scale)))[at]
+    usual = eased @ (whole - (1.0 - (1.0 - EASED) ** 2) * prior) @ eased - np.linalg.inv(whole)
+    values, vectors = np.linalg.eigh(usual[at, at])
+    told = values > NEGLIGIBLE * max(float(values.max()), 1e-300)
+    ratio = float(np.mean((vectors.T @ change)[told] ** 2 / values[told])) if told.any() else 0.0
+    found[at] = change * scale[at] * np.sqrt(max(1.0 - 1.0 / max(ratio, 1.0), 0.0))
+    return found
+
+
+def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
+    """What the structure leaves of left-out blocks beyond noise and the parameters' uncertainty, N·m, rms.
+
+    `matrix` is the parameters' covariance. A part that chance alone may leave is taken off, so that it is zero where
+    the structure is right.
+    """
+    rows = fitted.problem.setup.fitted
+    error = (fitted.residual_nm - held_out_change(fitted))[rows]
+    lever = (fitted.slopes / np.where(fitted.problem.log, fitted.physical, 1.0)[:, None])[:, rows]
+    noise, doubt = _noise_of_intervals(fitted)
+    more = float(np.mean(error**2)) - noise - float(np.sum(matrix * (lever @ lever.T))) / error.size
+    return float(np.sqrt(max(more - (2.0 * doubt) ** 2 / more, 0.0))) if more > 0.0 else 0.0
+
+
+def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:
+    """Variance of the noise of an interval's mean, (N·m)², and its standard error.
+
+    Where noise was taken for slow, what the structure leaves is in it; then it is that about a straight line in each
+    rest. Without rests the two cannot be told apart, and only the noise of the samples counts.
+    """
+    setup, noise = fitted.problem.setup, fitted.noise
+    grid, rows = setup.grid, setup.fitted
+    alike = 0.0 if noise.is_white else noise.ar1**2
+    single = (1.0 - alike) / (1.0 + alike)
+    most, count = noise.sd_nm**2, single * float(rows.sum())
+    if noise.is_white:
+        return most, most * np.sqrt(2.0 / count)
+    relaxed = rows & (grid.step_s * since_pulse(grid) > RELAXED_S)
+    rests = [rest for rest in grid.stretches(relaxed) if rest.stop - rest.start > SHORT]
+    least = setup.noise_sd_nm**2 / float(np.median(grid.count[rows]))
+    left = [np.polyfit(grid.time_s[rest], fitted.residual_nm[rest], 1, full=True)[1].sum() for rest in rests]
+    free = sum(rest.stop - rest.start - 2 for rest in rests)
+    found = float(np.clip(sum(left) / free, least, most)) if free else least
+    return found, found * float(np.sqrt(2.0 / count + 2.0 / max(single * free, 1.0)))
+
+
+def bands(model: Model) -> dict[str, Any]:
+    """Bands on both curves, as in MODEL.json; empty if the method gives no covariance."""
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):
         return {}
     width = np.linspace(0.0, model.recruitment.basis.largest_us, POINTS)
     time_s = np.linspace(0.0, linear.memory_s, POINTS)
     curve = _band(model.recruitment(width), recruitment_slopes(model.recruitment.basis, covariance, width), covariance)
-    _widen(curve, model.recruitment.basis.design(width) @ unpenalised_change_nm)
     step = _band(linear.step_response(time_s), step_slopes(linear, covariance, time_s), covariance)
     return {
         "level_percent": 95,
@@ -73,8 +181,13 @@ def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray)
 def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Pointwise 95 % band on the predicted torque without noise, N·m: lower and upper, each of shape (N,).
 
-    It contains the uncertainty of the model and, where it was not fitted, the size of what cannot be foreseen; not the
-    noise of the measurement. Raises ValueError: the model has no covariance (another method).
+    It contains the uncertainty of the model, what its structure leaves (`unexplained`) and, where it was not fitted,
+    the size of what cannot be foreseen; not the noise of the measurement.
+
+    Raises
+    ------
+    ValueError
+        The model has no covariance (another method).
     """
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):
@@ -83,6 +196,7 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     sd = _sd(slopes(model, grid, covariance.names), covariance)
     middle = grid.start_s + (np.arange(grid.size) + float(np.mean(grid.fraction))) * grid.step_s
     share = np.sqrt(sum(rms**2 for _, rms in unforeseen(model).values()))
+    sd = np.hypot(sd, model.fit.get("unexplained_nm", 0.0))
     seen = ~record.held_out if same_data(model, record) else np.zeros(record.time_s.size, bool)
     half = POINTWISE * np.hypot(np.interp(record.time_s, middle, sd), np.where(seen, 0.0, share))
     predicted = model.predict(record)
@@ -112,12 +226,6 @@ def _band(value: np.ndarray, slopes: np.ndarray, covariance: Covariance) -> dict
         "whole_lower": value - factor * sd,
         "whole_upper": value + factor * sd,
     }
-
-
-def _widen(band: dict[str, np.ndarray], bias_nm: np.ndarray) -> None:
-    """Widen the whole band by what the smoothness penalty may hide at a bend."""
-    for side, sign in (("whole_lower", -1.0), ("whole_upper", 1.0)):
-        band[side] = band["value"] + sign * (np.abs(band[side] - band["value"]) + BENT * np.abs(bias_nm))
 
 
 def whole_factor(matrix: np.ndarray, sd: np.ndarray) -> float:

@@ -45,7 +45,7 @@ USUAL = Rates(
     start=np.array([0.08, 6.0, 0.10]),
     step=np.array([0.006, 0.5, 0.008]),
     trend=np.zeros(LEVELS),
-    trend_sd=np.array([0.025, 1.2, 0.012]),
+    trend_sd=np.array([0.04, 1.2, 0.012]),  # a muscle that loses 40 % in ten trials begins with -0.055: no surprise
     turn=np.array([0.008, 0.5, 0.005]),
 )
 
