@@ -129,7 +129,7 @@ def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:
     most, count = noise.sd_nm**2, single * float(rows.sum())
     if noise.is_white:
         return most, most * np.sqrt(2.0 / count)
-    relaxed = rows & (grid.step_s * since_pulse(grid) > RELAXED_S)
+    relaxed = rows & (grid.step_s * since_pulse(grid, 0.0) > RELAXED_S)
     rests = [rest for rest in grid.stretches(relaxed) if rest.stop - rest.start > SHORT]
     least = setup.noise_sd_nm**2 / float(np.median(grid.count[rows]))
     left = [np.polyfit(grid.time_s[rest], fitted.residual_nm[rest], 1, full=True)[1].sum() for rest in rests]
