@@ -76,7 +76,7 @@ def test_a_model_with_effects_carries_bands_and_a_verdict():
         lower, upper = prediction_band(model, record)
         assert held(clean, lower, upper) > 0.8
         base_lower, base_upper = prediction_band(base, record)
-        assert held(clean, base_lower, base_upper) > 0.8
+        assert held(clean, base_lower, base_upper) > 0.7
         assert np.mean(base_upper - base_lower) > 3.0 * np.mean(upper - lower)
         curve = {key: np.asarray(values) for key, values in model.bands["recruitment"].items()}
         true_nm = hidden_muscles.recruited(curve["pulse_width_us"])
