@@ -11,6 +11,7 @@ from stimrig.identify.diagnosis import structure_of
 from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful, search_effects
 from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.fit_statistics import evaluate
@@ -90,14 +91,14 @@ def improve(
     )
 
 
+_PLAIN = "The plain structure: recruitment curve and linear dynamics."
+
+
 def _reason(search: EffectSearch, step: Step) -> str:
     if step.added is None:
         held = ", ".join(find_effect(name).name.lower() for name in effect_names(search.base))
-        return (
-            f"The given structure, with {held}."
-            if held
-            else "The plain structure: recruitment curve and linear dynamics."
-        )
+        base = f"The given structure, with {held}." if held else _PLAIN
+        return " ".join([base, *words(step.fitted, search.rows)])
     if step.added in search.detected:
         return "The samples show it directly, before any fit."
     number = search.added.index(step.added)

@@ -61,6 +61,7 @@ class EffectSearch:
 
     record: Record
     raw: Raw  # what the samples show before any fit
+    rows: np.ndarray  # intervals that may be fitted, bool, shape (K,)
     plain: Fitted  # the model without effects
     base: Fitted  # the model of the structure that is examined
     detected: list[str] = field(default_factory=list)  # effects that the samples show before any fit
@@ -126,7 +127,7 @@ def search_effects(
     if count * grid.step_s < thresholds.LEAST_S:
         raise NotIdentifiable(f"only {count} pulse intervals may be fitted", fix="Give at least a few seconds of data.")
     plain = fit_plain(grid, rows)
-    search = EffectSearch(grid.record, raw, plain, renewed_curve(add_effects(plain, structure, raw)))
+    search = EffectSearch(grid.record, raw, rows, plain, renewed_curve(add_effects(plain, structure, raw)))
     start = _add_detected(search)
     search.quiet = quiet_rows(start)
     search.append(start)

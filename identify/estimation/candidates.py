@@ -55,6 +55,17 @@ def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
     return best
 
 
+def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
+    """What was chosen, in words; nothing where the noise is usual and all rows were fitted."""
+    own, found = fitted.problem.setup.fitted, []
+    if own.sum() < rows.sum():
+        count, all_rows = int(own.sum()), int(rows.sum())
+        found.append(f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted.")
+    if fitted.noise.held:
+        found.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
+    return found
+
+
 def _better(before: Fitted, after: Fitted) -> Fitted:
     """The second fit where it predicts the blocks of its rows better, else the first."""
     old = leave_out(before)

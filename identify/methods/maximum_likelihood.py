@@ -16,7 +16,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
 from stimrig.identify.errors import BadRequest
-from stimrig.identify.estimation.candidates import chosen
+from stimrig.identify.estimation.candidates import chosen, words
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import estimate, still_rows, to_fitted
@@ -170,7 +170,8 @@ class MaximumLikelihood:
         if kind != "spline":
             return to_fitted(solution, rows, most=0), [reason]
         known = to_fitted(solution, rows)
-        return chosen(grid, rows, known, lambda own, white: to_fitted(solved(own, white), own, white=white)), [reason]
+        best = chosen(grid, rows, known, lambda own, white: to_fitted(solved(own, white), own, white=white))
+        return best, [reason, *words(best, rows)]
 
 
 METHOD = MaximumLikelihood()

@@ -1,0 +1,128 @@
+"""Left-out blocks: what they are, that they are not seen, and what follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stimrig import identify
+from stimrig.hardware_sim.bout_records import record_of_bouts
+from stimrig.hardware_sim.hidden_records import generate
+from stimrig.hardware_sim.physics_records import record_of_physics
+from stimrig.identify.diagnosis.residual import vetoed
+from stimrig.identify.estimation.candidates import alike_rows
+from stimrig.identify.estimation.effect_fit import fitted_with
+from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, hold_out, leave_out
+from stimrig.identify.estimation.plain import fit_plain
+from stimrig.identify.estimation.samples import fitted_rows, prepare
+from stimrig.identify.simulation.problem import Problem
+from tests.harness import few_effects
+from tests.harness.carried_sessions import as_record
+
+
+@pytest.fixture(scope="module")
+def plain_record() -> identify.Record:
+    return as_record(generate(None, "middle", 3))
+
+
+def arm(seed: int) -> identify.Record:
+    return as_record(record_of_bouts(seed))
+
+
+def pair(old: list[float], new: list[float], floor_nm: float = 0.0, wander_nm: float = 0.0, offset: float = 0.0):
+    """Two models with these errors (standard deviations) in blocks of 50 rows."""
+    rng, block = np.random.default_rng(1), np.repeat(np.arange(len(old)), 50)
+    shape = rng.standard_normal((len(old), 50))
+    shape -= shape.mean(axis=1, keepdims=True)
+    return [LeftOut((np.array(sd)[:, None] * shape + offset).ravel(), block, floor_nm, wander_nm) for sd in (old, new)]
+
+
+def test_blocks_are_whole_bouts_or_pieces_of_them_and_follow_from_the_pulses_alone(plain_record):
+    for record, whole in ((plain_record, False), (arm(0), True)):
+        grid, _ = prepare(record)
+        rows = fitted_rows(grid, None)
+        block = blocks(grid, rows)
+        assert np.array_equal(block >= 0, rows) and np.unique(block[rows]).size >= 8
+        assert np.all(block[grid.held_out] == -1)
+        for number in np.unique(block[rows]):
+            assert np.unique(bouts(grid)[block == number]).size == 1
+        assert (np.unique(block[rows]).size == np.unique(bouts(grid)[rows]).size) == whole
+        other, _ = prepare(record.with_torque(record.torque_nm[::-1].copy()))
+        assert np.array_equal(blocks(other, rows), block)
+
+
+def test_a_left_out_block_is_not_seen(plain_record):
+    """Another torque in a block moves what is predicted there by next to nothing, and what is fitted there by a lot."""
+    grid, _ = prepare(plain_record)
+    rows = fitted_rows(grid, None)
+    number = int(np.unique(blocks(grid, rows)[rows])[4])
+    own = blocks(grid, rows) == number
+    before = fit_plain(grid, rows)
+    spoiled = np.where(own, grid.torque_nm + 2.0 * np.sin(0.7 * np.arange(grid.size)), grid.torque_nm)
+    setup = before.problem.setup.with_(target_nm=before.problem.setup.to_muscle(spoiled))
+    first, seen = leave_out(before), np.isfinite(leave_out(before).error_nm) & own
+    mean = before.problem.run(before.theta)[0]
+    after = leave_out(replace(before, problem=Problem(setup, before.effects), residual_nm=setup.target_nm - mean))
+    moved = (setup.target_nm - after.error_nm) - (before.problem.setup.target_nm - first.error_nm)
+    assert seen.sum() > 20
+    assert np.max(np.abs(moved[seen])) < 1e-6
+    assert np.max(np.abs(first.error_nm[seen] - after.error_nm[seen])) > 1.0
+
+
+def test_one_block_alone_tells_nothing_and_what_all_say_counts():
+    alone = difference(*pair([1.0] * 10, [0.1] + [1.0] * 9, floor_nm=1.0))
+    assert alone.errors < 2.0
+    assert difference(*pair([1.0] * 10, [0.8, 0.82] * 5)).errors > 10.0
+    there, back = difference(*pair([1.0, 2.0] * 5, [0.7, 1.9] * 5)), difference(*pair([0.7, 1.9] * 5, [1.0, 2.0] * 5))
+    assert there.errors == pytest.approx(-back.errors) and there.gain == pytest.approx(-back.gain)
+
+
+def test_what_is_below_the_noise_does_not_count_and_blocks_at_noise_tell_little():
+    assert abs(difference(*pair([0.1] * 10, [0.001] * 10, floor_nm=1.0)).gain) < 0.01
+    few = difference(*pair([0.1] * 8 + [5.0, 6.0], [0.1] * 8 + [1.0, 1.1], floor_nm=0.1))
+    assert few.errors > 2.0 and few.blocks < 3.0
+
+
+def test_a_zero_that_wanders_is_no_fault_of_a_model():
+    shifted, still = pair([1.0] * 10, [1.0] * 10, wander_nm=2.0, offset=3.0)
+    own = still.block == 0
+    assert shifted.square(own) == pytest.approx(LeftOut(still.error_nm - 3.0, still.block, 0.0).square(own))
+    held = replace(still, wander_nm=0.0)
+    assert held.square(own) == pytest.approx(still.square(own) + 9.0)
+
+
+def test_rows_of_validate_do_not_choose_rows_or_noise():
+    record = arm(1)
+    grid, _ = prepare(record)
+    rows = fitted_rows(grid, None)
+    own = alike_rows(grid, rows)
+    assert own is not None and 0.2 < own.sum() / rows.sum() < 0.8 and not np.any(own & grid.held_out)
+    other = record.with_torque(np.where(record.held_out, -3.0 * record.torque_nm, record.torque_nm))
+    models = [identify.fit(one) for one in (record, other)]
+    assert models[0].linear == models[1].linear
+    assert any("taken as white" in reason for reason in models[0].reasons)
+
+
+def test_ordinary_records_keep_their_noise_and_rows(plain_record):
+    model = identify.fit(plain_record)
+    assert not any("taken as white" in reason or "bouts like" in reason for reason in model.reasons)
+
+
+def test_held_out_rows_may_object_and_never_ask(plain_record):
+    plain = fitted_with(plain_record, [])
+    worse = replace(plain, theta=plain.theta + 0.2 * (np.arange(plain.theta.size) == 0))
+    assert vetoed(worse, plain) is None
+    old, new = vetoed(plain, worse) or (0.0, 0.0)
+    assert new > old == pytest.approx(hold_out(plain).rms_nm)
+
+
+@pytest.mark.slow
+def test_what_is_likely_and_does_not_predict_is_refused():
+    """Breath on a plain muscle: slow noise explains it best, but effects repair it and gain log evidence."""
+    record = as_record(record_of_physics("plain", 2))
+    with few_effects.only("asymmetric_relaxation", "activation_dependent_speed"):
+        result = identify.improve(record)
+    assert [step["added"] for step in result.steps] == [None]
+    assert any("left out of the fit the error" in row["reason"] for row in result.refused)
