@@ -251,9 +251,13 @@ def _scan(base: Fitted, progress: Progress, before: list[Candidate]) -> list[Can
 
 
 def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
-    """Whether an effect can be tried: no earlier step looks for it, it is not there, the record has its columns."""
+    """Whether an effect can be tried: no earlier step looks for it, it is not there, the record has its columns.
+
+    Only the likelihood asks for one that comes and goes by no law: not where a few jumps decide the likelihood.
+    """
     record = base.problem.setup.grid.record
-    return not effect.raw and effect.id not in present and all(getattr(record, n) is not None for n in effect.needs)
+    asked = not effect.raw and effect.id not in present and not (effect.sporadic and base.heavy_tails)
+    return asked and all(getattr(record, need) is not None for need in effect.needs)
 
 
 def _likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:

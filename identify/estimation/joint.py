@@ -92,11 +92,16 @@ class Fitted:
         return float(np.mean(white**4) / max(np.mean(white**2) ** 2, 1e-300) - 3.0)
 
     @property
+    def heavy_tails(self) -> bool:
+        """Whether a few jumps hold most of the innovations' squares."""
+        return self.excess_kurtosis > HEAVY_TAILS
+
+    @property
     def distrusted(self) -> tuple[str, ...]:
         """Why its likelihood is no evidence, in words; empty where nothing speaks against it."""
         slow = "The slow noise is as slow as it may be: zero and slow shapes cost the likelihood nothing."
         heavy = f"A few jumps decide the likelihood: excess kurtosis {self.excess_kurtosis:.0f}."
-        return (slow,) * self.noise.at_bound + (heavy,) * (self.excess_kurtosis > HEAVY_TAILS)
+        return (slow,) * self.noise.at_bound + (heavy,) * self.heavy_tails
 
     @property
     def effects(self) -> list[tuple[str, Form]]:

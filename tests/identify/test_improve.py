@@ -61,7 +61,7 @@ def held(record: identify.Record, lower: np.ndarray, upper: np.ndarray) -> float
 
 @pytest.mark.slow
 def test_a_model_with_effects_carries_bands_and_a_verdict():
-    """The band holds the muscle's own torque, and without the effect it is far wider; twice the noise, no more than twice as wide.
+    """The band holds the muscle's own torque, and without the effect it is far wider; it grows with the noise at most.
 
     The verdict's gates are those of any model.
     """
