@@ -22,10 +22,8 @@ from stimrig.identify.simulation.problem import Problem
 
 APART_S = 1.0
 """A pause that separates two bouts of stimulation; the zeros of a PRBS are shorter."""
-ENOUGH_BOUTS = 8
-"""So many bouts are a block each; of fewer, long ones are cut."""
 PIECES, LEAST_S = 10, 2.0
-"""Blocks that a record of few bouts is cut into, and their least length, s."""
+"""A block has about this part of the rows at most, unless that is less than so many seconds."""
 START_S = 0.3
 """Rows after a start that stay in the fit: they alone tell the state that the record begins with."""
 NEAR = 0.02
@@ -45,6 +43,8 @@ LEAST_WEIGHT = 0.01
 """Weight of a block in which both models err no more than white noise."""
 LEAST_BLOCKS = 1.5
 """Number of telling blocks below which nothing is concluded."""
+MOVED_RAD = 0.05
+"""A joint that moves by more at rest is not held."""
 SLACK = 0.05
 """Log posterior that a step may fall short of its promise by."""
 FLOOR_SHARE = 0.0015
@@ -62,26 +62,17 @@ def bouts(grid: Grid) -> np.ndarray:
 def blocks(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """The number of each interval's block, shape (K,); -1 where `rows` is false.
 
-    Whole bouts; where there are few, pieces of them. They depend on the pulses alone, so that all models of a record
-    share them.
+    Whole bouts; long ones are cut into pieces of about equal numbers of rows. They depend on the pulses alone, so that
+    all models of a record share them.
     """
-    bout = bouts(grid)
-    if np.unique(bout[rows]).size < ENOUGH_BOUTS:
-        edges = np.r_[0, np.flatnonzero(np.diff(bout)) + 1, grid.size]
-        edges = _cut(edges, np.r_[0, np.cumsum(rows)], LEAST_S / grid.step_s)
-        bout = np.searchsorted(edges, np.arange(grid.size), side="right")
-    return np.where(rows, bout, -1)
-
-
-def _cut(edges: np.ndarray, count: np.ndarray, least: float) -> np.ndarray:
-    """Bouts cut into pieces of about equal numbers of rows."""
-    piece = max(count[-1] / PIECES, least)
-    found = [edges]
+    edges, count = np.r_[0, np.flatnonzero(np.diff(bouts(grid))) + 1, grid.size], np.r_[0, np.cumsum(rows)]
+    piece, found = max(count[-1] / PIECES, LEAST_S / grid.step_s), [edges]
     for start, stop in pairwise(edges):
         pieces = max(round((count[stop] - count[start]) / piece), 1)
         inner = count[start] + (count[stop] - count[start]) * np.arange(1, pieces) / pieces
         found.append(np.searchsorted(count, inner))
-    return np.unique(np.concatenate(found))
+    edges = np.unique(np.concatenate(found))
+    return np.where(rows, np.searchsorted(edges, np.arange(grid.size), side="right"), -1)
 
 
 def near_widths(grid: Grid, seen: np.ndarray) -> np.ndarray:
@@ -181,8 +172,11 @@ def _allowed_nm(fitted: Fitted) -> tuple[float, float]:
     """Error that does not matter, and scatter of the torque at rest, N·m."""
     setup = fitted.problem.setup
     grid = setup.grid
-    still = setup.target_nm[setup.fitted & (grid.step_s * since_pulse(grid) >= FORGOTTEN_S)]
+    rest = setup.fitted & (grid.step_s * since_pulse(grid) >= FORGOTTEN_S)
+    still = setup.target_nm[rest]
     wander = 1.4826 * float(np.median(np.abs(still - np.median(still)))) if still.size else 0.0
+    if grid.angle_rad is not None and still.size and np.ptp(grid.angle_rad[rest]) > MOVED_RAD:
+        wander = 0.0  # a joint that moves has its passive torque at rest
     return max(grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm), wander
 
 
@@ -234,18 +228,18 @@ class Difference:
 def difference(before: LeftOut, after: LeftOut) -> Difference:
     """Compare two models of one record, block by block of the second.
 
-    A block in which both err by no more than white noise tells nothing: each block weighs as the share of the larger
-    error that is not white noise.
+    Each row weighs as the share of its block's larger error that is not white noise: a block in which both err by no
+    more tells nothing.
     """
     pairs, noise = [], before.floor_nm**2
     for number in np.unique(after.block[after.block >= 0]):
         own = (after.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
         if own.any():
-            pairs.append((before.square(own), after.square(own)))
+            pairs.append((before.square(own), after.square(own), own.sum()))
     if not pairs:
         return Difference(0.0, float("inf"), 0.0)
-    old, new = np.array(pairs).T
-    weight = np.maximum(1.0 - noise / np.maximum(np.maximum(old, new), 1e-300), LEAST_WEIGHT)
+    old, new, rows = np.array(pairs).T
+    weight = rows * np.maximum(1.0 - noise / np.maximum(np.maximum(old, new), 1e-300), LEAST_WEIGHT)
     ratio = 0.5 * np.log((old + noise) / (new + noise))
     gain = float(weight @ ratio / weight.sum())
     told = float(weight.sum() ** 2 / (weight @ weight))

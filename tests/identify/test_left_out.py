@@ -40,7 +40,7 @@ def pair(old: list[float], new: list[float], floor_nm: float = 0.0, wander_nm: f
 
 
 def test_blocks_are_whole_bouts_or_pieces_of_them_and_follow_from_the_pulses_alone(plain_record):
-    for record, whole in ((plain_record, False), (arm(0), True)):
+    for record in (plain_record, arm(0)):
         grid, _ = prepare(record)
         rows = fitted_rows(grid, None)
         block = blocks(grid, rows)
@@ -48,7 +48,7 @@ def test_blocks_are_whole_bouts_or_pieces_of_them_and_follow_from_the_pulses_alo
         assert np.all(block[grid.held_out] == -1)
         for number in np.unique(block[rows]):
             assert np.unique(bouts(grid)[block == number]).size == 1
-        assert (np.unique(block[rows]).size == np.unique(bouts(grid)[rows]).size) == whole
+        assert np.bincount(block[rows]).max() <= 1.6 * max(rows.sum() / 10, 80)
         other, _ = prepare(record.with_torque(record.torque_nm[::-1].copy()))
         assert np.array_equal(blocks(other, rows), block)
 
