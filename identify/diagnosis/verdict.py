@@ -132,7 +132,7 @@ def judge(search: EffectSearch) -> Verdict:
             strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
     else:
         refused = max((c.gain for tried in search.rounds for c in tried if c.refused), default=0.0)
-        strange = strange or left.left or (refused > thresholds.REFUSED and not last.distrusted)
+        strange = strange or left.left or (refused > thresholds.REFUSED and not last.heavy_tails)
     # Naming an effect claims more than naming none, so less error is allowed.
     form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR
     before, after = (held_out_error(fitted, form, last) for fitted in (first, last))

@@ -35,7 +35,7 @@ def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters
     )
     return SimpleNamespace(
         log_likelihood=log_likelihood - 20.0,
-        distrusted=(),
+        heavy_tails=False,
         effects=forms,
         noise=SimpleNamespace(band=band),
         parameters_of=parameters_of,
