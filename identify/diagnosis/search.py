@@ -253,12 +253,13 @@ def _scan(base: Fitted, progress: Progress, before: list[Candidate]) -> list[Can
 def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     """Whether an effect can be tried: no earlier step looks for it, it is not there, the record has its columns.
 
-    Only the likelihood asks for one that comes and goes by no law: not where a few jumps decide the likelihood, and for
-    a narrow band of noise not where the noise is held white.
+    Only the likelihood asks for one that comes and goes by no law: not where jumps of held readings decide the
+    likelihood, and for a narrow band of noise not where the noise is held white.
     """
-    record = base.problem.setup.grid.record
+    grid = base.problem.setup.grid
+    record, jumps = grid.record, base.heavy_tails and grid.readings is not None
     asked = not effect.raw and effect.id not in present
-    asked = asked and not (effect.sporadic and base.heavy_tails) and not (effect.band and base.noise.held)
+    asked = asked and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
     return asked and all(getattr(record, need) is not None for need in effect.needs)
 
 

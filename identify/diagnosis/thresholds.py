@@ -16,7 +16,7 @@ NEXT_MARGIN = 10.0
 """Log evidence that every further effect must gain, at least."""
 JUDGED = 4
 """So many candidates of a round, the likeliest first, are judged by left-out blocks."""
-BETTER = 1.5
+BETTER = 1.0
 """Standard errors by which the error on left-out blocks must fall with an effect."""
 BETTER_THAN_ALIKE = 3.0
 """The same if it resembles an effect that is there, or both change the dynamics: one effect in an inexact form looks
