@@ -198,8 +198,10 @@ def allowed(search: EffectSearch, candidate: Candidate, seen: Difference) -> boo
         return True
     if not effect.predictable:
         return seen.errors >= thresholds.NO_WORSE
-    alike = resembles_earlier(search.last, candidate.effect, candidate.form.stage, search.detected)
-    return seen.errors >= (thresholds.BETTER_THAN_ALIKE if alike else thresholds.BETTER)
+    if resembles_earlier(search.last, effect, candidate.form.stage, search.detected):
+        return seen.errors >= thresholds.BETTER_THAN_ALIKE
+    weak = candidate.gain < thresholds.NEXT_MARGIN
+    return seen.errors >= (thresholds.BETTER_IF_WEAK if weak else thresholds.BETTER)
 
 
 def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iterable[str]) -> bool:

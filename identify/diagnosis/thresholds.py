@@ -18,6 +18,8 @@ JUDGED = 4
 """So many candidates of a round, the likeliest first, are judged by left-out blocks."""
 BETTER = 1.0
 """Standard errors by which the error on left-out blocks must fall with an effect."""
+BETTER_IF_WEAK = 1.5
+"""The same for a first effect that gains less log evidence than a further one must."""
 BETTER_THAN_ALIKE = 3.0
 """The same if it resembles an effect that is there, or both change the dynamics: one effect in an inexact form looks
 like two."""
