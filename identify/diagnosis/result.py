@@ -34,7 +34,9 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     base_prediction = predict_fitted(search.base)[0]
     row = steps(search)
     base = row[0].statistics
-    missing = [_missing(search, verdict, effect, row) for effect in _ranked(search, verdict)]
+    ranked = _ranked(search, verdict)
+    covariance = covariance_of(search.last.written) if ranked else np.zeros((0, 0))
+    missing = [_missing(search, verdict, effect, row, covariance) for effect in ranked]
     final = row[-1].statistics
     residual = record.torque_nm - (
         predict_fitted(search.last)[0] if verdict.kind == "unexplained_structure" else base_prediction
@@ -72,12 +74,14 @@ def _ranked(search: EffectSearch, verdict: Verdict) -> list[str]:
     )
 
 
-def _missing(search: EffectSearch, verdict: Verdict, effect: str, row: list[Step]) -> dict[str, Any]:
+def _missing(
+    search: EffectSearch, verdict: Verdict, effect: str, row: list[Step], covariance: np.ndarray
+) -> dict[str, Any]:
     number = next(i for i, step in enumerate(row) if step.added == effect)
     before, after = row[number - 1].statistics, row[number].statistics
     fitted = search.last.written
     index = [e for e, _ in fitted.effects].index(effect)
-    own = describe_parameters(fitted, index, covariance_of(fitted))
+    own = describe_parameters(fitted, index, covariance)
     rivals = verdict.rivals.get(effect, {})
     named = _close(search, effect)
     ranked = sorted((name for name in rivals if name and name != effect), key=lambda name: -rivals[name])

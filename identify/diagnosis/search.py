@@ -71,7 +71,7 @@ class EffectSearch:
     added: list[str] = field(default_factory=list)  # effects, in order
     margins: list[float] = field(default_factory=list)  # log evidence required in each round
     left_out: list[LeftOut] = field(default_factory=list)  # what each model of the chain predicts on left-out blocks
-    free_gain: list[float] = field(default_factory=list)  # log evidence for a gain that varies without a law
+    free_gain: float = 0.0  # log evidence for a gain that varies without a law, beside the first model
     losses: dict[str, float] = field(default_factory=dict)  # log evidence lost without each effect, if of several
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # intervals in which the muscle rests
     residuals: list[ResidualStructure] = field(default_factory=list)  # what that of each model of the chain shows
@@ -163,8 +163,8 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     tried = _scan(search.last, lambda done, text: progress(0.1 + 0.3 * number + 0.3 * done, text), before)
     candidates = sorted((_discounted(search, c) for c in tried), key=lambda c: -c.gain)
     search.rounds.append(candidates)
-    free_gain = try_effect(FREE_GAIN, search.last)
-    search.free_gain.append(free_gain.gain if free_gain else 0.0)
+    if not number and (lawless := try_effect(FREE_GAIN, search.last)) is not None:
+        search.free_gain = lawless.gain
     search.margins.append(_margin(search, len(search.added)))
     able = []
     for place, candidate in enumerate(candidates[: thresholds.JUDGED]):
@@ -368,8 +368,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
     """
     wanted, tried = search.added, search.rounds[: len(search.added)]
     search.added, search.chain, search.residuals = [], search.chain[:1], search.residuals[:1]
-    search.rounds, search.margins, search.free_gain = [], [], search.free_gain[: len(wanted)]
-    search.left_out = search.left_out[:1]
+    search.rounds, search.margins, search.left_out = [], [], search.left_out[:1]
     for number, effect in enumerate(wanted):
         before, described = search.last, find_effect(effect)
         fitted = last if number == len(wanted) - 1 else _part(last, before, [*effect_names(before), effect])

@@ -122,7 +122,7 @@ def judge(search: EffectSearch) -> Verdict:
     strange = readings is not None and readings.held_s > thresholds.LONGEST_HELD_S
     if effects:
         strange = strange or (explained < thresholds.LEAST_EXPLAINED and left.left)
-        lawless = search.free_gain[0] > search.rounds[0][0].gain + thresholds.FREE_GAIN_MARGIN
+        lawless = search.free_gain > search.rounds[0][0].gain + thresholds.FREE_GAIN_MARGIN
         strange = strange or (lawless and explained < thresholds.EXPLAINED_BY_LAWS)
         if find_effect(effects[0]).band:
             strange = strange or (

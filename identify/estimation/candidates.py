@@ -14,7 +14,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.left_out import bouts, difference, leave_out, near_widths
-from stimrig.identify.estimation.rests import since_pulse
+from stimrig.identify.estimation.rests import relaxed
 from stimrig.identify.records.record import FORGOTTEN_S
 
 Fit = Callable[[np.ndarray, bool], Fitted]
@@ -47,11 +47,12 @@ def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
     """
     if not best.distrusted:
         return best
-    best = _better(best, fit(rows, True))
-    own = alike_rows(grid, rows)
-    if own is not None:
-        for white in (False, True):
-            best = _better(best, fit(own, white))
+    own, unseen = alike_rows(grid, rows), leave_out(best)
+    for asked, white in ((rows, True), *(((own, False), (own, True)) if own is not None else ())):
+        other = fit(asked, white)
+        found = leave_out(other, np.where(other.problem.setup.fitted, unseen.block, -1))
+        if difference(unseen, found).errors >= BETTER:
+            best, unseen = other, found
     return best
 
 
@@ -64,13 +65,6 @@ def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
     if fitted.noise.held:
         found.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
     return found
-
-
-def _better(before: Fitted, after: Fitted) -> Fitted:
-    """The second fit where it predicts the blocks of its rows better, else the first."""
-    old = leave_out(before)
-    new = leave_out(after, np.where(after.problem.setup.fitted, old.block, -1))
-    return after if difference(old, new).errors >= BETTER else before
 
 
 def alike_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
@@ -90,7 +84,7 @@ def alike_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
     ahead = grid.held_out & (grid.pulse_width_us > 0)
     if len(alike) < LEAST_BOUTS or own.sum() == rows.sum() or np.mean(near_widths(grid, own)[ahead]) < COVERED:
         return None
-    return own | (rows & (grid.step_s * since_pulse(grid) >= FORGOTTEN_S))
+    return own | (rows & relaxed(grid, FORGOTTEN_S))
 
 
 def _smooth(grid: Grid, own: np.ndarray) -> bool | None:

@@ -183,9 +183,9 @@ def solve(
     start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
     assert start is not None
 
-    def trials(at: _Point, step: int, damping: float) -> Trial[_Point] | None:
+    def trials(at: Point, step: int, damping: float) -> Trial[Point] | None:
         first = min(damping, LARGEST_FIRST)
-        change, shortened = _step(at, first)
+        change, shortened = newton_step(at, first)
         # Gain of the whole step if the log posterior were a parabola; later steps do what a shortened one leaves.
         promised = 0.5 * float(at.gradient @ change) * shortened
         # The start of an effect may be a point where the gradient is zero at first.
@@ -195,14 +195,14 @@ def solve(
         if floor is not None and step > 1 and at.log_evidence + OPTIMISM * (promised + 1.0) < floor:
             return None
 
-        def trial(damping: float) -> _Point:
-            moved = change if damping == first else _step(at, damping)[0]
+        def trial(damping: float) -> Point:
+            moved = change if damping == first else newton_step(at, damping)[0]
             there = np.clip(at.theta + moved, problem.lower, problem.upper)
             return _at(problem, there, at.noise, profiled=profiled) or replace(at, value=-np.inf)
 
         return trial
 
-    def gain(at: _Point, trial: _Point) -> float | None:
+    def gain(at: Point, trial: Point) -> float | None:
         return trial.value - at.value if trial.value > at.value - 1e-9 else None
 
     search = Search(DAMPING, trials, gain, lambda gained, step: gained < tolerance and step >= 2)
@@ -222,7 +222,7 @@ def solve(
 
 
 @dataclass(frozen=True)
-class _Point:
+class Point:
     """A point of the search: parameters, residual, slopes, noise, log-likelihood, and log posterior (`value`)."""
 
     problem: Problem
@@ -252,29 +252,29 @@ class _Point:
         return self.value - 0.5 * (float(np.linalg.slogdet(self.hessian)[1]) - self.problem.prior_log_det)
 
 
+def log_posterior(problem: Problem, theta: np.ndarray, residual_nm: np.ndarray, noise: NoiseLevel) -> float:
+    """Up to a constant, with the noise as given."""
+    white = problem.setup.whitened(residual_nm[None, :], noise)
+    return -0.5 * float(np.sum(white**2)) - _penalty(problem, theta)
+
+
 def _at(
     problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = False, profiled: bool = True
-) -> _Point | None:
+) -> Point | None:
     mean, slopes = problem.run(theta, derivatives=True)
     if slopes is None or not np.all(np.isfinite(mean)):
         return None
     residual = problem.setup.target_nm - mean
-    if profiled:
-        level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
-    else:
-        white = problem.setup.whitened(residual[None, :], noise)
-        level, log_likelihood = noise, -0.5 * float(np.sum(white**2))
-    return _Point(problem, theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
+    if not profiled:
+        value = log_posterior(problem, theta, residual, noise)
+        return Point(problem, theta, residual, slopes, noise, value, value)
+    level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
+    return Point(problem, theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
 
 
-def _step(at: _Point, damping: float) -> tuple[np.ndarray, float]:
-    return newton_step(at.problem, at.theta, at.gradient, at.hessian, damping)
-
-
-def newton_step(
-    problem: Problem, theta: np.ndarray, gradient: np.ndarray, hessian: np.ndarray, damping: float
-) -> tuple[np.ndarray, float]:
+def newton_step(at: Point, damping: float) -> tuple[np.ndarray, float]:
     """Damped Newton step, and the factor by which it was shortened. Parameters at a bound do not leave it."""
+    problem, theta, gradient, hessian = at.problem, at.theta, at.gradient, at.hessian
     stuck = ((theta <= problem.lower) & (gradient < 0)) | ((theta >= problem.upper) & (gradient > 0))
     for chosen in problem.chosen:
         stuck[chosen.places.start : chosen.places.stop] |= chosen.form.fixed

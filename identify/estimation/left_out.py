@@ -15,8 +15,8 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.joint import Fitted, gram, newton_step, solve
-from stimrig.identify.estimation.rests import since_pulse
+from stimrig.identify.estimation.joint import Fitted, Point, log_posterior, newton_step, solve
+from stimrig.identify.estimation.rests import relaxed
 from stimrig.identify.records.record import FORGOTTEN_S
 from stimrig.identify.simulation.problem import Problem
 
@@ -172,7 +172,7 @@ def _allowed_nm(fitted: Fitted) -> tuple[float, float]:
     """Error that does not matter, and scatter of the torque at rest, N·m."""
     setup = fitted.problem.setup
     grid = setup.grid
-    rest = setup.fitted & (grid.step_s * since_pulse(grid) >= FORGOTTEN_S)
+    rest = setup.fitted & relaxed(grid, FORGOTTEN_S)
     still = setup.target_nm[rest]
     wander = 1.4826 * float(np.median(np.abs(still - np.median(still)))) if still.size else 0.0
     if grid.angle_rad is not None and still.size and np.ptp(grid.angle_rad[rest]) > MOVED_RAD:
@@ -184,19 +184,13 @@ def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
     """The most probable parameters on some of the fitted rows: one Gauss-Newton step, or more where it is too long."""
     problem, setup = fitted.problem, fitted.problem.setup
     own = Problem(setup.with_(fitted=kept), fitted.effects)
-    residual = np.where(setup.fitted, fitted.residual_nm, 0.0)
-    products = gram(own.setup.whitened(np.vstack([residual, fitted.slopes]), fitted.noise))
-    mean, precision = problem.prior
-    away = fitted.theta - mean
-    gradient, hessian = products[0, 1:] - precision @ away, products[1:, 1:] + precision
-    step = newton_step(problem, fitted.theta, gradient, hessian, RIDGE)[0]
-    before = float(products[0, 0]) + float(away @ precision @ away)
+    before = log_posterior(own, fitted.theta, fitted.residual_nm, fitted.noise)
+    at = Point(own, fitted.theta, fitted.residual_nm, fitted.slopes, fitted.noise, before, before)
+    step = newton_step(at, RIDGE)[0]
     for factor in SHORTER:
         theta = np.clip(fitted.theta + factor * step, problem.lower, problem.upper)
-        left = np.where(kept, setup.target_nm - problem.run(theta)[0], 0.0)
-        white, there = own.setup.whitened(left[None, :], fitted.noise)[0], theta - mean
-        gained = before - float(white @ white) - float(there @ precision @ there)
-        if gained >= TRUSTED * factor * float(gradient @ step) - SLACK:
+        gained = log_posterior(own, theta, setup.target_nm - problem.run(theta)[0], fitted.noise) - before
+        if gained >= TRUSTED * factor * 0.5 * float(at.gradient @ step) - 0.5 * SLACK:
             return theta
     return solve(own, fitted.theta, fitted.noise, most=STEPS, profiled=False).theta
 
@@ -208,7 +202,7 @@ class Difference:
     Parameters
     ----------
     gain : float
-        Mean over blocks of the logarithm of the ratio of errors; above 0: the second model is better.
+        Mean over rows of the logarithm of the ratio of their blocks' errors; above 0: the second model is better.
     sd : float
         Its standard error over blocks.
     blocks : float

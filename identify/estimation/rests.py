@@ -56,6 +56,11 @@ def _level(torque_nm: np.ndarray, since_s: np.ndarray, rows: np.ndarray) -> tupl
     return level_nm, max(float(np.hypot(scatter_nm, share * (high_nm - low_nm))), 1e-9)
 
 
+def relaxed(grid: Grid, after_s: float) -> np.ndarray:
+    """bool, shape (K,): intervals that begin so long after the last pulse, s."""
+    return grid.step_s * since_pulse(grid) >= after_s
+
+
 def since_pulse(grid: Grid, strongest_us: float = 0.0) -> np.ndarray:
     """Intervals without a stronger pulse up to each, itself included; anew where a part or a known state begins."""
     at = np.arange(grid.size)

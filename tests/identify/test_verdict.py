@@ -57,7 +57,7 @@ class Made:
         self.raw = SimpleNamespace(readings=None)
         self.work = EffectSearch(
             record=object(), raw=self.raw, rows=np.ones(4000, bool), plain=base, base=base,  # pyright: ignore[reportArgumentType]
-            rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=[0.0], residuals=[self.left()],
+            rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=0.0, residuals=[self.left()],
         )  # fmt: skip
         monkeypatch.setattr(verdict, "seen_at_rest", self._seen_at_rest)
         monkeypatch.setattr(verdict, "vetoed", self._rise)
@@ -220,7 +220,7 @@ RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any
         [(68.0, 12.1), (67.0, 12.0)],
     ),
     "a gain without a law explains more": (
-        lambda made, nameless, likelihood: setattr(made.add(FIRST, 50.0, likelihood).work, "free_gain", [nameless]),
+        lambda made, nameless, likelihood: setattr(made.add(FIRST, 50.0, likelihood).work, "free_gain", nameless),
         [(58.1, 89.0)],
         [(58.0, 89.0), (58.1, 90.0)],
     ),
