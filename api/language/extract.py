@@ -52,6 +52,7 @@ NOT_SHOWN = {
     "problem",
     "spawn",
     "BadChunk",
+    "inflated",
     "ngettext",
     "policy",
     "WireError",

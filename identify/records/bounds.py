@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +14,7 @@ LARGEST_FILE_BYTES = 256 * 2**20
 PIECE_BYTES = 2**20
 LARGEST_ROWS = 5_000_000
 """Forty minutes at the highest rate; a file of more is cut, or sampled at a lower rate."""
+LEAST_SAMPLES = 8
 LONGEST_S = 24 * 3600.0
 """From the first sample to the last, pauses included."""
 LOWEST_HZ, HIGHEST_HZ = 39.0, 2100.0
@@ -42,10 +45,9 @@ def content_of(path: Path) -> bytes:
     """A file's bytes, at most as many as a record can have. Raises BadRecord: it cannot be read, or is larger."""
     try:
         with path.open("rb") as file:
-            pieces, size = [], 0
-            while size <= LARGEST_FILE_BYTES and (piece := file.read(PIECE_BYTES)):
-                pieces.append(piece)
-                size += len(piece)
+            pieces = [file.read(PIECE_BYTES)]
+            while pieces[-1] and len(pieces) * PIECE_BYTES <= LARGEST_FILE_BYTES:
+                pieces.append(file.read(PIECE_BYTES))
     except FileNotFoundError as error:
         raise BadRecord("no such file", place=str(path), fix="Check the path.") from error
     except IsADirectoryError as error:
@@ -55,10 +57,29 @@ def content_of(path: Path) -> bytes:
         raise BadRecord(f"can't be read ({reason})", place=str(path), fix="Check its rights.") from error
     except ValueError as error:  # a NUL in the name
         raise BadRecord("no such file", place=repr(str(path)), fix="Check the path.") from error
-    if size > LARGEST_FILE_BYTES:
+    if sum(map(len, pieces)) > LARGEST_FILE_BYTES:
         fix = "Cut the record, or give the sealed recording."
         raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), fix=fix)
     return b"".join(pieces)
+
+
+class BadPiece(Exception):
+    """A piece of a file that is not what it is declared to be."""
+
+
+DAMAGED = "packed data that are damaged, or longer than any record"
+
+
+def inflated(data: Any, most: int, damaged: str = DAMAGED, whole: bool = True) -> bytes:
+    """What zlib packed, at most so many bytes. Raises BadPiece: no zlib, or with `whole` not all of it."""
+    packer = zlib.decompressobj()
+    try:
+        found = packer.decompress(data, most)
+    except zlib.error as error:
+        raise BadPiece("packed data that do not unpack") from error
+    if whole and not packer.eof:
+        raise BadPiece(damaged)
+    return found
 
 
 def largest(column: str) -> float:
@@ -69,6 +90,12 @@ def largest(column: str) -> float:
 def fix_of(column: str, wrong: np.ndarray, otherwise: str) -> str:
     """What to do about numbers of a column that are too large, or none."""
     return UNITS.get(column, otherwise) if np.isfinite(wrong).all() else otherwise
+
+
+def check_size(size: int, place: str) -> None:
+    """Refuse what is no record but a handful of samples. Raises BadRecord: fewer than 8."""
+    if size < LEAST_SAMPLES:
+        raise BadRecord(f"only {size} samples", place=place, fix="Give a few seconds of data.")
 
 
 def check_rate(pulse_rate_hz: float, place: str) -> None:

@@ -6,7 +6,6 @@ memory. The numbers are then taken from the file's own bytes, each bound checked
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 from h5py import h5a, h5d, h5f, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS
+from stimrig.identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS, BadPiece, inflated
 
 LARGEST_CHUNK_BYTES = 16 * 2**20
 MOST_CHUNKS = 100_000
@@ -24,7 +23,7 @@ OVERHEAD_BYTES = 4096
 """What a filter may add to what cannot be packed."""
 
 
-class BadChunk(Exception):
+class BadChunk(BadPiece):
     """A piece of a dataset that is not what it is declared to be."""
 
 
@@ -70,7 +69,7 @@ def unpacked(data: Any, filters: Sequence[int], skipped: int, itemsize: int, ful
         if skipped >> index & 1:
             continue
         if filters[index] == h5z.FILTER_DEFLATE:
-            data = inflated(data, full + OVERHEAD_BYTES)
+            data = inflated(data, full + OVERHEAD_BYTES, "packed data that are damaged, or longer than declared")
         elif filters[index] == h5z.FILTER_SHUFFLE:
             data = np.frombuffer(data, np.uint8, len(data) // itemsize * itemsize).reshape(itemsize, -1).T.tobytes()
         else:
@@ -80,18 +79,6 @@ def unpacked(data: Any, filters: Sequence[int], skipped: int, itemsize: int, ful
     if len(data) != full:
         raise BadChunk("a chunk that does not unpack to its size")
     return data
-
-
-def inflated(data: Any, most: int) -> bytes:
-    """What gzip's filter packed, at most so many bytes. Raises BadChunk: damaged, or longer."""
-    packer = zlib.decompressobj()
-    try:
-        found = packer.decompress(data, most)
-    except zlib.error as error:
-        raise BadChunk("packed data that do not unpack") from error
-    if not packer.eof:
-        raise BadChunk("packed data that are damaged, or longer than declared")
-    return found
 
 
 def fletcher32(data: Any) -> tuple[int, int]:
@@ -104,6 +91,7 @@ def fletcher32(data: Any) -> tuple[int, int]:
 
 FIX = "Give a sealed recording, as written by the rig at the end of a test."
 LONGEST_TEXT = 10_000
+ELSEWHERE = object()
 FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 
 
@@ -138,15 +126,19 @@ class StrictFile:
 
     def has(self, path: str) -> bool:
         """Whether something is called so; what it is, `numbers` says."""
+        return self._find(path) is not None
+
+    def _find(self, path: str) -> Any:
+        """What hard links alone lead to: None where nothing is called so, `ELSEWHERE` at another kind of link."""
         here: Any = self._root
-        for part in path.strip("/").encode().split(b"/"):
-            with self._asking(path):
+        with self._asking(path):
+            for part in path.strip("/").encode().split(b"/"):
                 if not isinstance(here, h5g.GroupID) or not here.links.exists(part):
-                    return False
+                    return None
                 if here.links.get_info(part).type != h5l.TYPE_HARD:
-                    return True
+                    return ELSEWHERE
                 here = h5o.open(here, part)
-        return True
+        return here
 
     def numbers(self, path: str) -> np.ndarray:
         """A dataset of one dimension as float64.
@@ -203,15 +195,12 @@ class StrictFile:
             return h5py.File(self._file).attrs[name]
 
     def _dataset(self, path: str) -> Any:
-        """The dataset of a path, by hard links alone, its data inside this file."""
-        here: Any = self._root
-        for part in path.strip("/").encode().split(b"/"):
-            with self._asking(path):
-                if not isinstance(here, h5g.GroupID) or not here.links.exists(part):
-                    raise BadRecord(f"incomplete recording (no {path})", place=self.name, fix=FIX)
-                if here.links.get_info(part).type != h5l.TYPE_HARD:
-                    raise self._bad("a link to somewhere else", path)
-                here = h5o.open(here, part)
+        """The dataset of a path, its data inside this file."""
+        here = self._find(path)
+        if here is None:
+            raise BadRecord(f"incomplete recording (no {path})", place=self.name, fix=FIX)
+        if here is ELSEWHERE:
+            raise self._bad("a link to somewhere else", path)
         with self._asking(path):
             if not isinstance(here, h5d.DatasetID):
                 raise self._bad("no dataset", path)
@@ -242,7 +231,7 @@ class StrictFile:
             if unknown := [number for number in filters if number not in FILTERS]:
                 raise self._bad(f"a filter (number {unknown[0]}) other than gzip, shuffle and fletcher32", path)
             return read_chunks(self.content, dataset, plan.get_chunk()[0], filters, dtype, size)
-        except BadChunk as error:
+        except BadPiece as error:
             raise self._bad(str(error), path) from error
 
     @contextmanager

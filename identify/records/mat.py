@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
-import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,8 +19,8 @@ import numpy as np
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns
 from stimrig.identify.records.assemble import PULSE_RATE_HZ, FileContent, record_of
-from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS
-from stimrig.identify.records.columns import Column, Given
+from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, BadPiece, inflated
+from stimrig.identify.records.columns import Given
 from stimrig.identify.records.record import Record, Source
 
 HEADER_BYTES = 128
@@ -39,36 +39,22 @@ FIX = "Save plain columns of numbers from MATLAB: save('record.mat', 'time_s', '
 OBJECTS = "Turn it into plain numbers or texts first: seconds(t), cellstr(s), table2struct(T, 'ToScalar', true)."
 
 
-class BadMat(Exception):
-    """A piece of a MAT file that is not what it is declared to be."""
-
-
 @dataclass(frozen=True)
 class Variable:
-    """A variable that was not looked at closely yet.
-
-    Parameters
-    ----------
-    kind : int
-        MATLAB's class.
-    shape : tuple of int
-        Its dimensions, as declared.
-    flags : int
-        Whether it is complex.
-    body : memoryview
-        What follows its name.
-    order : str
-        "<" or ">".
-    packed : bool
-        Whether `body` holds the whole element as it was packed, its head included.
-    """
+    """A variable that was not looked at closely yet."""
 
     kind: int
+    """MATLAB's class."""
     shape: tuple[int, ...]
+    """Its dimensions, as declared."""
     flags: int
+    """Whether it is complex."""
     body: memoryview
+    """What follows its name."""
     order: str
+    """"<" or ">"."""
     packed: bool = False
+    """Whether `body` holds the whole element as it was packed, its head included."""
 
     @property
     def size(self) -> int:
@@ -78,50 +64,52 @@ class Variable:
     def _opened(self, most_bytes: int = LARGEST_FILE_BYTES) -> Variable:
         if not self.packed:
             return self
-        whole = memoryview(_unpacked(self.body, most_bytes))
+        whole = memoryview(inflated(self.body, most_bytes))
         tag, inside, _ = _element(whole, 0, self.order)
         if tag != MATRIX:
-            raise BadMat("a packed variable that is none")
+            raise BadPiece("a packed variable that is none")
         return _matrix(inside, self.order)[1]
 
     def numbers(self) -> np.ndarray:
         """Its numbers, as float64 in one dimension.
 
-        Raises BadMat: not real numbers in a row or a column, or not all there.
+        Raises BadPiece: not real numbers in a row or a column, or not all there.
         """
         if self.kind not in NUMERIC:
-            raise BadMat(f"{KINDS.get(self.kind, 'no numbers')}. {OBJECTS}")
+            raise BadPiece(f"{KINDS.get(self.kind, 'no numbers')}. {OBJECTS}")
         if self.flags & COMPLEX:
-            raise BadMat("complex numbers. Give real ones.")
+            raise BadPiece("complex numbers. Give real ones.")
         if max(self.shape, default=0) != self.size or self.size > LARGEST_ROWS:
-            raise BadMat(f"{'×'.join(map(str, self.shape))} numbers. Give one row or column of at most {LARGEST_ROWS}.")
+            raise BadPiece(
+                f"{'×'.join(map(str, self.shape))} numbers. Give one row or column of at most {LARGEST_ROWS}."
+            )
         here = self._opened(8 * self.size + HEAD_BYTES)
         tag, data, _ = _element(here.body, 0, here.order)
         if tag not in NUMBERS or len(data) != here.size * np.dtype(NUMBERS[tag]).itemsize:
-            raise BadMat("numbers that are declared and not there")
+            raise BadPiece("numbers that are declared and not there")
         return np.frombuffer(data, here.order + NUMBERS[tag]).astype(float)
 
     def texts(self) -> list[str]:
         """Its texts: of a cell array each element's, of a character array each row's.
 
-        Raises BadMat: no texts, or not all there.
+        Raises BadPiece: no texts, or not all there.
         """
         if self.kind not in (CHAR, CELL):
-            raise BadMat(f"{KINDS.get(self.kind, 'no texts')}. {OBJECTS}")
+            raise BadPiece(f"{KINDS.get(self.kind, 'no texts')}. {OBJECTS}")
         if self.size > LARGEST_ROWS:
-            raise BadMat(f"{self.size} texts. At most {LARGEST_ROWS} are read.")
+            raise BadPiece(f"{self.size} texts. At most {LARGEST_ROWS} are read.")
         here = self._opened()
         if here.kind == CHAR:
             return _rows_of(here)
         found = []
         for cell in _matrices(here, here.size):
             if cell.kind != CHAR:
-                raise BadMat(f"a cell array with {KINDS.get(cell.kind, 'something')} in it. Give texts only.")
+                raise BadPiece(f"a cell array with {KINDS.get(cell.kind, 'something')} in it. Give texts only.")
             found.append("".join(_rows_of(cell)[:1]))
         return found
 
     def fields(self) -> dict[str, Variable]:
-        """The fields of a struct of one element; nothing for anything else. Raises BadMat: damaged."""
+        """The fields of a struct of one element; nothing for anything else. Raises BadPiece: damaged."""
         if self.kind != STRUCT or self.size != 1:
             return {}
         here = self._opened()
@@ -131,11 +119,10 @@ class Variable:
         _, names, place = _element(here.body, place, here.order)
         each = int.from_bytes(length[:4], "little" if here.order == "<" else "big")
         if not 0 < each <= 64 or len(names) % each or len(names) > 64 * MOST_VARIABLES:
-            raise BadMat("names of fields that are none")
+            raise BadPiece("names of fields that are none")
         raw = bytes(names)
         titles = [_name(raw[at : at + each]) for at in range(0, len(raw), each)]
-        inside = Variable(here.kind, here.shape, here.flags, here.body[place:], here.order)
-        return dict(zip(titles, _matrices(inside, len(titles)), strict=True))
+        return dict(zip(titles, _matrices(replace(here, body=here.body[place:]), len(titles)), strict=True))
 
 
 def variables(content: bytes, name: str) -> dict[str, Variable]:
@@ -158,8 +145,8 @@ def variables(content: bytes, name: str) -> dict[str, Variable]:
                 found[title] = variable
             elements += 1  # those without a name, or with one that was there before, count too
             if elements > MOST_VARIABLES:
-                raise BadMat(f"more than {MOST_VARIABLES} variables")
-    except BadMat as error:
+                raise BadPiece(f"more than {MOST_VARIABLES} variables")
+    except BadPiece as error:
         raise BadRecord(f"a damaged MAT file ({error})", place=name, fix=FIX) from error
     return found
 
@@ -175,27 +162,27 @@ def _listed(tag: int, body: memoryview, order: str) -> tuple[str, Variable]:
         return _matrix(body, order)
     if tag != PACKED:
         return "", Variable(0, (), 0, body, order)
-    head = memoryview(_unpacked(body, HEAD_BYTES, whole=False))
+    head = memoryview(inflated(body, HEAD_BYTES, whole=False))
     inside, _, _ = struct.unpack_from(order + "IIQ", head.tobytes().ljust(16, b"\0"))
     if inside != MATRIX:
         return "", Variable(0, (), 0, body, order)
     title, variable = _matrix(head[8:], order)
-    return title, Variable(variable.kind, variable.shape, variable.flags, body, order, packed=True)
+    return title, replace(variable, body=body, packed=True)
 
 
 def _element(view: memoryview, place: int, order: str) -> tuple[int, memoryview, int]:
     """Tag and data of an element, and where the next one begins."""
     if not 0 <= place <= len(view) - 8:
-        raise BadMat("it ends within a variable")
+        raise BadPiece("it ends within a variable")
     tag, size = struct.unpack_from(order + "II", view, place)
     if tag >> 16:  # up to four bytes stand in the tag itself
         size, tag = tag >> 16, tag & 0xFFFF
         if size > 4:
-            raise BadMat("a short element that is long")
+            raise BadPiece("a short element that is long")
         return tag, view[place + 4 : place + 4 + size], place + 8
     begin, end = place + 8, place + 8 + size
     if end > len(view):
-        raise BadMat("it ends within a variable")
+        raise BadPiece("it ends within a variable")
     return tag, view[begin:end], end if tag == PACKED else end + -size % 8
 
 
@@ -205,11 +192,11 @@ def _matrix(body: memoryview, order: str) -> tuple[str, Variable]:
     _, dims, place = _element(body, place, order)
     _, title, place = _element(body, place, order)
     if len(flags) != 8 or len(dims) % 4 or not 8 <= len(dims) <= 32 or len(title) > 64:
-        raise BadMat("a variable without a head")
+        raise BadPiece("a variable without a head")
     (word,) = struct.unpack_from(order + "I", flags)
     shape = tuple(np.frombuffer(dims, order + "i4").tolist())
     if min(shape) < 0:
-        raise BadMat("a variable of less than nothing")
+        raise BadPiece("a variable of less than nothing")
     return _name(bytes(title)), Variable(word & 0xFF, shape, word & 0xFF00, body[place:], order)
 
 
@@ -218,7 +205,7 @@ def _matrices(here: Variable, count: int) -> Iterator[Variable]:
     for _ in range(count):
         tag, body, place = _element(here.body, place, here.order)
         if tag != MATRIX:
-            raise BadMat("a cell or field that is no variable")
+            raise BadPiece("a cell or field that is no variable")
         yield _matrix(body, here.order)[1] if len(body) else Variable(6, (0, 0), 0, body, here.order)
 
 
@@ -229,12 +216,12 @@ def _rows_of(here: Variable) -> list[str]:
     tag, data, _ = _element(here.body, 0, here.order)
     codec = TEXTS.get(tag)
     if codec is None or len(here.shape) != 2 or here.size > LARGEST_ROWS or here.shape[1] > LONGEST_TEXT:
-        raise BadMat("texts that are none")
+        raise BadPiece("texts that are none")
     order = {"<": "-le", ">": "-be"}[here.order] if codec in ("utf-16", "utf-32") else ""
     text = bytes(data).decode(codec + order, "replace")
     rows, length = here.shape
     if len(text) < here.size:
-        raise BadMat("texts that are declared and not there")
+        raise BadPiece("texts that are declared and not there")
     return [text[row : rows * length : rows].rstrip() for row in range(rows)]
 
 
@@ -242,51 +229,38 @@ def _name(raw: bytes) -> str:
     return raw.partition(b"\0")[0].decode("ascii", "replace")
 
 
-def _unpacked(data: memoryview, most: int, whole: bool = True) -> bytes:
-    """What zlib packed, at most so many bytes; with `whole` no more may follow."""
-    packer = zlib.decompressobj()
-    try:
-        found = packer.decompress(data, most)
-    except zlib.error as error:
-        raise BadMat("packed data that do not unpack") from error
-    if whole and not packer.eof:
-        raise BadMat("packed data that are damaged, or longer than any record")
-    return found
-
-
 RATE = "pulse_rate_hz"
 """A variable of one number that says the pulse rate."""
-MOST_TOLD = 12
 
 
-def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None = None, given: Given | None = None) -> Record:
+def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None, given: Given) -> Record:
     """A record of a MAT file from its bytes; `path` is how it is called, `given` what `--map` says.
 
     Raises BadRecord: with the file and the variable, and what to do.
     """
     name = str(path)
-    scope, known, given = _scope(variables(content, name), given or {}, name)
+    scope, known, given = _scope(variables(content, name), given, name)
     header = list(known)
     found = columns.columns(header, given, [], f"{name}, {scope}" if scope else name)
-    of = {
-        target: f"{scope}.{header[column.index]}" if scope else header[column.index] for target, column in found.items()
-    }
+    before = f"{scope}." if scope else ""
+    of = {target: before + header[column.index] for target, column in found.items()}
 
     def cell(row: int, column: str) -> str:
         return f"{of[column]}({row + 1})"
 
-    numbers = {
-        target: _numbers(known[header[column.index]], column, f"{name}, {of[target]}")
-        for target, column in found.items()
-        if target != "segment"
-    }
+    numbers: dict[str, np.ndarray] = {}
+    for target, column in found.items():
+        with _told(f"{name}, {of[target]}"):
+            if target != "segment":
+                numbers[target] = known[header[column.index]].numbers() * column.factor
     _check_lengths(numbers, of, name)
     segment, names = None, []
     if "segment" in found:
         variable = known[header[found["segment"].index]]
         segment, names = _segments(variable, numbers["time_s"].size, f"{name}, {of['segment']}")
     if pulse_rate_hz is None and RATE in known:
-        pulse_rate_hz = float(_numbers(known[RATE], Column(0), f"{name}, {RATE}")[:1].sum())
+        with _told(f"{name}, {RATE}"):
+            pulse_rate_hz = float(known[RATE].numbers()[:1].sum())
         bounds.check_rate(pulse_rate_hz, f"{name}, {RATE}")
     notes = "; ".join(column.note for column in found.values() if column.note)
     source = Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=(notes,) if notes else ())
@@ -301,7 +275,7 @@ def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, M
     for title, variable in top.items():
         try:
             fields = variable.fields()
-        except BadMat as error:
+        except BadPiece as error:
             raise BadRecord(str(error), place=f"{name}, {title}", fix=FIX) from error
         inside = {target: replace(asked, text=asked.text.removeprefix(f"{title}.")) for target, asked in given.items()}
         if fields and columns.complete(columns.places(list(fields), inside)):
@@ -324,10 +298,11 @@ def _nothing(top: Mapping[str, Variable], given: Given, name: str) -> BadRecord:
     raise AssertionError("columns that could not be found can be read")
 
 
-def _numbers(variable: Variable, column: Column, place: str) -> np.ndarray:
+@contextmanager
+def _told(place: str) -> Iterator[None]:
     try:
-        return variable.numbers() * column.factor
-    except BadMat as error:
+        yield
+    except BadPiece as error:
         raise BadRecord(str(error).rstrip("."), place=place) from error
 
 
@@ -343,10 +318,8 @@ def _check_lengths(numbers: Mapping[str, np.ndarray], of: Mapping[str, str], nam
 
 def _segments(variable: Variable, size: int, place: str) -> tuple[np.ndarray, list[str]]:
     """A number for each row's segment, and the names by number; one text stands for all rows."""
-    try:
+    with _told(place):
         texts = variable.texts() if variable.kind in (CHAR, CELL) else [f"{code:g}" for code in variable.numbers()]
-    except BadMat as error:
-        raise BadRecord(str(error).rstrip("."), place=place) from error
     if len(texts) == 1:
         texts = texts * size
     if len(texts) != size:
