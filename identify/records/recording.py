@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -234,19 +235,17 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
         raise BadRecord(f"torque {what}", place=f"{name}, /torque/torque_nm, sample {bad[0]}", fix=FIX)
     pulses, doubts = read_pulses(file, name, time_s, rate)
     width, late = _in_force(pulses, time_s, rate)
-    angle, note = _read_angle(file, name, time_s, inside)
-    if angle is not None:
-        doubts = doubts | angle.unknown
+    more, unknown, note = _read_angle(file, name, time_s, inside)
+    doubts = doubts | unknown
     bounds.check_span(time_s[inside], f"{name}, /torque/time_s")
     identity, digest, whose = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
     source = Source(path.name, identity, digest, notes=(note,) if note else (), participant=whose)
+    more |= {"late_s": late} if pulses.late_s.any() else {}
+    more |= {"doubted": doubts} if doubts.any() else {}
+    columns: dict[str, Any] = {label: column[inside] for label, column in more.items()}
     return Record.from_arrays(
         time_s[inside], width[inside], torque[inside], code[inside], segment_names=names, pulse_rate_hz=rate,
-        source=source, pulses=pulses,
-        angle_rad=None if angle is None else angle.angle_rad[inside],
-        velocity_rad_s=None if angle is None else angle.velocity_rad_s[inside],
-        late_s=late[inside] if pulses.late_s.any() else None,
-        doubted=doubts[inside] if doubts.any() else None,
+        source=source, pulses=pulses, **columns,
     )  # fmt: skip
 
 
@@ -255,9 +254,8 @@ def _check_format(file: StrictFile) -> None:
         raise BadRecord("HDF5, but no stimrig recording", place=file.name, fix=FIX)
     version = file.number("format_version", 0)
     if version != 1:
-        raise BadRecord(
-            f"format version {version:g}, this software reads 1", place=file.name, fix="Update the software."
-        )
+        message = f"format version {version:g}, this software reads 1"
+        raise BadRecord(message, place=file.name, fix="Update the software.")
 
 
 def _samples(file: StrictFile, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -303,48 +301,25 @@ def _in_force(pulses: Pulses, time_s: np.ndarray, pulse_rate_hz: float) -> tuple
     return np.where(inside, pulses.width_us[last], 0.0), np.where(inside, pulses.late_s[last], 0.0)
 
 
-@dataclass(frozen=True)
-class _Angle:
-    """Angle and velocity at each torque sample.
+def _read_angle(
+    file: StrictFile, name: str, time_s: np.ndarray, inside: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray, str]:
+    """Angle and velocity at the torque's times, linear between the sensor's samples; rows without any; and a note.
 
-    Parameters
-    ----------
-    angle_rad, velocity_rad_s : ndarray, shape (N,)
-        Linear between the sensor's samples.
-    unknown : ndarray of bool, shape (N,)
-        Rows in a long gap between them, before the first or after the last.
+    There is no column where the rig had no sensor, or where it failed in the rows that make the record, `inside`.
     """
-
-    angle_rad: np.ndarray
-    velocity_rad_s: np.ndarray
-    unknown: np.ndarray
-
-
-def _read_angle(file: StrictFile, name: str, time_s: np.ndarray, inside: np.ndarray) -> tuple[_Angle | None, str]:
-    """The angle at the times of the torque, and a note; None where the rig had no sensor or its sensor failed.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (N,)
-        Of the torque, s, rising.
-    inside : ndarray of bool, shape (N,)
-        The rows that make the record.
-
-    Raises
-    ------
-    BadRecord
-        Incomplete, or with values that no joint has.
-    """
+    nothing = np.zeros(time_s.size, bool)
     if not file.has(GROUP):
-        return None, ""
+        return {}, nothing, ""
     at_s = file.numbers(f"{GROUP}/time_s")
     angle, velocity = file.numbers(f"{GROUP}/angle_rad"), file.numbers(f"{GROUP}/velocity_rad_s")
     _check_angle(at_s, angle, velocity, name)
     unknown = _unknown(at_s, time_s)
     share = float(np.mean(unknown[inside]))
     if share > MOST_UNKNOWN:
-        return None, f"no angle: the angle sensor gave none in {share:.0%} of the record"
-    return _Angle(np.interp(time_s, at_s, angle), np.interp(time_s, at_s, velocity), unknown), ""
+        return {}, nothing, f"no angle: the angle sensor gave none in {share:.0%} of the record"
+    columns = {"angle_rad": angle, "velocity_rad_s": velocity}
+    return {label: np.interp(time_s, at_s, values) for label, values in columns.items()}, unknown, ""
 
 
 def _check_angle(at_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray, name: str) -> None:
@@ -360,6 +335,7 @@ def _check_angle(at_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray, name
 
 
 def _unknown(at_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """Rows in a long gap between the sensor's samples, before the first or after the last."""
     if at_s.size < 2:
         return np.ones(time_s.size, bool)
     after = np.clip(np.searchsorted(at_s, time_s), 1, at_s.size - 1)
