@@ -113,7 +113,6 @@ def _phase_s(time_s: np.ndarray, width_us: np.ndarray, pulse_rate_hz: float) -> 
 PAUSE_S = 1.0
 """A jump of the clock as long as this, at zero pulse width, is a pause between two tests."""
 MOST_PAUSES = 1000
-LEAST_SAMPLES = 8
 MOST_GAPS = 0.1
 """Share of the samples before which samples are missing, at most."""
 NEAR = 0.75
@@ -182,8 +181,7 @@ def regular(columns: Columns, at: At, told: At, pulse_rate_hz: float) -> tuple[C
 
 
 def _check_rising(time_s: np.ndarray, at: At) -> None:
-    if time_s.size < LEAST_SAMPLES:
-        raise BadRecord(f"only {time_s.size} samples", place=at(0), fix="Give a few seconds of data.")
+    bounds.check_size(time_s.size, at(0))
     gaps = np.diff(time_s)
     backwards = np.flatnonzero(~(gaps > 0))
     if backwards.size:
@@ -218,8 +216,7 @@ def _pauses(time_s: np.ndarray, width_us: np.ndarray, at: At) -> list[int]:
 
 
 def _part(time_s: np.ndarray, torque_nm: np.ndarray, first: int, at: At) -> _Part:
-    if time_s.size < LEAST_SAMPLES:
-        raise BadRecord(f"only {time_s.size} samples", place=at(first), fix="Give a few seconds of data.")
+    bounds.check_size(time_s.size, at(first))
     gaps = np.diff(time_s)
     typical_s = float(np.median(gaps))
     near = np.abs(gaps - typical_s) <= NEAR * typical_s

@@ -161,7 +161,6 @@ PAUSE_S = 30.0
 """What of a pause is kept in the time at most: every pulse interval of it is a row of the grid."""
 SAME_RATE = 0.01
 """Sampling rates that differ by less, as a share, are one nominal rate and two clocks."""
-LEAST_SAMPLES = 8
 TOLD_WHERE_SO = ("late_s", "doubted")
 """Columns that a record lacks where there is nothing to tell."""
 RESAMPLED = ("time_s", "torque_nm", "angle_rad", "velocity_rad_s")
@@ -229,9 +228,7 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
         if abs(record.pulse_rate_hz - rate_hz) > 1e-6:
             message = f"{record.pulse_rate_hz:g} pulses/s, the first has {rate_hz:g}"
             raise BadRecord(message, place=f"recording {number}", fix="Join recordings of one pulse rate.")
-        if record.time_s.size < LEAST_SAMPLES:
-            message = f"only {record.time_s.size} samples"
-            raise BadRecord(message, place=f"recording {number}", fix="Give a few seconds of data.")
+        bounds.check_size(record.time_s.size, f"recording {number}")
         own = _pieces(record, begun)
         _refuse_twice(own, known, f"recording {number}")
         pieces += own
@@ -354,17 +351,12 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     first, ended, slot_s = 0, 0, pieces[0].slot_s
     for index, piece in enumerate(pieces):
         time_s = piece.record.time_s
-        pause = folded = 0
-        shift_s = 0.0
-        if index:
-            pause = _pause(pieces[index - 1], piece, rate_hz)
-            folded = min(pause, round(PAUSE_S * rate_hz))
-            start = ended + 1 + folded
-            own = piece.interval(0, rate_hz)
-            shift_s = slot_s + (start - own) / rate_hz - piece.slot_s
-            ended = start + piece.interval(-1, rate_hz) - own
-        else:
-            ended = piece.interval(-1, rate_hz)
+        own = piece.interval(0, rate_hz)
+        pause = _pause(pieces[index - 1], piece, rate_hz) if index else 0
+        folded = min(pause, round(PAUSE_S * rate_hz))
+        start = ended + 1 + folded if index else own
+        shift_s = slot_s + (start - own) / rate_hz - piece.slot_s
+        ended = start + piece.interval(-1, rate_hz) - own
         times.append(time_s + shift_s)
         if piece.record.pulses is not None:
             pulses.append(_pulses(piece.record.pulses, shift_s, float(time_s[0]), float(time_s[-1])))

@@ -178,15 +178,12 @@ class Record(Summarised):
             raise BadRecord("the record holds no sample", fix="Give at least a few seconds of data.")
         changed = np.r_[True, code[1:] != code[:-1]]
         changed[[part.first for part in parts]] = True
-        starts = np.flatnonzero(changed)
-        begins = np.zeros(size, np.int64)
-        begins[starts[1:]] = 1
         return cls(
             time_s=time_s,
             pulse_width_us=np.ascontiguousarray(pulse_width_us, float),
             torque_nm=np.ascontiguousarray(torque_nm, float),
-            segment=np.cumsum(begins),
-            segment_names=tuple(known[index] for index in code[starts]),
+            segment=np.cumsum(changed) - 1,
+            segment_names=tuple(known[index] for index in code[changed]),
             pulses=pulses,
             pulse_rate_hz=pulse_rate_hz,
             source=source or Source(),
