@@ -17,6 +17,7 @@ from stimrig.identify.estimation.plain import renewed_curve
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.methods import check_options, method_of
 from stimrig.identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
+from stimrig.identify.methods.maximum_likelihood import start
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 
@@ -133,7 +134,7 @@ def _fit_effects(
     """Maximum likelihood with the named effects, each in its most likely form or in the one given after a colon."""
     for name in wanted:
         find_effect(name.partition(":")[0])  # an unknown one is refused before anything is fitted
-    base, reasons = MAXIMUM_LIKELIHOOD.start(grid, rows, options)
+    base, reasons = start(grid, rows, options)
     steps = count(1)
 
     def tell(effect: str) -> None:

@@ -23,14 +23,8 @@ MOST_RUNS = 20_000
 def find_repeats(width_us: np.ndarray, known: np.ndarray, memory: int) -> np.ndarray:
     """A number for each interval, the same for those with the same input, shape (K,); -1 where it did not repeat.
 
-    Parameters
-    ----------
-    width_us : ndarray, shape (K,)
-        Width held in each interval, µs.
-    known : ndarray of bool, shape (K,)
-        Intervals whose stimulation and torque are known, and that follow on the one before.
-    memory : int
-        Intervals after which the muscle has forgotten.
+    `known` says in which intervals stimulation and torque are known, and follow on the one before; after `memory`
+    intervals the muscle has forgotten.
     """
     first = max(width_us.size - MOST_ROWS, 0)
     width = np.ascontiguousarray(width_us[first:])

@@ -43,14 +43,8 @@ def curve_weights(fraction: np.ndarray, step_s: float, time_constant_s: float, d
     """Weights of (y0, y0', y1, y1') for the curve between two boundary states, shape (N, 4).
 
     It is the cubic with the smallest change that makes it exact for a held input. Without the change, a lag of a few
-    milliseconds would bend the curve more sharply than a cubic can.
-
-    Parameters
-    ----------
-    fraction : ndarray, shape (N,)
-        Place in the step, 0 to 1.
-    step_s, time_constant_s, damping : float
-        Of the step, and T and ζ of the dynamics; T = 0 for the cubic itself.
+    milliseconds would bend the curve more sharply than a cubic can. `fraction`, (N,), is the place in the step, 0 to 1;
+    with T = 0 it is the cubic itself.
     """
     s, t = fraction, 1.0 - fraction
     weights = np.stack([(1.0 + 2.0 * s) * t * t, s * t * t, s * s * (3.0 - 2.0 * s), -s * s * t], axis=1)
@@ -67,40 +61,20 @@ def curve_weights(fraction: np.ndarray, step_s: float, time_constant_s: float, d
 
 
 def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Exact transition of T² y'' + 2 ζ T y' + y = w over one step with w held.
+    """Exact transition of T² y'' + 2 ζ T y' + y = w over one step with w held: Φ, shape (2, 2), and Γ, (2,).
 
-    Parameters
-    ----------
-    time_constant_s : float
-        T, s, positive.
-    damping : float
-        ζ, positive, 1 is critical.
-    step_s : float or ndarray
-        Length of the step, s; for an array, its shape follows those given below.
-
-    Returns
-    -------
-    phi : ndarray, shape (2, 2)
-        State transition of x = (y, y').
-    gamma : ndarray, shape (2,)
-        Input vector: x[k+1] = phi @ x[k] + gamma * w[k].
+    With x = (y, y'), x[k+1] = Φ x[k] + Γ w[k].
     """
     p11, p12, p21, p22 = step_matrix(time_constant_s, damping, step_s)
     return np.array([[p11, p12], [p21, p22]]), np.array([1.0 - p11, -p21])
 
 
 def recursion(a: np.ndarray, forced: np.ndarray) -> np.ndarray:
-    """y[k] = forced[k] - a[1] y[k-1] - a[2] y[k-2] …, from rest, along the first axis.
+    """y[k] = forced[k] - a[1] y[k-1] - a[2] y[k-2] …, from rest, along the first axis; a[0] = 1.
 
     This is a lower triangular banded system, which LAPACK solves by this recursion. scipy.signal.lfilter does the same,
-    but its import takes 0.3 s, a third of the time of `stimrig fit`.
-
-    Parameters
-    ----------
-    a : ndarray, shape (l + 1,)
-        Denominator, a[0] = 1.
-    forced : ndarray, shape (K,) or (K, M)
-        Right-hand side; it is overwritten if it is in Fortran order.
+    but its import takes 0.3 s, a third of the time of `stimrig fit`. `forced`, shape (K,) or (K, M), is overwritten if
+    it is in Fortran order.
     """
     from scipy.linalg import lapack  # here: its import takes as long as a fit, which does not need it
 

@@ -14,22 +14,10 @@ step_matrix = njit(cache=True, nogil=True)(second_order.step_matrix)
 def through(drive, torque, rate, rows, even, varied, begins, initial):  # pragma: no cover
     """Four rows at a time through given transitions: each waits for itself alone, so four take hardly longer than one.
 
-    Parameters
-    ----------
-    drive : ndarray, shape (M, K)
-        Held drive of each interval, N·m.
-    torque, rate : ndarray, shape (M, K + 1)
-        Where the states go.
-    rows : ndarray of int, shape (4,)
-        Which; a row may stand there several times.
-    even : ndarray, shape (4, 4)
-        Transition of each row, column by column, where it is the same in all intervals.
-    varied : ndarray, shape (4, K) or (4, 0)
-        Transition of each interval, the same for all rows, where it is not.
-    begins : ndarray of int, shape (B,)
-        Intervals at whose start a part of the record begins; the first is 0.
-    initial : ndarray, shape (M, B, 2)
-        State with which each part begins.
+    `torque` and `rate`, (M, K + 1), take the states of the `rows`, (4,), of `drive`, (M, K); a row may stand there
+    several times. `even`, (4, 4), holds each row's transition, where it is the same in all intervals; else `varied`,
+    (4, K) and not (4, 0), that of each interval for all rows. Each part begins at an interval of `begins`, (B,), the
+    first 0, with a state of `initial`, (M, B, 2).
     """
     size = drive.shape[1]
     a, b, c, d = rows
@@ -83,21 +71,10 @@ def boundary_states(
     drive_nm: np.ndarray,
     initial: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States at the ends of the pulse intervals.
+    """Torque and its rate at the ends of the pulse intervals, each of shape (K + 1,) or (K + 1, M).
 
-    Parameters
-    ----------
-    time_constant_s, damping, step_s : float
-        As in `transition`.
-    drive_nm : ndarray, shape (K,) or (K, M)
-        Held input of each interval, N·m; columns are filtered separately.
-    initial : tuple of float
-        Torque, N·m, and its rate, N·m/s, at the start; at rest by default.
-
-    Returns
-    -------
-    torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
-        y and y' at the start of interval 0, …, at the end of interval K - 1.
+    `drive_nm`, shape (K,) or (K, M), is held in each interval; columns are filtered separately, from torque and rate in
+    `initial`. The rest is as in `transition`.
     """
     drive = np.ascontiguousarray(np.atleast_2d(drive_nm.T), float)
     even = np.tile(second_order.step_matrix(time_constant_s, damping, step_s), (len(drive), 1))
@@ -110,16 +87,8 @@ def boundary_states(
 def read_at(torque, rate, interval, place, offset, weights):  # pragma: no cover
     """The curve through boundary states at samples, shape (N,); constant before the first and after the last state.
 
-    Parameters
-    ----------
-    torque, rate : ndarray, shape (K + 1,)
-        Boundary states.
-    interval, place : ndarray of int, shape (N,)
-        Interval of each sample, and index of its place within an interval.
-    offset : ndarray of int, shape (U,)
-        For each place: number of intervals from the sample's own to the one in which the curve is read.
-    weights : ndarray, shape (U, 4)
-        As `curve_weights` gives them.
+    `interval` and `place`, (N,), say in which interval each sample is, at which of U places; `offset`, (U,), how many
+    intervals from there its curve is read, with `weights`, (U, 4), of `curve_weights`.
     """
     out = np.empty(interval.size)
     last = torque.size - 1
@@ -136,25 +105,10 @@ def read_at(torque, rate, interval, place, offset, weights):  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def mean_weights(four, offset, place, interval, count):  # pragma: no cover
-    """Weights of the boundary states in each interval's mean of its samples.
+    """The earliest boundary's offset, and weights of (y, y') at the boundaries in each interval's mean, (K, B, 2).
 
-    Parameters
-    ----------
-    four : ndarray, shape (U, 4)
-        Weights of (y, y') before and after each place in an interval at which samples were taken.
-    offset : ndarray of int, shape (U,)
-        Number of intervals from the sample's own to the one in which the curve is read.
-    place, interval : ndarray of int, shape (N,)
-        Place and interval of each sample.
-    count : ndarray of int, shape (K,)
-        Samples in each interval.
-
-    Returns
-    -------
-    first : int
-        Offset of the earliest boundary.
-    weights : ndarray, shape (K, B, 2)
-        For (y, y').
+    `four`, (U, 4), and `offset`, (U,), are as in `read_at`; `place` and `interval`, (N,), are those of each sample, and
+    `count`, (K,), the samples in each interval.
     """
     low, high = offset[0], offset[0]
     for u in range(offset.size):
@@ -174,14 +128,7 @@ def mean_weights(four, offset, place, interval, count):  # pragma: no cover
 def read_means(torque, rate, first, weights):  # pragma: no cover
     """Means over intervals, shape (M, K), from boundary states; constant before the first and after the last state.
 
-    Parameters
-    ----------
-    torque, rate : ndarray, shape (M, K + 1)
-        Boundary states.
-    first : int
-        Offset of the earliest boundary.
-    weights : ndarray, shape (K, B, 2) or (1, B, 2)
-        As `mean_weights` gives them; a single row holds for all intervals.
+    `first` and `weights` are as `mean_weights` gives them; a single row of weights holds for all intervals.
     """
     rows, size = torque.shape[0], torque.shape[1] - 1
     even = weights.shape[0] == 1 and size > 1

@@ -76,114 +76,81 @@ class SpeedLaw(IntEnum):
 
 
 @njit(cache=True, nogil=True)
+def _line(slope, x):  # pragma: no cover
+    """1 + slope x, at least 0.08."""
+    return max(1.0 + slope * x, 0.08) if slope != 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def _below(log_ratio, gap):  # pragma: no cover
+    """The ratio where a gap, in units of a soft edge, is negative; 1 where it is positive."""
+    return np.exp(log_ratio * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap))) if log_ratio != 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def _share(x):  # pragma: no cover
+    return min(max(x, 0.0), 1.2)
+
+
+@njit(cache=True, nogil=True)
 def _uptake(slope, w, a):  # pragma: no cover
     """Factor on the lag of a saturating uptake, where w/(1 + s w) - a/(1 + s a) drives a towards w."""
-    w, a = min(max(w, 0.0), 1.2), min(max(a, 0.0), 1.2)
-    return max(1.0 + slope * w, 0.08) * max(1.0 + slope * a, 0.08)
+    return _line(slope, _share(w)) * _line(slope, _share(a)) if slope != 0.0 else 1.0
+
+
+@njit(cache=True, nogil=True)
+def _bounded(factor):  # pragma: no cover
+    return min(max(factor, 0.02), 50.0)
 
 
 @njit(cache=True, nogil=True)
 def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     """Factors on T, on the slower and on the quicker lag; `law` holds a value for each `SpeedLaw`."""
-    m = 1.0
-    if law[SpeedLaw.RATIO_BY_DRIVE] != 0.0:
-        d = (w - y) / (0.02 * scale_nm)
-        m *= np.exp(law[SpeedLaw.RATIO_BY_DRIVE] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
-    if law[SpeedLaw.RATIO_BY_RATE] != 0.0:
-        d = v / (0.1 * scale_nm)
-        m *= np.exp(law[SpeedLaw.RATIO_BY_RATE] * 0.5 * (1.0 - d / np.sqrt(1.0 + d * d)))
-    level = abs(y) / scale_nm
-    if law[SpeedLaw.TORQUE] != 0.0:
-        m *= max(1.0 + law[SpeedLaw.TORQUE] * level, 0.08)
-    if law[SpeedLaw.DRIVE] != 0.0:
-        m *= max(1.0 + law[SpeedLaw.DRIVE] * abs(w) / scale_nm, 0.08)
+    level, part = abs(y) / scale_nm, abs(w) / scale_nm
+    lacking, rising = (w - y) / (0.02 * scale_nm), v / (0.1 * scale_nm)
+    m = _below(law[SpeedLaw.RATIO_BY_DRIVE], lacking) * _below(law[SpeedLaw.RATIO_BY_RATE], rising)
+    m = m * _line(law[SpeedLaw.TORQUE], level) * _line(law[SpeedLaw.DRIVE], part)
     if law[SpeedLaw.EXPONENTIAL] != 0.0:
         m *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)
-    if law[SpeedLaw.INVERSE_TORQUE] != 0.0:
-        m *= 1.0 / max(1.0 + law[SpeedLaw.INVERSE_TORQUE] * level, 0.08)
-    if law[SpeedLaw.INVERSE_DRIVE] != 0.0:
-        m *= 1.0 / max(1.0 + law[SpeedLaw.INVERSE_DRIVE] * abs(w) / scale_nm, 0.08)
-    d = 1.0
-    if law[SpeedLaw.SLOW_TORQUE] != 0.0:
-        d *= max(1.0 + law[SpeedLaw.SLOW_TORQUE] * level, 0.08)
-    if law[SpeedLaw.SLOW_RATIO_BY_DRIVE] != 0.0:
-        gap = (w - y) / (0.02 * scale_nm)
-        d *= np.exp(law[SpeedLaw.SLOW_RATIO_BY_DRIVE] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
-    if law[SpeedLaw.SLOW_INVERSE_DRIVE] != 0.0:
-        d *= 1.0 / max(1.0 + law[SpeedLaw.SLOW_INVERSE_DRIVE] * abs(w) / scale_nm, 0.08)
-    if law[SpeedLaw.ACTIVATION] != 0.0:
-        between = min(max((y + slow_s * v) / scale_nm, 0.0), 1.2)
-        m *= max(1.0 + law[SpeedLaw.ACTIVATION] * between, 0.08)
+    m *= 1.0 / _line(law[SpeedLaw.INVERSE_TORQUE], level)
+    m *= 1.0 / _line(law[SpeedLaw.INVERSE_DRIVE], part)
+    m *= _line(law[SpeedLaw.ACTIVATION], _share((y + slow_s * v) / scale_nm))
+    d = _line(law[SpeedLaw.SLOW_TORQUE], level) * _below(law[SpeedLaw.SLOW_RATIO_BY_DRIVE], lacking)
+    d *= 1.0 / _line(law[SpeedLaw.SLOW_INVERSE_DRIVE], part)
     if law[SpeedLaw.LEVEL] != 0.0 or law[SpeedLaw.SLOW_LEVEL] != 0.0:
-        gap = (w - y) / (0.02 * scale_nm)
-        side = np.log(0.5 + 1.5 * min(level, 1.2)) * gap / np.sqrt(1.0 + gap * gap)
+        side = np.log(0.5 + 1.5 * min(level, 1.2)) * lacking / np.sqrt(1.0 + lacking * lacking)
         m *= np.exp(law[SpeedLaw.LEVEL] * side)
         d *= np.exp(law[SpeedLaw.SLOW_LEVEL] * side)
     if law[SpeedLaw.SLOW_SATURATING_DRIVE] != 0.0:
-        part = abs(w) / scale_nm
         d *= max(1.0 + law[SpeedLaw.SLOW_SATURATING_DRIVE] * 1.15 * part / (part + 0.15), 0.08)
-    q = 1.0
-    if law[SpeedLaw.QUICK_RATIO_BY_RATE] != 0.0 or law[SpeedLaw.SLOW_RATIO_BY_RATE] != 0.0:
-        gap = v / (0.1 * scale_nm)
-        side = 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap))
-        q *= np.exp(law[SpeedLaw.QUICK_RATIO_BY_RATE] * side)
-        d *= np.exp(law[SpeedLaw.SLOW_RATIO_BY_RATE] * side)
-    if law[SpeedLaw.QUICK_RATIO_BY_DRIVE] != 0.0:
-        gap = (w - y) / (0.02 * scale_nm)
-        q *= np.exp(law[SpeedLaw.QUICK_RATIO_BY_DRIVE] * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap)))
-    if law[SpeedLaw.SLOW_CALCIUM] != 0.0:
-        d *= max(1.0 + law[SpeedLaw.SLOW_CALCIUM] * bound, 0.08)
-    if law[SpeedLaw.QUICK_CALCIUM] != 0.0:
-        q *= max(1.0 + law[SpeedLaw.QUICK_CALCIUM] * bound, 0.08)
-    if law[SpeedLaw.SLOW_PUMP] != 0.0:
-        d *= _uptake(law[SpeedLaw.SLOW_PUMP], w / scale_nm, (y + quick_s * v) / scale_nm)
-    if law[SpeedLaw.QUICK_PUMP] != 0.0:
-        q *= _uptake(law[SpeedLaw.QUICK_PUMP], w / scale_nm, (y + slow_s * v) / scale_nm)
-    return min(max(m, 0.02), 50.0), min(max(d, 0.02), 50.0), min(max(q, 0.02), 50.0)
+    d *= _below(law[SpeedLaw.SLOW_RATIO_BY_RATE], rising)
+    d = d * _line(law[SpeedLaw.SLOW_CALCIUM], bound)
+    d *= _uptake(law[SpeedLaw.SLOW_PUMP], w / scale_nm, (y + quick_s * v) / scale_nm)
+    q = _below(law[SpeedLaw.QUICK_RATIO_BY_RATE], rising) * _below(law[SpeedLaw.QUICK_RATIO_BY_DRIVE], lacking)
+    q = q * _line(law[SpeedLaw.QUICK_CALCIUM], bound)
+    q *= _uptake(law[SpeedLaw.QUICK_PUMP], w / scale_nm, (y + slow_s * v) / scale_nm)
+    return _bounded(m), _bounded(d), _bounded(q)
 
 
 @njit(cache=True, nogil=True)
 def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
     """Factor on the second of two lags; `lag_s` is its present value, s."""
-    factor = 1.0
-    if law[linear] != 0.0:
-        factor *= max(1.0 + law[linear] * min(max((y + lag_s * v) / scale_nm, 0.0), 1.2), 0.08)
-    if law[inverse] != 0.0:
-        factor *= 1.0 / max(1.0 + law[inverse] * min(max(y / scale_nm, 0.0), 1.2), 0.08)
-    return min(max(factor, 0.02), 50.0)
+    factor = _line(law[linear], _share((y + lag_s * v) / scale_nm))
+    return _bounded(factor * (1.0 / _line(law[inverse], _share(y / scale_nm))))
 
 
 @njit(cache=True, nogil=True)
 def run_core(
     drive, time_constant_s, damping, law, multiplier, begins, initial, scale_nm, step_s, shared
 ):  # pragma: no cover
-    """Boundary states of rows of drives.
+    """Boundary states of rows of drives, torque, N·m, and its rate, each of shape (M, K + 1).
 
-    Parameters
-    ----------
-    drive : ndarray, shape (M, K)
-        Held drive of each interval, N·m.
-    time_constant_s, damping : ndarray, shape (M,)
-        T, s, and ζ.
-    law : ndarray, shape (M, len(SpeedLaw))
-        Coefficient of each speed law.
-    multiplier : ndarray, shape (M or 1 or 0, K)
-        A further, given factor on T; no rows if there is none.
-    begins : ndarray of int, shape (B,)
-        Intervals at whose start a part of the record begins; the first is 0.
-    initial : ndarray, shape (M, B, 2)
-        Torque, N·m, and its rate, N·m/s, with which each part begins.
-    scale_nm : float
-        Full torque, N·m.
-    step_s : float
-        Pulse interval, s.
-    shared : bool
-        Rows that differ from row 0 only in their drive use row 0's transitions. Their derivative then ignores that the
-        drive changes the speed: ten times faster, and good enough for the fit.
+    `drive`, (M, K), is held in each interval; T, s, and ζ have shape (M,), `law` (M, len(SpeedLaw)). `multiplier`,
+    (M or 1 or 0, K), is a further, given factor on T; no rows if there is none. Each part begins at an interval of
+    `begins`, (B,), the first 0, with its torque and rate in `initial`, (M, B, 2). `scale_nm` is the full torque.
 
-    Returns
-    -------
-    torque_nm, rate_nm_s : ndarray, shape (M, K + 1)
+    With `shared`, rows that differ from row 0 in their drive alone use its transitions. Their derivative then ignores
+    that the drive changes the speed: ten times faster, and good enough for the fit.
     """
     rows, size = drive.shape
     given = multiplier.shape[0]
@@ -196,12 +163,9 @@ def run_core(
         base = time_constant_s[m]
         slow_s = base * (damping[m] + np.sqrt(max(damping[m] * damping[m] - 1.0, 0.0)))
         quick_s = 2.0 * damping[m] * base - slow_s
-        lawful = False
-        for j in range(law.shape[1]):
-            lawful = lawful or law[m, j] != 0.0
+        lawful = np.any(law[m] != 0.0)
         alike = shared and m > 0 and base == time_constant_s[0] and damping[m] == damping[0]
-        for j in range(law.shape[1]):
-            alike = alike and law[m, j] == law[0, j]
+        alike = alike and np.all(law[m] == law[0])
         y, v, bound, part = 0.0, 0.0, 0.0, 0
         slow_second = law[m, SpeedLaw.SLOW_SECOND_ACTIVATION] != 0.0 or law[m, SpeedLaw.SLOW_SECOND_ATTACHED] != 0.0
         quick_second = law[m, SpeedLaw.QUICK_SECOND_ACTIVATION] != 0.0 or law[m, SpeedLaw.QUICK_SECOND_ATTACHED] != 0.0
@@ -233,10 +197,7 @@ def run_core(
                     inverse = SpeedLaw.SLOW_SECOND_ATTACHED if slow_second else SpeedLaw.QUICK_SECOND_ATTACHED
                     lag_s = last * (slow_s if slow_second else quick_s)
                     second = _second(law[m], linear, inverse, y, v, lag_s, scale_nm)
-                    if slow_second:
-                        d *= second
-                    else:
-                        q *= second
+                    d, q = (d * second, q) if slow_second else (d, q * second)
                     turned, last = last / second, second
                 v *= turned  # y' = (a - y) / lag: a stays the same when the lag changes
                 f *= given_f

@@ -44,41 +44,25 @@ EFFECT = Effect(
             12.0,
         ),
         _form("calcium_quick_lag", "faster lag times (1 + slope·c), c: bound calcium", Law.QUICK_CALCIUM, -0.9, 12.0),
-        _two_lags(
-            "activation_slow_lag",
-            "a' = (w - a)/fast, y' = (a - y)/(slow (1 + slope·a/y_max))",
-            Law.SLOW_SECOND_ACTIVATION,
-            _BOUND,
+        *(
+            _two_lags(f"{name}_{lag}_lag", f"a' = (w - a)/{other}, y' = (a - y){words}", law, source)
+            for lag, other, activation, attached in (
+                ("slow", "fast", Law.SLOW_SECOND_ACTIVATION, Law.SLOW_SECOND_ATTACHED),
+                ("quick", "slow", Law.QUICK_SECOND_ACTIVATION, Law.QUICK_SECOND_ATTACHED),
+            )
+            for name, words, law, source in (
+                ("activation", f"/({lag} (1 + slope·a/y_max))", activation, _BOUND),
+                ("attached", f"(1 + slope·y/y_max)/{lag}", attached, _ATTACHED),
+            )
         ),
-        _two_lags(
-            "attached_slow_lag",
-            "a' = (w - a)/fast, y' = (a - y)(1 + slope·y/y_max)/slow",
-            Law.SLOW_SECOND_ATTACHED,
-            _ATTACHED,
-        ),
-        _two_lags(
-            "activation_quick_lag",
-            "a' = (w - a)/slow, y' = (a - y)/(quick (1 + slope·a/y_max))",
-            Law.QUICK_SECOND_ACTIVATION,
-            _BOUND,
-        ),
-        _two_lags(
-            "attached_quick_lag",
-            "a' = (w - a)/slow, y' = (a - y)(1 + slope·y/y_max)/quick",
-            Law.QUICK_SECOND_ATTACHED,
-            _ATTACHED,
-        ),
-        _two_lags(
-            "pump_slow_lag",
-            "a' = (w/(1 + s·w) - a/(1 + s·a))/slow, y' = (a - y)/fast, s = slope/y_max",
-            Law.SLOW_PUMP,
-            _PUMP,
-        ),
-        _two_lags(
-            "pump_quick_lag",
-            "a' = (w/(1 + s·w) - a/(1 + s·a))/fast, y' = (a - y)/slow, s = slope/y_max",
-            Law.QUICK_PUMP,
-            _PUMP,
+        *(
+            _two_lags(
+                name, f"a' = (w/(1 + s·w) - a/(1 + s·a))/{own}, y' = (a - y)/{other}, s = slope/y_max", law, _PUMP
+            )
+            for name, own, other, law in (
+                ("pump_slow_lag", "slow", "fast", Law.SLOW_PUMP),
+                ("pump_quick_lag", "fast", "slow", Law.QUICK_PUMP),
+            )
         ),
     ),
     signature="Small torques develop faster (or slower) than large ones: the sign of the error depends on level and "

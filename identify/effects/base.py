@@ -157,32 +157,34 @@ class Scene:
         """Length of the record, s."""
         return float(self.time_s[-1] - self.time_s[0])
 
+    @property
+    def angle(self) -> np.ndarray:
+        """Of the joint, rad, shape (K,); only of a record that has it."""
+        assert self.angle_rad is not None
+        return self.angle_rad
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Velocity of the joint, rad/s, shape (K,); 0 without one."""
+        return np.zeros_like(self.time_s) if self.velocity_rad_s is None else self.velocity_rad_s
+
     @cached_property
     def away_rad(self) -> np.ndarray:
         """Angle from the reference angle, rad, shape (K,)."""
-        assert self.angle_rad is not None
-        return self.angle_rad - (self.angle_rad[0] if self.reference_rad is None else self.reference_rad)
+        return self.angle - (self.angle[0] if self.reference_rad is None else self.reference_rad)
 
     @cached_property
     def place(self) -> np.ndarray:
         """Place in the range of fitted angles, from -1 to 1 at its ends and held there beyond them, shape (K,)."""
-        assert self.angle_rad is not None
-        low, high = self.angle_range
-        return np.clip((2.0 * self.angle_rad - low - high) / max(high - low, LEAST_RANGE_RAD), -1.0, 1.0)
+        return self._placed(self.angle)
 
-    @property
-    def angle_range(self) -> tuple[float, float]:
-        """Smallest and largest angle that the model holds for, rad."""
-        assert self.angle_rad is not None
-        return self.angle_range_rad or (float(self.angle_rad.min()), float(self.angle_rad.max()))
+    def _placed(self, angle_rad: np.ndarray | float) -> np.ndarray:
+        low, high = self.angle_range_rad or (float(self.angle.min()), float(self.angle.max()))
+        return np.clip((2.0 * angle_rad - low - high) / max(high - low, LEAST_RANGE_RAD), -1.0, 1.0)
 
     def bends(self, degrees: int) -> np.ndarray:
         """Chebyshev polynomials of `place`, of degrees 1 to `degrees`, all 0 at the reference angle, shape (n, K)."""
-        away = self.away_rad
-        assert self.angle_rad is not None
-        low, high = self.angle_range
-        own = float(self.angle_rad[0] - away[0])
-        home = np.clip((2.0 * own - low - high) / max(high - low, LEAST_RANGE_RAD), -1.0, 1.0)
+        home = self._placed(float(self.angle[0] - self.away_rad[0]))
         return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
 
 

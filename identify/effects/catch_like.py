@@ -37,10 +37,12 @@ def _trains(name: str, equation: str, least_gap_s: float) -> Form:
 
 
 @njit(cache=True, nogil=True)
-def _train(on: np.ndarray, step_s: float, least_gap_s: float) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+def _train(
+    on: np.ndarray, step_s: float, least_gap_s: float, within: bool = False
+) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
     """Time under pulses since the onset of the present train, and the silence before that train, s.
 
-    A silence longer than `least_gap_s` ends a train.
+    A silence longer than `least_gap_s` ends a train; `within` counts the time of shorter ones, too.
     """
     since = np.full(on.size, 1e9)
     before = np.zeros(on.size)
@@ -55,6 +57,8 @@ def _train(on: np.ndarray, step_s: float, least_gap_s: float) -> tuple[np.ndarra
             length += step_s
         else:
             gap += step_s
+            if within:
+                length += step_s
     return since, before
 
 
@@ -74,24 +78,6 @@ def _used_up(
             else:
                 out[m, k] = x
                 x *= forget
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _since_onset(on: np.ndarray, least_gap_s: float, step_s: float) -> np.ndarray:  # pragma: no cover
-    """Time since the first pulse of the present train, s, at the middle of each interval; 1e9 without a pulse."""
-    out = np.full(on.size, 1e9)
-    gap, since = 1e9, 1e9
-    for k in range(on.size):
-        if on[k] > 0:
-            if gap >= least_gap_s:
-                since = 0.0
-            gap = 0.0
-            out[k] = since + 0.5 * step_s
-            since += step_s
-        else:
-            gap += step_s
-            since += step_s
     return out
 
 
@@ -147,7 +133,7 @@ def flat(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     name=f"burst_{BURST_S * 1000:.0f}_ms",
 )
 def burst(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    since = _since_onset(scene.on, GAP_S - 0.004, scene.step_s)
+    since, _ = _train(scene.on, scene.step_s, np.nextafter(GAP_S - 0.004, 0.0), True)  # just as long ends it, too
     return drive * (1.0 + p["gain"] * np.exp(-((since / BURST_S) ** 4)))
 
 

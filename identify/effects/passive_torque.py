@@ -22,13 +22,9 @@ _STIFF = _part("stiffness_nm_per_rad", "N·m/rad", 3.0, "elastic part, at the re
 _VISCOUS = _part("viscosity_nm_s_per_rad", "N·m·s/rad", 0.6, "viscous part")
 
 
-def _speed(scene: Scene) -> np.ndarray:
-    return np.zeros_like(scene.time_s) if scene.velocity_rad_s is None else scene.velocity_rad_s
-
-
 @form("additive", "y + stiffness·Δ + viscosity·velocity, Δ = angle - reference angle", _STIFF, _VISCOUS)
 def linear(_: None, p: Values, scene: Scene) -> np.ndarray:
-    return p["stiffness_nm_per_rad"] * scene.away_rad + p["viscosity_nm_s_per_rad"] * _speed(scene)
+    return p["stiffness_nm_per_rad"] * scene.away_rad + p["viscosity_nm_s_per_rad"] * scene.speed
 
 
 @form(
@@ -42,7 +38,7 @@ def linear(_: None, p: Values, scene: Scene) -> np.ndarray:
 def exponential(_: None, p: Values, scene: Scene) -> np.ndarray:
     k = p["steepness_per_rad"]
     elastic = p["stiffness_nm_per_rad"] * np.expm1(np.clip(k * scene.away_rad, -30.0, 8.0)) / k
-    return elastic + p["viscosity_nm_s_per_rad"] * _speed(scene)
+    return elastic + p["viscosity_nm_s_per_rad"] * scene.speed
 
 
 @form(
@@ -56,7 +52,7 @@ def exponential(_: None, p: Values, scene: Scene) -> np.ndarray:
 def two_sided(_: None, p: Values, scene: Scene) -> np.ndarray:
     away = scene.away_rad
     elastic = p["stiffness_nm_per_rad"] * away + p["bend_nm_per_rad2"] * away**2 + p["hardening_nm_per_rad3"] * away**3
-    return elastic + p["viscosity_nm_s_per_rad"] * _speed(scene)
+    return elastic + p["viscosity_nm_s_per_rad"] * scene.speed
 
 
 _FREE = (
@@ -71,7 +67,7 @@ _FREE = (
 
 
 def _surface(_: None, p: Values, scene: Scene) -> np.ndarray:
-    velocity, place = _speed(scene), scene.place
+    velocity, place = scene.speed, scene.place
     elastic = sum(p[f"elastic_{i}_nm"] * bend for i, bend in enumerate(scene.bends(len(SIZES)), start=1))
     viscous = p["viscosity_nm_s_per_rad"] + p["tilt_nm_s_per_rad"] * place + p["bow_nm_s_per_rad"] * place**2
     acceleration = 0.0 if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
@@ -96,20 +92,9 @@ surface = Form(
 def relaxed(
     value: np.ndarray, time_s: np.ndarray, begins: np.ndarray, relaxation_s: np.ndarray
 ) -> np.ndarray:  # pragma: no cover
-    """What follows a value by a first-order lag, exact for a value that goes straight from point to point.
+    """What follows a value by a first-order lag, exact for a value that goes straight from point to point; (M, K).
 
-    Parameters
-    ----------
-    value, time_s : ndarray, shape (K,)
-        What is followed, and when, s.
-    begins : ndarray of bool, shape (K,)
-        Where it has already arrived: at the begin of each recording.
-    relaxation_s : ndarray, shape (M,)
-        Time constants, s.
-
-    Returns
-    -------
-    ndarray, shape (M, K)
+    `value` and `time_s`, (K,), are what is followed, and when; it has already arrived where a recording `begins`, (K,).
     """
     rows, size = relaxation_s.size, value.size
     out = np.empty((rows, size))

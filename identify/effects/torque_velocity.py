@@ -13,8 +13,7 @@ _TOP = Parameter("top", "1", 1.05, 1.9, 1.4, (1.4,), about="largest torque when 
 
 @form("output", "y (1 - slope·velocity)", _SIDE)
 def linear(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    assert scene.velocity_rad_s is not None
-    return y * np.maximum(1.0 - p["slope_s_per_rad"] * scene.velocity_rad_s, 0.0)
+    return y * np.maximum(1.0 - p["slope_s_per_rad"] * scene.speed, 0.0)
 
 
 def _hyperbola(y: np.ndarray, p: Values, v: np.ndarray) -> np.ndarray:
@@ -35,8 +34,7 @@ def _hyperbola(y: np.ndarray, p: Values, v: np.ndarray) -> np.ndarray:
     source="Hill 1938; Thelen 2003",
 )
 def hill(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    assert scene.velocity_rad_s is not None
-    return _hyperbola(y, p, p["slope_s_per_rad"] * scene.velocity_rad_s)
+    return _hyperbola(y, p, p["slope_s_per_rad"] * scene.speed)
 
 
 @form(
@@ -51,9 +49,8 @@ def hill(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 )
 def surface(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     """As `hill`, its slope another one at each angle: moment arm and fibre length change with it."""
-    assert scene.velocity_rad_s is not None
     slope = p["slope_s_per_rad"] + p["tilt_s_per_rad"] * scene.place + p["bow_s_per_rad"] * scene.place**2
-    return _hyperbola(y, p, slope * scene.velocity_rad_s)
+    return _hyperbola(y, p, slope * scene.speed)
 
 
 @form(
@@ -64,11 +61,10 @@ def surface(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ'",
 )
 def marion(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    assert scene.angle_rad is not None and scene.velocity_rad_s is not None
-    angle = np.abs(scene.angle_rad)
-    return y + p["gain_nm_s_per_rad2"] * angle * np.exp(
-        -p["decay_per_rad"] * angle
-    ) * scene.velocity_rad_s * np.minimum(np.abs(y) / (0.2 * scene.scale_nm), 1.0)
+    angle = np.abs(scene.angle)
+    return y + p["gain_nm_s_per_rad2"] * angle * np.exp(-p["decay_per_rad"] * angle) * scene.speed * np.minimum(
+        np.abs(y) / (0.2 * scene.scale_nm), 1.0
+    )
 
 
 @form(
@@ -80,9 +76,8 @@ def marion(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 )
 def bell(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     """As `marion`, but as a share of the torque; the slope is the largest one over all angles."""
-    assert scene.angle_rad is not None and scene.velocity_rad_s is not None
-    place = p["decay_per_rad"] * np.abs(scene.angle_rad)
-    share = p["slope_s_per_rad"] * place * np.exp(1.0 - place) * scene.velocity_rad_s
+    place = p["decay_per_rad"] * np.abs(scene.angle)
+    share = p["slope_s_per_rad"] * place * np.exp(1.0 - place) * scene.speed
     return y * np.maximum(1.0 - share, 0.0)
 
 

@@ -1,73 +1,54 @@
 """Identification methods: one file each, found in this folder.
 
-The module of a method has a variable `METHOD`, an object that satisfies `Method`.
+The module of a method has a variable `METHOD`, a `Method`.
 """
 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
-from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.model import Model
 
 
-@runtime_checkable
-class Method(Protocol):
+@dataclass(frozen=True)
+class Method:
     """A method that estimates a Hammerstein model from a record.
 
-    Attributes
-    ----------
-    id : str
-        As users write it: `two-stage`.
-    summary : str
-        One line.
-    options : mapping of str to str
-        Each option's name and what it does.
+    `fit(grid, fit_on, **options)` fits a model to the grid's record; `fit_on` names the segments to use, or is None.
     """
 
-    @property
-    def id(self) -> str: ...
+    id: str  # as users write it: `two-stage`
+    summary: str  # one line
+    options: Mapping[str, str]  # each option's name and what it does
+    fit: Callable[..., Model]
 
-    @property
-    def summary(self) -> str: ...
 
-    @property
-    def options(self) -> Mapping[str, str]: ...
-
-    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Fit a model to the grid's record; `fit_on` names the segments to use."""
-        ...
+def _in_file(module: str) -> Method | None:
+    method = getattr(import_module(f"{__name__}.{module}"), "METHOD", None)
+    return method if isinstance(method, Method) else None
 
 
 @cache
 def methods() -> dict[str, Method]:
     """Every method by its id."""
-    found: dict[str, Method] = {}
-    for info in pkgutil.iter_modules(__path__):
-        method = getattr(import_module(f"{__name__}.{info.name}"), "METHOD", None)
-        if isinstance(method, Method):
-            found[method.id] = method
-    return dict(sorted(found.items()))
+    found = [_in_file(info.name) for info in pkgutil.iter_modules(__path__)]
+    return {method.id: method for method in sorted(filter(None, found), key=lambda method: method.id)}
 
 
 def method_of(name: str) -> Method:
     """The method with this id. If its file has the same name, no other method is imported.
 
-    Raises
-    ------
-    BadRequest
-        No method has this id.
+    Raises BadRequest: no method has this id.
     """
     own = name.replace("-", "_")
-    if own.isidentifier() and any(info.name == own for info in pkgutil.iter_modules(__path__)):
-        found = getattr(import_module(f"{__name__}.{own}"), "METHOD", None)
-        if isinstance(found, Method) and found.id == name:
-            return found
+    if own in (info.name for info in pkgutil.iter_modules(__path__)) and (found := _in_file(own)) and found.id == name:
+        return found
     if name not in methods():
         raise BadRequest(f"unknown method {name!r}", place="method", fix=f"Known: {', '.join(methods())}.")
     return methods()[name]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import estimate, still_rows, to_fitted
 from stimrig.identify.estimation.projection import Projection, Solution, log_likelihood, project, search, whiten
 from stimrig.identify.estimation.samples import fitted_rows
+from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.two_stage import general
 from stimrig.identify.model import Model
@@ -112,69 +112,66 @@ def monotone(solution: Solution) -> Solution:
     return replace(solution, coefficients=coefficients)
 
 
-class MaximumLikelihood:
-    """The default method."""
-
-    id = "maximum-likelihood"
-    summary = "Joint estimate of recruitment spline and second-order dynamics by variable projection on all segments."
-    options: Mapping[str, str] = MappingProxyType(
-        {
-            "recruitment": "spline (default, (8)), power-series (6), sigmoid (30) or near-sigmoid, for short records",
-            "earlier": "with near-sigmoid: this person's last model, from which the curve is not expected to be far",
-            "monotone": "true: the spline never falls (default: false)",
-            "knots": "number of knots of the spline (default: 19, or 31 if the curve is steep)",
-            "power": "order of the power series (default: by BIC)",
-            "delay_s": "a known delay, s (default: estimated)",
-            "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
-        }
-    )
-
-    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Fit; see `identify.fit`."""
-        rows = fitted_rows(grid, fit_on)
-        order = order_option(options.get("order", "second-order"))
-        if order != "second-order":
-            return general(self.id, grid, rows, rows, 8, int(options.get("knots", KNOTS)), order)
-        fitted, reasons = self.start(grid, rows, options)
-        return finish(self.id, fitted, [*reasons, *_why(fitted)])
-
-    def start(self, grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
-        """Fit the structure without effects, to which effects are added; with the reasons for its form."""
-        if options.get("recruitment") == "near-sigmoid" or "earlier" in options:
-            from stimrig.identify.estimation.averaged import near_sigmoid  # here: only this curve needs scipy
-
-            return near_sigmoid(grid, rows, options)
-        delay_s = float(options["delay_s"]) if "delay_s" in options else None
-        knots = int(options["knots"]) if "knots" in options else None
-
-        def solved(own: np.ndarray, white: bool) -> Solution:
-            return estimate(grid, still_rows(grid, own), knots, delay_s, white)[0]
-
-        solution = solved(rows, False)
-        kind = str(options.get("recruitment", "spline"))
-        if kind == "power-series":
-            solution, reason = power_series(solution, int(options["power"]) if "power" in options else None)
-        elif kind == "sigmoid":
-            solution, reason = sigmoid(solution), "sigmoid (30)"
-        elif kind == "spline":
-            size = solution.projection.basis.size
-            reason = f"spline of {size} coefficients, smoothed to {solution.freedom:.1f} effective ones"
-        else:
-            raise BadRequest(
-                f"unknown recruitment {kind!r}",
-                place="recruitment",
-                fix="Give spline, power-series, sigmoid or near-sigmoid.",
-            )
-        if flag(options.get("monotone", False), "monotone"):
-            return to_fitted(monotone(solution), rows, most=0), [reason, "recruitment constrained to be monotone"]
-        if kind != "spline":
-            return to_fitted(solution, rows, most=0), [reason]
-        known = to_fitted(solution, rows)
-        best = chosen(grid, rows, known, lambda own, white: to_fitted(solved(own, white), own, white=white))
-        return best, [reason, *words(best, rows)]
+def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+    """Fit; see `identify.fit`."""
+    rows = fitted_rows(grid, fit_on)
+    order = order_option(options.get("order", "second-order"))
+    if order != "second-order":
+        return general(METHOD.id, grid, rows, rows, 8, int(options.get("knots", KNOTS)), order)
+    fitted, reasons = start(grid, rows, options)
+    return finish(METHOD.id, fitted, [*reasons, *_why(fitted)])
 
 
-METHOD = MaximumLikelihood()
+def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fitted, list[str]]:
+    """Fit the structure without effects, to which effects are added; with the reasons for its form."""
+    if options.get("recruitment") == "near-sigmoid" or "earlier" in options:
+        from stimrig.identify.estimation.averaged import near_sigmoid  # here: only this curve needs scipy
+
+        return near_sigmoid(grid, rows, options)
+    delay_s = float(options["delay_s"]) if "delay_s" in options else None
+    knots = int(options["knots"]) if "knots" in options else None
+
+    def solved(own: np.ndarray, white: bool) -> Solution:
+        return estimate(grid, still_rows(grid, own), knots, delay_s, white)[0]
+
+    solution = solved(rows, False)
+    kind = str(options.get("recruitment", "spline"))
+    if kind == "power-series":
+        solution, reason = power_series(solution, int(options["power"]) if "power" in options else None)
+    elif kind == "sigmoid":
+        solution, reason = sigmoid(solution), "sigmoid (30)"
+    elif kind == "spline":
+        size = solution.projection.basis.size
+        reason = f"spline of {size} coefficients, smoothed to {solution.freedom:.1f} effective ones"
+    else:
+        raise BadRequest(
+            f"unknown recruitment {kind!r}",
+            place="recruitment",
+            fix="Give spline, power-series, sigmoid or near-sigmoid.",
+        )
+    if flag(options.get("monotone", False), "monotone"):
+        return to_fitted(monotone(solution), rows, most=0), [reason, "recruitment constrained to be monotone"]
+    if kind != "spline":
+        return to_fitted(solution, rows, most=0), [reason]
+    known = to_fitted(solution, rows)
+    best = chosen(grid, rows, known, lambda own, white: to_fitted(solved(own, white), own, white=white))
+    return best, [reason, *words(best, rows)]
+
+
+METHOD = Method(
+    "maximum-likelihood",
+    "Joint estimate of recruitment spline and second-order dynamics by variable projection on all segments.",
+    {
+        "recruitment": "spline (default, (8)), power-series (6), sigmoid (30) or near-sigmoid, for short records",
+        "earlier": "with near-sigmoid: this person's last model, from which the curve is not expected to be far",
+        "monotone": "true: the spline never falls (default: false)",
+        "knots": "number of knots of the spline (default: 19, or 31 if the curve is steep)",
+        "power": "order of the power series (default: by BIC)",
+        "delay_s": "a known delay, s (default: estimated)",
+        "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
+    },
+    fit,
+)
 
 
 def _why(fitted: Fitted) -> list[str]:

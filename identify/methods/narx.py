@@ -7,9 +7,7 @@ rises. Such models predict one step ahead very well, but may drift or diverge in
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import combinations_with_replacement
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,6 +16,7 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete, run_narx
 from stimrig.identify.estimation.finish import finish_discrete
 from stimrig.identify.estimation.samples import fitted_rows
+from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import quiet_level
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve
@@ -26,55 +25,51 @@ from stimrig.identify.recruitment.bases import SplineBasis
 MOST_TERMS = 14
 
 
-class Narx:
-    """The black box."""
-
-    id = "narx"
-    summary = "Polynomial NARX of degree 3 by orthogonal forward regression: a black box, for comparison."
-    options: Mapping[str, str] = MappingProxyType(
-        {
-            "torque_lags": "number of past torques (default: 2)",
-            "width_lags": "number of past pulse widths (default: 3)",
-            "degree": "highest degree (default: 3)",
-            "terms": f"largest number of terms (default: {MOST_TERMS})",
-        }
-    )
-
-    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Fit on the named segments, or on all that may be fitted."""
-        rows = fitted_rows(grid, fit_on)
-        torque_lags, width_lags = int(options.get("torque_lags", 2)), int(options.get("width_lags", 3))
-        baseline = quiet_level(grid)
-        torque_scale = float(np.std(grid.torque_nm[rows])) or 1.0
-        width_scale = float(np.max(grid.pulse_width_us)) or 1.0
-        torque = (np.nan_to_num(grid.torque_nm) - baseline) / torque_scale
-        width = grid.held(grid.pulse_width_us) / width_scale
-        variables = [(0, lag) for lag in range(1, torque_lags + 1)] + [(1, lag) for lag in range(1, width_lags + 1)]
-        degree = int(options.get("degree", 3))
-        terms = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(len(variables)), d)]
-        lead = max(torque_lags, width_lags)
-        used = rows.copy()
-        for lag in range(1, lead + 1):
-            used[lag:] &= rows[:-lag]
-        used[:lead] = False
-        past = np.stack([np.roll((torque, width)[kind], lag) for kind, lag in variables], axis=1)[used]
-        candidates = np.stack([np.prod(past[:, list(term)], axis=1) for term in terms], axis=1)
-        chosen, weights = forward_regression(candidates, torque[used], int(options.get("terms", MOST_TERMS)))
-        recipe = {
-            "variables": variables,
-            "terms": [list(terms[i]) for i in chosen],
-            "weights": [float(w) for w in weights],
-            "torque_scale_nm": torque_scale,
-            "width_scale_us": width_scale,
-            "baseline_nm": baseline,
-        }
-        curve = steady_curve(recipe, float(np.max(grid.pulse_width_us)))
-        block = Discrete((1.0,), (1.0,), 1, grid.step_s, float(np.mean(grid.fraction)))
-        reasons = [f"{len(chosen)} of {len(terms)} terms: " + ", ".join(name_of(terms[i], variables) for i in chosen)]
-        return finish_discrete(self.id, grid, rows, block, curve, reasons, {"narx": recipe})
+def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+    """Fit on the named segments, or on all that may be fitted."""
+    rows = fitted_rows(grid, fit_on)
+    torque_lags, width_lags = int(options.get("torque_lags", 2)), int(options.get("width_lags", 3))
+    baseline = quiet_level(grid)
+    torque_scale = float(np.std(grid.torque_nm[rows])) or 1.0
+    width_scale = float(np.max(grid.pulse_width_us)) or 1.0
+    torque = (np.nan_to_num(grid.torque_nm) - baseline) / torque_scale
+    width = grid.held(grid.pulse_width_us) / width_scale
+    variables = [(0, lag) for lag in range(1, torque_lags + 1)] + [(1, lag) for lag in range(1, width_lags + 1)]
+    degree = int(options.get("degree", 3))
+    terms = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(len(variables)), d)]
+    lead = max(torque_lags, width_lags)
+    used = rows.copy()
+    for lag in range(1, lead + 1):
+        used[lag:] &= rows[:-lag]
+    used[:lead] = False
+    past = np.stack([np.roll((torque, width)[kind], lag) for kind, lag in variables], axis=1)[used]
+    candidates = np.stack([np.prod(past[:, list(term)], axis=1) for term in terms], axis=1)
+    chosen, weights = forward_regression(candidates, torque[used], int(options.get("terms", MOST_TERMS)))
+    recipe = {
+        "variables": variables,
+        "terms": [list(terms[i]) for i in chosen],
+        "weights": [float(w) for w in weights],
+        "torque_scale_nm": torque_scale,
+        "width_scale_us": width_scale,
+        "baseline_nm": baseline,
+    }
+    curve = steady_curve(recipe, float(np.max(grid.pulse_width_us)))
+    block = Discrete((1.0,), (1.0,), 1, grid.step_s, float(np.mean(grid.fraction)))
+    reasons = [f"{len(chosen)} of {len(terms)} terms: " + ", ".join(name_of(terms[i], variables) for i in chosen)]
+    return finish_discrete(METHOD.id, grid, rows, block, curve, reasons, {"narx": recipe})
 
 
-METHOD = Narx()
+METHOD = Method(
+    "narx",
+    "Polynomial NARX of degree 3 by orthogonal forward regression: a black box, for comparison.",
+    {
+        "torque_lags": "number of past torques (default: 2)",
+        "width_lags": "number of past pulse widths (default: 3)",
+        "degree": "highest degree (default: 3)",
+        "terms": f"largest number of terms (default: {MOST_TERMS})",
+    },
+    fit,
+)
 
 
 def name_of(term: tuple[int, ...], variables: list[tuple[int, int]]) -> str:

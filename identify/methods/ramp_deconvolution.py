@@ -7,8 +7,6 @@ for the rising and one for the falling half; the sigmoid (30) is fitted to both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import completed
 from stimrig.identify.estimation.projection import ar1_or_white
+from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import near_rest, quiet_level, segment_rows
 from stimrig.identify.model import Model, Noise
 from stimrig.identify.recruitment import fit_points
@@ -29,51 +28,47 @@ NATURAL_FREQUENCY_RAD_S = 0.85 * np.pi
 KNOTS_PER_S = 6.0
 
 
-class RampDeconvolution:
-    """Recruitment from one ramp, with dynamics from the literature."""
-
-    id = "ramp-deconvolution"
-    summary = "The ramp deconvolved with critically damped dynamics of given frequency, then the sigmoid (30)."
-    options: Mapping[str, str] = MappingProxyType(
-        {"natural_frequency_rad_s": "1/Tω of the critically damped dynamics (default: 0.85π = 2.67)"}
-    )
-
-    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Fit; `fit_on` names the ramp if it is not called `ramp`."""
-        frequency = float(options.get("natural_frequency_rad_s", NATURAL_FREQUENCY_RAD_S))
-        if not 0.05 <= frequency <= 100.0:
-            raise BadRequest(
-                f"{frequency:g} rad/s is out of range", place="natural_frequency_rad_s", fix="Give 0.05 to 100 rad/s."
-            )
-        ramp = segment_rows(grid, fit_on or ("ramp",), self.id)
-        if np.unique(grid.pulse_width_us[ramp]).size < 8:
-            raise NotIdentifiable(
-                "the ramp has fewer than 8 pulse widths", fix="Record a triangular ramp over the whole range."
-            )
-        linear = SecondOrder(1.0 / frequency, 1.0)
-        drive, baseline = deconvolved(grid, ramp, linear)
-        width = grid.pulse_width_us
-        rising = ramp & (np.gradient(width) > 0)
-        falling = ramp & (np.gradient(width) < 0)
-        curve = fit_points(width[ramp], drive[ramp])
-        residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
-        rows = near_rest(grid, ramp)
-        ar1, delta_bic = ar1_or_white(residual, runs(rows))
-        model = Model(
-            method=self.id,
-            recruitment=curve,
-            linear=linear,
-            pulse_rate_hz=1.0 / grid.step_s,
-            sample_rate_hz=grid.record.sample_rate_hz,
-            baseline_nm=baseline,
-            noise=Noise(block_sd_nm=float(np.std(residual[rows])), ar1=ar1, delta_bic=delta_bic),
-            reasons=(f"given dynamics: critically damped, {frequency:.4g} rad/s",),
-            extra={"deconvolved": {"rising": _curve(width, drive, rising), "falling": _curve(width, drive, falling)}},
+def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+    """Fit; `fit_on` names the ramp if it is not called `ramp`."""
+    frequency = float(options.get("natural_frequency_rad_s", NATURAL_FREQUENCY_RAD_S))
+    if not 0.05 <= frequency <= 100.0:
+        raise BadRequest(
+            f"{frequency:g} rad/s is out of range", place="natural_frequency_rad_s", fix="Give 0.05 to 100 rad/s."
         )
-        return completed(model, grid, rows, 5.0)
+    ramp = segment_rows(grid, fit_on or ("ramp",), METHOD.id)
+    if np.unique(grid.pulse_width_us[ramp]).size < 8:
+        raise NotIdentifiable(
+            "the ramp has fewer than 8 pulse widths", fix="Record a triangular ramp over the whole range."
+        )
+    linear = SecondOrder(1.0 / frequency, 1.0)
+    drive, baseline = deconvolved(grid, ramp, linear)
+    width = grid.pulse_width_us
+    rising = ramp & (np.gradient(width) > 0)
+    falling = ramp & (np.gradient(width) < 0)
+    curve = fit_points(width[ramp], drive[ramp])
+    residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
+    rows = near_rest(grid, ramp)
+    ar1, delta_bic = ar1_or_white(residual, runs(rows))
+    model = Model(
+        method=METHOD.id,
+        recruitment=curve,
+        linear=linear,
+        pulse_rate_hz=1.0 / grid.step_s,
+        sample_rate_hz=grid.record.sample_rate_hz,
+        baseline_nm=baseline,
+        noise=Noise(block_sd_nm=float(np.std(residual[rows])), ar1=ar1, delta_bic=delta_bic),
+        reasons=(f"given dynamics: critically damped, {frequency:.4g} rad/s",),
+        extra={"deconvolved": {"rising": _curve(width, drive, rising), "falling": _curve(width, drive, falling)}},
+    )
+    return completed(model, grid, rows, 5.0)
 
 
-METHOD = RampDeconvolution()
+METHOD = Method(
+    "ramp-deconvolution",
+    "The ramp deconvolved with critically damped dynamics of given frequency, then the sigmoid (30).",
+    {"natural_frequency_rad_s": "1/Tω of the critically damped dynamics (default: 0.85π = 2.67)"},
+    fit,
+)
 
 
 def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.ndarray, float]:

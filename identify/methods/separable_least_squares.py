@@ -7,8 +7,6 @@ of the muscle. `memory_s` gives the length in seconds instead.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,6 +16,7 @@ from stimrig.identify.dynamics.linear import Discrete
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import finish_discrete
 from stimrig.identify.estimation.samples import fitted_rows
+from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import shifted
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve, fit_shape
@@ -26,41 +25,37 @@ from stimrig.identify.recruitment.bases import SigmoidBasis
 TAPS = 41
 
 
-class SeparableLeastSquares:
-    """Impulse response and sigmoid."""
-
-    id = "separable-least-squares"
-    summary = "Finite impulse response (41 taps) behind the sigmoid (30), by separable least squares."
-    options: Mapping[str, str] = MappingProxyType(
-        {"taps": "length of the impulse response in pulses (default: 41)", "memory_s": "or its length in seconds"}
-    )
-
-    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Fit on the named segments, or on all that may be fitted."""
-        if "taps" in options and "memory_s" in options:
-            raise BadRequest("both taps and memory_s are given", place="options", fix="Give one of them.")
-        taps = int(options.get("taps", TAPS))
-        if "memory_s" in options:
-            taps = round(float(options["memory_s"]) / grid.step_s) + 1
-        if not 2 <= taps <= 2000:
-            raise BadRequest(f"{taps} taps is out of range", place="taps", fix="Give 2 to 2000.")
-        rows = fitted_rows(grid, fit_on)
-        if rows.sum() <= taps + 4:
-            raise NotIdentifiable(
-                f"{int(rows.sum())} pulse intervals are too few for {taps} taps",
-                fix="Record longer, or use fewer taps.",
-            )
-        seen = grid.pulse_width_us[rows]
-        if not np.ptp(seen) > 0:
-            raise NotIdentifiable("the pulse width never changes", fix="Record a PRBS and a ramp.")
-        basis, response = separate(grid, rows, taps)
-        gain = float(response.sum())
-        block = Discrete(tuple(response / gain), (1.0,), 0, grid.step_s, float(np.mean(grid.fraction)))
-        reasons = [f"{taps} taps: a memory of {(taps - 1) * grid.step_s:.3g} s"]
-        return finish_discrete(self.id, grid, rows, block, Curve(basis, np.array([gain])), reasons)
+def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+    """Fit on the named segments, or on all that may be fitted."""
+    if "taps" in options and "memory_s" in options:
+        raise BadRequest("both taps and memory_s are given", place="options", fix="Give one of them.")
+    taps = int(options.get("taps", TAPS))
+    if "memory_s" in options:
+        taps = round(float(options["memory_s"]) / grid.step_s) + 1
+    if not 2 <= taps <= 2000:
+        raise BadRequest(f"{taps} taps is out of range", place="taps", fix="Give 2 to 2000.")
+    rows = fitted_rows(grid, fit_on)
+    if rows.sum() <= taps + 4:
+        raise NotIdentifiable(
+            f"{int(rows.sum())} pulse intervals are too few for {taps} taps",
+            fix="Record longer, or use fewer taps.",
+        )
+    seen = grid.pulse_width_us[rows]
+    if not np.ptp(seen) > 0:
+        raise NotIdentifiable("the pulse width never changes", fix="Record a PRBS and a ramp.")
+    basis, response = separate(grid, rows, taps)
+    gain = float(response.sum())
+    block = Discrete(tuple(response / gain), (1.0,), 0, grid.step_s, float(np.mean(grid.fraction)))
+    reasons = [f"{taps} taps: a memory of {(taps - 1) * grid.step_s:.3g} s"]
+    return finish_discrete(METHOD.id, grid, rows, block, Curve(basis, np.array([gain])), reasons)
 
 
-METHOD = SeparableLeastSquares()
+METHOD = Method(
+    "separable-least-squares",
+    "Finite impulse response (41 taps) behind the sigmoid (30), by separable least squares.",
+    {"taps": "length of the impulse response in pulses (default: 41)", "memory_s": "or its length in seconds"},
+    fit,
+)
 
 
 def separate(grid: Grid, rows: np.ndarray, taps: int) -> tuple[SigmoidBasis, np.ndarray]:

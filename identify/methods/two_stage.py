@@ -16,9 +16,7 @@ cost is (12), the error of the model's output in a free run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,6 +29,7 @@ from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.estimation.finish import finish, finish_discrete
 from stimrig.identify.estimation.plain import pilot_solution, to_fitted
 from stimrig.identify.estimation.projection import Projection, Solution, project, search
+from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve, FixedShape
@@ -244,44 +243,40 @@ def choose_order(
 STARTS_S = (0.06, 0.15, 0.35, 0.8)
 
 
-class TwoStage:
-    """Dynamics from the PRBS, recruitment from the ramp."""
-
-    id = "two-stage"
-    summary = "The paper's method: dynamics from the PRBS, recruitment spline from the ramp, dynamics again."
-    options: Mapping[str, str] = MappingProxyType(
-        {
-            "iterations": "number of iterations of stage one and stage two (default: 1)",
-            "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
-            "linear": "output-error (default) or equation-error, equation (25) as printed",
-            "inverse": "true: recruitment by inverting G, equation (26) as printed (default: false)",
-            "knots": "number of knots of the spline (default: 31)",
-        }
-    )
-
-    def fit(self, grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
-        """Fit; the first name of `fit_on` is the segment for the dynamics, the others for the recruitment."""
-        names = fit_on or ("prbs", "ramp")
-        if len(names) < 2:
-            raise BadRequest(
-                "two-stage needs two segments, the first for the dynamics, the second for the recruitment",
-                place="fit_on",
-                fix="Give, for example, prbs,ramp.",
-            )
-        prbs = segment_rows(grid, names[:1], self.id)
-        ramp = segment_rows(grid, names[1:], self.id)
-        iterations = int(options.get("iterations", 1))
-        knots = int(options.get("knots", KNOTS))
-        literal = options.get("linear", "output-error") == "equation-error"
-        inverse = flag(options.get("inverse", False), "inverse")
-        order = order_option(options.get("order", "second-order"))
-        if order == "second-order" and not literal and not inverse:
-            solution, reasons = physical(grid, prbs, ramp, iterations, knots)
-            return finish(self.id, to_fitted(solution, solution.projection.rows, most=0), reasons)
-        return general(self.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
+def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
+    """Fit; the first name of `fit_on` is the segment for the dynamics, the others for the recruitment."""
+    names = fit_on or ("prbs", "ramp")
+    if len(names) < 2:
+        raise BadRequest(
+            "two-stage needs two segments, the first for the dynamics, the second for the recruitment",
+            place="fit_on",
+            fix="Give, for example, prbs,ramp.",
+        )
+    prbs = segment_rows(grid, names[:1], METHOD.id)
+    ramp = segment_rows(grid, names[1:], METHOD.id)
+    iterations = int(options.get("iterations", 1))
+    knots = int(options.get("knots", KNOTS))
+    literal = options.get("linear", "output-error") == "equation-error"
+    inverse = flag(options.get("inverse", False), "inverse")
+    order = order_option(options.get("order", "second-order"))
+    if order == "second-order" and not literal and not inverse:
+        solution, reasons = physical(grid, prbs, ramp, iterations, knots)
+        return finish(METHOD.id, to_fitted(solution, solution.projection.rows, most=0), reasons)
+    return general(METHOD.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
 
 
-METHOD = TwoStage()
+METHOD = Method(
+    "two-stage",
+    "The paper's method: dynamics from the PRBS, recruitment spline from the ramp, dynamics again.",
+    {
+        "iterations": "number of iterations of stage one and stage two (default: 1)",
+        "order": "second-order (default), auto, or l,n,d of equations (1) to (3)",
+        "linear": "output-error (default) or equation-error, equation (25) as printed",
+        "inverse": "true: recruitment by inverting G, equation (26) as printed (default: false)",
+        "knots": "number of knots of the spline (default: 31)",
+    },
+    fit,
+)
 
 
 def physical(
@@ -296,7 +291,7 @@ def physical(
     prbs, ramp : ndarray of bool, shape (K,)
         Rows for the dynamics and for the recruitment.
     iterations, knots : int
-        See `TwoStage.options`.
+        See `METHOD.options`.
     """
     largest = float(np.max(grid.pulse_width_us))
     # Two levels only, so f can be taken as a straight line through both (15).

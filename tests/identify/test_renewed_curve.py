@@ -16,7 +16,7 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import renewed_curve
 from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.fitting import MOVING_JOINT
-from stimrig.identify.methods.maximum_likelihood import METHOD
+from stimrig.identify.methods.maximum_likelihood import start
 from stimrig.identify.records.record import Record
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
@@ -93,7 +93,7 @@ def test_a_model_that_does_not_know_of_the_joint_keeps_its_curve():
 @pytest.mark.parametrize("options", [{"recruitment": "power-series"}, {"recruitment": "sigmoid"}])
 def test_a_curve_that_is_no_smoothed_spline_stays_of_its_kind(options: dict[str, str]):
     grid, raw = prepare(whole())
-    base = add_effects(METHOD.start(grid, fitted_rows(grid, None), options)[0], ["passive_torque:linear"], raw)
+    base = add_effects(start(grid, fitted_rows(grid, None), options)[0], ["passive_torque:linear"], raw)
     assert renewed_curve(base) is base
 
 
