@@ -287,13 +287,13 @@ def _from_dict(data: dict[str, Any]) -> Model:
 
 def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
     """Refuse parameters that no fit gives: some would cause a division by zero. Unknown effects are not checked."""
-    from stimrig.identify.effects import registry  # imported here, so that reading a model does not import numba
+    from stimrig.identify.effects import known_form  # imported here, so that reading a model does not import numba
     from stimrig.identify.effects.base import Scene
 
-    effect = registry().get(entry["id"])
-    form = effect and next((f for f in effect.forms if entry.get("form", "") in ("", f.name)), None)
-    if effect is None or form is None:
+    known = known_form(entry)
+    if known is None:
         return
+    effect, form = known
     settings = {"scale_nm": 1.0} | entry.get("settings", {})
     scene = Scene(
         time_s=np.array([0.0, model_schema.PLAUSIBLE]),  # the length of the fitted record is not in the file

@@ -55,7 +55,8 @@ def compare(model: Model, record: Record) -> Comparison:
         Fewer than eight pulse intervals are known.
     """
     grid = make_grid(record)
-    _refuse_doubted(grid)
+    if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
+        raise BadRecord("nearly all samples are doubted", place="doubted", fix="Give a record with known pulses.")
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
     residual = record.torque_nm - predicted
@@ -161,12 +162,6 @@ def _left_out(grid: Grid) -> str:
     if not pulses:
         return f"{seconds:.1f} s are left out: the stimulation there is not known."
     return f"{told}; {seconds:.1f} s are left out, where the time of the pulses is not known."
-
-
-def _refuse_doubted(grid: Grid) -> None:
-    """Refuse a record of which hardly any stimulation is known."""
-    if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
-        raise BadRecord("nearly all samples are doubted", place="doubted", fix="Give a record with known pulses.")
 
 
 def _lost(grid: Grid) -> int:

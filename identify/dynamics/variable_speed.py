@@ -109,14 +109,14 @@ def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
     level, part = abs(y) / scale_nm, abs(w) / scale_nm
     lacking, rising = (w - y) / (0.02 * scale_nm), v / (0.1 * scale_nm)
     m = _below(law[SpeedLaw.RATIO_BY_DRIVE], lacking) * _below(law[SpeedLaw.RATIO_BY_RATE], rising)
-    m = m * _line(law[SpeedLaw.TORQUE], level) * _line(law[SpeedLaw.DRIVE], part)
+    m = m * _line(law[SpeedLaw.TORQUE], level) * _line(law[SpeedLaw.DRIVE] * abs(w) / scale_nm, 1.0)
     if law[SpeedLaw.EXPONENTIAL] != 0.0:
         m *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)
     m *= 1.0 / _line(law[SpeedLaw.INVERSE_TORQUE], level)
-    m *= 1.0 / _line(law[SpeedLaw.INVERSE_DRIVE], part)
+    m *= 1.0 / _line(law[SpeedLaw.INVERSE_DRIVE] * abs(w) / scale_nm, 1.0)
     m *= _line(law[SpeedLaw.ACTIVATION], _share((y + slow_s * v) / scale_nm))
     d = _line(law[SpeedLaw.SLOW_TORQUE], level) * _below(law[SpeedLaw.SLOW_RATIO_BY_DRIVE], lacking)
-    d *= 1.0 / _line(law[SpeedLaw.SLOW_INVERSE_DRIVE], part)
+    d *= 1.0 / _line(law[SpeedLaw.SLOW_INVERSE_DRIVE] * abs(w) / scale_nm, 1.0)
     if law[SpeedLaw.LEVEL] != 0.0 or law[SpeedLaw.SLOW_LEVEL] != 0.0:
         side = np.log(0.5 + 1.5 * min(level, 1.2)) * lacking / np.sqrt(1.0 + lacking * lacking)
         m *= np.exp(law[SpeedLaw.LEVEL] * side)

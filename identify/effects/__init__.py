@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -88,6 +88,13 @@ def find_effect(effect_id: str) -> Effect:
     return effects[effect_id]
 
 
+def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
+    """The effect and the form of a model's row; None if either is unknown here."""
+    effect, name = registry().get(entry["id"]), entry.get("form", "")
+    forms = effect.forms if effect else ()
+    return next(((effect, form) for form in forms if effect and name in ("", form.name)), None)
+
+
 def depend_on_joint(names: Iterable[str]) -> bool:
     """Whether one of some effects depends on the angle or the velocity of the joint."""
     return any(find_effect(name).moves_with_joint for name in names)
@@ -107,6 +114,7 @@ __all__ = [
     "depend_on_joint",
     "find_effect",
     "form",
+    "known_form",
     "library",
     "registry",
 ]

@@ -7,8 +7,6 @@ least squares with bounds is a quadratic programme whose matrices are banded. It
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
@@ -105,31 +103,28 @@ class _Programme:
             if gap < CLOSE and np.max(np.abs(outside)) < CLOSE and np.max(np.abs(gradient)) < 100 * CLOSE:
                 break
             grams = [T.gram(w, self.bands) for (T, *_), w in zip(self.sides, dual / slack, strict=True)]
-            at = _Point(gradient, outside, slack, dual, cholesky_banded(self.P + np.sum(grams, axis=0), lower=True))
-            _, ds, dz = self._step(at, slack * dual)
+            at = gradient, outside, slack, dual, cholesky_banded(self.P + np.sum(grams, axis=0), lower=True)
+            _, ds, dz = self._step(*at, slack * dual)
             length = min(_longest(slack, ds), _longest(dual, dz))
             ahead = float(np.mean((slack + length * ds) * (dual + length * dz)))
-            dv, ds, dz = self._step(at, slack * dual + ds * dz - gap * (ahead / gap) ** 3)
+            dv, ds, dz = self._step(*at, slack * dual + ds * dz - gap * (ahead / gap) ** 3)
             length = 0.99 * min(_longest(slack, ds), _longest(dual, dz))
             v, slack, dual = v + length * dv, slack + length * ds, dual + length * dz
         return v
 
-    def _step(self, at: _Point, product: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Newton's step of v, slack and dual that takes `product` off slack times dual."""
-        dv = cho_solve_banded((at.factor, True), -at.gradient - self.back((at.dual * at.outside - product) / at.slack))
-        ds = -at.outside - self.constrained(dv)
-        return dv, ds, (-product - at.dual * ds) / at.slack
-
-
-@dataclass(frozen=True)
-class _Point:
-    """Where Newton's step is taken from: what is left of each condition, and the factor of its matrix."""
-
-    gradient: np.ndarray
-    outside: np.ndarray
-    slack: np.ndarray
-    dual: np.ndarray
-    factor: np.ndarray
+    def _step(
+        self,
+        gradient: np.ndarray,
+        outside: np.ndarray,
+        slack: np.ndarray,
+        dual: np.ndarray,
+        factor: np.ndarray,
+        product: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Newton's step of v, slack and dual that takes `product` off slack times dual; `factor` is of its matrix."""
+        dv = cho_solve_banded((factor, True), -gradient - self.back((dual * outside - product) / slack))
+        ds = -outside - self.constrained(dv)
+        return dv, ds, (-product - dual * ds) / slack
 
 
 def _longest(x: np.ndarray, dx: np.ndarray) -> float:

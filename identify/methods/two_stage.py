@@ -16,7 +16,7 @@ cost is (12), the error of the model's output in a free run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -348,7 +348,7 @@ def general(
             chosen = asked if isinstance(asked, tuple) else (2, 1, 1)
             b, a = equation_error(torque - baseline, drive, rows, chosen)
             gain_free = output_error(torque, drive, rows, chosen, start=stable(a), most=0)
-            return gain_free.__class__(b, stable(a), chosen[2], baseline, gain_free.output_nm, gain_free.squares, 0.0)
+            return replace(gain_free, b=b, a=stable(a), baseline_nm=baseline, bic=0.0)
         if isinstance(asked, tuple):
             return output_error(torque, drive, rows, asked)
         best, why = choose_order(torque, drive, rows, earliest)
@@ -389,11 +389,9 @@ def _curve_through(
     grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float, inverse: bool
 ) -> Curve:
     """The recruitment spline for a given discrete linear block: fitted to its output, or by inverting it."""
-    return (_from_inverse if inverse else _from_output)(grid, block, rows, knots, baseline_nm)
-
-
-def _from_output(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
-    """Least squares on the output: the columns of the spline are filtered, the torque is not."""
+    if inverse:
+        return _from_inverse(grid, block, rows, knots, baseline_nm)
+    # Least squares on the output: the columns of the spline are filtered, the torque is not.
     target = grid.torque_nm[rows] - baseline_nm
     return _penalised(grid, lambda columns: block.filter(grid.held(columns))[rows], target, knots)
 

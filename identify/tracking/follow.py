@@ -17,7 +17,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.effects import registry
+from stimrig.identify.effects import known_form
 from stimrig.identify.effects.base import Form, Scene
 from stimrig.identify.errors import BadModel
 from stimrig.identify.model import Model
@@ -211,12 +211,10 @@ def slow_forms(model: Model) -> dict[str, tuple[Form, dict[str, Any]]]:
     """By effect id, the form and the parameters of each of the model's effects that has a slow state."""
     found = {}
     for entry in model.effects:
-        effect = registry().get(entry["id"])
-        forms = () if effect is None else effect.forms
-        form = next((form for form in forms if entry.get("form", "") in ("", form.name)), None)
-        if form is not None and form.state is not None:
+        known = known_form(entry)
+        if known and known[1].state is not None:
             values = {name: np.full((1, 1), parameter_value(value)) for name, value in entry["parameters"].items()}
-            found[entry["id"]] = form, values
+            found[entry["id"]] = known[1], values
     return found
 
 
