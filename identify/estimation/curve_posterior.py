@@ -134,7 +134,7 @@ class CurvePosterior:
             return trial[1] - at[1] if trial[1] > at[1] - 1e-9 else None
 
         search = Search(DAMPING, trials, gain, lambda gained, _step: gained < ENOUGH)
-        z, value = descend(search, (z, self.value(z, kind)), STEPS).at
+        (z, value), _ = descend(search, (z, self.value(z, kind)), STEPS)
         root = _solve(self._bent(z, kind)[1], np.zeros(z.size), 1e-9)[1]
         evidence = value + 0.5 * float(np.linalg.slogdet(self.precision)[1]) - float(np.sum(np.log(np.diag(root))))
         return Mode(kind, z, evidence, root)

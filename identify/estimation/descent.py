@@ -48,25 +48,17 @@ class Search(Generic[Point]):
     gain : callable
         What a trial gains over the point before; None where it is worse.
     settled : callable
-        Whether the search ends after a step that gained so much; with the step's number.
+        Whether the search ends after a step that gained so much; with the step's number. By default it never does.
     """
 
     damping: Damping
     trials: Callable[[Point, int, float], Trial[Point] | None]
     gain: Callable[[Point, Point], float | None]
-    settled: Callable[[float, int], bool]
+    settled: Callable[[float, int], bool] = lambda _gained, _step: False
 
 
-@dataclass(frozen=True)
-class Descent(Generic[Point]):
-    """Where a search ended, and the number of steps begun until then."""
-
-    at: Point
-    steps: int
-
-
-def descend(search: Search[Point], at: Point, most: int) -> Descent[Point]:
-    """Search from a point, in at most so many steps."""
+def descend(search: Search[Point], at: Point, most: int) -> tuple[Point, int]:
+    """Search from a point, in at most so many steps: where it ends, and the number of steps begun until then."""
     rule = search.damping
     damping = rule.first
     for step in range(1, most + 1):
@@ -77,8 +69,8 @@ def descend(search: Search[Point], at: Point, most: int) -> Descent[Point]:
                 break
             damping, failed = max(rule.more * damping, rule.raised), failed + 1
         if found is None or gain is None:
-            return Descent(at, step)
+            return at, step
         at, damping = found, max(damping / rule.less, rule.least)
         if search.settled(gain, step):
-            return Descent(at, step)
-    return Descent(at, most)
+            return at, step
+    return at, most

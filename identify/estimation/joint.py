@@ -206,8 +206,7 @@ def solve(
         return trial.value - at.value if trial.value > at.value - 1e-9 else None
 
     search = Search(DAMPING, trials, gain, lambda gained, step: gained < tolerance and step >= 2)
-    found = descend(search, start, most)
-    at = found.at
+    at, steps = descend(search, start, most)
     return Fitted(
         problem=problem,
         theta=at.theta,
@@ -217,7 +216,7 @@ def solve(
         residual_nm=at.residual,
         slopes=at.slopes,
         hessian=at.hessian,
-        converged=most == 0 or found.steps < most,
+        converged=most == 0 or steps < most,
     )
 
 

@@ -20,7 +20,6 @@ from stimrig.identify.estimation.joint import Fitted, gram, solve
 from stimrig.identify.estimation.projection import (
     Projection,
     Solution,
-    State,
     ar1_or_white,
     bounded,
     curve_points,
@@ -148,8 +147,8 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
     order = bending_order(grid.pulse_width_us[rows])
     projection = Projection(grid, basis, spline_roughness(basis, order=order), rows, delay_s)
     delay = 0.0 if delay_s is None else delay_s
-    starts = [State(projection, bounded(projection, SecondOrder(t, 0.9, delay))) for t in STARTS_S]
-    best = min(starts, key=lambda state: state.cost)
+    starts = [Solution(projection, bounded(projection, SecondOrder(t, 0.9, delay))) for t in STARTS_S]
+    best = min(starts, key=lambda start: start.cost)
     return descend_from(best, most=12, tolerance=0.5)
 
 
@@ -165,7 +164,7 @@ def designed(first: Solution, count: int | None = None) -> tuple[Projection, Sec
     basis, roughness = fitting_spline(first.curve, largest_us, count, widths_us)
     for _ in range(2):
         projection = replace(old, basis=basis, roughness=roughness)
-        shown = basis, State(projection, first.linear, variance=first.variance).coefficients[: basis.size]
+        shown = basis, Solution(projection, first.linear, variance=first.variance).above_rest[: basis.size]
         basis, roughness = fitting_spline(curve_points(*shown), largest_us, count, widths_us, shown)
     return replace(old, basis=basis, roughness=roughness), first.linear
 
@@ -226,22 +225,28 @@ def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
     return chosen(grid, rows, fit(rows, False), fit)
 
 
-def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20, white: bool = False) -> Fitted:
+def to_fitted(
+    solution: Solution,
+    rows: np.ndarray,
+    most: int = 20,
+    white: bool = False,
+    coefficients: np.ndarray | None = None,
+) -> Fitted:
     """The solution of the joint problem on some rows, with white and slow noise, started from a projected solution.
 
     The projected solution may be of fewer rows, where the joint moves in the others: see `still_rows`. `white`: the
-    noise is held white.
+    noise is held white. `coefficients`: in place of the solution's own.
     """
-    solution = _fill_zeros(solution, rows)
-    setup = setup_of(solution, rows)
+    found = _fill_zeros(solution.projection, solution.coefficients if coefficients is None else coefficients, rows)
+    setup = _setup_of(solution, found, rows)
     problem = Problem(setup, [])
     size, linear = solution.projection.basis.size, solution.linear
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
     parts = setup.grid.begins.size
-    values[list(problem.baselines)] = setup.to_muscle(solution.coefficients[size : size + parts])
-    values[list(problem.initials)] = setup.sign * solution.coefficients[size + parts :]
-    values[problem.coefficients] = setup.sign * solution.coefficients[:size]
+    values[list(problem.baselines)] = setup.to_muscle(found[size : size + parts])
+    values[list(problem.initials)] = setup.sign * found[size + parts :]
+    values[problem.coefficients] = setup.sign * found[:size]
     noise = WHITE if white else NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
     fitted = solve(problem, problem.from_physical(values), noise, most=most)
     values = fitted.physical
@@ -254,28 +259,27 @@ def to_fitted(solution: Solution, rows: np.ndarray, most: int = 20, white: bool 
     return max(fitted, solve(problem, theta, noise, most=most), key=lambda found: found.log_evidence)
 
 
-def _fill_zeros(solution: Solution, rows: np.ndarray) -> Solution:
-    """The solution with a zero for parts of which it has no row: the middle of their torque without pulses."""
-    projection, grid = solution.projection, solution.projection.grid
-    found = solution.coefficients.copy()
+def _fill_zeros(projection: Projection, coefficients: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The coefficients with a zero for parts of which there is no row: the middle of their torque without pulses."""
+    grid, found = projection.grid, coefficients.copy()
     for part in range(grid.begins.size):
         own = rows & (grid.part == part)
         if own.any() and not np.any(projection.rows & own):
             rest = own & (grid.pulse_width_us == 0)
             found[projection.basis.size + part] = np.median(grid.torque_nm[rest if rest.any() else own])
-    return replace(solution, coefficients=found)
+    return found
 
 
-def setup_of(solution: Solution, rows: np.ndarray) -> Setup:
+def _setup_of(solution: Solution, coefficients: np.ndarray, rows: np.ndarray) -> Setup:
     """The set-up that all candidates share, from the projected solution and the rows that are fitted."""
     projection, grid = solution.projection, solution.projection.grid
     size = projection.basis.size
-    curve = projection.basis.design(np.linspace(0.0, projection.basis.largest_us, 101)) @ solution.coefficients[:size]
+    curve = projection.basis.design(np.linspace(0.0, projection.basis.largest_us, 101)) @ coefficients[:size]
     sign = 1.0 if curve[np.argmax(np.abs(curve))] >= 0 else -1.0
-    zero = float(solution.coefficients[size])
+    zero = float(coefficients[size])
     target = sign * (grid.torque_nm - zero)
     parts = grid.begins.size
-    own_zero = sign * (solution.coefficients[size : size + parts][grid.part] - zero)
+    own_zero = sign * (coefficients[size : size + parts][grid.part] - zero)
     smooth = np.convolve(np.where(rows, target - own_zero, 0.0), np.ones(3) / 3, "same")
     scale = float(np.percentile(np.abs(smooth[rows]), 99.5))
     level_nm, sd_nm = projection.rests if rows is projection.rows else rest_levels(grid, rows)

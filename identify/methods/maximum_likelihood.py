@@ -7,7 +7,6 @@ power series (6), sigmoid (30), a monotone spline, near-sigmoid."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from stimrig.identify.estimation.candidates import chosen, words
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import estimate, still_rows, to_fitted
-from stimrig.identify.estimation.projection import Projection, Solution, log_likelihood, project, search, whiten
+from stimrig.identify.estimation.projection import Projection, Solution, log_likelihood, search, whiten
 from stimrig.identify.estimation.samples import fitted_rows
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, order_option
@@ -73,7 +72,7 @@ def sigmoid(first: Solution) -> Solution:
 
     def residual(x: np.ndarray) -> np.ndarray:
         trial = problem(x)
-        solution = project(trial, linear(x), ar1=first.ar1)
+        solution = Solution(trial, linear(x), ar1=first.ar1)
         return whiten(solution.residual_nm, trial.stretches, first.ar1)
 
     bounds = np.log([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS])
@@ -86,8 +85,8 @@ def sigmoid(first: Solution) -> Solution:
     return search(problem(found.x), linear(found.x), ar1=first.ar1, most=3)
 
 
-def monotone(solution: Solution) -> Solution:
-    """The solution with a recruitment curve that never falls (or never rises, if stimulation lowers the torque).
+def monotone(solution: Solution) -> np.ndarray:
+    """The coefficients with a recruitment curve that never falls (or never rises, if stimulation lowers the torque).
 
     A B-spline curve rises if its coefficients rise. The coefficients are sums of steps of one sign, found by
     non-negative least squares for the same penalised problem and the same dynamics.
@@ -108,8 +107,7 @@ def monotone(solution: Solution) -> Solution:
     steps[:size, :size] = sign * np.tril(np.ones((size, size)))
     for extra in range(problem.extras):  # these may have either sign
         steps[size + extra, size + 2 * extra : size + 2 * extra + 2] = 1.0, -1.0
-    coefficients = steps @ nnls(root @ steps, right, maxiter=50 * steps.shape[1])[0]
-    return replace(solution, coefficients=coefficients)
+    return steps @ nnls(root @ steps, right, maxiter=50 * steps.shape[1])[0]
 
 
 def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
@@ -150,7 +148,8 @@ def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fit
             fix="Give spline, power-series, sigmoid or near-sigmoid.",
         )
     if flag(options.get("monotone", False), "monotone"):
-        return to_fitted(monotone(solution), rows, most=0), [reason, "recruitment constrained to be monotone"]
+        fitted = to_fitted(solution, rows, most=0, coefficients=monotone(solution))
+        return fitted, [reason, "recruitment constrained to be monotone"]
     if kind != "spline":
         return to_fitted(solution, rows, most=0), [reason]
     known = to_fitted(solution, rows)

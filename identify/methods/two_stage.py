@@ -28,7 +28,7 @@ from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.estimation.finish import finish, finish_discrete
 from stimrig.identify.estimation.plain import pilot_solution, to_fitted
-from stimrig.identify.estimation.projection import Projection, Solution, project, search
+from stimrig.identify.estimation.projection import Projection, Solution, search
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted
 from stimrig.identify.model import Model
@@ -174,7 +174,7 @@ def output_error(
         rough = equation_error(torque - _rest_level(torque, drive, rows), drive, rows, order)[1]
         start = _steiglitz_mcbride(target, drive, rows, order, stable(rough))
     search = Search(DAMPING, trials, gain, lambda gained, _step: not gained > 1e-9)
-    found = descend(search, solve(start), most if poles else 0).at
+    found = descend(search, solve(start), most if poles else 0)[0]
     theta, cost = found.theta, found.cost
     count, free = int(rows.sum()), poles + zeros + 2
     bic = count * np.log(max(cost / count, 1e-300)) + free * np.log(count)
@@ -296,7 +296,7 @@ def physical(
     largest = float(np.max(grid.pulse_width_us))
     # Two levels only, so f can be taken as a straight line through both (15).
     straight = Projection(grid, PowerBasis(1, largest), np.zeros((1, 1)), near_rest(grid, prbs))
-    starts = [project(straight, SecondOrder(t, 0.9, 0.02)) for t in STARTS_S]
+    starts = [Solution(straight, SecondOrder(t, 0.9, 0.02)) for t in STARTS_S]
     linear = search(straight, min(starts, key=lambda s: s.variance).linear).linear
     reasons = [f"PRBS alone: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}"]
     both = near_rest(grid, prbs) | near_rest(grid, ramp)
@@ -309,19 +309,19 @@ def physical(
     reasons.append(f"after stage two: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}")
     # The last curve and the last dynamics; baseline and noise are estimated from both segments.
     final = Projection(grid, solution.projection.basis, solution.projection.roughness, both)
-    return project(final, linear, weight=solution.weight), reasons
+    return Solution(final, linear, weight=solution.weight), reasons
 
 
 def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) -> Solution:
     """Stage one: the spline for given dynamics, fitted to the output of G."""
     largest = float(np.max(grid.pulse_width_us))
     coarse = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
-    pilot = project(Projection(grid, coarse, spline_roughness(coarse), rows), linear)
+    pilot = Solution(Projection(grid, coarse, spline_roughness(coarse), rows), linear)
     first = SplineBasis(adapted_knots(pilot.curve, largest, knots))
-    rough = project(Projection(grid, first, spline_roughness(first), rows), linear)
+    rough = Solution(Projection(grid, first, spline_roughness(first), rows), linear)
     basis = SplineBasis(adapted_knots(rough.curve, largest, knots))
     roughness = spline_roughness(basis, (first, rough.coefficients[: first.size]))
-    return project(Projection(grid, basis, roughness, rows), linear)
+    return Solution(Projection(grid, basis, roughness, rows), linear)
 
 
 def general(
