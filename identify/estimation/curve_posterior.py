@@ -97,11 +97,12 @@ class CurvePosterior:
         """Unknowns at a shape, without deviation."""
         return np.r_[three, np.zeros(self.n), self.data.mean]
 
-    @classmethod
-    def linear_of(cls, prior: NearShape, mode: Mode) -> np.ndarray:
+    def _log_steps(self, z: np.ndarray, kind: int) -> np.ndarray:
+        return self.prior.log_steps(z[:3]) + self.prior.roots[kind] @ z[3 : 3 + self.n]
+
+    def linear_of(self, mode: Mode) -> np.ndarray:
         """x at a mode."""
-        log_steps = prior.log_steps(mode.z[:3]) + prior.roots[mode.kind] @ mode.z[3 : 3 + prior.basis.size]
-        return np.r_[np.exp(log_steps), mode.z[3 + prior.basis.size :]]
+        return np.r_[np.exp(self._log_steps(mode.z, mode.kind)), mode.z[3 + self.n :]]
 
     def _beyond(self, x: np.ndarray) -> tuple[float, float]:
         """How far the log of the plateau is from what is expected, in standard deviations, and the plateau, N·m."""
@@ -111,8 +112,7 @@ class CurvePosterior:
 
     def value(self, z: np.ndarray, kind: int) -> float:
         """Log posterior, up to a constant."""
-        log_steps = self.prior.log_steps(z[:3]) + self.prior.roots[kind] @ z[3 : 3 + self.n]
-        x, away = np.r_[np.exp(np.minimum(log_steps, 50.0)), z[self.others]], z - self.mean
+        x, away = np.r_[np.exp(np.minimum(self._log_steps(z, kind), 50.0)), z[self.others]], z - self.mean
         fit = x @ (self.data.gram @ x - 2.0 * self.data.moment) + self.data.energy
         return float(-0.5 * (fit + away @ self.precision @ away + self._beyond(x)[0] ** 2))
 
@@ -185,7 +185,7 @@ class CurvePosterior:
         for index in np.unique(which):
             mode, rows = modes[index], which == index
             normal = rng.standard_normal((int(rows.sum()), mode.z.size))
-            x[rows] = self.linear_of(self.prior, mode) + self._moved(mode, normal)
+            x[rows] = self.linear_of(mode) + self._moved(mode, normal)
         return x
 
     def _moved(self, mode: Mode, normal: np.ndarray) -> np.ndarray:

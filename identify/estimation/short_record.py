@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
@@ -57,10 +58,6 @@ class Short:
         Their probabilities.
     noise : NoiseLevel
         Of the intervals' means.
-    residual_nm : ndarray, shape (K,)
-        Measured minus the most probable model, N·m.
-    three : ndarray, shape (3,)
-        Log gain, middle and log width at the most probable mode.
     likely : ndarray, shape (n + E,)
         Steps of the curve, baselines and initial states at the most probable mode.
     rise_us : float
@@ -80,8 +77,6 @@ class Short:
     modes: tuple[Mode, ...]
     weights: np.ndarray
     noise: NoiseLevel
-    residual_nm: np.ndarray
-    three: np.ndarray
     likely: np.ndarray
     rise_us: float
     strange: float
@@ -90,6 +85,11 @@ class Short:
     def largest_us(self) -> float:
         """Largest width of the curve, µs."""
         return self.basis.largest_us
+
+    @property
+    def three(self) -> np.ndarray:
+        """Log gain, middle and log width at the most probable mode."""
+        return self.modes[int(np.argmax(self.weights))].z[:3]
 
     @cached_property
     def mean_nm(self) -> np.ndarray:
@@ -106,97 +106,6 @@ CORRELATED = 6.0
 """Log likelihood by which correlated noise must explain the residual better before it is believed."""
 LOG_T, LOG_DAMPING = (np.log(0.2), 1.2), (0.0, 0.8)
 """Prior mean and standard deviation, as in `Problem.prior`."""
-
-
-class ShortData:
-    """One record, with the prior of everything but the curve.
-
-    Parameters
-    ----------
-    grid : Grid
-        The record on the grid of pulses.
-    rows : ndarray of bool, shape (K,)
-        Intervals to fit.
-    sign : float
-        1 where stimulation raises the record's torque, -1 where it lowers it.
-    last : Earlier or None
-        What is known of this person from the last session.
-    """
-
-    def __init__(self, grid: Grid, rows: np.ndarray, sign: float, last: Earlier | None) -> None:
-        self.grid, self.rows, self.sign = grid, rows, sign
-        torque = grid.torque_nm[rows]
-        scale = self.scale_nm = max(float(np.percentile(np.abs(torque - np.median(torque[:8])), 98)), 1e-9)
-        self.first_sd_nm = max(grid.mean_noise_nm(rows), 1e-4 * scale)
-        self.stretches = ends_of(grid.stretches(rows))
-        states = grid.starts.size
-        sd = np.r_[np.full(grid.begins.size, 0.5 * scale), np.tile([0.3 * scale, 2.0 * scale], states)]
-        lower, upper = grid.delay_bounds_s
-        dynamics_sd = np.array([LOG_T[1], LOG_DAMPING[1], max((upper - lower) / 2.0, 1e-5)])
-        self.dynamics_mean = np.array([LOG_T[0], LOG_DAMPING[0], 0.0])
-        self.dynamics_precision = np.diag(1.0 / dynamics_sd**2)
-        if last is not None:
-            self.dynamics_mean, self.dynamics_precision = last.dynamics(dynamics_sd[2])
-        quiet = torque[: max(int(0.2 / grid.step_s), 4)]
-        self.others_mean = np.r_[np.full(grid.begins.size, float(np.median(sign * quiet))), np.zeros(2 * states)]
-        self.others_precision = np.diag(1.0 / sd**2)
-
-    @property
-    def quiet(self) -> NoiseLevel:
-        """The noise of an interval's mean if it is only that of the samples."""
-        return NoiseLevel(0.0, 0.0, self.first_sd_nm)
-
-    def quadratic(self, basis: SplineBasis, linear: SecondOrder, noise: NoiseLevel, x: np.ndarray | None) -> Quadratic:
-        """The quadratic form at some dynamics; with the derivatives by the dynamics if a curve is given."""
-        projection = Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)
-        columns = projection.columns(linear)
-        n = basis.size
-        columns[:, :n] = np.cumsum(columns[:, :n][:, ::-1], axis=1)[:, ::-1]
-        mean, precision = self.others_mean, self.others_precision
-        if x is not None:
-            coefficients = np.r_[np.cumsum(x[:n]), x[n : columns.shape[1]]]
-            columns = np.concatenate([columns, projection.slopes(linear, coefficients)], axis=1)
-            at = np.array([np.log(linear.time_constant_s), np.log(linear.damping), linear.delay_s])
-            mean = np.r_[mean, self.dynamics_mean - at]
-            full = np.zeros((mean.size, mean.size))
-            full[: self.others_mean.size, : self.others_mean.size] = precision
-            full[self.others_mean.size :, self.others_mean.size :] = self.dynamics_precision
-            precision = full
-        target = np.where(self.rows, self.sign * self.grid.torque_nm, 0.0)
-        white = whitened(np.vstack([columns.T, target]), self.stretches, noise)
-        products = white @ white.T
-        return Quadratic(products[:-1, :-1], products[:-1, -1], float(products[-1, -1]), mean, precision)
-
-    def bounded(self, linear: SecondOrder, moved: np.ndarray) -> SecondOrder:
-        """Dynamics moved by changes of log T, log ζ and the delay, within their bounds."""
-        t = linear.time_constant_s * float(np.exp(np.clip(moved[0], -0.7, 0.7)))
-        z = linear.damping * float(np.exp(np.clip(moved[1], -0.7, 0.7)))
-        return SecondOrder(t, z, linear.delay_s + float(moved[2])).bounded(self.grid.delay_bounds_s)
-
-    def residual(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray) -> np.ndarray:
-        """Measured minus model, N·m, shape (K,)."""
-        projection = Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)
-        n = basis.size
-        mean = projection.columns(linear) @ np.r_[np.cumsum(x[:n]), x[n:]]
-        return np.where(self.grid.count > 0, self.sign * self.grid.torque_nm, 0.0) - mean
-
-    def noise(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray, near: NoiseLevel) -> NoiseLevel:
-        """The noise of the residual; at least that of the samples, and correlated only where that is plain."""
-        residual = self.residual(basis, linear, x)
-        sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
-        own = NoiseLevel(0.0, 0.0, max(sd, self.first_sd_nm))
-        slow, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)
-        flat = -0.5 * float(self.rows.sum()) * (np.log(2 * np.pi * sd * sd) + 1.0)
-        return replace(slow, sd_nm=max(slow.sd_nm, own.sd_nm)) if likelihood > flat + CORRELATED else own
-
-
-def direction(grid: Grid, rows: np.ndarray) -> float:
-    """1 where stimulation raises the torque, -1 where it lowers it."""
-    slow = SecondOrder(0.2, 0.9).on_grid(grid, grid.pulse_width_us)[rows]
-    torque = grid.torque_nm[rows]
-    return 1.0 if float((slow - slow.mean()) @ (torque - torque.mean())) >= 0.0 else -1.0
-
-
 DRAWS = 400
 OUTER = 10
 """Largest number of times that the dynamics are linearised anew."""
@@ -213,13 +122,11 @@ STRANGE = 0.8
 """Standard deviation of the log density from which a curve counts as far from the known shape."""
 
 
-@dataclass(frozen=True)
-class _Start:
-    """Where a search begins: dynamics, shape, noise."""
-
-    linear: SecondOrder
-    three: np.ndarray
-    noise: NoiseLevel
+def direction(grid: Grid, rows: np.ndarray) -> float:
+    """1 where stimulation raises the torque, -1 where it lowers it."""
+    slow = SecondOrder(0.2, 0.9).on_grid(grid, grid.pulse_width_us)[rows]
+    torque = grid.torque_nm[rows]
+    return 1.0 if float((slow - slow.mean()) @ (torque - torque.mean())) >= 0.0 else -1.0
 
 
 def fit_short(
@@ -253,26 +160,80 @@ def fit_short(
     numpy.linalg.LinAlgError
         No solution is found.
     """
-    data = ShortData(grid, rows, before.sign if before is not None else direction(grid, rows), last)
-    known_us = [known.largest_us for known in (last, before) if known is not None]
-    search = _Search(data, max([float(np.max(grid.pulse_width_us)), *known_us]), last, before, fine)
+    search = _Search(grid, rows, last, before, fine)
     if before is not None:
-        start = _Start(before.linear, before.three, before.noise)
-    elif last is not None:
-        start = _Start(last.linear, last.mean, data.quiet)
-    else:
-        start = min((search.scan(t) for t in STARTS_S), key=lambda found: found[0])[1]
-    return search.fit(start, draws)
+        return search.fit(before.linear, before.three, before.noise, draws)
+    if last is not None:
+        return search.fit(last.linear, last.mean, search.quiet, draws)
+    _, linear, three = min((search.scan(t) for t in STARTS_S), key=lambda found: found[0])
+    return search.fit(linear, three, search.quiet, draws)
 
 
 class _Search:
-    """One record and one prior."""
+    """One record, and the prior: of its curve, and of everything else."""
 
-    def __init__(
-        self, data: ShortData, largest_us: float, last: Earlier | None, before: Short | None, fine: bool
-    ) -> None:
-        self.data, self.largest_us, self.last, self.near = data, largest_us, last, before
+    def __init__(self, grid: Grid, rows: np.ndarray, last: Earlier | None, before: Short | None, fine: bool) -> None:
+        self.grid, self.rows, self.last, self.near = grid, rows, last, before
+        self.sign = before.sign if before is not None else direction(grid, rows)
+        known_us = [known.largest_us for known in (last, before) if known is not None]
+        self.largest_us = max([float(np.max(grid.pulse_width_us)), *known_us])
         self.knots = FINE_KNOTS if fine else KNOTS
+        torque = grid.torque_nm[rows]
+        scale = self.scale_nm = max(float(np.percentile(np.abs(torque - np.median(torque[:8])), 98)), 1e-9)
+        self.stretches = ends_of(grid.stretches(rows))
+        # The noise of an interval's mean if it is only that of the samples.
+        self.quiet = NoiseLevel(0.0, 0.0, max(grid.mean_noise_nm(rows), 1e-4 * scale))
+        states = grid.starts.size
+        sd = np.r_[np.full(grid.begins.size, 0.5 * scale), np.tile([0.3 * scale, 2.0 * scale], states)]
+        lower, upper = grid.delay_bounds_s
+        dynamics_sd = np.array([LOG_T[1], LOG_DAMPING[1], max((upper - lower) / 2.0, 1e-5)])
+        self.dynamics_mean = np.array([LOG_T[0], LOG_DAMPING[0], 0.0])
+        self.dynamics_precision = np.diag(1.0 / dynamics_sd**2)
+        if last is not None:
+            self.dynamics_mean, self.dynamics_precision = last.dynamics(dynamics_sd[2])
+        still = float(np.median(self.sign * torque[: max(int(0.2 / grid.step_s), 4)]))
+        self.others_mean = np.r_[np.full(grid.begins.size, still), np.zeros(2 * states)]
+        self.others_precision = np.diag(1.0 / sd**2)
+
+    # ---- the record ----
+
+    def projection(self, basis: SplineBasis) -> Projection:
+        return Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)
+
+    def quadratic(self, basis: SplineBasis, linear: SecondOrder, noise: NoiseLevel, x: np.ndarray | None) -> Quadratic:
+        """The quadratic form at some dynamics; with the derivatives by the dynamics if a curve is given."""
+        projection, n = self.projection(basis), basis.size
+        columns = projection.columns(linear)
+        columns[:, :n] = np.cumsum(columns[:, :n][:, ::-1], axis=1)[:, ::-1]
+        mean, precision = self.others_mean, self.others_precision
+        if x is not None:
+            coefficients = np.r_[np.cumsum(x[:n]), x[n : columns.shape[1]]]
+            columns = np.concatenate([columns, projection.slopes(linear, coefficients)], axis=1)
+            at = np.array([np.log(linear.time_constant_s), np.log(linear.damping), linear.delay_s])
+            mean = np.r_[mean, self.dynamics_mean - at]
+            precision = np.asarray(block_diag(precision, self.dynamics_precision))
+        target = np.where(self.rows, self.sign * self.grid.torque_nm, 0.0)
+        white = whitened(np.vstack([columns.T, target]), self.stretches, noise)
+        products = white @ white.T
+        return Quadratic(products[:-1, :-1], products[:-1, -1], float(products[-1, -1]), mean, precision)
+
+    def moved(self, linear: SecondOrder, by: np.ndarray) -> SecondOrder:
+        """Dynamics moved by changes of log T, log ζ and the delay, within their bounds."""
+        t, z = (value * float(np.exp(np.clip(log, -0.7, 0.7))) for value, log in zip(linear.core, by, strict=False))
+        return SecondOrder(t, z, linear.delay_s + float(by[2])).bounded(self.grid.delay_bounds_s)
+
+    def noise(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray, near: NoiseLevel) -> NoiseLevel:
+        """The noise of the residual; at least that of the samples, and correlated only where that is plain."""
+        n = basis.size
+        mean = self.projection(basis).columns(linear) @ np.r_[np.cumsum(x[:n]), x[n:]]
+        residual = np.where(self.grid.count > 0, self.sign * self.grid.torque_nm, 0.0) - mean
+        sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
+        own = replace(self.quiet, sd_nm=max(sd, self.quiet.sd_nm))
+        slow, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)
+        flat = -0.5 * float(self.rows.sum()) * (np.log(2 * np.pi * sd * sd) + 1.0)
+        return replace(slow, sd_nm=max(slow.sd_nm, own.sd_nm)) if likelihood > flat + CORRELATED else own
+
+    # ---- the curve ----
 
     def prior(self, three: np.ndarray) -> NearShape:
         """The prior of the curve on knots that suit a shape."""
@@ -287,8 +248,8 @@ class _Search:
             basis, rise = self.near.basis, self.near.rise_us
         else:
             self.near = None
-        mean, precision = new_person(self.largest_us, self.data.scale_nm)
-        plateau = float(np.log(self.data.scale_nm)) + 0.1, PLATEAU_LOG_SD
+        mean, precision = new_person(self.largest_us, self.scale_nm)
+        plateau = float(np.log(self.scale_nm)) + 0.1, PLATEAU_LOG_SD
         return NearShape(basis, logistic, mean, precision, plateau, rise)
 
     def _on(self, basis: SplineBasis) -> bool:
@@ -302,14 +263,15 @@ class _Search:
         moved = abs(middle - self.near.three[1])
         return 0.75 < rise / self.near.rise_us < 1.33 and moved < 0.25 * self.near.rise_us
 
-    def scan(self, time_constant_s: float) -> tuple[float, _Start]:
-        """The best shape for given dynamics from a coarse grid, with its cost."""
+    # ---- the fit ----
+
+    def scan(self, time_constant_s: float) -> tuple[float, SecondOrder, np.ndarray]:
+        """The best shape for given dynamics from a coarse grid: its cost, the dynamics, the shape."""
         linear = SecondOrder(time_constant_s, 0.9, 0.0)
-        three = np.array([np.log(self.data.scale_nm), 0.5 * self.largest_us, np.log(self.largest_us / 6.0)])
+        three = np.array([np.log(self.scale_nm), 0.5 * self.largest_us, np.log(self.largest_us / 6.0)])
         prior = self.prior(three)
-        data = self.data.quadratic(prior.basis, linear, self.data.quiet, None)
-        n = prior.basis.size
-        best = (np.inf, three)
+        data = self.quadratic(prior.basis, linear, self.quiet, None)
+        n, best = prior.basis.size, np.inf
         others = data.gram[n:, n:] + data.precision
         for middle in np.linspace(0.1, 0.9, 13) * self.largest_us:
             for width in self.largest_us / np.array([100.0, 40.0, 20.0, 10.0]):
@@ -323,88 +285,77 @@ class _Search:
                 right[1:] += data.precision @ data.mean
                 found = np.linalg.solve(inner, right)
                 cost = -float(right @ found)
-                if found[0] > 0.0 and cost < best[0]:
-                    best = cost, np.array([np.log(found[0]), middle, np.log(width)])
-        return best[0], _Start(linear, best[1], self.data.quiet)
+                if found[0] > 0.0 and cost < best:
+                    best, three = cost, np.array([np.log(found[0]), middle, np.log(width)])
+        return best, linear, three
 
-    def fit(self, start: _Start, draws: int) -> Short:
-        """The whole fit, from a start."""
-        linear, noise, prior = start.linear, start.noise, self.prior(start.three)
-        n, extras = prior.basis.size, self.data.others_mean.size
-        data = self.data.quadratic(prior.basis, linear, noise, None)
+    def fit(self, linear: SecondOrder, three: np.ndarray, noise: NoiseLevel, draws: int) -> Short:
+        """The whole fit, from dynamics, a shape and a noise."""
+        prior = self.prior(three)
+        n, extras = prior.basis.size, self.others_mean.size
+        posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, None))
         near = [] if self.near is None else list(self.near.modes)
         chosen = MIDDLING if self.near is None else int(np.argmax(self.near.weights))
-        flat = CurvePosterior(prior, data)
-        z = near[chosen].z[: 3 + n + extras] if near else flat.start(start.three)
-        found = flat.mode(z, chosen)
-        posterior, weights = flat, np.zeros(0)
+        z = near[chosen].z[: 3 + n + extras] if near else posterior.start(three)
+        found, weights = posterior.mode(z, chosen), np.zeros(0)
         for turn in range(OUTER):
-            x = CurvePosterior.linear_of(prior, found)
-            posterior = CurvePosterior(prior, self.data.quadratic(prior.basis, linear, noise, x))
+            x = posterior.linear_of(found)
+            posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, x))
             found = posterior.mode(np.r_[found.z[: 3 + n + extras], np.zeros(3)], chosen)
-            x = CurvePosterior.linear_of(prior, found)
-            settled = bool(np.max(np.abs(x[n + extras :]) / self._sd(found)) < SETTLED)
-            linear = self.data.bounded(linear, x[n + extras :])
+            x = posterior.linear_of(found)
+            settled = bool(np.max(np.abs(x[n + extras :]) / _dynamics_sd(found)) < SETTLED)
+            linear = self.moved(linear, x[n + extras :])
             x = x[: n + extras]
             if not (settled or turn == OUTER - 1):
                 continue
-            noise = self.data.noise(prior.basis, linear, x, noise)
-            posterior = CurvePosterior(prior, self.data.quadratic(prior.basis, linear, noise, x))
+            noise = self.noise(prior.basis, linear, x, noise)
+            posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, x))
             near = posterior.modes(np.r_[found.z[: 3 + n + extras], np.zeros(3)], near)
             weights = _probabilities(near)
             likely = int(np.argmax(weights))
             if likely == chosen or turn == OUTER - 1:
                 break
             chosen, found = likely, near[likely]
-            linear = self.data.bounded(linear, found.z[-3:])
-        drawn = posterior.draws(near, weights, draws, seed=draws)
-        return self._short(prior, linear, noise, near, weights, drawn)
-
-    def _sd(self, mode: Mode) -> np.ndarray:
-        inverse = np.linalg.solve(mode.root, np.eye(mode.z.size)[:, -3:])
-        return np.sqrt(np.maximum(np.sum(inverse**2, axis=0), 1e-18))
+            linear = self.moved(linear, found.z[-3:])
+        return self._short(posterior, linear, noise, near, weights, draws)
 
     def _short(
         self,
-        prior: NearShape,
+        posterior: CurvePosterior,
         linear: SecondOrder,
         noise: NoiseLevel,
         modes: list[Mode],
         weights: np.ndarray,
-        drawn: np.ndarray,
+        draws: int,
     ) -> Short:
-        n, extras = prior.basis.size, self.data.others_mean.size
-        moved = drawn[:, n + extras :]
-        dynamics = np.stack(
-            [
-                np.clip(linear.time_constant_s * np.exp(moved[:, 0]), *TIME_CONSTANT_BOUNDS_S),
-                np.clip(linear.damping * np.exp(moved[:, 1]), *DAMPING_BOUNDS),
-                np.clip(linear.delay_s + moved[:, 2], *self.data.grid.delay_bounds_s),
-            ],
-            axis=1,
-        )
-        coefficients = np.cumsum(drawn[:, :n], axis=1)
-        likely = modes[int(np.argmax(weights))]
-        best = CurvePosterior.linear_of(prior, likely)
-        centre = self.data.bounded(linear, best[n + extras :])
+        prior = posterior.prior
+        n, extras = prior.basis.size, self.others_mean.size
+        drawn = posterior.draws(modes, weights, draws, seed=draws)
+        dynamics = np.c_[np.exp(drawn[:, n + extras : -1]) * linear.core, linear.delay_s + drawn[:, -1]]
+        lower, upper = np.array([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS, self.grid.delay_bounds_s]).T
+        best = posterior.linear_of(modes[int(np.argmax(weights))])
         return Short(
-            grid=self.data.grid,
-            rows=self.data.rows,
+            grid=self.grid,
+            rows=self.rows,
             basis=prior.basis,
-            sign=self.data.sign,
-            linear=centre,
-            coefficients_nm=coefficients,
-            dynamics=dynamics,
+            sign=self.sign,
+            linear=self.moved(linear, best[n + extras :]),
+            coefficients_nm=np.cumsum(drawn[:, :n], axis=1),
+            dynamics=np.clip(dynamics, lower, upper),
             others_nm=drawn[:, n : n + extras],
             modes=tuple(modes),
             weights=weights,
             noise=noise,
-            residual_nm=self.data.residual(prior.basis, centre, best[: n + extras]),
-            three=likely.z[:3],
             likely=best[: n + extras],
             rise_us=prior.rise_us,
             strange=float(sum(weights[i] for i, kind in enumerate(prior.deviations) if kind.sd > STRANGE)),
         )
+
+
+def _dynamics_sd(mode: Mode) -> np.ndarray:
+    """Standard deviations of the three changes of the dynamics at a mode."""
+    inverse = np.linalg.solve(mode.root, np.eye(mode.z.size)[:, -3:])
+    return np.sqrt(np.maximum(np.sum(inverse**2, axis=0), 1e-18))
 
 
 def _probabilities(modes: list[Mode]) -> np.ndarray:
