@@ -266,7 +266,7 @@ MODEL = fields(
         "effects": several(EFFECT, most=50),
         "joint": joint,
         "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),
-        "fit": fields({}, dict.fromkeys(STATISTICS, STATISTIC) | {"unexplained_nm": number(0.0, PLAUSIBLE)}),
+        "fit": fields({}, dict.fromkeys(STATISTICS, STATISTIC) | {"unexplained_nm": number(0.0, 1e300)}),
         "residual_tests": each(each(anything)),
         "valid_for": each(PAIR),
         "quality": fields(

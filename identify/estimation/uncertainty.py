@@ -106,10 +106,12 @@ def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
     """What the structure leaves of left-out blocks beyond noise and the parameters' uncertainty, N·m, rms.
 
     `matrix` is the parameters' covariance. A part that chance alone may leave is taken off, so that it is zero where
-    the structure is right.
+    the structure is right. No error counts for more than the torque's own range: far from linear, one step of a refit
+    may go anywhere.
     """
     rows = fitted.problem.setup.fitted
-    error = (fitted.residual_nm - held_out_change(fitted))[rows]
+    range_nm = float(np.ptp(fitted.problem.setup.grid.torque_nm[rows]))
+    error = np.clip((fitted.residual_nm - held_out_change(fitted))[rows], -range_nm, range_nm)
     lever = (fitted.slopes / np.where(fitted.problem.log, fitted.physical, 1.0)[:, None])[:, rows]
     noise, doubt = _noise_of_intervals(fitted)
     more = float(np.mean(error**2)) - noise - float(np.sum(matrix * (lever @ lever.T))) / error.size

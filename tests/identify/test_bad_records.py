@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from stimrig import identify
@@ -163,6 +163,16 @@ def test_a_million_rows():
     torque=st.sampled_from(["zero", "noise", "steps", "huge", "spike"]),
     names=st.lists(st.sampled_from(["rest", "prbs", "ramp", "validate", "my own"]), min_size=1, max_size=5),
     method=st.sampled_from(METHODS),
+)
+@example(
+    size=400,
+    rate=100.0,
+    pulse_rate=20.0,
+    seed=4,
+    widths="many",
+    torque="huge",
+    names=["prbs", "validate"],
+    method="maximum-likelihood",
 )
 def test_any_record_gets_an_answer(size, rate, pulse_rate, seed, widths, torque, names, method):
     rng = np.random.default_rng(seed)
