@@ -25,6 +25,8 @@ from stimrig.identify.effects import Effect, Form, Parameter, Scene, find_effect
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import (
     BAND_COST,
+    TOLERANCE,
+    WORTHLESS,
     Candidate,
     add_effects,
     detected_effects,
@@ -46,6 +48,8 @@ MOST = 3
 """Effects at most."""
 FORMS = 3
 """Forms of an effect that are tried beside another effect."""
+NO_RIVAL = 0.4
+"""Share of the best effect's gain below which another is no rival of it."""
 
 Progress = Callable[[float, str], None]
 """Called with the share done, 0 to 1, and a line of text. It may raise `Cancelled`."""
@@ -160,7 +164,8 @@ def _add_detected(search: EffectSearch) -> Fitted:
 def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tuple[Candidate, LeftOut] | None:
     """The likeliest candidate of a round that predicts left-out blocks better; None if none does."""
     before = search.rounds[0] if search.rounds else []
-    tried = _scan(search.last, lambda done, text: progress(0.1 + 0.3 * number + 0.3 * done, text), before)
+    listed, least = _worth_a_fit(search.last)
+    tried = _scan(search.last, listed, least, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
     candidates = sorted((_discounted(search, c) for c in tried), key=lambda c: -c.gain)
     search.rounds.append(candidates)
     if not number and (lawless := try_effect(FREE_GAIN, search.last)) is not None:
@@ -170,6 +175,8 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     for place, candidate in enumerate(candidates[: thresholds.JUDGED]):
         if candidate.gain < search.margins[-1]:
             break
+        if candidate.gain < least:
+            candidate = candidates[place] = _fitted_to_its_end(candidate)
         unseen = leave_out(candidate.fitted)
         seen = difference(search.left_out[-1], unseen)
         if not allowed(search, candidate, seen):
@@ -226,18 +233,37 @@ def released(fitted: Fitted) -> Fitted:
 # ---- one round: every effect of the library tried on a model -----------------------------------------------------
 
 
-def _scan(base: Fitted, progress: Progress, before: list[Candidate]) -> list[Candidate]:
-    """Add each applicable effect to a model; best first. `before` holds the candidates of an earlier round."""
+def _worth_a_fit(base: Fitted) -> tuple[list[Effect], float]:
+    """Effects that can be tried on a model, and the gain below which a fit need not be continued to its end.
+
+    One step of each effect's first form shows what the best one gains at least. What gains far less is no rival of it.
+    """
     present = effect_names(base)
     listed = [effect for effect in registry().values() if _applicable(effect, base, present)]
     # Slow ones first, so that all processes end at about the same time.
     listed.sort(key=lambda effect: -len(effect.forms))
+    firsts = [fit_form(e, e.forms[0], base, base.residual_nm, {}, np.inf) for e in listed if not e.band]
+    gains = [found.log_evidence - base.log_evidence for found in firsts if found is not None]
+    return listed, max(WORTHLESS, NO_RIVAL * max(gains, default=0.0))
+
+
+def _fitted_to_its_end(candidate: Candidate) -> Candidate:
+    """A candidate whose fit may have been stopped."""
+    begun = candidate.fitted
+    fitted = solve(begun.problem, begun.theta, begun.noise, tolerance=TOLERANCE)
+    return replace(candidate, fitted=fitted, gain=candidate.gain + fitted.log_evidence - begun.log_evidence)
+
+
+def _scan(
+    base: Fitted, listed: list[Effect], least: float, before: list[Candidate], progress: Progress
+) -> list[Candidate]:
+    """Add each of some effects to a model; best first. `before` holds the candidates of an earlier round."""
     earlier = {candidate.effect.id: candidate for candidate in before}
 
     def tried(number: int) -> tuple[str, Fitted, float, dict[str, float]] | None:
         """Without the problem: it holds functions, which cannot be sent between processes."""
         effect = listed[number]
-        found = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)))
+        found = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)), least)
         return found and (found.form.name, replace(found.fitted, problem=None), found.gain, found.forms)
 
     found: list[Candidate] = []
@@ -330,7 +356,8 @@ def _exhausted(search: EffectSearch) -> bool:
     left, last = search.residuals[-1], search.last
     if last.noise.ar1 > thresholds.SLOWEST_AR1 and left.slow_nm > left.white_nm:
         return False  # such slow noise may be a drift: the rests cannot tell how small the residual could be
-    return left.ideal - last.log_likelihood < thresholds.NEXT_MARGIN and left.ratio < thresholds.NEXT_MARGIN
+    near = thresholds.NEAR_IDEAL if last.noise.is_white else thresholds.NEXT_MARGIN
+    return left.ideal - last.log_likelihood < near and left.ratio < thresholds.NEXT_MARGIN
 
 
 def prior(effect: Effect) -> float:

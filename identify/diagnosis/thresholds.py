@@ -14,6 +14,9 @@ FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
 """Log evidence that every further effect must gain, at least."""
+NEAR_IDEAL = 30.0
+"""Log-likelihood that the last model may fall short of the ideal by, where its residual is white: the size of the noise
+is known no better. Nothing further is then looked for."""
 JUDGED = 4
 """So many candidates of a round, the likeliest first, are judged by left-out blocks."""
 BETTER = 1.0
