@@ -15,14 +15,14 @@ import numpy as np
 from stimrig.identify.criticism.correlation import correlation_tests
 from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent, rms
+from stimrig.identify.estimation.fit_statistics import UNDEFINED, figures, rms
 from stimrig.identify.estimation.quality import range_warnings
 from stimrig.identify.estimation.repetition import repetition
 from stimrig.identify.estimation.samples import block_means, inspect
 from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
-from stimrig.identify.results import Comparison, FitStatistics
+from stimrig.identify.results import Comparison
 from stimrig.identify.yardstick import repetition_sentences
 
 POINTS = 4000
@@ -67,7 +67,8 @@ def compare(model: Model, record: Record) -> Comparison:
     held = record.held_out & counted
     whole = _figures(record, predicted, noise, counted)
     held_out = _figures(record, predicted, noise, held) if held.any() else None
-    said = [text for text in (_left_out(grid), raw.readings.words if raw.readings else "") if text]
+    left_out = _left_out(grid)
+    said = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
     clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
     again = {"repetition": repetition(clean, block_means(grid, residual), grid.fitted)}
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
@@ -80,21 +81,16 @@ def compare(model: Model, record: Record) -> Comparison:
         by=_error_shares(record, residual, noise, counted),
         tests=tests,
         where=tuple(places),
-        left_out=_left_out(grid),
+        left_out=left_out,
         series=_series(model, record, predicted, noise),
         plain=(*_plain(whole, held_out, noise, tests, places), *repetition_sentences(again), *said, *outside),
     )
 
 
-def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> FitStatistics:
-    measured, guess = record.torque_nm[rows], predicted[rows]
-    return {
-        "fit_percent": best_fit_percent(measured, guess, noise),
-        "ceiling_percent": ceiling_percent(measured, noise),
-        "rms_nm": rms(measured - guess),
-        "excess_rms_nm": float(np.sqrt(max(rms(measured - guess) ** 2 - noise**2, 0.0))),
-        "samples": int(rows.sum()),
-    }
+def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> dict[str, Any]:
+    found = figures(record.torque_nm[rows], predicted[rows], noise)
+    excess = float(np.sqrt(max(found["rms_nm"] ** 2 - noise**2, 0.0)))
+    return found | {"excess_rms_nm": excess, "samples": int(rows.sum())}
 
 
 def _series(model: Model, record: Record, predicted: np.ndarray, noise: float) -> dict[str, Any]:
@@ -124,8 +120,8 @@ def _band(model: Model, record: Record, predicted: np.ndarray, noise: float) -> 
 
 
 def _plain(
-    whole: FitStatistics,
-    held_out: FitStatistics | None,
+    whole: dict[str, Any],
+    held_out: dict[str, Any] | None,
     noise_sd_nm: float,
     tests: dict[str, Any],
     places: list[dict[str, Any]],
@@ -213,20 +209,19 @@ def _spans(time_s: np.ndarray) -> Groups:
 
 def _table(groups: Groups, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray) -> list[dict[str, Any]]:
     """For each group that counts: number of samples, error, mean, and share of the error above the noise."""
-    parts = [(label, residual_nm[rows & counted]) for label, rows in groups]
-    excess = [max(float(np.sum(values**2) - values.size * noise_sd_nm**2), 0.0) for _, values in parts]
-    total = sum(excess)
-    return [
-        {
-            "label": label,
-            "samples": int(values.size),
-            "rms_nm": float(np.sqrt(np.mean(values**2))),
-            "mean_nm": float(np.mean(values)),
-            "share_of_excess": own / total if total > 0 else 0.0,
-        }
-        for (label, values), own in zip(parts, excess, strict=True)
-        if values.size
+    parts = [(label, residual_nm[rows & counted]) for label, rows in groups if np.any(rows & counted)]
+    table = [
+        {"label": label, "samples": int(values.size), "rms_nm": rms(values), "mean_nm": float(np.mean(values))}
+        for label, values in parts
     ]
+    return _with_shares(table, [float(np.sum(values**2) - values.size * noise_sd_nm**2) for _, values in parts])
+
+
+def _with_shares(table: list[dict[str, Any]], excess: list[float]) -> list[dict[str, Any]]:
+    """The rows with the share of each in the error above the noise."""
+    above = [max(own, 0.0) for own in excess]
+    total = sum(above)
+    return [row | {"share_of_excess": own / total if total > 0 else 0.0} for row, own in zip(table, above, strict=True)]
 
 
 def _frequency_rows(
@@ -243,21 +238,17 @@ def _frequency_rows(
         inside = (frequency >= low) & (frequency < high)
         if not inside.any() or low >= rate / 2:
             continue
-        noise = noise_sd_nm * float(np.sqrt(inside.sum() / frequency.size))
+        top = min(high, rate / 2)
         rows.append(
             {
-                "label": f"{low:g}-{min(high, rate / 2):g} Hz",
+                "label": f"{low:g}-{top:g} Hz",
                 "from_hz": low,
-                "to_hz": min(high, rate / 2),
+                "to_hz": top,
                 "rms_nm": float(np.sqrt(power[inside].sum())),
-                "noise_nm": noise,
+                "noise_nm": noise_sd_nm * float(np.sqrt(inside.sum() / frequency.size)),
             }
         )
-    excess = [max(row["rms_nm"] ** 2 - row["noise_nm"] ** 2, 0.0) for row in rows]
-    total = sum(excess)
-    for row, value in zip(rows, excess, strict=True):
-        row["share_of_excess"] = value / total if total > 0 else 0.0
-    return rows
+    return _with_shares(rows, [row["rms_nm"] ** 2 - row["noise_nm"] ** 2 for row in rows])
 
 
 # ---- the worst places ----

@@ -29,26 +29,16 @@ class Method:
     fit: Callable[..., Model]
 
 
-def _in_file(module: str) -> Method | None:
-    method = getattr(import_module(f"{__name__}.{module}"), "METHOD", None)
-    return method if isinstance(method, Method) else None
-
-
 @cache
 def methods() -> dict[str, Method]:
     """Every method by its id."""
-    found = [_in_file(info.name) for info in pkgutil.iter_modules(__path__)]
-    return {method.id: method for method in sorted(filter(None, found), key=lambda method: method.id)}
+    modules = [import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
+    found = [module.METHOD for module in modules if isinstance(getattr(module, "METHOD", None), Method)]
+    return {method.id: method for method in sorted(found, key=lambda method: method.id)}
 
 
 def method_of(name: str) -> Method:
-    """The method with this id. If its file has the same name, no other method is imported.
-
-    Raises BadRequest: no method has this id.
-    """
-    own = name.replace("-", "_")
-    if own in (info.name for info in pkgutil.iter_modules(__path__)) and (found := _in_file(own)) and found.id == name:
-        return found
+    """The method with this id. Raises BadRequest: no method has this id."""
     if name not in methods():
         raise BadRequest(f"unknown method {name!r}", place="method", fix=f"Known: {', '.join(methods())}.")
     return methods()[name]

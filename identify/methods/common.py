@@ -54,6 +54,15 @@ def quiet_level(grid: Grid) -> float:
     return float(np.percentile(grid.torque_nm[some], 5))
 
 
+def with_past(rows: np.ndarray, lead: int) -> np.ndarray:
+    """The rows of which the `lead` rows before are among them, too: all that they are regressed on was measured."""
+    used = rows.copy()
+    for lag in range(1, lead + 1):
+        used[lag:] &= rows[:-lag]
+    used[:lead] = False
+    return used
+
+
 def order_option(value: object) -> str | tuple[int, int, int]:
     """`second-order`, `auto`, or (l, n, d) from `2,1,1` or a sequence. Raises BadRequest: it is none of these."""
     if value in ("second-order", "auto"):

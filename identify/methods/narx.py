@@ -17,7 +17,7 @@ from stimrig.identify.dynamics.linear import Discrete, run_narx
 from stimrig.identify.estimation.finish import finish_discrete
 from stimrig.identify.estimation.samples import fitted_rows
 from stimrig.identify.methods import Method
-from stimrig.identify.methods.common import quiet_level
+from stimrig.identify.methods.common import quiet_level, with_past
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SplineBasis
@@ -37,11 +37,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     variables = [(0, lag) for lag in range(1, torque_lags + 1)] + [(1, lag) for lag in range(1, width_lags + 1)]
     degree = int(options.get("degree", 3))
     terms = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(len(variables)), d)]
-    lead = max(torque_lags, width_lags)
-    used = rows.copy()
-    for lag in range(1, lead + 1):
-        used[lag:] &= rows[:-lag]
-    used[:lead] = False
+    used = with_past(rows, max(torque_lags, width_lags))
     past = np.stack([np.roll((torque, width)[kind], lag) for kind, lag in variables], axis=1)[used]
     candidates = np.stack([np.prod(past[:, list(term)], axis=1) for term in terms], axis=1)
     chosen, weights = forward_regression(candidates, torque[used], int(options.get("terms", MOST_TERMS)))

@@ -16,6 +16,7 @@ cost is (12), the error of the model's output in a free run."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,7 +31,7 @@ from stimrig.identify.estimation.finish import finish, finish_discrete
 from stimrig.identify.estimation.plain import pilot_solution, to_fitted
 from stimrig.identify.estimation.projection import Projection, Solution, search
 from stimrig.identify.methods import Method
-from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted
+from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted, with_past
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve, FixedShape
 from stimrig.identify.recruitment.bases import PowerBasis, SplineBasis
@@ -43,40 +44,18 @@ DAMPING = Damping(first=1e-3, less=10.0, more=10.0, least=1e-12)
 
 @dataclass(frozen=True)
 class OutputError:
-    """A fitted linear block.
-
-    Parameters
-    ----------
-    b, a : ndarray
-        Coefficients of equations (2), (3), with the gain.
-    delay_samples : int
-        d.
-    baseline_nm : float
-        Constant in the output.
-    output_nm : ndarray, shape (K,)
-        Free run of the block with the baseline.
-    squares : float
-        Sum of squared errors over the fitted rows.
-    bic : float
-        Smaller is better.
-    """
+    """A fitted linear block: coefficients of equations (2) and (3), with the gain."""
 
     b: np.ndarray
     a: np.ndarray
     delay_samples: int
-    baseline_nm: float
-    output_nm: np.ndarray
-    squares: float
-    bic: float
-
-    @property
-    def gain(self) -> float:
-        """B(1)/A(1)."""
-        return float(np.sum(self.b) / np.sum(self.a))
+    baseline_nm: float  # constant in the output
+    bic: float  # smaller is better
 
     def block(self, step_s: float, centre: float) -> Discrete:
         """The block with unit gain at DC."""
-        return Discrete(tuple(self.b / self.gain), tuple(self.a), self.delay_samples, step_s, centre)
+        gain = float(np.sum(self.b) / np.sum(self.a))
+        return Discrete(tuple(self.b / gain), tuple(self.a), self.delay_samples, step_s, centre)
 
 
 def stable(a: np.ndarray) -> np.ndarray:
@@ -103,15 +82,18 @@ def equation_error(
     torque: np.ndarray, drive: np.ndarray, rows: np.ndarray, order: tuple[int, int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(b, a) by equation (25), literally: least squares of (24) with rows of (23)."""
-    zeros, poles, delay = order[1], order[0], order[2]
-    columns = [shifted(drive, delay + j) for j in range(zeros + 1)] + [-shifted(torque, j) for j in range(1, poles + 1)]
-    lead = max(poles, zeros + delay)
-    used = rows.copy()
-    for j in range(1, lead + 1):  # every regressor must have been measured
-        used[j:] &= rows[:-j]
-    used[:lead] = False
-    theta = np.linalg.lstsq(np.stack(columns, axis=1)[used], torque[used], rcond=None)[0]
+    poles, zeros, delay = order
+    used = with_past(rows, max(poles, zeros + delay))
+    columns = np.stack(_regressors(drive, torque, order), axis=1)
+    theta = np.linalg.lstsq(columns[used], torque[used], rcond=None)[0]
     return theta[: zeros + 1], np.r_[1.0, theta[zeros + 1 :]]
+
+
+def _regressors(drive: np.ndarray, torque: np.ndarray, order: tuple[int, int, int]) -> list[np.ndarray]:
+    """Past drives and torques of equation (23), each of shape (K,)."""
+    poles, zeros, delay = order
+    drives = [shifted(drive, delay + j) for j in range(zeros + 1)]
+    return drives + [-shifted(torque, j) for j in range(1, poles + 1)]
 
 
 def output_error(
@@ -172,13 +154,12 @@ def output_error(
 
     if start is None:
         rough = equation_error(torque - _rest_level(torque, drive, rows), drive, rows, order)[1]
-        start = _steiglitz_mcbride(target, drive, rows, order, stable(rough))
+        start = _steiglitz_mcbride(target, drive, rows, order, stable(rough), lambda a: solve(a).cost)
     search = Search(DAMPING, trials, gain, lambda gained, _step: not gained > 1e-9)
     found = descend(search, solve(start), most if poles else 0)[0]
-    theta, cost = found.theta, found.cost
-    count, free = int(rows.sum()), poles + zeros + 2
-    bic = count * np.log(max(cost / count, 1e-300)) + free * np.log(count)
-    return OutputError(theta[:-1], found.a, delay, float(theta[-1]), found.fitted, cost, float(bic))
+    theta, count, free = found.theta, int(rows.sum()), poles + zeros + 2
+    bic = count * np.log(max(found.cost / count, 1e-300)) + free * np.log(count)
+    return OutputError(theta[:-1], found.a, delay, float(theta[-1]), float(bic))
 
 
 def _rest_level(torque: np.ndarray, drive: np.ndarray, rows: np.ndarray) -> float:
@@ -187,26 +168,24 @@ def _rest_level(torque: np.ndarray, drive: np.ndarray, rows: np.ndarray) -> floa
 
 
 def _steiglitz_mcbride(
-    target: np.ndarray, drive: np.ndarray, rows: np.ndarray, order: tuple[int, int, int], a: np.ndarray
+    target: np.ndarray,
+    drive: np.ndarray,
+    rows: np.ndarray,
+    order: tuple[int, int, int],
+    a: np.ndarray,
+    cost_of: Callable[[np.ndarray], float],
 ) -> np.ndarray:
     """Repeated equation error of signals filtered by 1/A, which removes most of the bias of (25)."""
-    poles, zeros, delay = order
     best, best_cost = a, np.inf
     for _ in range(12):
-        y = recursion(a, target.copy())
-        u = recursion(a, drive.copy())
-        ones = recursion(a, np.ones(drive.size))
-        columns = [shifted(u, delay + j) for j in range(zeros + 1)] + [-shifted(y, j) for j in range(1, poles + 1)]
-        theta = np.linalg.lstsq(np.stack([*columns, ones], axis=1)[rows], y[rows], rcond=None)[0]
-        a = stable(np.r_[1.0, theta[zeros + 1 : -1]])
-        drives = [recursion(a, shifted(drive, delay + j).copy()) for j in range(zeros + 1)]
-        design = np.stack([*drives, np.ones(drive.size)], axis=1)[rows]
-        error = target[rows] - design @ np.linalg.lstsq(design, target[rows], rcond=None)[0]
-        cost = float(error @ error)
-        if cost < best_cost * (1 - 1e-6):
-            best, best_cost = a, cost
-        else:
+        y, u, ones = (recursion(a, signal.copy()) for signal in (target, drive, np.ones(drive.size)))
+        columns = np.stack([*_regressors(u, y, order), ones], axis=1)
+        theta = np.linalg.lstsq(columns[rows], y[rows], rcond=None)[0]
+        a = stable(np.r_[1.0, theta[order[1] + 1 : -1]])
+        cost = cost_of(a)
+        if not cost < best_cost * (1 - 1e-6):
             break
+        best, best_cost = a, cost
     return best
 
 
@@ -363,11 +342,9 @@ def general(
     curve = _curve_through(grid, found.block(grid.step_s, centre), rows, knots, baseline, inverse)
     for _ in range(iterations):
         found = linear_part(curve(grid.pulse_width_us), both, chosen)
-        block = found.block(grid.step_s, centre)
-        curve = _curve_through(grid, block, rows, knots, baseline, inverse)
-    block = found.block(grid.step_s, centre)
+        curve = _curve_through(grid, found.block(grid.step_s, centre), rows, knots, baseline, inverse)
     reasons.append(f"linear part (l, n, d) = {chosen}")
-    return finish_discrete(method_id, grid, both, block, curve, reasons)
+    return finish_discrete(method_id, grid, both, found.block(grid.step_s, centre), curve, reasons)
 
 
 def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
