@@ -28,43 +28,21 @@ SOFTWARE = {"name": "stimrig", "version": "0.1.0"}
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise that the fit assumes.
+    """The noise that the fit assumes."""
 
-    Parameters
-    ----------
-    white_sd_nm : float
-        White measurement noise of a sample, N·m.
-    block_sd_nm : float
-        Standard deviation of the noise on the grid of pulses, N·m.
-    ar1 : float
-        Correlation of neighbouring pulse intervals; 0 if white noise describes the residual better.
-    delta_bic : float
-        Evidence for AR(1) over white noise (positive: AR(1)).
-    """
-
-    white_sd_nm: float = 0.0
-    block_sd_nm: float = 0.0
-    ar1: float = 0.0
-    delta_bic: float = 0.0
+    white_sd_nm: float = 0.0  # white measurement noise of a sample
+    block_sd_nm: float = 0.0  # standard deviation of the noise on the grid of pulses
+    ar1: float = 0.0  # correlation of neighbouring pulse intervals; 0 if white noise describes the residual better
+    delta_bic: float = 0.0  # evidence for AR(1) over white noise (positive: AR(1))
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """The estimated parameters and their covariance.
+    """The estimated parameters and their covariance."""
 
-    Parameters
-    ----------
-    names : tuple of str
-        One per parameter, ending in its unit: time_constant_s, damping, delay_s, baseline_nm, recruitment_0_nm, …
-    values : ndarray, shape (P,)
-        Estimates.
-    matrix : ndarray, shape (P, P)
-        Covariance; units are products of the parameters' units.
-    """
-
-    names: tuple[str, ...]
-    values: np.ndarray
-    matrix: np.ndarray
+    names: tuple[str, ...]  # ending in the unit: time_constant_s, damping, delay_s, baseline_nm, recruitment_0_nm, …
+    values: np.ndarray  # estimates, shape (P,)
+    matrix: np.ndarray  # covariance, shape (P, P); units are products of the parameters' units
 
     def sd(self, name: str) -> float:
         """Standard deviation of a parameter by its name."""
@@ -74,55 +52,29 @@ class Covariance:
 
 @dataclass(frozen=True, repr=False)
 class Model(Summarised):
-    """A Hammerstein model, with or without effects.
+    """A Hammerstein model, with or without effects. What the dicts hold is as in MODEL.json (`docs/`)."""
 
-    Parameters
-    ----------
-    method : str
-        Id of the method that estimated it.
-    recruitment : Curve
-        f(u), N·m.
-    linear : SecondOrder or Discrete
-        G, unit gain at DC.
-    pulse_rate_hz, sample_rate_hz : float
-        Pulses and samples per second of the fitted record.
-    baseline_nm : float
-        Torque at rest, N·m.
-    initial : tuple of float
-        Torque above the baseline, N·m, and its rate, N·m/s, at the first pulse of the fitted record.
-    noise : Noise
-        The noise.
-    effects : tuple of dict
-        Effects, each {"id", "form", "parameters", …} as in MODEL.json; empty for the plain structure.
-    covariance : Covariance or None
-        Of all parameters; None if the method gives none.
-    fit, residual_tests, valid_for, quality, bands, data : dict
-        See `docs/` and MODEL.json; `fit` holds fit_percent, held_out_fit_percent, rms_nm, held_out_rms_nm,
-        ceiling_percent and noise_sd_nm.
-    joint : dict
-        g(x, ẋ) and h(x, ẋ) as tables with bands (`identify.simulation.joint_surface`); empty where the joint was held.
-    reasons : tuple of str
-        Reasons for the structure, the number of knots and the noise model.
-    """
-
-    method: str
-    recruitment: Curve
-    linear: Linear
-    pulse_rate_hz: float
+    method: str  # id of the method that estimated it
+    recruitment: Curve  # f(u), N·m
+    linear: Linear  # G, unit gain at DC
+    pulse_rate_hz: float  # of the fitted record
     sample_rate_hz: float
-    baseline_nm: float = 0.0
+    baseline_nm: float = 0.0  # torque at rest
     initial: tuple[float, float] = (0.0, 0.0)
+    """Torque above the baseline, N·m, and its rate, N·m/s, at the first pulse of the fitted record."""
     noise: Noise = field(default_factory=Noise)
-    effects: tuple[dict[str, Any], ...] = ()
-    covariance: Covariance | None = None
+    effects: tuple[dict[str, Any], ...] = ()  # each {"id", "form", "parameters", …}; empty for the plain structure
+    covariance: Covariance | None = None  # of all parameters; None if the method gives none
     fit: dict[str, Any] = field(default_factory=dict)
+    """fit_percent, held_out_fit_percent, rms_nm, held_out_rms_nm, ceiling_percent, noise_sd_nm and more."""
     residual_tests: dict[str, Any] = field(default_factory=dict)
     valid_for: dict[str, Any] = field(default_factory=dict)
     quality: dict[str, Any] = field(default_factory=dict)
     bands: dict[str, Any] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
     joint: dict[str, Any] = field(default_factory=dict)
-    reasons: tuple[str, ...] = ()
+    """g(x, ẋ) and h(x, ẋ) as tables with bands (`simulation.joint_surface`); empty where the joint was held."""
+    reasons: tuple[str, ...] = ()  # for the structure, the number of knots and the noise model
     extra: dict[str, Any] = field(default_factory=dict)
     model_id: str = ""
     created: str = ""
@@ -130,25 +82,30 @@ class Model(Summarised):
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""
-        from stimrig.identify.simulation.predict import (
-            predict,  # imported here, so that reading a model does not import numba
-        )
+        from stimrig.identify.simulation.predict import predict  # here: reading a model does not import numba
 
         return predict(self, record)
-
-    def _sheet(self) -> Sheet:
-        return _words(self)
 
     def figures(self) -> dict[str, dict[str, Any]]:
         """Threshold, plateau, saturation, and of a second-order block its parameters: `value`, `sd` and `unit` of each.
 
         An `sd` is None if the model has no covariance.
         """
-        found = landmarks(self.recruitment, _curve_covariance(self))
+        found = landmarks(self.recruitment, self.curve_covariance)
         if isinstance(self.linear, SecondOrder):
             for name, unit in (("time_constant_s", "s"), ("damping", "1"), ("delay_s", "s")):
-                found[name] = {"value": getattr(self.linear, name), "sd": _sd(self, name), "unit": unit}
+                found[name] = {"value": getattr(self.linear, name), "sd": self._sd(name), "unit": unit}
         return found
+
+    @property
+    def curve_covariance(self) -> np.ndarray | None:
+        """Covariance of the recruitment curve's coefficients, N²·m²; None if the model has none."""
+        known = self.covariance
+        names = [f"recruitment_{place}_nm" for place in range(self.recruitment.basis.size)]
+        if known is None or not set(names) <= set(known.names):
+            return None
+        rows = [known.names.index(name) for name in names]
+        return known.matrix[np.ix_(rows, rows)]
 
     def to_dict(self) -> dict[str, Any]:
         """MODEL.json as a dict of lists, numbers and texts."""
@@ -156,7 +113,6 @@ class Model(Summarised):
         level, needed = self.recruitment.inverse()
         rate = self.sample_rate_hz if isinstance(self.linear, SecondOrder) else 1.0 / self.linear.step_s
         b, a, delay = self.linear.discrete(rate)
-        covariance = self.covariance
         return json_value(
             {
                 "schema_version": SCHEMA_VERSION,
@@ -181,12 +137,10 @@ class Model(Summarised):
                 | self.recruitment.to_dict(),
                 "baseline_nm": self.baseline_nm,
                 "initial": list(self.initial),
-                "noise": self.noise.__dict__,
+                "noise": vars(self.noise),
                 "valid_for": self.valid_for,
                 "uncertainty": {
-                    "covariance": None
-                    if covariance is None
-                    else {"names": covariance.names, "values": covariance.values, "matrix": covariance.matrix},
+                    "covariance": self.covariance and vars(self.covariance),
                     "bands": self.bands,
                     "figures": self.figures(),
                 },
@@ -230,7 +184,8 @@ class Model(Summarised):
             with np.errstate(all="ignore"):
                 table = model.recruitment.table()[1]
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
-            raise BadModel(f"the parts do not match ({_line(error)})", fix=model_schema.FIX) from error
+            said = " ".join(f"{type(error).__name__} {error}".split())[:100]
+            raise BadModel(f"the parts do not match ({said})", fix=model_schema.FIX) from error
         if not np.isfinite(table).all():
             raise BadModel("the curve is not finite", place="recruitment.basis", fix=model_schema.FIX)
         for index, entry in enumerate(model.effects):
@@ -256,6 +211,50 @@ class Model(Summarised):
     def with_(self, **changes: Any) -> Model:
         """A copy of the model with some fields changed."""
         return replace(self, **changes)
+
+    def _sheet(self) -> Sheet:
+        fit, known = self.fit, self.valid_for
+        named = ", ".join(str(effect["id"]) for effect in self.effects) or "no effects"
+        width_us, torque_nm = self.recruitment.table()
+        top_us = float(width_us[np.argmax(np.abs(torque_nm))])
+        plateau = self.figures()["plateau_nm"]
+        largest = estimate(plateau["value"], plateau["sd"], "N·m")
+        rows = [
+            ("fit", fit_words(fit)),
+            (held_out_label(fit), fit_words(fit, "held_out_")),
+            ("noise", f"{quantity(self.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
+            ("repetition", repetition_words(fit)),
+            ("dynamics", self._dynamics()),
+            ("recruitment", f"largest {largest}, at {quantity(top_us, 'µs')}"),
+            ("baseline", estimate(self.baseline_nm, self._sd("baseline_nm"), "N·m")),
+            *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in self.effects],
+        ]
+        if "pulse_width_us" in known and "pulse_rate_hz" in known:
+            widths, rates = _span(known["pulse_width_us"], "µs"), _span(known["pulse_rate_hz"], "pulses/s")
+            rows.append(("valid for", f"{widths}, {rates}"))
+        if self.quality:
+            first = self.quality.get("reasons", [])[:1]
+            rows.append(("quality", ": ".join([str(self.quality.get("verdict", "")), *first])))
+        rows.append(("made", f"{self.created} from {self.data.get('name') or 'a record without a name'}"))
+        unseen = f"{held_out_label(fit)} {quantity(fit.get('held_out_fit_percent'), '%')}"
+        figures = f"fit {quantity(fit.get('fit_percent'), '%')}, {unseen}"
+        return Sheet(f"Model {self.model_id[:8]}, {self.method}, {named}: {figures}", tuple(rows))
+
+    def _dynamics(self) -> str:
+        linear = self.linear
+        if isinstance(linear, SecondOrder):
+            return (
+                f"time constant {estimate(linear.time_constant_s, self._sd('time_constant_s'), 's')}, "
+                f"damping {estimate(linear.damping, self._sd('damping'), '1')}, "
+                f"delay {estimate(1e3 * linear.delay_s, self._sd('delay_s', 1e3), 'ms')}"
+            )
+        step = quantity(1e3 * linear.step_s, "ms")
+        return f"order {len(linear.a) - 1} in steps of {step}, delay {quantity(linear.delay_samples, 'steps')}"
+
+    def _sd(self, name: str, factor: float = 1.0) -> float | None:
+        """Standard deviation of a parameter; None if the model has none."""
+        known = self.covariance
+        return factor * known.sd(name) if known is not None and name in known.names else None
 
 
 def _from_dict(data: dict[str, Any]) -> Model:
@@ -322,67 +321,6 @@ def _covariance(data: dict[str, Any] | None) -> Covariance | None:
     if values.shape != (size,) or matrix.shape != (size, size):
         raise BadModel("names, values and matrix differ in size", place="uncertainty.covariance", fix=model_schema.FIX)
     return Covariance(names, values, matrix)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__} {error}".split())[:100]
-
-
-def _words(model: Model) -> Sheet:
-    fit, known = model.fit, model.valid_for
-    named = ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
-    width_us, torque_nm = model.recruitment.table()
-    top_us = float(width_us[np.argmax(np.abs(torque_nm))])
-    plateau = model.figures()["plateau_nm"]
-    largest = estimate(plateau["value"], plateau["sd"], "N·m")
-    rows = [
-        ("fit", fit_words(fit)),
-        (held_out_label(fit), fit_words(fit, "held_out_")),
-        ("noise", f"{quantity(model.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
-        ("repetition", repetition_words(fit)),
-        ("dynamics", _dynamics(model)),
-        ("recruitment", f"largest {largest}, at {quantity(top_us, 'µs')}"),
-        ("baseline", estimate(model.baseline_nm, _sd(model, "baseline_nm"), "N·m")),
-        *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in model.effects],
-    ]
-    if "pulse_width_us" in known and "pulse_rate_hz" in known:
-        widths, rates = _span(known["pulse_width_us"], "µs"), _span(known["pulse_rate_hz"], "pulses/s")
-        rows.append(("valid for", f"{widths}, {rates}"))
-    if model.quality:
-        first = model.quality.get("reasons", [])[:1]
-        rows.append(("quality", ": ".join([str(model.quality.get("verdict", "")), *first])))
-    rows.append(("made", f"{model.created} from {model.data.get('name') or 'a record without a name'}"))
-    unseen = f"{held_out_label(fit)} {quantity(fit.get('held_out_fit_percent'), '%')}"
-    figures = f"fit {quantity(fit.get('fit_percent'), '%')}, {unseen}"
-    return Sheet(f"Model {model.model_id[:8]}, {model.method}, {named}: {figures}", tuple(rows))
-
-
-def _sd(model: Model, name: str, factor: float = 1.0) -> float | None:
-    """Standard deviation of a parameter; None if the model has none."""
-    known = model.covariance
-    return factor * known.sd(name) if known is not None and name in known.names else None
-
-
-def _curve_covariance(model: Model) -> np.ndarray | None:
-    """Covariance of the recruitment curve's coefficients, N²·m²; None if the model has none."""
-    known = model.covariance
-    names = [f"recruitment_{place}_nm" for place in range(model.recruitment.basis.size)]
-    if known is None or not set(names) <= set(known.names):
-        return None
-    rows = [known.names.index(name) for name in names]
-    return known.matrix[np.ix_(rows, rows)]
-
-
-def _dynamics(model: Model) -> str:
-    linear = model.linear
-    if isinstance(linear, SecondOrder):
-        return (
-            f"time constant {estimate(linear.time_constant_s, _sd(model, 'time_constant_s'), 's')}, "
-            f"damping {estimate(linear.damping, _sd(model, 'damping'), '1')}, "
-            f"delay {estimate(1e3 * linear.delay_s, _sd(model, 'delay_s', 1e3), 'ms')}"
-        )
-    step = quantity(1e3 * linear.step_s, "ms")
-    return f"order {len(linear.a) - 1} in steps of {step}, delay {quantity(linear.delay_samples, 'steps')}"
 
 
 def _parameters(values: dict[str, Any], most: int = 4) -> str:

@@ -7,8 +7,8 @@ Rows of tables are dicts with the keys of the schema. `to_dict()` gives JSON val
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, TypedDict
+from dataclasses import dataclass
+from typing import Any
 
 from stimrig.identify.caution import caution
 from stimrig.identify.json_text import json_value
@@ -29,83 +29,44 @@ FEW = 3
 """Number of rows of a long table that a summary shows."""
 
 
-class FitStatistics(TypedDict):
-    """How well a model fits some rows. Per cent are NaN if the torque is constant there."""
-
-    fit_percent: float
-    ceiling_percent: float
-    rms_nm: float
-    excess_rms_nm: float
-    samples: int
-
-
 class Result(Summarised):
     """A dataclass that is shown, and written as JSON."""
 
     def to_dict(self) -> dict[str, Any]:
         """All fields as dicts, lists, numbers and texts; None for a number that is not finite."""
-        return {item.name: _document(getattr(self, item.name)) for item in fields(self)}  # pyright: ignore[reportArgumentType]
-
-
-def _document(value: Any) -> Any:
-    if isinstance(value, tuple) and any(isinstance(item, Model) for item in value):
-        return [item.to_dict() for item in value]
-    return json_value(value)
+        return {
+            name: [model.to_dict() for model in value] if name == "models" else json_value(value)
+            for name, value in vars(self).items()
+        }
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Comparison(Result):
-    """A model compared with a measurement.
+    """A model compared with a measurement. Per cent are NaN where the torque is constant."""
 
-    Parameters
-    ----------
-    fit_percent, ceiling_percent : float
-        Best fit on all rows, and the best fit that the noise allows, %.
-    rms_nm, excess_rms_nm : float
-        Error on all rows, and the part of it above the noise, N·m.
-    samples : int
-        Number of rows.
-    noise_sd_nm : float
-        White measurement noise of a sample, N·m.
-    repetition : dict
-        What repeats in the record, and how much of that the model explains: see `identify.estimation.repetition`.
-    fitted : FitStatistics
-        The same for rows that may be fitted.
-    held_out : FitStatistics or None
-        The same for rows of `validate`; None if there are none.
-    by : dict of list of dict
-        The error by "segment", "level" of pulse width, "direction", "time" and "frequency"; each row has `label`,
-        `rms_nm` and `share_of_excess`.
-    tests : dict
-        Correlations of the residual: `lags_s`, `false_alarm_rate`, `innovations`, and `tests`, each with `with`,
-        `values`, `band`, `largest`, `at_lag_s`, `passed`, `words`.
-    where : tuple of dict
-        Worst places first: `segment`, `start_s`, `end_s`, `pulse_width_us`, `direction`, `share_of_excess`,
-        `mean_error_nm`, `text`.
-    series : dict
-        Values for plots, at most 4000 points: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`,
-        `residual_nm`, `pulse_width_us`, `segment`, `noise_band_nm`.
-    left_out : str
-        How much was not counted, and why; empty if everything was counted.
-    plain : tuple of str
-        Sentences for people.
-    """
-
-    fit_percent: float
-    ceiling_percent: float
-    rms_nm: float
-    excess_rms_nm: float
-    samples: int
-    noise_sd_nm: float
-    repetition: Row
-    fitted: FitStatistics
-    held_out: FitStatistics | None
+    fit_percent: float  # best fit on all rows
+    ceiling_percent: float  # the best fit that the noise allows
+    rms_nm: float  # error on all rows
+    excess_rms_nm: float  # the part of it above the noise
+    samples: int  # number of rows
+    noise_sd_nm: float  # white measurement noise of a sample
+    repetition: Row  # what repeats, and how much of it the model explains: see `identify.estimation.repetition`
+    fitted: Row  # the first five fields for rows that may be fitted
+    held_out: Row | None  # the same for rows of `validate`; None if there are none
     by: Mapping[str, Sequence[Row]]
+    """The error by "segment", "level" of pulse width, "direction", "time" and "frequency"; each row has `label`,
+    `rms_nm` and `share_of_excess`."""
     tests: Row
+    """Correlations of the residual: `lags_s`, `false_alarm_rate`, `innovations`, and `tests`, each with `with`,
+    `values`, `band`, `largest`, `at_lag_s`, `passed`, `words`."""
     where: tuple[Row, ...]
+    """Worst places first: `segment`, `start_s`, `end_s`, `pulse_width_us`, `direction`, `share_of_excess`,
+    `mean_error_nm`, `text`."""
     series: Row
-    left_out: str
-    plain: tuple[str, ...]
+    """Values for plots, at most 4000 points: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`,
+    `residual_nm`, `pulse_width_us`, `segment`, `noise_band_nm`."""
+    left_out: str  # how much was not counted, and why; empty if everything was counted
+    plain: tuple[str, ...]  # sentences for people
 
     def _sheet(self) -> Sheet:
         alarms = [
@@ -127,58 +88,30 @@ class Comparison(Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Diagnosis(Result):
-    """What the model of a record lacks.
+    """What the model of a record lacks."""
 
-    Parameters
-    ----------
-    noise_sd_nm : float
-        White measurement noise of a sample, N·m.
-    slow_noise : dict
-        `sd_nm`, and `ar1`, the correlation of neighbouring pulse intervals.
-    base : dict
-        The model of the examined structure: `fit_percent`, `rms_nm`, `ceiling_percent`, the same with `held_out_`, and
-        `held_out_by`, which says how the held-out values were found.
-    verdict : str
-        "effect_missing", "nothing_missing" or "unexplained_structure".
-    probability : float
-        Of the verdict, 0 to 1.
-    missing : tuple of dict
-        Effects, most probable first: `effect`, `name`, `probability`, errors before and after, `confused_with`,
-        `next_experiment` (words) and `next_experiment_plan`, `form`, `equation`, `parameters`, `rival_probabilities`,
-        `plain`.
-    where : tuple of dict
-        Where the error is, as in `Comparison`.
-    with_all : dict
-        The model with all of `missing`: the keys of `base`, and `noise_sd_nm`.
-    explained : float
-        Share, 0 to 1, of the explainable log-likelihood that the effects explain.
-    structure_left : float
-        Log-likelihood by which the residuals at work and at rest still differ.
-    unseen : dict or None
-        Error of the last model on held-out rows, `rms_nm`, and the error that noise and its uncertainty allow,
-        `allowed_nm`, both of means over pulse intervals; None if there are too few held-out rows.
-    candidates : tuple of list of dict
-        Effects tried in each round, best first: `effect`, `form`, `log_evidence_gain`, `rms_nm`, `forms`.
-    notes : tuple of str
-        Further reasons for the verdict.
-    plain : tuple of str
-        Sentences for people.
-    """
-
-    noise_sd_nm: float
-    slow_noise: Row
+    noise_sd_nm: float  # white measurement noise of a sample
+    slow_noise: Row  # `sd_nm`, and `ar1`, the correlation of neighbouring pulse intervals
     base: Row
-    verdict: str
-    probability: float
+    """The model of the examined structure: `fit_percent`, `rms_nm`, `ceiling_percent`, the same with `held_out_`, and
+    `held_out_by`, which says how the held-out values were found."""
+    verdict: str  # a key of `VERDICTS`
+    probability: float  # of the verdict, 0 to 1
     missing: tuple[Row, ...]
-    where: tuple[Row, ...]
-    with_all: Row
-    explained: float
-    structure_left: float
+    """Effects, most probable first: `effect`, `name`, `probability`, errors before and after, `confused_with`,
+    `next_experiment` (words) and `next_experiment_plan`, `form`, `equation`, `parameters`, `rival_probabilities`,
+    `plain`."""
+    where: tuple[Row, ...]  # where the error is, as in `Comparison`
+    with_all: Row  # the model with all of `missing`: the keys of `base`, and `noise_sd_nm`
+    explained: float  # share, 0 to 1, of the explainable log-likelihood that the effects explain
+    structure_left: float  # log-likelihood by which the residuals at work and at rest still differ
     unseen: Row | None
+    """Error of the last model on held-out rows, `rms_nm`, and the error that noise and its uncertainty allow,
+    `allowed_nm`, both of means over pulse intervals; None if there are too few held-out rows."""
     candidates: tuple[Sequence[Row], ...]
-    notes: tuple[str, ...]
-    plain: tuple[str, ...]
+    """Effects tried in each round, best first: `effect`, `form`, `log_evidence_gain`, `rms_nm`, `forms`."""
+    notes: tuple[str, ...]  # further reasons for the verdict
+    plain: tuple[str, ...]  # sentences for people
 
     def _sheet(self) -> Sheet:
         slow = quantity(self.slow_noise.get("sd_nm"), "N·m")
@@ -203,28 +136,15 @@ class Diagnosis(Result):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Improvement(Result):
-    """Models of a record, each with one more effect than the one before.
+    """Models of a record, each with one more effect than the one before."""
 
-    Parameters
-    ----------
-    noise_sd_nm : float
-        White measurement noise of a sample, N·m.
-    verdict : str
-        As in `Diagnosis`, for the first model, before effects were added.
-    steps : tuple of dict
-        `added` (None in the first), `fit_percent`, `rms_nm`, `held_out_rms_nm`, `held_out_fit_percent`,
-        `ceiling_percent`, `repetition`, `model_id`, `reason`.
-    models : tuple of Model
-        One per step; the last one has all added effects.
-    refused : tuple of dict
-        Effects that were not added, best first: `effect`, `log_evidence_gain`, `reason`.
-    """
-
-    noise_sd_nm: float
-    verdict: str
+    noise_sd_nm: float  # white measurement noise of a sample
+    verdict: str  # as in `Diagnosis`, for the first model, before effects were added
     steps: tuple[Row, ...]
-    models: tuple[Model, ...]
-    refused: tuple[Row, ...]
+    """`added` (None in the first), `fit_percent`, `rms_nm`, `held_out_rms_nm`, `held_out_fit_percent`,
+    `ceiling_percent`, `repetition`, `model_id`, `reason`."""
+    models: tuple[Model, ...]  # one per step; the last one has all added effects
+    refused: tuple[Row, ...]  # effects that were not added, best first: `effect`, `log_evidence_gain`, `reason`
 
     def _sheet(self) -> Sheet:
         rows = [
@@ -248,37 +168,23 @@ class Improvement(Result):
 class Carried(Result):
     """The structure of an earlier model on a new record, beside the plain structure.
 
-    Parameters
-    ----------
-    carried_from : str
-        Id of the earlier model.
-    offered : str
-        "carried" or "plain": the better of the two.
-    why, reason : str
-        Why, as one word for programs and as a sentence.
-    still_needed, no_longer_needed, undecided : tuple of str
-        Effects of the earlier model that the record asks for, those that it does not, and those that it cannot judge
-        since something else is missing. All are empty if the structure could not be carried over at all.
-    effects : tuple of dict
-        Effects of the earlier model: `effect`, `name`, `form` (in the new model; None without it), `needed` (None:
-        undecided), `log_evidence_gain` (None if it was not compared), `required`, `why`, `reason`.
-    figures : tuple of dict
-        For each of `models`: `fit_percent`, `ceiling_percent`, `held_out_fit_percent`, `rms_nm`, `held_out_rms_nm`,
-        `held_out_by`.
-    models : tuple of Model
-        The plain model, then the one with the effects that are still needed, if there are any.
+    The three lists of effects are empty if the structure could not be carried over at all.
     """
 
-    carried_from: str
-    offered: str
-    why: str
-    reason: str
-    still_needed: tuple[str, ...]
-    no_longer_needed: tuple[str, ...]
-    undecided: tuple[str, ...]
+    carried_from: str  # id of the earlier model
+    offered: str  # "carried" or "plain": the better of the two
+    why: str  # one word for programs
+    reason: str  # the same as a sentence
+    still_needed: tuple[str, ...]  # effects of the earlier model that the record asks for
+    no_longer_needed: tuple[str, ...]  # those that it does not
+    undecided: tuple[str, ...]  # those that it cannot judge, since something else is missing
     effects: tuple[Row, ...]
+    """Effects of the earlier model: `effect`, `name`, `form` (in the new model; None without it), `needed` (None:
+    undecided), `log_evidence_gain` (None if it was not compared), `required`, `why`, `reason`."""
     figures: tuple[Row, ...]
-    models: tuple[Model, ...]
+    """For each of `models`: `fit_percent`, `ceiling_percent`, `held_out_fit_percent`, `rms_nm`, `held_out_rms_nm`,
+    `held_out_by`."""
+    models: tuple[Model, ...]  # the plain one, then that with the effects that are still needed, if there are any
 
     @property
     def model(self) -> Model:

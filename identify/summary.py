@@ -25,18 +25,10 @@ LONGEST = 300
 
 @dataclass(frozen=True)
 class Sheet:
-    """A title and rows of a label and a text.
+    """A title and rows of a label and a text."""
 
-    Parameters
-    ----------
-    title : str
-        What it is, with the most important values, in one line.
-    rows : tuple of (str, str)
-        One line each.
-    """
-
-    title: str
-    rows: tuple[tuple[str, str], ...]
+    title: str  # what it is, with the most important values, in one line
+    rows: tuple[tuple[str, str], ...]  # one line each
 
     def line(self) -> str:
         """The title alone."""

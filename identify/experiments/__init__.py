@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import make_grid
+from stimrig.identify.dynamics.grid import ends_of, make_grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.experiments.designs import Design, designs
@@ -29,33 +29,15 @@ NOTHING = "nothing"
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Experiment(Result):
-    """A test that tells rival effects apart.
+    """A test that tells rival effects apart."""
 
-    Parameters
-    ----------
-    rivals : tuple of str
-        Ids of the effects.
-    segments : tuple of dict
-        The test: `name`, `sequence` and `settings` of each segment, as `POST /v1/tests` takes them.
-    duration_s : float
-        Duration, s.
-    dose : dict
-        `pulses`, `pulse_width_sum_us` and `torque_time_nm_s`.
-    expected_log_evidence : float
-        How clearly the test is expected to decide: of the pair with the smallest.
-    decides : bool
-        Whether that is enough.
-    text : str
-        The test in one sentence.
-    """
-
-    rivals: tuple[str, ...]
-    segments: tuple[Mapping[str, Any], ...]
+    rivals: tuple[str, ...]  # ids of the effects
+    segments: tuple[Mapping[str, Any], ...]  # `name`, `sequence`, `settings` of each, as `POST /v1/tests` takes them
     duration_s: float
-    dose: Mapping[str, float]
-    expected_log_evidence: float
-    decides: bool
-    text: str
+    dose: Mapping[str, float]  # `pulses`, `pulse_width_sum_us` and `torque_time_nm_s`
+    expected_log_evidence: float  # how clearly the test is expected to decide: of the pair with the smallest
+    decides: bool  # whether that is enough
+    text: str  # the test in one sentence
 
     def _sheet(self) -> Sheet:
         rows = [("test", self.text), ("pulses", f"{self.dose['pulses']:.0f}")]
@@ -124,19 +106,11 @@ def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[st
 
 
 def _blank(record: Record, width: np.ndarray) -> Record:
-    rate = PER_PULSE * record.pulse_rate_hz
-    held = np.repeat(width, PER_PULSE)
-    time_s = np.arange(held.size) / rate
-    angle = None if record.angle_rad is None else np.full(held.size, float(record.angle_rad[0]))
-    still = None if record.velocity_rad_s is None else np.zeros(held.size)
-    return Record.from_arrays(
-        time_s,
-        held,
-        np.zeros(held.size),
-        angle_rad=angle,
-        velocity_rad_s=still,
-        pulse_rate_hz=record.pulse_rate_hz,
-    )
+    held, rate_hz = np.repeat(width, PER_PULSE), record.pulse_rate_hz
+    time_s, zeros = np.arange(held.size) / (PER_PULSE * rate_hz), np.zeros(held.size)
+    angle = None if record.angle_rad is None else zeros + float(record.angle_rad[0])
+    still = None if record.velocity_rad_s is None else zeros
+    return Record.from_arrays(time_s, held, zeros, angle_rad=angle, velocity_rad_s=still, pulse_rate_hz=rate_hz)
 
 
 def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
@@ -147,13 +121,11 @@ def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
     true_mean = _simulate(truth, record, False)[0]
     rival_mean, slopes = _simulate(rival, record, True)
     assert slopes is not None
-    size = true_mean.size
-    stretch = (np.array([0], np.int64), np.array([size], np.int64))
-    white = whitened(np.vstack([true_mean - rival_mean, slopes]), stretch, truth.noise)
+    whole = ends_of([slice(0, true_mean.size)])
+    white = whitened(np.vstack([true_mean - rival_mean, slopes]), whole, truth.noise)
     gap, slopes = white[0], white[1:]
-    hessian = rival.hessian
     b = slopes @ gap
-    gain = b @ np.linalg.lstsq(hessian + slopes @ slopes.T, b, rcond=None)[0]
+    gain = b @ np.linalg.lstsq(rival.hessian + slopes @ slopes.T, b, rcond=None)[0]
     return max(0.5 * float(gap @ gap - gain), 0.0)
 
 

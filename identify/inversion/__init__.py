@@ -54,33 +54,15 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Inversion:
-    """Pulse widths for a reference.
+    """Pulse widths for a reference; arrays of shape (K,)."""
 
-    Parameters
-    ----------
-    reference : Reference
-        What was asked for.
-    pulse_width_us : ndarray, shape (K,)
-        µs.
-    predicted_nm : ndarray, shape (K,)
-        Torque above rest that the model predicts for them, mean in each pulse's period, N·m.
-    unreachable : tuple of Stretch
-        Where it is not reached, in order of time.
-    fit_percent : float or None
-        Best fit % where it can be reached; None if the reference does not change there.
-    whole_fit_percent : float or None
-        Of all of it.
-    tolerance_nm : float
-        A smaller difference counts as reached, N·m.
-    """
-
-    reference: Reference
+    reference: Reference  # what was asked for
     pulse_width_us: np.ndarray
-    predicted_nm: np.ndarray
-    unreachable: tuple[Stretch, ...]
-    fit_percent: float | None
-    whole_fit_percent: float | None
-    tolerance_nm: float
+    predicted_nm: np.ndarray  # torque above rest that the model predicts for them, mean in each pulse's period
+    unreachable: tuple[Stretch, ...]  # where it is not reached, in order of time
+    fit_percent: float | None  # best fit where it can be reached; None if the reference does not change there
+    whole_fit_percent: float | None  # of all of it
+    tolerance_nm: float  # a smaller difference counts as reached
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""

@@ -37,20 +37,13 @@ NAMES = {
 class Reference:
     """Torque above rest, mean over each pulse interval.
 
-    Parameters
-    ----------
-    torque_nm : ndarray, shape (K,)
-        N·m, with the sign that the record of the model has.
-    pulse_rate_hz : float
-        Pulses per second.
-    angle_rad : ndarray or None, shape (K,)
-        Angle of the joint, rad, mean over each pulse interval, where it moves. The torque is then the whole torque that
-        the cell measures, passive torque included, above that of a joint at rest at the first angle.
+    With an angle it is the whole torque that the cell measures, passive torque included, above that of a joint at rest
+    at the first angle.
     """
 
-    torque_nm: np.ndarray
+    torque_nm: np.ndarray  # with the sign that the record of the model has, shape (K,)
     pulse_rate_hz: float = 40.0
-    angle_rad: np.ndarray | None = None
+    angle_rad: np.ndarray | None = None  # of the joint, where it moves, mean over each pulse interval, shape (K,)
 
     @property
     def motion(self) -> Motion | None:

@@ -146,11 +146,8 @@ def curve_covariance(model: Model) -> np.ndarray:
     """
     size = model.recruitment.basis.size
     top_nm = float(np.ptp(model.recruitment.table()[1]))
-    found = np.eye(size) * (SHAPE * top_nm) ** 2
-    if model.covariance is not None:
-        own = [place for place, name in enumerate(model.covariance.names) if name.startswith("recruitment_")]
-        found = found + 4.0 * model.covariance.matrix[np.ix_(own, own)]
-    return found
+    own, fitted = np.eye(size) * (SHAPE * top_nm) ** 2, model.curve_covariance
+    return own if fitted is None else own + 4.0 * fitted
 
 
 def look(model: Model, expected: State, record: Record) -> Seen:
