@@ -29,6 +29,7 @@ from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import draw_scenario, rng_of
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.diagnosis import side_by_side as workers
+from stimrig.identify.estimation.earlier import Earlier
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.experiments.adaptive import Target
@@ -136,10 +137,10 @@ def adaptive(
         own = pieces(levels, 40.0)
         return own[int(rng.integers(len(own)))].pulse_width_us
 
-    known = {"earlier": earlier} if earlier is not None else {}
+    known = {} if earlier is None else {"earlier": Earlier(earlier)}
     limits = {"left_s": LONGEST_S / 2.0, "left_nm_s": float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0}
     made = play(muscle, noise, TARGET, timed=timed, choose=by_chance if random else None, **limits, **known)
-    result, model = finished(muscle, made, noise, seed, known)
+    result, model = finished(muscle, made, noise, seed, {} if earlier is None else {"earlier": earlier})
     return result | {"cpu_s": [round(s, 4) for s in spent[2:]]}, model
 
 

@@ -40,17 +40,15 @@ def outlook(
 
     `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
-    from stimrig.identify.experiments.adaptive import decide, reach
+    from stimrig.identify.experiments.adaptive import Asked, decide, reach
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.1, "playing the test on a simulated muscle")
-    left = {"target": Target(**target), "left_s": playable_s, "left_nm_s": max_torque_time_nm_s}
-    top = {"largest_us": largest_us, "pulse_rate_hz": pulse_rate_hz}
-    person = known(models)
-    opening = decide(None, (), **left, **top, **person)
+    asked = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models))
+    opening = decide(None, (), asked)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
-    found = reach(plateau_nm=NEW_PERSON_SHARE * max_torque_nm, **left, **top, **person)
-    return clean({"opening_us": widths, "reach": asdict(found), "known": bool(person)})
+    found = reach(asked, NEW_PERSON_SHARE * max_torque_nm)
+    return clean({"opening_us": widths, "reach": asdict(found), "known": asked.earlier is not None})
 
 
 def warm() -> None:
@@ -59,8 +57,8 @@ def warm() -> None:
     outlook(lambda _share, _text: None, target, 6.0, 100.0, largest_us=300.0, max_torque_nm=15.0, pulse_rate_hz=40.0)
 
 
-def known(models: Sequence[str]) -> dict[str, Any]:
-    """The last model and how much the person changes between sessions; nothing of a new person.
+def known(models: Sequence[str]) -> Any:
+    """The last model and how much the person changes between sessions, `Earlier`; None of a new person.
 
     A model that cannot be read here is left out. A last model that cannot be read, or that is of another kind than the
     adaptive test fits, is no help, and none is taken in its place.
@@ -73,14 +71,9 @@ def known(models: Sequence[str]) -> dict[str, Any]:
         with suppress(identify.IdentifyError):
             last = identify.Model.from_json(text)
             read.append(last)
-    if last is None:
-        return {}
-    change = learn_change(read)
-    try:
-        Earlier(last, change)
-    except identify.IdentifyError:
-        return {}
-    return {"earlier": last, "change": change}
+    with suppress(identify.IdentifyError):
+        return None if last is None else Earlier(last, learn_change(read))
+    return None
 
 
 def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any) -> dict[str, Any]:
@@ -104,7 +97,7 @@ class Running:
     """One adaptive test, as far as it was measured."""
 
     target: Any
-    known: dict[str, Any]
+    known: Any
     playable_s: float
     max_torque_time_nm_s: float
     largest_us: float
@@ -136,7 +129,7 @@ class Running:
         torque_time_nm_s, measured_s
             Torque-time that was measured, N·m·s, and until when, s.
         """
-        from stimrig.identify.experiments.adaptive import decide
+        from stimrig.identify.experiments.adaptive import Asked, decide
 
         for held, new in zip(self.samples, (host_time_s, counter, torque_nm), strict=True):
             held.extend(new)  # pyright: ignore[reportArgumentType]
@@ -144,17 +137,10 @@ class Running:
             laid_us[index] = 0.0
         record = record_of(*self.samples, laid_us, late, segments, self.pulse_rate_hz)
         committed_nm_s = self._expected(laid_us[round(measured_s * self.pulse_rate_hz) :])
-        found = decide(
-            record,
-            laid_us,
-            target=self.target,
-            left_s=max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz),
-            left_nm_s=max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s),
-            largest_us=self.largest_us,
-            pulse_rate_hz=self.pulse_rate_hz,
-            before=self.before,
-            **self.known,
-        )
+        left_s = max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz)
+        left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
+        asked = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.known)
+        found = decide(record, laid_us, asked, self.before)
         self.before = found if found.short is not None else self.before
         told = found.to_dict()
         for number, segment in enumerate(

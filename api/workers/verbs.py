@@ -44,8 +44,8 @@ def fit(
         progress(0.2 + 0.8 * share, text)
 
     options: dict[str, Any] = {} if recruitment is None else {"recruitment": recruitment}
-    if earlier := adaptive_verbs.known(models).get("earlier"):
-        options["earlier"] = earlier
+    if earlier := adaptive_verbs.known(models):
+        options["earlier"] = earlier.model
     model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further, **options)
     return {
         "json": model.to_json(),

@@ -22,14 +22,13 @@ from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest, IdentifyError
 from stimrig.identify.estimation.averaged import averaged
 from stimrig.identify.estimation.disturbance import disturbed, unsure
-from stimrig.identify.estimation.earlier import Change, Earlier
+from stimrig.identify.estimation.earlier import Earlier
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.estimation.short_record import Short, fit_short
 from stimrig.identify.experiments.designs import Piece, Segment, pieces
 from stimrig.identify.experiments.knowledge import Foresight, Knowledge, Target, knowledge
-from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.near_shape import KNOTS
 
@@ -80,18 +79,29 @@ class Decision:
         }
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What a test is to find out, what it may spend on that, and whom it is about.
+
+    Raises BadRequest: a number that is none.
+    """
+
+    target: Target  # what must be known
+    left_s: float  # time that the participant's profile still allows
+    left_nm_s: float  # torque-time, N·m·s, that it still allows
+    largest_us: float  # largest width that may be played
+    pulse_rate_hz: float = 40.0
+    earlier: Earlier | None = None  # what is known of this person from earlier sessions
+
+    def __post_init__(self) -> None:
+        for name in ("left_s", "left_nm_s", "largest_us", "pulse_rate_hz"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
+                raise BadRequest(f"{value!r} is no positive number", place=name, fix="Give a number from 0.")
+
+
 def decide(
-    record: Record | None,
-    played_us: np.ndarray | Sequence[float],
-    *,
-    target: Target,
-    left_s: float,
-    left_nm_s: float,
-    largest_us: float,
-    pulse_rate_hz: float = 40.0,
-    earlier: Model | None = None,
-    change: Change | None = None,
-    before: Decision | None = None,
+    record: Record | None, played_us: np.ndarray | Sequence[float], asked: Asked, before: Decision | None = None
 ) -> Decision:
     """The next piece of an adaptive test, or its end.
 
@@ -101,65 +111,39 @@ def decide(
         What was measured so far, from the test's first pulse; None before the first.
     played_us : array, shape (P,)
         Widths of all pulses that were played or are committed, µs; may reach beyond the record's end.
-    target : Target
-        What must be known.
-    left_s, left_nm_s : float
-        Time, s, and torque-time, N·m·s, that the participant's profile still allows.
-    largest_us : float
-        Largest width that may be played, µs.
-    pulse_rate_hz : float
-        Pulses a second.
-    earlier : Model, optional
-        The last approved model of this person, with second-order dynamics.
-    change : Change, optional
-        By how much this person changes between sessions (`learn_change`); the usual change if None.
+    asked : Asked
+        What the test is to find out, with what is left of its limits.
     before : Decision, optional
         The decision before this one: the search then starts from its fit.
 
-    Returns
-    -------
-    Decision
-
     Raises
     ------
-    BadRequest
-        A number that is none, or an earlier model that cannot be used.
     BadRecord
         The record holds what no measurement gives.
     """
-    _check(left_s=left_s, left_nm_s=left_nm_s, largest_us=largest_us, pulse_rate_hz=pulse_rate_hz)
-    played = np.asarray(played_us, float)
-    last = None if earlier is None else Earlier(earlier, change or Change())
     if record is None or record.time_s[-1] - record.time_s[0] < LEAST_S:
-        return _opening(largest_us, pulse_rate_hz, left_s, left_nm_s, last)
+        return _opening(asked)
     try:
         grid, raw = prepare(record)
         with np.errstate(all="ignore"):
-            short, wrong = _fitted(grid, raw, last, before.short if before else None)
+            short, wrong = _fitted(grid, raw, asked.earlier, before.short if before else None)
     except (np.linalg.LinAlgError, IdentifyError) as error:
         return Decision("misfit", words=f"No model can be fitted ({error}). The rest of the fixed test is played.")
     known = knowledge(short)
     if wrong:
         return Decision("misfit", words=f"{wrong} The rest of the fixed test is played.", knowledge=known, short=short)
-    there = known.curve.percent <= target.curve_percent and known.step.percent <= target.step_percent
-    if there and _settled(short):
+    if known.reaches(asked.target) and _settled(short):
         return Decision("enough", words=f"Enough is known. {_state(known)}", knowledge=known, short=short)
-    return _next(short, known, played, target, left_s, left_nm_s, largest_us)
+    return _next(short, known, np.asarray(played_us, float), asked)
 
 
-def _check(**numbers: float) -> None:
-    for name, value in numbers.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
-            raise BadRequest(f"{value!r} is no positive number", place=name, fix="Give a number from 0.")
-
-
-def _opening(largest_us: float, rate: float, left_s: float, left_nm_s: float, last: Earlier | None) -> Decision:
-    rise = largest_us * np.arange(1, round(RISE_S * rate) + 1) / round(RISE_S * rate)
-    widths = np.r_[
-        np.zeros(round(REST_S * rate)), rise, np.full(round(TOP_S * rate), largest_us), np.zeros(round(FALL_S * rate))
-    ]
-    dose = 0.0 if last is None else float(np.sum(np.abs(last.model.recruitment(widths))) / rate)
-    if widths.size / rate > left_s or dose > left_nm_s:
+def _opening(asked: Asked) -> Decision:
+    rate = asked.pulse_rate_hz
+    before, up, top, after = (round(seconds * rate) for seconds in (REST_S, RISE_S, TOP_S, FALL_S))
+    rise = asked.largest_us * np.arange(1, up + 1) / up
+    widths = np.r_[np.zeros(before), rise, np.full(top, asked.largest_us), np.zeros(after)]
+    dose = 0.0 if asked.earlier is None else float(np.sum(np.abs(asked.earlier.model.recruitment(widths))) / rate)
+    if widths.size / rate > asked.left_s or dose > asked.left_nm_s:
         return Decision("spent", words="The torque-time or the time that is left does not allow a first piece.")
     return Decision("next", (Piece("opening", widths).segment(1),), "A first look at the whole range.", None, dose)
 
@@ -210,21 +194,13 @@ def _settled(short: Short) -> bool:
     return short.grid.size * short.grid.step_s >= SETTLED_S
 
 
-def _next(
-    short: Short,
-    known: Knowledge,
-    played: np.ndarray,
-    target: Target,
-    left_s: float,
-    left_nm_s: float,
-    largest_us: float,
-) -> Decision:
+def _next(short: Short, known: Knowledge, played: np.ndarray, asked: Asked) -> Decision:
     rate = 1.0 / short.grid.step_s
-    foresight = Foresight.of(short, played, target)
-    candidates = pieces(_levels(short, known, largest_us), rate)
+    foresight = Foresight.of(short, played, asked.target)
+    candidates = pieces(_levels(short, known, asked.largest_us), rate)
     after, dose = foresight.after(candidates)
     seconds = np.array([piece.pulse_width_us.size for piece in candidates]) / rate
-    allowed = (dose <= left_nm_s) & (seconds <= left_s + 1e-9)
+    allowed = (dose <= asked.left_nm_s) & (seconds <= asked.left_s + 1e-9)
     if not allowed.any():
         return Decision(
             "spent", words=f"The torque-time or the time is used up. {_state(known)}", knowledge=known, short=short
@@ -261,6 +237,8 @@ def _state(known: Knowledge) -> str:
 
 SAMPLES = 10
 """Simulated samples per pulse."""
+NOISE_NM = 0.05
+"""White noise of a simulated sample."""
 USUAL = (SecondOrder(0.35, 0.9), ((1.0, 0.40, 0.05),)), (SecondOrder(0.45, 0.8), ((0.5, 0.30, 0.03), (0.5, 0.60, 0.04)))
 """Two muscles: dynamics, and groups of motor units: share, middle and width of their thresholds in largest widths."""
 
@@ -284,54 +262,29 @@ class Reach:
         return max(self.curve_percent, self.step_percent), self.torque_time_nm_s
 
 
-def reach(
-    *,
-    target: Target,
-    left_s: float,
-    left_nm_s: float,
-    largest_us: float,
-    plateau_nm: float,
-    noise_nm: float = 0.05,
-    pulse_rate_hz: float = 40.0,
-    earlier: Model | None = None,
-    change: Change | None = None,
-) -> Reach:
+def reach(asked: Asked, plateau_nm: float) -> Reach:
     """What an adaptive test can reach.
 
     Parameters
     ----------
-    target : Target
-        What must be known.
-    left_s, left_nm_s : float
-        Time, s, and torque-time, N·m·s, that the profile allows.
-    largest_us : float
-        Largest width that may be played, µs.
+    asked : Asked
+        What it is to find out, within which limits.
     plateau_nm : float
-        Torque at that width, N·m: from the calibration, or a guess. A known person's last model is used instead.
-    noise_nm : float
-        White noise of a sample of the load cell at ten samples per pulse, N·m.
-    pulse_rate_hz : float
-        Pulses a second.
-    earlier, change : Model, Change, optional
-        As for `decide`.
+        Torque at the largest width, N·m: from the calibration, or a guess. A known person's last model is used instead.
 
     Raises
     ------
     BadRequest
         A number that is none.
     """
-    for name, value in (("plateau_nm", plateau_nm), ("noise_nm", noise_nm)):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < float("inf"):
-            raise BadRequest(f"{value!r} is no positive number", place=name, fix="Give a number above 0, in N·m.")
-    limits = {"left_s": left_s, "left_nm_s": left_nm_s, "largest_us": largest_us, "pulse_rate_hz": pulse_rate_hz}
+    value = plateau_nm
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < float("inf"):
+        fix = "Give a number above 0, in N·m."
+        raise BadRequest(f"{value!r} is no positive number", place="plateau_nm", fix=fix)
+    earlier = asked.earlier
     if earlier is not None:
-        last = Earlier(earlier, change or Change())
-        muscles = [(last.linear, lambda u: np.abs(earlier.recruitment(u)))]
-    else:
-        muscles = [(linear, _curve(groups, largest_us, plateau_nm)) for linear, groups in USUAL]
-    known = {"earlier": earlier, "change": change} if earlier is not None else {}
-    tests = [_play(linear, curve, target, noise_nm, limits, known) for linear, curve in muscles]
-    return worse(tests)
+        return _play(earlier.linear, lambda u: np.abs(earlier.model.recruitment(u)), asked)
+    return worse([_play(linear, _curve(groups, asked.largest_us, plateau_nm), asked) for linear, groups in USUAL])
 
 
 def worse(tests: Sequence[Reach]) -> Reach:
@@ -353,25 +306,22 @@ def _curve(groups: Groups, largest_us: float, plateau_nm: float) -> Curve:
     return curve
 
 
-def _play(linear: SecondOrder, curve: Curve, target: Target, noise_nm: float, limits: dict, known: dict) -> Reach:
-    rate = limits["pulse_rate_hz"]
+def _play(linear: SecondOrder, curve: Curve, asked: Asked) -> Reach:
+    rate, target = asked.pulse_rate_hz, asked.target
     widths, record, decision, dose = np.zeros(0), None, None, 0.0
     while True:
-        left = limits | {
-            "left_s": max(limits["left_s"] - widths.size / rate, 0.0),
-            "left_nm_s": max(limits["left_nm_s"] - dose, 0.0),
-        }
-        decision = decide(record, widths, target=target, before=decision, **left, **known)
+        left_s, left_nm_s = max(asked.left_s - widths.size / rate, 0.0), max(asked.left_nm_s - dose, 0.0)
+        decision = decide(record, widths, replace(asked, left_s=left_s, left_nm_s=left_nm_s), decision)
         if decision.kind != "next":
             return _reached(decision, target, widths.size / rate, dose)
         widths = np.r_[widths, *(segment.settings["pulse_width_us"] for segment in decision.segments)]
         dose = float(np.sum(curve(widths))) / rate
-        if record is None and dose > limits["left_nm_s"]:
+        if record is None and dose > asked.left_nm_s:
             return _reached(Decision("spent"), target, 0.0, 0.0)
         drive = np.repeat(curve(widths), SAMPLES)
         torque = boundary_states(*linear.core, 1.0 / (rate * SAMPLES), drive)[0][:-1]
         # Always the same noise: the same question has one answer, and what was measured stays.
-        measured = torque + noise_nm * np.random.default_rng(1).standard_normal(torque.size)
+        measured = torque + NOISE_NM * np.random.default_rng(1).standard_normal(torque.size)
         time_s = np.arange(torque.size) / (rate * SAMPLES)
         record = Record.from_arrays(time_s, np.repeat(widths, SAMPLES), measured, pulse_rate_hz=rate)
 
@@ -381,7 +331,7 @@ def _reached(decision: Decision, target: Target, seconds: float, torque_time_nm_
         words = "The torque-time or the time that is left does not allow a first piece: nothing can be reached."
         return Reach(False, float("inf"), float("inf"), 0.0, 0.0, words)
     curve, step = decision.knowledge.curve.percent, decision.knowledge.step.percent
-    there = curve <= target.curve_percent and step <= target.step_percent
+    there = decision.knowledge.reaches(target)
     words = f"The target should be reached in about {seconds:.0f} s with {torque_time_nm_s:.0f} N·m·s."
     if not there:
         words = (

@@ -30,11 +30,10 @@ class Segment:
 
 @dataclass(frozen=True)
 class Design:
-    """A test: segments in order, and what people call it."""
+    """A test."""
 
-    name: str
-    words: str
-    segments: tuple[Segment, ...]
+    words: str  # what people call it
+    segments: tuple[Segment, ...]  # in order
 
     def pulse_widths(self, pulse_rate_hz: float) -> np.ndarray:
         """Pulse widths, one per pulse, µs."""
@@ -99,32 +98,27 @@ def designs(largest_us: float) -> list[Design]:
 
     stairs = Segment("staircase", "staircase", {"max_pulse_width_us": top, "levels": 6, "hold_s": 1.0, "down": True})
     return [
-        Design("ramp", "One more ramp", (rest(2), ramp(5), rest(2))),
-        Design("fast ramp", "A fast ramp", (rest(2), ramp(1.5), rest(2))),
+        Design("One more ramp", (rest(2), ramp(5), rest(2))),
+        Design("A fast ramp", (rest(2), ramp(1.5), rest(2))),
+        Design("Two ramps with a short rest between them", (rest(2), ramp(4), rest(2), ramp(4), rest(2))),
+        Design("A fast ramp and a slow one", (rest(2), ramp(1.5), rest(2), ramp(6), rest(2))),
+        Design("A ramp, a long rest, a ramp", (rest(2), ramp(4), rest(15), ramp(4), rest(2))),
+        Design("Steps on and off", (rest(2), steps(1.0, 1.5, 4), rest(2))),
         Design(
-            "repeated ramp", "Two ramps with a short rest between them", (rest(2), ramp(4), rest(2), ramp(4), rest(2))
-        ),
-        Design("two speeds", "A fast ramp and a slow one", (rest(2), ramp(1.5), rest(2), ramp(6), rest(2))),
-        Design("ramps and rest", "A ramp, a long rest, a ramp", (rest(2), ramp(4), rest(15), ramp(4), rest(2))),
-        Design("steps", "Steps on and off", (rest(2), steps(1.0, 1.5, 4), rest(2))),
-        Design(
-            "steps at levels",
             "Steps on and off at three levels",
             (rest(2), steps(0.8, 1.2, 2, 0.45), steps(0.8, 1.2, 2, 0.7), steps(0.8, 1.2, 2), rest(2)),
         ),
         Design(
-            "prbs at levels",
             "A short random sequence at each of three levels",
             (rest(2), prbs(0.45), rest(1), prbs(0.7), rest(1), prbs(1.0), rest(2)),
         ),
-        Design("staircase", "A staircase up and down", (rest(2), stairs, rest(2))),
-        Design("long step", "One long step", (rest(2), steps(6.0, 5.0, 1))),
+        Design("A staircase up and down", (rest(2), stairs, rest(2))),
+        Design("One long step", (rest(2), steps(6.0, 5.0, 1))),
         Design(
-            "conditioning",
             "A ramp, 10 s of stimulation, a ramp, a rest, a ramp",
             (rest(2), ramp(3), steps(10.0, 1.0, 1), ramp(3), rest(15), ramp(3), rest(2)),
         ),
-        Design("sham", "A test without stimulation", (rest(10, "sham"),)),
+        Design("A test without stimulation", (rest(10, "sham"),)),
     ]
 
 

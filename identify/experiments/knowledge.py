@@ -75,6 +75,10 @@ class Knowledge:
     step: Band  # response to a unit step
     plateau_nm: float  # f at the largest width, positive
 
+    def reaches(self, target: Target) -> bool:
+        """Whether both curves are known so well."""
+        return self.curve.percent <= target.curve_percent and self.step.percent <= target.step_percent
+
     def to_dict(self) -> dict:
         """Plain values for a page: bands in N·m and as shares."""
         unit = self.plateau_nm

@@ -10,8 +10,8 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.errors import BadRequest
-from stimrig.identify.estimation.earlier import USUAL, learn_change
-from stimrig.identify.experiments.adaptive import SETTLED_S, Reach, Target, decide, reach, worse
+from stimrig.identify.estimation.earlier import USUAL, Earlier, learn_change
+from stimrig.identify.experiments.adaptive import SETTLED_S, Asked, Reach, Target, decide, reach, worse
 from stimrig.identify.experiments.designs import pieces
 from stimrig.identify.records.record import Record
 from stimrig.rig.sequences import build
@@ -54,7 +54,7 @@ def test_the_rig_plays_every_piece_as_it_was_weighed():
 
 
 def test_the_first_piece_begins_at_rest_and_keeps_to_the_largest_width():
-    decision = decide(None, [], **LIMITS)
+    decision = decide(None, [], Asked(**LIMITS))
     widths = decision.segments[0].settings["pulse_width_us"]
     assert decision.kind == "next" and max(widths) <= 300.0
     assert not any(widths[:20])
@@ -91,7 +91,7 @@ def test_a_known_person_needs_less():
     first = played(muscle.another_day(np.random.default_rng(3)), 51_005)
     assert first.record is not None
     model = identify.fit(first.record, recruitment="near-sigmoid")
-    new, known = played(muscle, 51_004), played(muscle, 51_004, earlier=model)
+    new, known = played(muscle, 51_004), played(muscle, 51_004, earlier=Earlier(model))
     assert known.decision.kind == "enough"
     assert known.dose_nm_s(muscle) < new.dose_nm_s(muscle)
 
@@ -133,36 +133,36 @@ def test_torque_that_runs_away_is_never_enough(run_away):
     widths = np.r_[np.zeros(20), np.linspace(0.0, 300.0, 40), np.full(12, 300.0), np.zeros(20), np.full(100, 150.0)]
     time_s = np.arange(widths.size * 10) / 400.0
     torque = run_away(time_s) + noise(1)[: time_s.size]
-    decision = decide(Record.from_arrays(time_s, np.repeat(widths, 10), torque), widths, **LIMITS)
+    decision = decide(Record.from_arrays(time_s, np.repeat(widths, 10), torque), widths, Asked(**LIMITS))
     assert decision.kind == "misfit"
 
 
 @pytest.mark.slow
 def test_pulses_that_are_committed_beyond_the_record_count():
     muscle = sigmoid(51_007)
-    opening = np.array(decide(None, [], **LIMITS).segments[0].settings["pulse_width_us"])
+    opening = np.array(decide(None, [], Asked(**LIMITS)).segments[0].settings["pulse_width_us"])
     record = recorded(muscle, opening, ["opening"] * opening.size, noise(2))
-    decision = decide(record, np.r_[opening, np.full(40, 200.0)], **LIMITS)
+    decision = decide(record, np.r_[opening, np.full(40, 200.0)], Asked(**LIMITS))
     assert decision.kind == "next" and decision.expected_torque_time_nm_s >= 0.0
 
 
 @pytest.mark.slow
 def test_nothing_is_played_beyond_what_is_left():
     muscle = sigmoid(51_008)
-    opening = np.array(decide(None, [], **LIMITS).segments[0].settings["pulse_width_us"])
+    opening = np.array(decide(None, [], Asked(**LIMITS)).segments[0].settings["pulse_width_us"])
     record = recorded(muscle, opening, ["opening"] * opening.size, noise(3))
     for left in ({"left_s": 0.5}, {"left_s": 0.5, "left_nm_s": 0.0}):
-        assert decide(record, opening, **(LIMITS | left)).kind == "spent"
-    modest = decide(record, opening, **(LIMITS | {"left_nm_s": 0.5}))
+        assert decide(record, opening, Asked(**(LIMITS | left))).kind == "spent"
+    modest = decide(record, opening, Asked(**(LIMITS | {"left_nm_s": 0.5})))
     assert modest.kind == "spent" or modest.expected_torque_time_nm_s <= 0.5
-    assert decide(None, [], **(LIMITS | {"left_s": 1.0})).kind == "spent"
+    assert decide(None, [], Asked(**(LIMITS | {"left_s": 1.0}))).kind == "spent"
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -1.0, True, "2"])
 def test_numbers_that_are_none_are_refused(wrong):
     for name in ("left_s", "left_nm_s", "largest_us"):
         with pytest.raises(BadRequest, match="is no positive number"):
-            decide(None, [], **(LIMITS | {name: wrong}))
+            decide(None, [], Asked(**(LIMITS | {name: wrong})))
     for name in ("curve_percent", "step_percent"):
         with pytest.raises(BadRequest, match="is no target"):
             Target(**{name: wrong})
@@ -170,13 +170,13 @@ def test_numbers_that_are_none_are_refused(wrong):
 
 @pytest.mark.slow
 def test_what_cannot_be_reached_is_said_before_the_first_pulse():
-    few = reach(target=Target(1.0, 1.0), left_s=5.0, left_nm_s=100.0, largest_us=300.0, plateau_nm=6.0)
+    few = reach(Asked(Target(1.0, 1.0), 5.0, 100.0, 300.0), 6.0)
     assert not few.reachable and few.curve_percent > 1.0 and "out of reach" in few.words
     assert few.seconds <= 5.0
-    none = reach(target=Target(), left_s=1.0, left_nm_s=100.0, largest_us=300.0, plateau_nm=6.0)
+    none = reach(Asked(Target(), 1.0, 100.0, 300.0), 6.0)
     assert not none.reachable and none.seconds == 0.0
     with pytest.raises(BadRequest, match="plateau_nm"):
-        reach(target=Target(), left_s=30.0, left_nm_s=100.0, largest_us=300.0, plateau_nm=math.nan)
+        reach(Asked(Target(), 30.0, 100.0, 300.0), math.nan)
 
 
 def test_of_two_muscles_that_reach_the_target_the_one_that_takes_more_is_told():

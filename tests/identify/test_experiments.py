@@ -12,7 +12,7 @@ from stimrig.rig.sequences import build
 from tests.identify import hidden_muscles
 
 
-@pytest.mark.parametrize("design", designs(300.0), ids=lambda d: d.name)
+@pytest.mark.parametrize("design", designs(300.0), ids=lambda d: d.words)
 def test_the_rig_plays_what_was_simulated(design):
     for segment in design.segments:
         played = build(segment.sequence, segment.settings, 40.0)
@@ -27,5 +27,5 @@ def test_hysteresis_and_drift_are_told_apart_by_another_ramp():
     assert found.decides and "ramp" in found.text
     assert found.duration_s < 40.0 and found.dose["pulses"] > 0
     assert max(s["settings"].get("max_pulse_width_us", 0.0) for s in found.segments) <= 300.0
-    sham = next(design for design in designs(300.0) if design.name == "sham").pulse_widths(40.0)
+    sham = next(design for design in designs(300.0) if design.words == "A test without stimulation").pulse_widths(40.0)
     assert expected_log_evidence(sham, record, fits) < found.expected_log_evidence
