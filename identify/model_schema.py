@@ -48,18 +48,6 @@ def maybe(inner: Check) -> Check:
     return check
 
 
-def either(first: Check, second: Check) -> Check:
-    """One of two checks; the message is that of the second."""
-
-    def check(value: Any, place: str) -> None:
-        try:
-            first(value, place)
-        except BadModel:
-            second(value, place)
-
-    return check
-
-
 def several(inner: Check, least: int = 0, most: int = LONGEST, rising: bool = False) -> Check:
     """A list whose values all pass the inner check."""
 
@@ -133,7 +121,7 @@ STATISTICS = (
     "fit_percent", "ceiling_percent", "rms_nm", "noise_sd_nm", "held_out_fit_percent", "held_out_ceiling_percent",
     "held_out_rms_nm",
 )  # fmt: skip
-PAIR = either(maybe(ANY), several(maybe(ANY), 2, 2))
+
 COEFFICIENTS = several(ANY, 1, 2 * MOST_KNOTS)
 BASIS = kinds(
     {
@@ -166,6 +154,14 @@ LINEAR = kinds(
 )  # fmt: skip
 PLAUSIBLE = 1e6
 """Larger than any torque, N·m, or time, s, in a record."""
+
+
+def pair(value: Any, place: str) -> None:
+    """A number or null, or two of them."""
+    try:
+        STATISTIC(value, place)
+    except BadModel:
+        several(STATISTIC, 2, 2)(value, place)
 
 
 def sign(value: Any, place: str) -> None:
@@ -268,7 +264,7 @@ MODEL = fields(
         "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),
         "fit": fields({}, dict.fromkeys(STATISTICS, STATISTIC) | {"unexplained_nm": number(0.0, 1e300)}),
         "residual_tests": each(each(anything)),
-        "valid_for": each(PAIR),
+        "valid_for": each(pair),
         "quality": fields(
             {},
             {

@@ -113,7 +113,6 @@ def score(record: Record, clean_nm: np.ndarray, method: str, **options: Any) -> 
 def table1(
     trials: int = 100,
     progress: Callable[[float, str], Any] | None = None,
-    sample_rate_hz: float = 40.0,
     noise_levels_nm: tuple[float, ...] = NOISE_NM,
 ) -> dict[str, Any]:
     """Compute the table.
@@ -124,10 +123,8 @@ def table1(
         Records per noise level (without noise: one, since all would be equal).
     progress : callable, optional
         Called with the share done, 0 to 1, and a line of text.
-    sample_rate_hz : float
-        Sampling rate, Hz; the paper uses 1600 Hz, with 40 pulses/s.
     noise_levels_nm : tuple of float
-        Standard deviations of the output noise, N·m.
+        Standard deviations of the output noise, N·m, at 40 samples a second; the paper has 1600, with 40 pulses/s.
 
     Returns
     -------
@@ -139,7 +136,7 @@ def table1(
     total, done = len(noise_levels_nm) * len(OURS), 0
     for level in noise_levels_nm:
         count = trials if level > 0 else 1
-        records = [simulate(level, FIRST_SEED + trial, sample_rate_hz) for trial in range(count)]
+        records = [simulate(level, FIRST_SEED + trial) for trial in range(count)]
         for method in OURS:
             scores = []
             for trial, (record, clean) in enumerate(records):
@@ -151,7 +148,7 @@ def table1(
     return {
         "rows": rows,
         "trials": trials,
-        "sample_rate_hz": sample_rate_hz,
+        "sample_rate_hz": PULSE_RATE_HZ,
         "unit": "best fit, % (mean over trials); noise in N·m",
         "scored_on": "ours and ceiling: the noisy ramp; clean: the ramp without noise; unseen: multi-level, no noise",
         "explained_in": "docs/results/table1.md",

@@ -278,17 +278,14 @@ def worst_places(
         As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
     """
     length = max(round(STRETCH_S * record.sample_rate_hz), 1)
-    rising = direction_of(record)
-    excess_total, pieces = 0.0, []
+    rising, pieces = direction_of(record), []
     for run in np.split(np.arange(record.time_s.size), np.flatnonzero(np.diff(record.segment)) + 1):
-        for start in range(int(run[0]), int(run[-1]) + 1, length):
-            stop = min(start + length, int(run[-1]) + 1)
-            take = np.arange(start, stop)[rows[start:stop]]
-            if take.size < 2:
-                continue
-            excess = float(np.sum(residual_nm[take] ** 2) - take.size * noise_sd_nm**2)
-            excess_total += max(excess, 0.0)
-            pieces.append([start, stop, excess, int(np.sign(np.sum(rising[take])))])
+        for part in np.split(run, range(length, run.size, length)):
+            take = part[rows[part]]
+            if take.size >= 2:
+                excess = float(np.sum(residual_nm[take] ** 2) - take.size * noise_sd_nm**2)
+                pieces.append([int(part[0]), int(part[-1]) + 1, excess, int(np.sign(np.sum(rising[take])))])
+    excess_total = sum(max(piece[2], 0.0) for piece in pieces)
     if excess_total <= 0.0:
         return []
     merged = sorted(_merge(pieces, record), key=lambda piece: -piece[2])

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -175,9 +175,9 @@ def _misfit(short: Short) -> str | None:
     """Why the structure does not describe the record; None if it does, or if it is too early to say."""
     if not _finite(short):
         return "The estimate is not finite."
-    return (
-        _left(averaged(short, mean_of_draws=False), short.grid.mean_noise_nm(short.rows)) if _settled(short) else None
-    )
+    if not _settled(short):
+        return None
+    return _left(averaged(short, mean_of_draws=False), short.grid.mean_noise_nm(short.rows))
 
 
 def _left(fitted: Fitted, white_nm: float) -> str | None:
@@ -297,13 +297,10 @@ Groups = tuple[tuple[float, float, float], ...]
 
 
 def _curve(groups: Groups, largest_us: float, plateau_nm: float) -> Curve:
-    def curve(width_us: np.ndarray) -> np.ndarray:
-        x = np.asarray(width_us, float) / largest_us
-        total = sum(share * (np.tanh(0.5 * (x - middle) / width) + 1.0) / 2.0 for share, middle, width in groups)
-        start = sum(share * (np.tanh(-0.5 * middle / width) + 1.0) / 2.0 for share, middle, width in groups)
-        return np.asarray(plateau_nm * (total - start))
+    def recruited(x: Any) -> Any:
+        return sum(share * (np.tanh(0.5 * (x - middle) / width) + 1.0) / 2.0 for share, middle, width in groups)
 
-    return curve
+    return lambda width_us: plateau_nm * (recruited(np.asarray(width_us, float) / largest_us) - recruited(0.0))
 
 
 def _play(linear: SecondOrder, curve: Curve, asked: Asked) -> Reach:

@@ -136,10 +136,8 @@ def _curve(model: Model, largest_us: float | None, whole: bool) -> tuple[float, 
     widest_us = min(valid_us, float(width_us[-1]), np.inf if largest_us is None else largest_us)
     widest_us = float(np.floor(widest_us)) if whole else widest_us
     inside = width_us < widest_us
-    width_us, torque_nm = (
-        np.r_[width_us[inside], widest_us],
-        np.r_[torque_nm[inside], np.interp(widest_us, width_us, torque_nm)],
-    )
+    torque_nm = np.r_[torque_nm[inside], np.interp(widest_us, width_us, torque_nm)]
+    width_us = np.r_[width_us[inside], widest_us]
     if not np.max(sign * torque_nm) > 1e-9:
         raise BadModel(
             f"the model gives no torque up to {widest_us:g} µs", place="largest_us", fix="Allow wider pulses."

@@ -42,9 +42,8 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         )
     linear = SecondOrder(1.0 / frequency, 1.0)
     drive, baseline = deconvolved(grid, ramp, linear)
-    width = grid.pulse_width_us
-    rising = ramp & (np.gradient(width) > 0)
-    falling = ramp & (np.gradient(width) < 0)
+    width, slope = grid.pulse_width_us, np.gradient(grid.pulse_width_us)
+    halves = {"rising": ramp & (slope > 0), "falling": ramp & (slope < 0)}
     curve = fit_points(width[ramp], drive[ramp])
     residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
     rows = near_rest(grid, ramp)
@@ -58,7 +57,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         baseline_nm=baseline,
         noise=Noise(block_sd_nm=float(np.std(residual[rows])), ar1=ar1, delta_bic=delta_bic),
         reasons=(f"given dynamics: critically damped, {frequency:.4g} rad/s",),
-        extra={"deconvolved": {"rising": _curve(width, drive, rising), "falling": _curve(width, drive, falling)}},
+        extra={"deconvolved": {half: _curve(width[rows], drive[rows]) for half, rows in halves.items()}},
     )
     return completed(model, grid, rows, 5.0)
 
@@ -104,9 +103,6 @@ def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.n
     return columns @ np.linalg.solve(gram + penalty, moment)[:size], baseline
 
 
-def _curve(width_us: np.ndarray, drive_nm: np.ndarray, rows: np.ndarray) -> dict[str, list[float]]:
-    order = np.argsort(width_us[rows])
-    return {
-        "pulse_width_us": [float(x) for x in width_us[rows][order]],
-        "torque_nm": [float(x) for x in drive_nm[rows][order]],
-    }
+def _curve(width_us: np.ndarray, drive_nm: np.ndarray) -> dict[str, list[float]]:
+    order = np.argsort(width_us)
+    return {"pulse_width_us": width_us[order].tolist(), "torque_nm": drive_nm[order].tolist()}

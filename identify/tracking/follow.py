@@ -81,11 +81,6 @@ class Step:
     effects: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
-    def coming_effects(self) -> dict[str, float]:
-        """By effect id, its slow state as expected at the begin of the next trial."""
-        return {effect: states["coming"] for effect, states in self.effects.items()}
-
-    @property
     def disturbed_s(self) -> list[list[float]]:
         """Stretches from which nothing should be learnt, s since the record's begin: all of a trial that is odd."""
         if self.outcome in (Outcome.ODD, Outcome.NO_TORQUE, Outcome.CONTRADICTS):
@@ -120,10 +115,9 @@ def levels_of(state: State) -> dict[str, dict[str, float]]:
     return found
 
 
-def begin(model: Model, rates: Rates = USUAL, test: Record | None = None) -> State:
-    """What is expected of the first trial after an approval; with the record of the `test`, what that has done."""
-    state = State.start(curve_covariance(model), rates)
-    return state if test is None else passed(model, state, test)
+def begin(model: Model, rates: Rates = USUAL) -> State:
+    """What is expected of the first trial after an approval."""
+    return State.start(curve_covariance(model), rates)
 
 
 def follow(
@@ -193,15 +187,15 @@ def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Mo
         nevertheless: one that was held would be taken for a change of the others. By default all move freely.
         Whether the expected values themselves are inside, the caller has to look.
     """
-    coming = step.coming
+    coming, effects = step.coming, {effect: states["coming"] for effect, states in step.effects.items()}
     if bounds is None:
-        return moved_model(model, coming.values, coming.curve_nm, step.coming_effects)
+        return moved_model(model, coming.values, coming.curve_nm, effects)
     values = replace(Values(), **{name: getattr(coming.values, name) for name in QUANTITIES if name in bounds})
     low, high = bounds.get("gain", (1.0, 1.0))
     # The torque of every pulse stays within what the gain may be; if it does not, the curve keeps its shape.
     away = values.gain * largest_change(model, coming.curve_nm)
     inside = low <= values.gain - away and values.gain + away <= high
-    return moved_model(model, values, coming.curve_nm if inside else 0.0, step.coming_effects)
+    return moved_model(model, values, coming.curve_nm if inside else 0.0, effects)
 
 
 # ---- the approved model as it stands now ----

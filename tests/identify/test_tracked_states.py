@@ -125,7 +125,7 @@ def test_on_its_own_record_a_model_begins_rested(plain: Model, tested: Record) -
 
 def test_state_and_model_come_back_from_their_files(plain: Model) -> None:
     model = having(plain, "fatigue", "fitness")
-    step = follow(model, begin(model, test=record_of(WIDTHS, 100.0)), trial_of(model), rest_s=20.0)
+    step = follow(model, passed(model, begin(model), record_of(WIDTHS, 100.0)), trial_of(model), rest_s=20.0)
     back = State.from_dict(json.loads(json.dumps(step.coming.to_dict())))
     assert back.effects == step.coming.effects and back.ended_s == step.coming.ended_s
     moved = Model.from_json(model_for_next(model, step).to_json())
@@ -143,7 +143,7 @@ def trial_of(model: Model, begun_s: float | None = None) -> Record:
 def test_rests_are_told_by_the_clocks_of_the_records(plain: Model) -> None:
     model = having(plain, "fatigue", "fitness")
     span_s = WIDTHS.size / 40.0
-    tested = begin(model, test=record_of(WIDTHS, 1000.0))
+    tested = passed(model, begin(model), record_of(WIDTHS, 1000.0))
     assert tested.ended_s == pytest.approx(1000.0 + span_s, abs=1e-6)
     by_clock = follow(model, tested, trial_of(model, 1000.0 + span_s + 30.0))
     given = follow(model, tested, trial_of(model), rest_s=30.0)
@@ -169,7 +169,7 @@ def test_the_tracked_gain_takes_part_in_what_tires(plain: Model) -> None:
 
 def test_a_model_without_such_effects_is_followed_as_ever(plain: Model) -> None:
     record = trial_of(plain, 1000.0)
-    step = follow(plain, begin(plain, test=record), record)
+    step = follow(plain, passed(plain, begin(plain), record), record)
     other = follow(plain, None, record, rest_s=7.0)
     assert slow_forms(plain) == {} and step.effects == {} and step.coming.ended_s is None
     assert step.to_dict() == other.to_dict()
@@ -214,7 +214,7 @@ def test_the_next_trial_is_foretold_better_with_the_states(effect: str, changes:
     test = person.play(_test_widths())
     model = fit(test, effects=[effect])
     widths = np.r_[np.zeros(40), np.linspace(60.0, 170.0, 160), np.full(160, 170.0), np.full(80, 110.0), np.zeros(40)]
-    carried, forgot = begin(model, test=test), begin(model)
+    carried, forgot = passed(model, begin(model), test), begin(model)
     errors = []
     # The test hardly shows how it recovers (190 s, sd 70): soon after it that hardly matters.
     for rest_s in (10.0, 10.0, 60.0, 120.0, 10.0, 150.0):
