@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stimrig.identify import model_schema
-from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, linear_from_dict
+from stimrig.identify.dynamics.linear import Linear, SecondOrder, linear_from_dict
 from stimrig.identify.errors import BadModel
 from stimrig.identify.json_text import BadJson, json_value, parse
 from stimrig.identify.recruitment import Curve, basis_from_dict, landmarks
@@ -337,5 +337,3 @@ def _span(value: Any, unit: str) -> str:
     low, high = value if isinstance(value, list | tuple) else (value, value)
     return f"{quantity(low, '')} to {quantity(high, unit)}"
 
-
-__all__ = ["SCHEMA_VERSION", "Covariance", "Discrete", "Model", "Noise", "SecondOrder"]

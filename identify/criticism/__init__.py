@@ -75,7 +75,7 @@ def compare(model: Model, record: Record) -> Comparison:
     return Comparison(
         **whole,
         noise_sd_nm=noise,
-        **again,
+        repetition=again["repetition"],
         fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
         by=_error_shares(record, residual, noise, counted),

@@ -107,12 +107,9 @@ class Step:
 
 def levels_of(state: State) -> dict[str, dict[str, float]]:
     """`value`, `low` and `high` (95 %) of each tracked quantity."""
-    values = state.values
-    found = {}
-    for place, name in enumerate(QUANTITIES):
-        low, high = state.band(place)
-        found[name] = {"value": float(getattr(values, name)), "low": low, "high": high}
-    return found
+    mean, half = state.mean[:LEVELS], 1.96 * np.sqrt(np.diag(state.covariance)[:LEVELS])
+    ends = {"value": state.values, "low": Values.of(mean - half), "high": Values.of(mean + half)}
+    return {name: {end: getattr(values, name) for end, values in ends.items()} for name in QUANTITIES}
 
 
 def begin(model: Model, rates: Rates = USUAL) -> State:

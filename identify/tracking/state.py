@@ -109,12 +109,6 @@ class State:
         """Places of what a trial sees of: levels and curve, not the trends."""
         return np.r_[np.arange(LEVELS), np.arange(CURVE, self.mean.size)]
 
-    def band(self, quantity: int, sds: float = 1.96) -> tuple[float, float]:
-        """Lower and upper end of a quantity's band, in its unit."""
-        half = sds * float(np.sqrt(self.covariance[quantity, quantity]))
-        ends = np.array([self.mean[quantity] - half, self.mean[quantity] + half])
-        low, high = ends if QUANTITIES[quantity].endswith("_us") else np.exp(ends)
-        return float(low), float(high)
 
     def ahead(self, rates: Rates = USUAL) -> State:
         """Before the next trial."""
