@@ -336,4 +336,3 @@ def _parameters(values: dict[str, Any], most: int = 4) -> str:
 def _span(value: Any, unit: str) -> str:
     low, high = value if isinstance(value, list | tuple) else (value, value)
     return f"{quantity(low, '')} to {quantity(high, unit)}"
-

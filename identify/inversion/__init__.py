@@ -14,7 +14,7 @@ from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
 from stimrig.identify.simulation.joint_surface import Surfaces
-from stimrig.identify.simulation.pulses import Motion, above_rest
+from stimrig.identify.simulation.pulses import above_rest
 
 __all__ = ["Inversion", "Reference", "invert"]
 
@@ -123,16 +123,15 @@ def invert(
         A limit is not a positive number.
     """
     plant = Plant.of(model, reference, largest_us, rise_us, whole)
-    rate_hz, motion = reference.pulse_rate_hz, reference.motion
-    joint = _Joint.of(model, motion, plant.sign, rate_hz)
-    wanted = plant.sign * reference.torque_nm
-    needed = joint.active(wanted)
+    wanted, motion = plant.sign * reference.torque_nm, reference.motion
+    gain, passive_nm = _joint(model, reference, plant.sign)
+    needed = (wanted - passive_nm) / gain  # what the muscle has to give at the model's own angle
     demand, best, least = np.zeros(wanted.size), None, np.inf
     target, idle = needed, 0
     for _ in range(TURNS):
         demand = best_demand(plant.a, plant.b, target, plant.largest_nm, plant.rises(demand))
         widths = plant.widths(demand)
-        got = plant.sign * above_rest(model, widths, rate_hz, motion)
+        got = plant.sign * above_rest(model, widths, reference.pulse_rate_hz, motion)
         error = wanted - got
         left = float(np.sqrt(np.mean(error**2)))
         idle = idle + 1 if left > GAIN * least else 0
@@ -140,7 +139,7 @@ def invert(
             best, least = (demand, widths, got), left
         if idle > 1 or left < ENOUGH * plant.largest_nm or (not model.effects and rise_us is None):
             break
-        target = plant.linear(demand) + STEP * error / joint.gain
+        target = plant.linear(demand) + STEP * error / gain
     assert best is not None
     return _judged(plant, reference, needed, *best)
 
@@ -149,27 +148,17 @@ LEAST_GAIN = 0.05
 """Where less than this share of the torque is left, stimulation is not the way to have more of it."""
 
 
-@dataclass(frozen=True)
-class _Joint:
-    """g and h along a movement, shape (K,) or one for all."""
+def _joint(model: Model, reference: Reference, sign: float) -> tuple[np.ndarray | float, np.ndarray | float]:
+    """g at each pulse, at least `LEAST_GAIN`, and h, N·m above rest and positive in the direction of pull.
 
-    gain: np.ndarray | float = 1.0  # g at each pulse, at least `LEAST_GAIN`
-    passive_nm: np.ndarray | float = 0.0  # torque without any pulse, above rest, positive in the direction of pull
-
-    @classmethod
-    def of(cls, model: Model, motion: Motion | None, sign: float, pulse_rate_hz: float) -> _Joint:
-        """Along a movement; that of a joint held still without one. Raises BadModel as `above_rest`."""
-        surfaces = Surfaces.of(model.effects)
-        if surfaces is None:
-            return cls()
-        size = 1 if motion is None else motion.angle_rad.size
-        passive_nm = sign * above_rest(model, np.zeros(size), pulse_rate_hz, motion)
-        assert motion is not None  # `above_rest` has refused
-        return cls(np.maximum(surfaces.g(motion.angle_rad, motion.velocity_rad_s), LEAST_GAIN), passive_nm)
-
-    def active(self, wanted_nm: np.ndarray) -> np.ndarray:
-        """What the muscle has to give at the model's own angle, for a whole torque, N·m, shape (K,)."""
-        return (wanted_nm - self.passive_nm) / self.gain
+    Of a model that does not depend on the joint 1 and 0. Raises BadModel as `above_rest`.
+    """
+    surfaces, motion = Surfaces.of(model.effects), reference.motion
+    if surfaces is None:
+        return 1.0, 0.0
+    passive_nm = sign * above_rest(model, np.zeros(reference.torque_nm.size), reference.pulse_rate_hz, motion)
+    assert motion is not None  # `above_rest` has refused
+    return np.maximum(surfaces.g(motion.angle_rad, motion.velocity_rad_s), LEAST_GAIN), passive_nm
 
 
 # ---- where and why it is not reached ----

@@ -50,11 +50,6 @@ class Reference:
         """How the joint moves; None where nothing says so."""
         return None if self.angle_rad is None else Motion.of(self.angle_rad, self.pulse_rate_hz)
 
-    @property
-    def time_s(self) -> np.ndarray:
-        """Time of each pulse from the first, s, shape (K,)."""
-        return np.arange(self.torque_nm.size) / self.pulse_rate_hz
-
     @classmethod
     def of(
         cls,

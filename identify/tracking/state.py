@@ -109,7 +109,6 @@ class State:
         """Places of what a trial sees of: levels and curve, not the trends."""
         return np.r_[np.arange(LEVELS), np.arange(CURVE, self.mean.size)]
 
-
     def ahead(self, rates: Rates = USUAL) -> State:
         """Before the next trial."""
         move = np.eye(self.mean.size)
