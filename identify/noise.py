@@ -93,7 +93,7 @@ def _search(
     lower = np.array([np.log(SHORTEST), 0.0, turns[0], np.log(0.0008), 0.001])
     upper = np.array([0.0, 1.0, turns[1], np.log(0.12), 0.999])
     step = wide * np.array([1.5, 0.4, 0.12, 1.5, 0.4])
-    x, sd, log_likelihood = profile_band(residual, *stretches, np.clip(x, lower, upper), lower, upper, step, least)
+    x, sd, log_likelihood = _profile_band(residual, *stretches, np.clip(x, lower, upper), lower, upper, step, least)
     noise = NoiseLevel(
         ar1=float(1.0 - np.exp(x[0])),
         share=float(x[1] * (1.0 - x[4])),
@@ -109,16 +109,13 @@ def _search(
 
 def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tuple[NoiseLevel, float]:
     """The most likely noise with a narrow band between 2.8 and 14.5 Hz, and its log-likelihood."""
-    best: tuple[NoiseLevel, float] | None = None
     turns = (2 * np.pi * LOWEST_HZ * step_s, 2 * np.pi * min(HIGHEST_HZ, 0.42 / step_s) * step_s)
+    found = []
     for frequency_hz in _peaks(residual, stretches, step_s):
         for width_hz in (0.1, 0.7):
             x = np.array([np.log(0.3), 0.5, 2 * np.pi * frequency_hz * step_s, np.log(np.pi * width_hz * step_s), 0.5])
-            found = _search(residual, stretches, x, 1.0, 0.05, turns)
-            if best is None or found[1] > best[1]:
-                best = found
-    assert best is not None
-    return best
+            found.append(_search(residual, stretches, x, 1.0, 0.05, turns))
+    return max(found, key=lambda one: one[1])
 
 
 def _peaks(residual: np.ndarray, stretches: Stretches, step_s: float) -> list[float]:
@@ -140,10 +137,10 @@ def _peaks(residual: np.ndarray, stretches: Stretches, step_s: float) -> list[fl
 
 
 def whitened(rows: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> np.ndarray:
-    """Rows, shape (M, K), whitened to unit variance; the fitted intervals in order."""
+    """Rows on the grid, shape (M, K), whitened to unit variance; the fitted intervals in order, shape (M, F)."""
     if noise.band <= 0.0:
-        return whiten_rows(rows, *stretches, noise.ar1, noise.share)[0] / noise.sd_nm
-    white, _ = whiten_band(rows, *stretches, noise.ar1, noise.share, noise.turn, noise.keep, noise.band)
+        return _whiten_rows(rows, *stretches, noise.ar1, noise.share) / noise.sd_nm
+    white, _ = _whiten_band(rows, *stretches, noise.ar1, noise.share, noise.turn, noise.keep, noise.band)
     return white / noise.sd_nm
 
 
@@ -151,7 +148,7 @@ def band_part(residual: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> 
     """The narrow band's part of a residual; zero in intervals that were not fitted."""
     if noise.band <= 0.0:
         return np.zeros(residual.size)
-    return smooth_band(residual, *stretches, noise.ar1, noise.share, noise.turn, noise.keep, noise.band)
+    return _smooth_band(residual, *stretches, noise.ar1, noise.share, noise.turn, noise.keep, noise.band)
 
 
 # ---- kernels: white plus slow, then with a band -------------------------------------------------------------------
@@ -168,12 +165,6 @@ def _whiten_means(rows, start, stop, ar1, mean, total):  # pragma: no cover
     """Innovations of means of slow noise, x[k] = ar1 x[k-1] + e[k] + mean e[k-1], by the innovations algorithm."""
     white = np.empty((rows.shape[0], total))
     first = _ratio(ar1, mean)
-    logdet = 0.0
-    for i in range(start.size):
-        r = first
-        for _ in range(stop[i] - start[i]):
-            logdet += 0.5 * np.log(r / first)
-            r = 1.0 + mean * mean - mean * mean / r
     for m in range(rows.shape[0]):
         f = 0
         for i in range(start.size):
@@ -184,51 +175,24 @@ def _whiten_means(rows, start, stop, ar1, mean, total):  # pragma: no cover
                 x = ar1 * rows[m, k] + mean * e / r
                 r = 1.0 + mean * mean - mean * mean / r
                 f += 1
-    return white, logdet
+    return white
 
 
 @njit(cache=True, nogil=True)
-def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
-    """Innovations of white plus AR(1) noise, scaled to equal variance, by an exact Kalman filter.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (M, K)
-        Residuals or derivatives on the grid.
-    start, stop : ndarray of int, shape (S,)
-        Stretches of fitted intervals.
-    ar1 : float
-        Correlation of neighbours of the slow part.
-    share : float
-        Share of the variance that is slow, 0 … 1; the rest is white. Above 1: means of slow noise over an interval,
-        which are smoother than its values at single times.
-
-    Returns
-    -------
-    white : ndarray, shape (M, F)
-        Fitted intervals in order, unit variance where the total variance is 1.
-    half_log_det : float
-        0.5 log det of the correlation matrix.
-    """
-    total = np.int64(0)  # typed: `_whiten_means` is compiled once
-    for i in range(start.size):
-        total += stop[i] - start[i]
+def _whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
+    """Innovations of white plus AR(1) noise, scaled to equal variance, by an exact Kalman filter."""
+    total = np.sum(stop - start)
     if share > 1.0:
         return _whiten_means(rows, start, stop, ar1, (share - 1.0) * MEAN_OF_SLOW, total)
-    white = np.empty((rows.shape[0], total))
-    gain = np.empty(total)
-    scale = np.empty(total)
-    logdet = 0.0
+    white, gain, scale = np.empty((rows.shape[0], total)), np.empty(total), np.empty(total)
     f = 0
     noise = (1.0 - ar1 * ar1) * share
     for i in range(start.size):
         p = share
         for _ in range(stop[i] - start[i]):
-            s = p + 1.0 - share
-            s = max(s, 1e-12)
+            s = max(p + 1.0 - share, 1e-12)
             gain[f] = p / s
             scale[f] = 1.0 / np.sqrt(s)
-            logdet += 0.5 * np.log(s)
             p = ar1 * ar1 * (p - p * p / s) + noise
             f += 1
     for m in range(rows.shape[0]):
@@ -240,7 +204,7 @@ def whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
                 white[m, f] = e * scale[f]
                 x = ar1 * (x + gain[f] * e)
                 f += 1
-    return white, logdet
+    return white
 
 
 @njit(cache=True, nogil=True)
@@ -298,6 +262,10 @@ def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
     return 0.5 * total * np.log(variance) + logdet, variance
 
 
+STEPS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+"""In what directions of log(1 - ar1) and share a pattern search looks."""
+
+
 @njit(cache=True, nogil=True)
 def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
     """The most likely correlation and slow share of a residual, by a pattern search from the given start.
@@ -307,32 +275,23 @@ def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
     ar1, share, sd, log_likelihood : float
         `sd` is the total standard deviation, slow and white together.
     """
-    total = 0
-    for i in range(start.size):
-        total += stop[i] - start[i]
+    total = np.sum(stop - start)
     # a = log(1 - ar1), from log(SHORTEST) (long memory) to 0 (none).
     low, high = np.log(SHORTEST), 0.0
     a, b = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high), min(max(share, 0.0), 2.0)
     best, variance = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
-    for guess_a, guess_b in (
-        (np.log(0.3), 0.9),
-        (np.log(0.03), 0.3),
-        (np.log(0.03), 1.0),
-        (np.log(0.5), 0.02),
-        (np.log(0.3), 1.7),
-    ):
+    for forgotten, guess_b in ((0.3, 0.9), (0.03, 0.3), (0.03, 1.0), (0.5, 0.02), (0.3, 1.7)):
         if not wide:
             break
+        guess_a = np.log(forgotten)
         value, squares = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
         if value < best:
             best, a, b, variance = value, guess_a, guess_b, squares
     da, db = (0.6, 0.2) if wide else (0.15, 0.05)
     while da > 0.01:
         moved = False
-        for i in range(8):
-            na = a + da * (1.0 if i in (0, 4, 5) else -1.0 if i in (1, 6, 7) else 0.0)
-            nb = b + db * (1.0 if i in (2, 4, 6) else -1.0 if i in (3, 5, 7) else 0.0)
-            na, nb = min(max(na, low), high), min(max(nb, 0.0), 2.0)
+        for to_a, to_b in STEPS:
+            na, nb = min(max(a + da * to_a, low), high), min(max(b + db * to_b, 0.0), 2.0)
             if na == a and nb == b:
                 continue
             value, squares = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(na), nb)
@@ -347,20 +306,18 @@ def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
 def _system(ar1, slow, turn, keep, band):  # pragma: no cover
     """Transition of (slow, cos, sin) over a step, the stationary covariance, and what each step adds to it."""
     c, s = keep * np.cos(turn), keep * np.sin(turn)
-    f = np.zeros((3, 3))
-    f[0, 0] = ar1
-    f[1, 1], f[1, 2], f[2, 1], f[2, 2] = c, -s, s, c
-    p = np.zeros((3, 3))
-    p[0, 0], p[1, 1], p[2, 2] = slow, band, band
-    q = np.zeros(3)
-    q[0], q[1], q[2] = slow * (1 - ar1 * ar1), band * (1 - keep * keep), band * (1 - keep * keep)
-    return f, p, q
+    f = np.array(((ar1, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
+    fresh = band * (1 - keep * keep)
+    return f, np.diag(np.array((slow, band, band))), np.array((slow * (1 - ar1 * ar1), fresh, fresh))
 
 
 @njit(cache=True, nogil=True)
-def _ahead(f, p, q):  # pragma: no cover
-    """Covariance a step later."""
+def _ahead(f, p, gain, h, q):  # pragma: no cover
+    """Covariance a step later, after a measurement, whose covariance with the state is h; p is used up."""
     fresh = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            p[i, j] -= gain[i] * h[j]
     for i in range(3):
         for j in range(3):
             total = 0.0
@@ -377,40 +334,26 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
     """Kalman gains of (slow, cos, sin) and innovation variances for a stretch of `length` from the stationary state."""
     f, p, q = _system(ar1, slow, turn, keep, band)
     white = max(1.0 - slow - band, 1e-9)
-    gains = np.empty((length, 3))
-    variances = np.empty(length)
-    settled = False
+    gains, variances, h = np.empty((length, 3)), np.empty(length), np.empty(3)
     for k in range(length):
-        if settled:
-            for i in range(3):
-                gains[k, i] = gains[k - 1, i]
-            variances[k] = variances[k - 1]
-            continue
-        h = np.empty(3)
         for i in range(3):
             h[i] = p[i, 0] + p[i, 1]
-        v = h[0] + h[1] + white
-        variances[k] = v
+        variances[k] = h[0] + h[1] + white
         for i in range(3):
-            gains[k, i] = h[i] / v
-        for i in range(3):
-            for j in range(3):
-                p[i, j] -= gains[k, i] * h[j]
-        p = _ahead(f, p, q)
-        settled = k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11
+            gains[k, i] = h[i] / variances[k]
+        p = _ahead(f, p, gains[k], h, q)
+        if k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11:  # settled
+            gains[k + 1 :], variances[k + 1 :] = gains[k], variances[k]
+            break
     return gains, variances
 
 
 @njit(cache=True, nogil=True)
-def whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
-    """As `whiten_rows`, with an oscillator: `turn` is its angle per step, `keep` its decay, `band` its share."""
-    total, longest = np.int64(0), np.int64(0)  # typed: `_gains` is compiled once
-    for i in range(start.size):
-        total += stop[i] - start[i]
-        longest = max(longest, stop[i] - start[i])
-    gains, variances = _gains(longest, ar1, slow, turn, keep, band)
+def _whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
+    """As `_whiten_rows`, with an oscillator: `turn` is its angle per step, `keep` its decay, `band` its share."""
+    gains, variances = _gains(np.max(stop - start), ar1, slow, turn, keep, band)
     c, s = keep * np.cos(turn), keep * np.sin(turn)
-    white = np.empty((rows.shape[0], total))
+    white = np.empty((rows.shape[0], np.sum(stop - start)))
     logdet = 0.0
     for i in range(start.size):
         for k in range(stop[i] - start[i]):
@@ -437,7 +380,7 @@ def _band_cost(row, start, stop, x):  # pragma: no cover
     At x = (log(1 - ar1), slow share of the rest, turn, log(1 - keep), band).
     """
     slow = x[1] * (1.0 - x[4])
-    white, logdet = whiten_band(row, start, stop, 1.0 - np.exp(x[0]), slow, x[2], 1.0 - np.exp(x[3]), x[4])
+    white, logdet = _whiten_band(row, start, stop, 1.0 - np.exp(x[0]), slow, x[2], 1.0 - np.exp(x[3]), x[4])
     squares = 0.0
     for k in range(white.shape[1]):
         squares += white[0, k] * white[0, k]
@@ -447,7 +390,7 @@ def _band_cost(row, start, stop, x):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no cover
+def _profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no cover
     """Coordinate search from x, halving its steps to `least`; returns x, sd and log-likelihood."""
     rows = row.reshape(1, row.size)
     best, variance, total = _band_cost(rows, start, stop, x)
@@ -471,42 +414,27 @@ def profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no 
 
 
 @njit(cache=True, nogil=True)
-def smooth_band(row, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
+def _smooth_band(row, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
     """The oscillator's part of a residual, given all of it (fixed-interval smoother); zero outside the stretches."""
     out = np.zeros(row.size)
     for i in range(start.size):
         f, p, q = _system(ar1, slow, turn, keep, band)
+        c, s = f[1, 1], f[2, 1]
         length = stop[i] - start[i]
         gains, variances = _gains(length, ar1, slow, turn, keep, band)
-        errors = np.empty(length)
-        state = np.zeros((length, 3))
-        x = np.zeros(3)
+        errors, waves, covariances = np.empty(length), np.empty(length), np.empty((length, 3, 3))
+        x, u, v = 0.0, 0.0, 0.0
         for k in range(length):
-            errors[k] = row[start[i] + k] - x[0] - x[1]
-            y = np.empty(3)
-            for a in range(3):
-                state[k, a] = x[a]
-                y[a] = x[a] + gains[k, a] * errors[k]
-            for a in range(3):
-                x[a] = f[a, 0] * y[0] + f[a, 1] * y[1] + f[a, 2] * y[2]
+            errors[k], waves[k], covariances[k] = row[start[i] + k] - x - u, u, p
+            x, u, v = x + gains[k, 0] * errors[k], u + gains[k, 1] * errors[k], v + gains[k, 2] * errors[k]
+            x, u, v = ar1 * x, c * u - s * v, s * u + c * v
+            p = _ahead(f, p, gains[k], p[0] + p[1], q)
         # Backward pass on the adjoint r: x_hat = x + P r, with P h = gain * variance; only the oscillator is wanted.
         r = np.zeros(3)
-        covariances = np.zeros((length, 3, 3))
-        for k in range(length):
-            kalman = np.zeros((3, 3))
-            for a in range(3):
-                for b in range(3):
-                    covariances[k, a, b] = p[a, b]
-                    kalman[a, b] = p[a, b] - gains[k, a] * (p[0, b] + p[1, b])
-            p = _ahead(f, kalman, q)
         for k in range(length - 1, -1, -1):
-            back = np.zeros(3)
-            for a in range(3):
-                back[a] = f[0, a] * r[0] + f[1, a] * r[1] + f[2, a] * r[2]
-            weight = gains[k, 0] * back[0] + gains[k, 1] * back[1] + gains[k, 2] * back[2]
-            h = errors[k] / variances[k] - weight
-            r[0], r[1], r[2] = back[0] + h, back[1] + h, back[2]
-            out[start[i] + k] = (
-                state[k, 1] + covariances[k, 1, 0] * r[0] + covariances[k, 1, 1] * r[1] + covariances[k, 1, 2] * r[2]
-            )
+            r[0], r[1], r[2] = ar1 * r[0], c * r[1] + s * r[2], c * r[2] - s * r[1]
+            h = errors[k] / variances[k] - (gains[k, 0] * r[0] + gains[k, 1] * r[1] + gains[k, 2] * r[2])
+            r[0], r[1] = r[0] + h, r[1] + h
+            own = covariances[k, 1]
+            out[start[i] + k] = waves[k] + own[0] * r[0] + own[1] * r[1] + own[2] * r[2]
     return out

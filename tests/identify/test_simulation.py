@@ -13,7 +13,7 @@ from stimrig.identify.estimation.effect_fit import fitted_with, try_effect
 from stimrig.identify.estimation.joint import predict_fitted
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
-from stimrig.identify.noise import NoiseLevel, band_part, profile, whiten_rows, whitened
+from stimrig.identify.noise import NoiseLevel, band_part, profile, whitened
 from stimrig.identify.records.join import join
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
@@ -45,9 +45,10 @@ def test_whitening_is_that_of_the_dense_covariance(noise):
 
 def test_correlation_does_not_cross_a_gap():
     rows = np.random.default_rng(1).standard_normal((1, 60))
-    both, _ = whiten_rows(rows, np.array([0, 40]), np.array([30, 60]), 0.9, 0.7)
-    first, _ = whiten_rows(rows, np.array([0]), np.array([30]), 0.9, 0.7)
-    second, _ = whiten_rows(rows, np.array([40]), np.array([60]), 0.9, 0.7)
+    noise = NoiseLevel(0.9, 0.7, 1.0)
+    both = whitened(rows, (np.array([0, 40]), np.array([30, 60])), noise)
+    first = whitened(rows, (np.array([0]), np.array([30])), noise)
+    second = whitened(rows, (np.array([40]), np.array([60])), noise)
     np.testing.assert_allclose(both, np.c_[first, second])
 
 
