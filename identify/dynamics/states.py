@@ -14,36 +14,36 @@ step_matrix = njit(cache=True, nogil=True)(second_order.step_matrix)
 def through(drive, torque, rate, rows, even, varied, begins, initial):  # pragma: no cover
     """Four rows at a time through given transitions: each waits for itself alone, so four take hardly longer than one.
 
-    `torque` and `rate`, (M, K + 1), take the states of the `rows`, (4,), of `drive`, (M, K); a row may stand there
-    several times. `even`, (4, 4), holds each row's transition, where it is the same in all intervals; else `varied`,
-    (4, K) and not (4, 0), that of each interval for all rows. Each part begins at an interval of `begins`, (B,), the
-    first 0, with a state of `initial`, (M, B, 2).
+    `torque` and `rate`, (M, K + 1), take the states of the `rows`, (R,), of `drive`, (M, K). `even`, (M, 4), holds each
+    row's transition, where it is the same in all intervals; else `varied`, (4, K) and not (4, 0), that of each interval
+    for all rows. Each part begins at an interval of `begins`, (B,), the first 0, with a state of `initial`, (M, B, 2).
     """
-    size = drive.shape[1]
-    a, b, c, d = rows
-    for part in range(begins.size):
-        start, stop = begins[part], begins[part + 1] if part + 1 < begins.size else size
-        ya, va, yb, vb = initial[a, part, 0], initial[a, part, 1], initial[b, part, 0], initial[b, part, 1]
-        yc, vc, yd, vd = initial[c, part, 0], initial[c, part, 1], initial[d, part, 0], initial[d, part, 1]
-        for r in range(4):
-            torque[rows[r], start], rate[rows[r], start] = initial[rows[r], part, 0], initial[rows[r], part, 1]
-        a1, a2, a3, a4 = even[0]
-        b1, b2, b3, b4 = even[1]
-        c1, c2, c3, c4 = even[2]
-        d1, d2, d3, d4 = even[3]
-        for k in range(start, stop):
-            if varied.shape[1] > 0:
-                a1, a2, a3, a4 = varied[0, k], varied[1, k], varied[2, k], varied[3, k]
-                b1, b2, b3, b4 = a1, a2, a3, a4
-                c1, c2, c3, c4 = a1, a2, a3, a4
-                d1, d2, d3, d4 = a1, a2, a3, a4
-            wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
-            ya, va = wa + a1 * (ya - wa) + a2 * va, a3 * (ya - wa) + a4 * va
-            yb, vb = wb + b1 * (yb - wb) + b2 * vb, b3 * (yb - wb) + b4 * vb
-            yc, vc = wc + c1 * (yc - wc) + c2 * vc, c3 * (yc - wc) + c4 * vc
-            yd, vd = wd + d1 * (yd - wd) + d2 * vd, d3 * (yd - wd) + d4 * vd
-            torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
-            rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
+    size, last = drive.shape[1], rows.size - 1
+    for first in range(0, rows.size, 4):
+        a, b, c, d = rows[first], rows[min(first + 1, last)], rows[min(first + 2, last)], rows[min(first + 3, last)]
+        for part in range(begins.size):
+            start, stop = begins[part], begins[part + 1] if part + 1 < begins.size else size
+            for row in (a, b, c, d):
+                torque[row, start], rate[row, start] = initial[row, part, 0], initial[row, part, 1]
+            ya, yb, yc, yd = torque[a, start], torque[b, start], torque[c, start], torque[d, start]
+            va, vb, vc, vd = rate[a, start], rate[b, start], rate[c, start], rate[d, start]
+            a1, a2, a3, a4 = even[a]
+            b1, b2, b3, b4 = even[b]
+            c1, c2, c3, c4 = even[c]
+            d1, d2, d3, d4 = even[d]
+            for k in range(start, stop):
+                if varied.shape[1] > 0:
+                    a1, a2, a3, a4 = varied[0, k], varied[1, k], varied[2, k], varied[3, k]
+                    b1, b2, b3, b4 = a1, a2, a3, a4
+                    c1, c2, c3, c4 = a1, a2, a3, a4
+                    d1, d2, d3, d4 = a1, a2, a3, a4
+                wa, wb, wc, wd = drive[a, k], drive[b, k], drive[c, k], drive[d, k]
+                ya, va = wa + a1 * (ya - wa) + a2 * va, a3 * (ya - wa) + a4 * va
+                yb, vb = wb + b1 * (yb - wb) + b2 * vb, b3 * (yb - wb) + b4 * vb
+                yc, vc = wc + c1 * (yc - wc) + c2 * vc, c3 * (yc - wc) + c4 * vc
+                yd, vd = wd + d1 * (yd - wd) + d2 * vd, d3 * (yd - wd) + d4 * vd
+                torque[a, k + 1], torque[b, k + 1], torque[c, k + 1], torque[d, k + 1] = ya, yb, yc, yd
+                rate[a, k + 1], rate[b, k + 1], rate[c, k + 1], rate[d, k + 1] = va, vb, vc, vd
 
 
 @njit(cache=True, nogil=True)
@@ -51,13 +51,7 @@ def held_states(drive, even, begins, initial):  # pragma: no cover
     """Boundary states, each (M, K + 1), of rows of held drives; `even` (M, 4) holds each row's transition."""
     rows, size = drive.shape
     torque, rate = np.empty((rows, size + 1)), np.empty((rows, size + 1))
-    four, step, none = np.zeros(4, np.int64), np.zeros((4, 4)), np.empty((4, 0))
-    for m in range(0, rows, 4):
-        for r in range(4):
-            four[r] = min(m + r, rows - 1)
-            for j in range(4):
-                step[r, j] = even[four[r], j]
-        through(drive, torque, rate, four, step, none, begins, initial)
+    through(drive, torque, rate, np.arange(rows), even, np.empty((4, 0)), begins, initial)
     return torque, rate
 
 

@@ -13,66 +13,38 @@ from numba import njit
 
 from stimrig.identify.dynamics.states import step_matrix, through
 
-PARTS = 3
-"""Number of steps within a pulse interval in which a speed law is evaluated."""
+PARTS, LEVEL_PARTS = 3, 5
+"""Number of steps within a pulse interval in which a speed law, or the level of an activation, is evaluated."""
+
+
+class Lag(IntEnum):
+    """What a speed law multiplies: T, and so both lags, or one of them."""
+
+    BOTH = 0
+    SLOW = 1
+    QUICK = 2
 
 
 class SpeedLaw(IntEnum):
     """What the speed depends on: each law is a column of the kernel's table, and is neutral at 0.
 
-    T is the time constant; y the torque, w the drive, a the state between the two lags, all as shares of y_max.
+    y is the torque, w the drive, a the state between the two lags, all as shares of y_max.
     """
 
-    RATIO_BY_DRIVE = 0
-    """T: log ratio while the drive is below the torque"""
-    RATIO_BY_RATE = 1
-    """T: log ratio while the torque falls"""
-    TORQUE = 2
-    """T: linear in torque"""
-    DRIVE = 3
-    """T: linear in drive"""
-    EXPONENTIAL = 4
-    """T: exponential in torque"""
-    INVERSE_TORQUE = 5
-    """T: inverse linear in torque"""
-    INVERSE_DRIVE = 6
-    """T: inverse linear in drive"""
-    SLOW_TORQUE = 7
-    """slower lag: linear in torque"""
-    SLOW_RATIO_BY_DRIVE = 8
-    """slower lag: log ratio while the drive is below the torque"""
-    SLOW_INVERSE_DRIVE = 9
-    """slower lag: inverse linear in drive"""
-    ACTIVATION = 10
-    """T: linear in activation, the state between the two lags"""
-    LEVEL = 11
-    """T: power of 0.5 + 1.5 y/y_max; slower to rise and quicker to fall at high levels"""
-    SLOW_SATURATING_DRIVE = 12
-    """slower lag: linear in a drive that saturates"""
-    QUICK_RATIO_BY_RATE = 13
-    """quicker lag: log ratio while the torque falls"""
-    QUICK_RATIO_BY_DRIVE = 14
-    """quicker lag: log ratio while the drive is below the torque"""
-    SLOW_RATIO_BY_RATE = 15
-    """slower lag: log ratio while the torque falls"""
-    SLOW_CALCIUM = 16
-    """slower lag: linear in bound calcium, which follows with the quicker lag whether there is drive"""
-    QUICK_CALCIUM = 17
-    """quicker lag: linear in bound calcium, which follows with the slower lag"""
-    SLOW_LEVEL = 18
-    """slower lag: as LEVEL"""
-    SLOW_SECOND_ACTIVATION = 19
-    """two lags in a row, the slower one second: linear in its input a"""
-    SLOW_SECOND_ATTACHED = 20
-    """the same: inverse linear in torque"""
-    QUICK_SECOND_ACTIVATION = 21
-    """two lags in a row, the quicker one second: linear in its input a"""
-    QUICK_SECOND_ATTACHED = 22
-    """the same: inverse linear in torque"""
-    SLOW_PUMP = 23
-    """two lags in a row, the slower one first: a pump that saturates, linear in a and in drive"""
-    QUICK_PUMP = 24
-    """the same with the quicker one first"""
+    RATIO_BY_DRIVE = 0  # log ratio while the drive is below the torque
+    RATIO_BY_RATE = 1  # log ratio while the torque falls
+    TORQUE = 2  # linear in torque
+    DRIVE = 3  # linear in drive
+    EXPONENTIAL = 4  # exponential in torque
+    INVERSE_TORQUE = 5  # inverse linear in torque
+    INVERSE_DRIVE = 6  # inverse linear in drive
+    ACTIVATION = 7  # linear in activation, the state between the two lags
+    LEVEL = 8  # power of 0.5 + 1.5 y/y_max; slower to rise and quicker to fall at high levels
+    SATURATING_DRIVE = 9  # linear in a drive that saturates
+    CALCIUM = 10  # linear in bound calcium, which follows with the other lag whether there is drive
+    PUMP = 11  # of two lags in a row the first: a pump that saturates, linear in a and in drive
+    SECOND_ACTIVATION = 12  # of two lags in a row the second: linear in its input a
+    SECOND_ATTACHED = 13  # the same: inverse linear in torque
 
 
 @njit(cache=True, nogil=True)
@@ -104,77 +76,70 @@ def _bounded(factor):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _factor(law, w, y, v, scale_nm, slow_s, quick_s, bound):  # pragma: no cover
-    """Factors on T, on the slower and on the quicker lag; `law` holds a value for each `SpeedLaw`."""
+def _factor(law, w, y, v, scale_nm, lag_s, bound):  # pragma: no cover
+    """Factor on T or on one lag; `law` holds a value for each `SpeedLaw`, y follows a with `lag_s`."""
     level, part = abs(y) / scale_nm, abs(w) / scale_nm
     lacking, rising = (w - y) / (0.02 * scale_nm), v / (0.1 * scale_nm)
-    m = _below(law[SpeedLaw.RATIO_BY_DRIVE], lacking) * _below(law[SpeedLaw.RATIO_BY_RATE], rising)
-    m = m * _line(law[SpeedLaw.TORQUE], level) * _line(law[SpeedLaw.DRIVE] * abs(w) / scale_nm, 1.0)
+    a = (y + lag_s * v) / scale_nm
+    f = _below(law[SpeedLaw.RATIO_BY_DRIVE], lacking) * _below(law[SpeedLaw.RATIO_BY_RATE], rising)
+    f = f * _line(law[SpeedLaw.TORQUE], level) * _line(law[SpeedLaw.DRIVE] * abs(w) / scale_nm, 1.0)
     if law[SpeedLaw.EXPONENTIAL] != 0.0:
-        m *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)
-    m *= 1.0 / _line(law[SpeedLaw.INVERSE_TORQUE], level)
-    m *= 1.0 / _line(law[SpeedLaw.INVERSE_DRIVE] * abs(w) / scale_nm, 1.0)
-    m *= _line(law[SpeedLaw.ACTIVATION], _share((y + slow_s * v) / scale_nm))
-    d = _line(law[SpeedLaw.SLOW_TORQUE], level) * _below(law[SpeedLaw.SLOW_RATIO_BY_DRIVE], lacking)
-    d *= 1.0 / _line(law[SpeedLaw.SLOW_INVERSE_DRIVE] * abs(w) / scale_nm, 1.0)
-    if law[SpeedLaw.LEVEL] != 0.0 or law[SpeedLaw.SLOW_LEVEL] != 0.0:
+        f *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)
+    f *= 1.0 / _line(law[SpeedLaw.INVERSE_TORQUE], level)
+    f *= 1.0 / _line(law[SpeedLaw.INVERSE_DRIVE] * abs(w) / scale_nm, 1.0)
+    f *= _line(law[SpeedLaw.ACTIVATION], _share(a))
+    if law[SpeedLaw.LEVEL] != 0.0:
         side = np.log(0.5 + 1.5 * min(level, 1.2)) * lacking / np.sqrt(1.0 + lacking * lacking)
-        m *= np.exp(law[SpeedLaw.LEVEL] * side)
-        d *= np.exp(law[SpeedLaw.SLOW_LEVEL] * side)
-    if law[SpeedLaw.SLOW_SATURATING_DRIVE] != 0.0:
-        d *= max(1.0 + law[SpeedLaw.SLOW_SATURATING_DRIVE] * 1.15 * part / (part + 0.15), 0.08)
-    d *= _below(law[SpeedLaw.SLOW_RATIO_BY_RATE], rising)
-    d = d * _line(law[SpeedLaw.SLOW_CALCIUM], bound)
-    d *= _uptake(law[SpeedLaw.SLOW_PUMP], w / scale_nm, (y + quick_s * v) / scale_nm)
-    q = _below(law[SpeedLaw.QUICK_RATIO_BY_RATE], rising) * _below(law[SpeedLaw.QUICK_RATIO_BY_DRIVE], lacking)
-    q = q * _line(law[SpeedLaw.QUICK_CALCIUM], bound)
-    q *= _uptake(law[SpeedLaw.QUICK_PUMP], w / scale_nm, (y + slow_s * v) / scale_nm)
-    return _bounded(m), _bounded(d), _bounded(q)
+        f *= np.exp(law[SpeedLaw.LEVEL] * side)
+    if law[SpeedLaw.SATURATING_DRIVE] != 0.0:
+        f *= max(1.0 + law[SpeedLaw.SATURATING_DRIVE] * 1.15 * part / (part + 0.15), 0.08)
+    f = f * _line(law[SpeedLaw.CALCIUM], bound)
+    return _bounded(f * _uptake(law[SpeedLaw.PUMP], w / scale_nm, a))
 
 
 @njit(cache=True, nogil=True)
-def _second(law, linear, inverse, y, v, lag_s, scale_nm):  # pragma: no cover
+def _is_second(law):  # pragma: no cover
+    return law[SpeedLaw.SECOND_ACTIVATION] != 0.0 or law[SpeedLaw.SECOND_ATTACHED] != 0.0
+
+
+@njit(cache=True, nogil=True)
+def _second(law, y, v, lag_s, scale_nm):  # pragma: no cover
     """Factor on the second of two lags; `lag_s` is its present value, s."""
-    factor = _line(law[linear], _share((y + lag_s * v) / scale_nm))
-    return _bounded(factor * (1.0 / _line(law[inverse], _share(y / scale_nm))))
+    factor = _line(law[SpeedLaw.SECOND_ACTIVATION], _share((y + lag_s * v) / scale_nm))
+    return _bounded(factor * (1.0 / _line(law[SpeedLaw.SECOND_ATTACHED], _share(y / scale_nm))))
 
 
 @njit(cache=True, nogil=True)
-def run_core(
-    drive, time_constant_s, damping, law, multiplier, begins, initial, scale_nm, step_s, shared
-):  # pragma: no cover
+def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, scale_nm, step_s):  # pragma: no cover
     """Boundary states of rows of drives, torque, N·m, and its rate, each of shape (M, K + 1).
 
-    `drive`, (M, K), is held in each interval; T, s, and ζ have shape (M,), `law` (M, len(SpeedLaw)). `multiplier`,
-    (M or 1 or 0, K), is a further, given factor on T; no rows if there is none. Each part begins at an interval of
-    `begins`, (B,), the first 0, with its torque and rate in `initial`, (M, B, 2). `scale_nm` is the full torque.
+    `drive`, (M, K), is held in each interval; T, s, and ζ have shape (M,), `law` (M, len(Lag), len(SpeedLaw)).
+    `multiplier`, (M or 0, K), is a further, given factor on T; no rows if there is none. Each part begins at an
+    interval of `begins`, (B,), the first 0, with its torque and rate in `initial`, (M, B, 2). `scale_nm` is the full
+    torque.
 
-    With `shared`, rows that differ from row 0 in their drive alone use its transitions. Their derivative then ignores
-    that the drive changes the speed: ten times faster, and good enough for the fit.
+    Rows that differ from row 0 in their drive alone use its transitions. Their derivative then ignores that the drive
+    changes the speed: ten times faster, and good enough for the fit.
     """
     rows, size = drive.shape
     given = multiplier.shape[0]
     torque = np.zeros((rows, size + 1))
     rate = np.zeros((rows, size + 1))
     first, none, even = np.empty((4, size)), np.empty((4, 0)), np.zeros((rows, 4))
-    listed, counts = np.empty((2, rows), np.int64), np.zeros(2, np.int64)  # rows without a law; those like row 0
-    varied = False
+    kinds, varied = np.full(rows, 2), False  # 0: without a law; 1: like row 0
     for m in range(rows):
         base = time_constant_s[m]
         slow_s = base * (damping[m] + np.sqrt(max(damping[m] * damping[m] - 1.0, 0.0)))
         quick_s = 2.0 * damping[m] * base - slow_s
-        lawful = np.any(law[m] != 0.0)
-        alike = shared and m > 0 and base == time_constant_s[0] and damping[m] == damping[0]
-        alike = alike and np.all(law[m] == law[0])
+        both, slow, quick = law[m, Lag.BOTH], law[m, Lag.SLOW], law[m, Lag.QUICK]
+        on_both, on_slow, on_quick = np.any(both != 0.0), np.any(slow != 0.0), np.any(quick != 0.0)
+        alike = m > 0 and base == time_constant_s[0] and damping[m] == damping[0] and np.all(law[m] == law[0])
         y, v, bound, part = 0.0, 0.0, 0.0, 0
-        slow_second = law[m, SpeedLaw.SLOW_SECOND_ACTIVATION] != 0.0 or law[m, SpeedLaw.SLOW_SECOND_ATTACHED] != 0.0
-        quick_second = law[m, SpeedLaw.QUICK_SECOND_ACTIVATION] != 0.0 or law[m, SpeedLaw.QUICK_SECOND_ATTACHED] != 0.0
-        last = 1.0
-        forget = np.exp(-step_s / PARTS / max(quick_s if law[m, SpeedLaw.SLOW_CALCIUM] != 0.0 else slow_s, 1e-4))
+        slow_second, quick_second, last = _is_second(slow), _is_second(quick), 1.0
+        forget = np.exp(-step_s / PARTS / max(quick_s if slow[SpeedLaw.CALCIUM] != 0.0 else slow_s, 1e-4))
         kind = 1 if alike and varied else 0
-        if kind or (not lawful and given == 0):
-            listed[kind, counts[kind]] = m
-            counts[kind] += 1
+        if kind or not (on_both or on_slow or on_quick or given > 0):
+            kinds[m] = kind
             even[m, 0], even[m, 1], even[m, 2], even[m, 3] = step_matrix(base, damping[m], step_s)
             continue
         h = step_s / PARTS
@@ -184,19 +149,17 @@ def run_core(
                 torque[m, k], rate[m, k] = y, v
                 part += 1
             w = drive[m, k]
-            given_f = multiplier[m if given > 1 else 0, k] if given > 0 else 1.0
+            given_f = multiplier[m, k] if given > 0 else 1.0
             p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
             # The law is evaluated several times in an interval, since its sign may change within it.
             for _ in range(PARTS):
-                f, d, q = 1.0, 1.0, 1.0
-                if lawful:
-                    f, d, q = _factor(law[m], w, y, v, scale_nm, slow_s, quick_s, bound)
+                f = _factor(both, w, y, v, scale_nm, slow_s, bound) if on_both else 1.0
+                d = _factor(slow, w, y, v, scale_nm, quick_s, bound) if on_slow else 1.0
+                q = _factor(quick, w, y, v, scale_nm, slow_s, bound) if on_quick else 1.0
                 turned = 1.0
                 if slow_second or quick_second:
-                    linear = SpeedLaw.SLOW_SECOND_ACTIVATION if slow_second else SpeedLaw.QUICK_SECOND_ACTIVATION
-                    inverse = SpeedLaw.SLOW_SECOND_ATTACHED if slow_second else SpeedLaw.QUICK_SECOND_ATTACHED
-                    lag_s = last * (slow_s if slow_second else quick_s)
-                    second = _second(law[m], linear, inverse, y, v, lag_s, scale_nm)
+                    own, lag_s = (slow, last * slow_s) if slow_second else (quick, last * quick_s)
+                    second = _second(own, y, v, lag_s, scale_nm)
                     d, q = (d * second, q) if slow_second else (d, q * second)
                     turned, last = last / second, second
                 v *= turned  # y' = (a - y) / lag: a stays the same when the lag changes
@@ -221,37 +184,36 @@ def run_core(
                 first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22
             torque[m, k + 1] = y
             rate[m, k + 1] = v
-    four, step = np.zeros(4, np.int64), np.zeros((4, 4))
     for kind in range(2):
-        for i in range(0, counts[kind], 4):
-            for r in range(4):
-                four[r] = listed[kind, min(i + r, counts[kind] - 1)]
-                for j in range(4):
-                    step[r, j] = even[four[r], j]
-            through(drive, torque, rate, four, step, first if kind else none, begins, initial)
+        through(drive, torque, rate, np.flatnonzero(kinds == kind), even, first if kind else none, begins, initial)
     return torque, rate
 
 
 @njit(cache=True, nogil=True)
 def activate(
-    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float
+    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float, full_nm: float = 0.0
 ) -> np.ndarray:  # pragma: no cover
     """Mean over each interval of a, from 0; a' = (w - a)/τ, τ = rise if w > a, else fall; shapes (M, K), (M,).
 
-    With τ = 0, a follows w at once.
+    With τ = 0, a follows w at once. With a full torque, N·m, τ depends on the level a, as a share of it:
+    rise (0.5 + 1.5 a), fall/(0.5 + 1.5 a), evaluated several times in an interval.
     """
     rows, size = drive.shape
-    out = np.empty((rows, size))
+    parts = LEVEL_PARTS if full_nm > 0.0 else 1
+    out, h = np.empty((rows, size)), step_s / parts
     for m in range(rows):
         a = 0.0
         for k in range(size):
-            w = drive[m, k]
-            tau = rise_s[m] if w > a else fall_s[m]
-            if tau <= 0.0:
-                a = w
-                out[m, k] = w
-            else:
-                decay = np.exp(-step_s / tau)
-                out[m, k] = w + (a - w) * (1.0 - decay) * tau / step_s
-                a = w + (a - w) * decay
+            w, total = drive[m, k], 0.0
+            for _ in range(parts):
+                level = 0.5 + 1.5 * min(abs(a) / full_nm, 1.2) if full_nm > 0.0 else 1.0
+                tau = rise_s[m] * level if w > a else fall_s[m] / level
+                if tau <= 0.0:
+                    a = w
+                    total += w
+                else:
+                    decay = np.exp(-h / tau)
+                    total += w + (a - w) * (1.0 - decay) * tau / h
+                    a = w + (a - w) * decay
+            out[m, k] = total / parts
     return out

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from stimrig.identify.dynamics.variable_speed import Lag
 from stimrig.identify.dynamics.variable_speed import SpeedLaw as Law
 from stimrig.identify.effects.base import Effect, Form, Parameter
 
 
-def _form(name: str, equation: str, law: Law, lower: float = -0.85, upper: float = 5.0) -> Form:
+def _form(name: str, equation: str, lag: Lag, law: Law, lower: float = -0.85, upper: float = 5.0) -> Form:
     slope = Parameter("slope", "1", lower, upper, 0.0, (0.5, -0.35), about="change of T from rest to full torque")
-    return Form(name, "speed", equation, (slope,), law={"slope": law})
+    return Form(name, "speed", equation, (slope,), law={"slope": (lag, law)})
 
 
-def _two_lags(name: str, equation: str, law: Law, source: str) -> Form:
+def _two_lags(name: str, equation: str, lag: Lag, law: Law, source: str) -> Form:
     """A form for two different lags; it is also started from two different lags, in case the base model has none."""
     slope = Parameter("slope", "1", -0.9, 20.0, 0.0, (0.5, -0.35), about="change of the lag from rest to full torque")
     apart = ({"slope": 1.0, "base.damping": 1.25},)
-    return Form(name, "speed", equation, (slope,), law={"slope": law}, restarts=apart, source=source)
+    return Form(name, "speed", equation, (slope,), law={"slope": (lag, law)}, restarts=apart, source=source)
 
 
 _BOUND = "Ding, Wexler, Binder-Macleod 2000: force decays with τ1 + τ2·(bound calcium)"
@@ -27,41 +28,39 @@ EFFECT = Effect(
     id="activation_dependent_speed",
     name="Speed depends on activation",
     forms=(
-        _form("torque", "T (1 + slope·y/y_max)", Law.TORQUE),
-        _form("drive", "T (1 + slope·w/y_max)", Law.DRIVE),
-        _form("exponential", "T exp(slope·y/y_max)", Law.EXPONENTIAL, -2.0, 2.0),
-        _form("inverse_torque", "T/(1 + slope·y/y_max)", Law.INVERSE_TORQUE),
-        _form("inverse_drive", "T/(1 + slope·w/y_max)", Law.INVERSE_DRIVE),
-        _form("slow_lag", "slower lag times (1 + slope·y/y_max)", Law.SLOW_TORQUE),
-        _form("inverse_slow_lag", "slower lag divided by (1 + slope·w/y_max)", Law.SLOW_INVERSE_DRIVE),
-        _form("bound", "slower lag times (1 + slope·1.15 s/(s + 0.15)), s = w/y_max", Law.SLOW_SATURATING_DRIVE),
-        _form("activation", "T (1 + slope·a/y_max), a: the state between the two lags", Law.ACTIVATION),
+        _form("torque", "T (1 + slope·y/y_max)", Lag.BOTH, Law.TORQUE),
+        _form("drive", "T (1 + slope·w/y_max)", Lag.BOTH, Law.DRIVE),
+        _form("exponential", "T exp(slope·y/y_max)", Lag.BOTH, Law.EXPONENTIAL, -2.0, 2.0),
+        _form("inverse_torque", "T/(1 + slope·y/y_max)", Lag.BOTH, Law.INVERSE_TORQUE),
+        _form("inverse_drive", "T/(1 + slope·w/y_max)", Lag.BOTH, Law.INVERSE_DRIVE),
+        _form("slow_lag", "slower lag times (1 + slope·y/y_max)", Lag.SLOW, Law.TORQUE),
+        _form("inverse_slow_lag", "slower lag divided by (1 + slope·w/y_max)", Lag.SLOW, Law.INVERSE_DRIVE),
+        _form("bound", "slower lag times (1 + slope·1.15 s/(s + 0.15)), s = w/y_max", Lag.SLOW, Law.SATURATING_DRIVE),
+        _form("activation", "T (1 + slope·a/y_max), a: the state between the two lags", Lag.BOTH, Law.ACTIVATION),
         _form(
             "calcium_slow_lag",
             "slower lag times (1 + slope·c), c: bound calcium, which follows the stimulation",
-            Law.SLOW_CALCIUM,
+            Lag.SLOW,
+            Law.CALCIUM,
             -0.9,
             12.0,
         ),
-        _form("calcium_quick_lag", "faster lag times (1 + slope·c), c: bound calcium", Law.QUICK_CALCIUM, -0.9, 12.0),
+        _form(
+            "calcium_quick_lag", "faster lag times (1 + slope·c), c: bound calcium", Lag.QUICK, Law.CALCIUM, -0.9, 12.0
+        ),
         *(
-            _two_lags(f"{name}_{lag}_lag", f"a' = (w - a)/{other}, y' = (a - y){words}", law, source)
-            for lag, other, activation, attached in (
-                ("slow", "fast", Law.SLOW_SECOND_ACTIVATION, Law.SLOW_SECOND_ATTACHED),
-                ("quick", "slow", Law.QUICK_SECOND_ACTIVATION, Law.QUICK_SECOND_ATTACHED),
-            )
+            _two_lags(f"{name}_{own}_lag", f"a' = (w - a)/{other}, y' = (a - y){words}", lag, law, source)
+            for lag, own, other in ((Lag.SLOW, "slow", "fast"), (Lag.QUICK, "quick", "slow"))
             for name, words, law, source in (
-                ("activation", f"/({lag} (1 + slope·a/y_max))", activation, _BOUND),
-                ("attached", f"(1 + slope·y/y_max)/{lag}", attached, _ATTACHED),
+                ("activation", f"/({own} (1 + slope·a/y_max))", Law.SECOND_ACTIVATION, _BOUND),
+                ("attached", f"(1 + slope·y/y_max)/{own}", Law.SECOND_ATTACHED, _ATTACHED),
             )
         ),
         *(
-            _two_lags(
-                name, f"a' = (w/(1 + s·w) - a/(1 + s·a))/{own}, y' = (a - y)/{other}, s = slope/y_max", law, _PUMP
-            )
-            for name, own, other, law in (
-                ("pump_slow_lag", "slow", "fast", Law.SLOW_PUMP),
-                ("pump_quick_lag", "fast", "slow", Law.QUICK_PUMP),
+            _two_lags(name, f"a' = (w/(1 + s·w) - a/(1 + s·a))/{lags}, s = slope/y_max", lag, Law.PUMP, _PUMP)
+            for name, lags, lag in (
+                ("pump_slow_lag", "slow, y' = (a - y)/fast", Lag.SLOW),
+                ("pump_quick_lag", "fast, y' = (a - y)/slow", Lag.QUICK),
             )
         ),
     ),

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from stimrig.identify.dynamics.variable_speed import SpeedLaw, activate
+from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw, activate
 from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
 
 _LAGS = (
@@ -15,34 +14,6 @@ _LAGS = (
 _RATIO = Parameter(
     "ratio", "1", 0.12, 8.0, 1.0, (1.6, 0.6), "log", about="time constant of decay divided by that of development"
 )
-
-
-@njit(cache=True, nogil=True)
-def _activate_by_level(
-    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, scale: float, step_s: float
-) -> np.ndarray:  # pragma: no cover
-    """As `activate`, with time constants that depend on the level: rise (0.5 + 1.5 a), fall/(0.5 + 1.5 a)."""
-    rows, size = drive.shape
-    parts = 5
-    out = np.empty((rows, size))
-    for m in range(rows):
-        a = 0.0
-        for k in range(size):
-            w = drive[m, k]
-            total = 0.0
-            for _ in range(parts):
-                level = 0.5 + 1.5 * min(max(abs(a) / scale, 0.0), 1.2)
-                tau = rise_s[m] * level if w > a else fall_s[m] / level
-                if tau <= 1e-9:
-                    a = w
-                    total += w
-                else:
-                    h = step_s / parts
-                    decay = np.exp(-h / tau)
-                    total += w + (a - w) * (1.0 - decay) * tau / h
-                    a = w + (a - w) * decay
-            out[m, k] = total / parts
-    return out
 
 
 @form(
@@ -63,9 +34,9 @@ def kinetics(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 )
 def kinetics_by_level(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     lags = p["rise_s"][:, 0], p["fall_s"][:, 0]
-    if not np.any(lags[0]) and not np.any(lags[1]):
+    if not np.any(lags):
         return drive
-    return _activate_by_level(np.ascontiguousarray(drive), *lags, scene.scale_nm, scene.step_s)
+    return activate(np.ascontiguousarray(drive), *lags, scene.step_s, scene.scale_nm)
 
 
 EFFECT = Effect(
@@ -73,30 +44,31 @@ EFFECT = Effect(
     name="Contraction and relaxation differ in speed",
     forms=(
         *(
-            Form(name, "speed", words, (_RATIO,), law={"ratio": law}, log_law=("ratio",))
-            for name, words, law in (
-                ("by_drive", "T·ratio while the drive is below the torque, else T", SpeedLaw.RATIO_BY_DRIVE),
-                ("by_rate", "T·ratio while the torque falls, else T", SpeedLaw.RATIO_BY_RATE),
-                ("slow_lag", "slower lag·ratio while the drive is below the torque", SpeedLaw.SLOW_RATIO_BY_DRIVE),
-                ("slow_lag_by_rate", "slower lag·ratio while the torque falls", SpeedLaw.SLOW_RATIO_BY_RATE),
-                ("quick_lag", "faster lag·ratio while the drive is below the torque", SpeedLaw.QUICK_RATIO_BY_DRIVE),
-                ("quick_lag_by_rate", "faster lag·ratio while the torque falls", SpeedLaw.QUICK_RATIO_BY_RATE),
+            Form(name, "speed", words, (_RATIO,), law={"ratio": (lag, law)})
+            for name, words, lag, law in (
+                ("by_drive", "T·ratio while the drive is below the torque, else T", Lag.BOTH, SpeedLaw.RATIO_BY_DRIVE),
+                ("by_rate", "T·ratio while the torque falls, else T", Lag.BOTH, SpeedLaw.RATIO_BY_RATE),
+                ("slow_lag", "slower lag·ratio while the drive is below the torque", Lag.SLOW, SpeedLaw.RATIO_BY_DRIVE),
+                ("slow_lag_by_rate", "slower lag·ratio while the torque falls", Lag.SLOW, SpeedLaw.RATIO_BY_RATE),
+                (
+                    "quick_lag",
+                    "faster lag·ratio while the drive is below the torque",
+                    Lag.QUICK,
+                    SpeedLaw.RATIO_BY_DRIVE,
+                ),
+                ("quick_lag_by_rate", "faster lag·ratio while the torque falls", Lag.QUICK, SpeedLaw.RATIO_BY_RATE),
             )
         ),
         *(
             Form(
                 name,
                 "speed",
-                f"{lag}·ratio·c^-power while the drive is below the torque, else {lag}·c^power; c = 0.5 + 1.5 y/y_max",
+                f"{own}·ratio·c^-power while the drive is below the torque, else {own}·c^power; c = 0.5 + 1.5 y/y_max",
                 (_RATIO, Parameter("power", "1", 0.1, 2.0, 0.0, (0.5, 1.0), about="influence of the level")),
-                law={"ratio": first, "power": second},
-                log_law=("ratio",),
+                law={"ratio": (lag, SpeedLaw.RATIO_BY_DRIVE), "power": (lag, SpeedLaw.LEVEL)},
                 source="Winters 1995; Thelen 2003",
             )
-            for name, lag, first, second in (
-                ("by_level", "T", SpeedLaw.RATIO_BY_DRIVE, SpeedLaw.LEVEL),
-                ("slow_lag_by_level", "slower lag", SpeedLaw.SLOW_RATIO_BY_DRIVE, SpeedLaw.SLOW_LEVEL),
-            )
+            for name, own, lag in (("by_level", "T", Lag.BOTH), ("slow_lag_by_level", "slower lag", Lag.SLOW))
         ),
         kinetics,
         kinetics_by_level,

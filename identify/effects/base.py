@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.polynomial.chebyshev import chebvander
 
-from stimrig.identify.dynamics.variable_speed import SpeedLaw
+from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 
 STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
@@ -224,9 +224,8 @@ class Form:
     batched : bool
         Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row.
     law : dict
-        For "speed" only: the `SpeedLaw` of each parameter. `apply` is then not called.
-    log_law : tuple of str
-        Parameters whose logarithm the law uses.
+        For "speed" only: the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on
+        that scale. `apply` is then not called.
     propose : callable or None
         `propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
         there are none. `previous` holds the parameters of the form before it in a chain.
@@ -254,8 +253,7 @@ class Form:
     parameters: tuple[Parameter, ...]
     apply: Apply | None = None
     batched: bool = False
-    law: dict[str, SpeedLaw] = field(default_factory=dict)
-    log_law: tuple[str, ...] = ()
+    law: dict[str, tuple[Lag, SpeedLaw]] = field(default_factory=dict)
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     grows: bool = False
     accept: Callable[[dict[str, float], Scene], bool] | None = None

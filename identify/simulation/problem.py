@@ -7,6 +7,7 @@ only once.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,8 +16,8 @@ import numpy as np
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from stimrig.identify.dynamics.second_order import Core
 from stimrig.identify.dynamics.states import read_means
-from stimrig.identify.dynamics.variable_speed import SpeedLaw, run_core
-from stimrig.identify.effects.base import Form, Parameter
+from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw, run_core
+from stimrig.identify.effects.base import Form, Parameter, Values
 from stimrig.identify.recruitment import Basis
 from stimrig.identify.simulation.setup import WITHIN, Setup
 
@@ -89,18 +90,14 @@ class Problem:
         self.table = table
         self.size = len(table)
         self.log = np.array([p.scale == "log" for p in table])
-        self.lower = self._to_scale(np.array([p.lower for p in table]))
-        self.upper = self._to_scale(np.array([p.upper for p in table]))
+        self.lower = self.from_physical(np.array([p.lower for p in table]))
+        self.upper = self.from_physical(np.array([p.upper for p in table]))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters; those of an effect start with its id: `fatigue.onset_s`."""
         own = [f"{chosen.effect}.{p.name}" for chosen in self.chosen for p in chosen.parameters]
         return (*(p.name for p in self.table[: self.coefficients.stop]), *own)
-
-    def _to_scale(self, values: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.log, np.log(values), values)
 
     def physical(self, theta: np.ndarray) -> np.ndarray:
         """Parameters in their units."""
@@ -109,7 +106,8 @@ class Problem:
 
     def from_physical(self, values: np.ndarray) -> np.ndarray:
         """The inverse of `physical`."""
-        return self._to_scale(values)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.log, np.log(values), values)
 
     @cached_property
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
@@ -182,27 +180,22 @@ class Problem:
 
 
 class _StagePass:
-    """One pass of the signal through the stages. Row 0 is the model; each further row has one perturbed parameter."""
+    """One pass of the signal through the stages. Row 0 is the model; each further row has one perturbed parameter.
+
+    The rows of a stage's parameters come behind those of the stages before it. In all before, they are like row 0.
+    """
 
     def __init__(self, problem: Problem, theta: np.ndarray, derivatives: bool) -> None:
         self.problem, self.setup, self.theta, self.derivatives = problem, problem.setup, theta, derivatives
         self.value = problem.physical(theta)
         self.owners: list[tuple[int, float]] = []
 
-    def join(self, places: range) -> tuple[np.ndarray, np.ndarray]:
-        """Add a perturbed row for each of some parameters.
-
-        Returns
-        -------
-        rows : ndarray of int, shape (M,)
-            Row of the input from which each row of the output is computed.
-        values : ndarray, shape (M, len(places))
-            Parameters of each row, in their units.
-        """
+    def join(self, places: range) -> np.ndarray:
+        """Add a perturbed row for each of some parameters; their values in all rows, in their units, (M, places)."""
         present = len(self.owners) + 1
         own = self.value[places.start : places.stop]
         if not self.derivatives:
-            return np.arange(present), np.tile(own, (present, 1))
+            return np.tile(own, (present, 1))
         values = np.tile(own, (present + len(places), 1))
         for i, place in enumerate(places):
             step = self.problem.step[place]
@@ -211,49 +204,49 @@ class _StagePass:
             moved = self.theta[place] + step
             values[present + i, i] = np.exp(moved) if self.problem.log[place] else moved
             self.owners.append((place, step))
-        return np.r_[np.arange(present), np.zeros(len(places), np.int64)], values
+        return values
+
+    def grown(self, rows: np.ndarray) -> np.ndarray:
+        """A copy of an array of an earlier stage, with the rows that have come since then."""
+        return rows[np.r_[np.arange(len(rows)), np.zeros(len(self.owners) + 1 - len(rows), np.int64)]]
 
     def forms(self, stage: str) -> list[Chosen]:
         return [chosen for chosen in self.problem.chosen if chosen.form.stage == stage]
 
+    def joined(self, stage: str) -> Iterator[tuple[Chosen, Values]]:
+        """The forms of a stage, one after the other, with the parameters of all rows."""
+        for chosen in self.forms(stage):
+            yield chosen, self.named(chosen, self.join(chosen.places))
+
     @staticmethod
-    def named(chosen: Chosen, values: np.ndarray) -> dict[str, np.ndarray]:
+    def named(chosen: Chosen, values: np.ndarray) -> Values:
         columns = np.ascontiguousarray(values.T)  # compiled functions are then compiled for one layout alone
         return {p.name: columns[i, :, None] for i, p in enumerate(chosen.parameters)}
 
     def to_boundaries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """States at the ends of the intervals (torque, rate), and for each row its delay, s, and which states it
         uses."""
-        setup, scene = self.setup, self.setup.scene
         torque, rate = self.dynamics(self.gained())
         # A delay changes where the states are read, not the states: rows that differ only in delay share them.
-        owned, values = self.join(self.problem.delay)
-        delay = values[:, 0]
-        for chosen in self.forms("delay"):
-            rows, values = self.join(chosen.places)
-            owned = owned[rows]
-            lag = np.asarray(chosen.form.call(None, self.named(chosen, values), scene))
-            delay = delay[rows] + lag.reshape(lag.shape[0], -1)[:, 0]
-        ends, bending = setup.scene_at_ends, self.forms("filter") or self.forms("output")
-        if bending:
-            torque, rate, owned = torque[owned], rate[owned], np.arange(owned.size)
-        for chosen in self.forms("filter"):
-            rows, values = self.join(chosen.places)
-            delay = delay[rows]
-            torque, rate = chosen.form.call((torque[rows], rate[rows]), self.named(chosen, values), ends)
-        for chosen in self.forms("output"):
-            rows, values = self.join(chosen.places)
-            delay = delay[rows]
-            torque, rate = self.bend(chosen, torque[rows], rate[rows], values)
-        owned = np.arange(delay.size) if bending else owned
-        return torque, rate, delay, owned
+        owned, delay = np.arange(len(torque)), self.join(self.problem.delay)[:, 0]
+        for chosen, p in self.joined("delay"):
+            lag = np.asarray(chosen.form.call(None, p, self.setup.scene))
+            delay = self.grown(delay) + lag.reshape(lag.shape[0], -1)[:, 0]
+        owned = self.grown(owned)
+        if not (self.forms("filter") or self.forms("output")):
+            return torque, rate, delay, owned
+        torque, rate = torque[owned], rate[owned]
+        for chosen, p in self.joined("filter"):
+            torque, rate = chosen.form.call((self.grown(torque), self.grown(rate)), p, self.setup.scene_at_ends)
+        for chosen, p in self.joined("output"):
+            torque, rate = self.bend(chosen.form, self.grown(torque), self.grown(rate), p)
+        return torque, rate, self.grown(delay), np.arange(len(torque))
 
     def gained(self, states: dict[str, float] | None = None) -> np.ndarray:
         """The drive behind the gain stage; with `states`, the slow states of row 0 at the end are written there."""
         drive = self.recruit()
-        for chosen in self.forms("gain"):
-            rows, values = self.join(chosen.places)
-            drive, p = drive[rows], self.named(chosen, values)
+        for chosen, p in self.joined("gain"):
+            drive = self.grown(drive)
             if states is not None and chosen.form.state is not None:
                 states[chosen.effect] = float(chosen.form.state(drive, p, self.setup.scene)[0])
             drive = np.asarray(chosen.form.call(drive, p, self.setup.scene))
@@ -263,11 +256,9 @@ class _StagePass:
         setup, problem = self.setup, self.problem
         width = setup.grid.pulse_width_us[None, :]
         coefficients = self.value[problem.coefficients]
-        acting = self.forms("pulse_width")
-        for chosen in acting:
-            rows, values = self.join(chosen.places)
-            width = np.asarray(chosen.form.call(width[rows], self.named(chosen, values), setup.scene))
-        if not acting:
+        for chosen, p in self.joined("pulse_width"):
+            width = np.asarray(chosen.form.call(self.grown(width), p, setup.scene))
+        if not self.forms("pulse_width"):
             design = setup.design
             drive = (coefficients @ design)[None, :]
         else:
@@ -282,66 +273,55 @@ class _StagePass:
         return setup.grid.held(drive, axis=1)
 
     def dynamics(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        setup = self.setup
-        rows, core = self.join(range(2))
-        drive = drive[rows]
-        rows, initial = self.join(self.problem.initials)
-        drive, core = drive[rows], core[rows]
-        law = np.zeros((drive.shape[0], len(SpeedLaw)))
-        given: list[tuple[Chosen, np.ndarray]] = []
-        for chosen in self.forms("speed"):
-            rows, values = self.join(chosen.places)
-            drive, core, law, initial = drive[rows], core[rows], law[rows], initial[rows]
-            given = [(other, old[rows]) for other, old in given]
-            if chosen.form.law:
-                names = [p.name for p in chosen.parameters]
-                for name, column in chosen.form.law.items():
-                    value = values[:, names.index(name)]
-                    law[:, column] += np.log(value) if name in chosen.form.log_law else value
-            else:
-                given.append((chosen, values))
-        branches = [(drive, np.ones((drive.shape[0], 1)))]
-        for chosen in self.forms("branch"):
-            rows, values = self.join(chosen.places)
-            core, law, drive, initial = core[rows], law[rows], drive[rows], initial[rows]
-            given = [(other, old[rows]) for other, old in given]
-            split = []
-            for part, slower in branches:
-                for new, factor in chosen.form.call(part[rows], self.named(chosen, values), setup.scene):
-                    split.append((new, slower[rows] * factor))
-            branches = split
-        self.cores = core
-        torque, rate = self.respond(branches, core, law, initial, _NONE)
+        core, initial = self.join(range(2)), self.join(self.problem.initials)
+        speeds = [(chosen, self.join(chosen.places)) for chosen in self.forms("speed")]
+        branches = [(drive, np.ones((len(drive), 1)))]
+        for chosen, p in self.joined("branch"):
+            branches = [
+                (new, self.grown(slower) * factor)
+                for part, slower in branches
+                for new, factor in chosen.form.call(self.grown(part), p, self.setup.scene)
+            ]
+        branches = [(self.grown(part), self.grown(slower)) for part, slower in branches]
+        drive, self.cores, initial = self.grown(drive), self.grown(core), self.grown(initial)
+        law, given = np.zeros((len(drive), len(Lag), len(SpeedLaw))), []
+        for chosen, values in speeds:
+            p = self.named(chosen, self.grown(values))
+            if not chosen.form.law:
+                given.append((chosen.form, p))
+            for one in chosen.parameters:
+                if one.name in chosen.form.law:
+                    value = p[one.name][:, 0]
+                    law[:, *chosen.form.law[one.name]] += np.log(value) if one.scale == "log" else value
+        torque, rate = self.respond(branches, law, initial, _NONE)
         # A speed law given as a Python function needs the torque: it is iterated, starting from the torque without it.
         for _ in range(4 if given else 0):
             factor = np.ones_like(drive)
-            for chosen, values in given:
+            for form, p in given:
                 middle = 0.5 * (torque[:, 1:] + torque[:, :-1])
-                factor = factor * np.asarray(chosen.form.call((drive, middle), self.named(chosen, values), setup.scene))
+                factor = factor * np.asarray(form.call((drive, middle), p, self.setup.scene))
             if np.all(factor == 1.0):
                 break
-            factor = np.ascontiguousarray(np.clip(factor, 0.02, 50.0))
-            torque, rate = self.respond(branches, core, law, initial, factor)
+            torque, rate = self.respond(branches, law, initial, np.ascontiguousarray(np.clip(factor, 0.02, 50.0)))
         return torque, rate
 
     def respond(
-        self, branches: list, core: np.ndarray, law: np.ndarray, initial: np.ndarray, multiplier: np.ndarray
+        self, branches: list, law: np.ndarray, initial: np.ndarray, multiplier: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Sum of the responses of all branches; each starts with its share of the initial state."""
-        setup = self.setup
+        setup, (time_constant_s, damping) = self.setup, np.ascontiguousarray(self.cores.T)
         begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
         responses = [
             run_core(
                 np.ascontiguousarray(part),
-                np.ascontiguousarray(core[:, 0] * slower[:, 0]),
-                np.ascontiguousarray(core[:, 1]),
+                time_constant_s * slower[:, 0],
+                damping,
                 law,
                 multiplier,
                 setup.grid.starts,
                 begin,
                 setup.scale_nm,
                 setup.grid.step_s,
-                True,  # rows that differ in their drive alone use the transitions of row 0
             )
             for part, slower in branches
         ]
@@ -349,26 +329,23 @@ class _StagePass:
             return responses[0]
         return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore[return-value]
 
-    def bend(
-        self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def bend(self, form: Form, torque: np.ndarray, rate: np.ndarray, p: Values) -> tuple[np.ndarray, np.ndarray]:
         """A static output stage at the boundary states; the rate follows by a numerical chain rule."""
-        p, ends = self.named(chosen, values), self.setup.scene_at_ends
-        bent = np.asarray(chosen.form.call(torque, p, ends))
+        ends = self.setup.scene_at_ends
+        bent = np.asarray(form.call(torque, p, ends))
         if np.array_equal(bent, torque):
             return bent, rate
         ahead = self.setup.grid.step_s / 32.0
-        later = np.asarray(chosen.form.call(torque + ahead * rate, p, ends))
-        sooner = np.asarray(chosen.form.call(torque - ahead * rate, p, ends))
+        later = np.asarray(form.call(torque + ahead * rate, p, ends))
+        sooner = np.asarray(form.call(torque - ahead * rate, p, ends))
         return bent, (later - sooner) / (2 * ahead)
 
     def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray, owned: np.ndarray) -> np.ndarray:
         grid = self.setup.grid
         mean = np.empty((delay.size, grid.size))
         alike: dict[tuple[float, Core | None], list[int]] = {}
-        curves = self.curves()
-        for row, lag in enumerate(delay.tolist()):  # rows added later have the dynamics of row 0
-            alike.setdefault((lag, curves[row if row < len(curves) else 0]), []).append(row)
+        for row, read in enumerate(zip(delay.tolist(), self.curves(), strict=True)):
+            alike.setdefault(read, []).append(row)
         for (lag, core), rows in alike.items():
             own = owned[rows]
             if own[-1] - own[0] + 1 == own.size and np.all(np.diff(own) == 1):
@@ -378,25 +355,23 @@ class _StagePass:
 
     def curves(self) -> list[Core | None]:
         """How the curve of each row is read: exactly, from its T and ζ; or all as cubics, where both lags are long."""
-        cores: list[Core] = [(time_constant_s, damping) for time_constant_s, damping in self.cores.tolist()]
+        cores: list[Core] = [(time_constant_s, damping) for time_constant_s, damping in self.grown(self.cores).tolist()]
         return [*cores] if self.setup.grid.curve(cores[0]) else [None] * len(cores)
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         part = self.setup.part_of(scene is not None)
         scene = scene or self.setup.scene
-        rows, values = self.join(self.problem.baselines)
-        value = value[rows] + (values if part is None else values[:, part])
-        for chosen in self.forms("additive"):
-            present = value.shape[0]
-            rows, values = self.join(chosen.places)
-            value = value[rows]
+        values = self.join(self.problem.baselines)
+        value = self.grown(value) + (values if part is None else values[:, part])
+        for chosen, p in self.joined("additive"):
+            present, value = len(value), self.grown(value)
             if chosen.effect in skip:
                 continue
             # An added torque does not depend on the signal: rows with the same parameters share one evaluation.
-            own = np.r_[0, np.arange(present, rows.size)]
+            own = np.r_[0, np.arange(present, len(value))]
             fine = chosen.form.fine and scene is self.setup.scene
             at = self.setup.scene_within if fine else scene
-            added = np.asarray(chosen.form.call(None, self.named(chosen, values[own]), at))
+            added = np.asarray(chosen.form.call(None, {name: column[own] for name, column in p.items()}, at))
             if fine:
                 added = added.reshape(len(own), -1, WITHIN).mean(axis=2)
             value[:present] += added[:1]
@@ -405,12 +380,11 @@ class _StagePass:
 
     def sense(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         """Apply the sensor stage, which works with the record's own zero and sign."""
-        for chosen in self.forms("sensor"):
-            rows, values = self.join(chosen.places)
-            value = value[rows]
+        for chosen, p in self.joined("sensor"):
+            value = self.grown(value)
             if chosen.effect in skip or (scene is None and chosen.form.fixed):  # the target was corrected for it
                 continue
             seen = self.setup.to_record(value)
-            shown = np.asarray(chosen.form.call(seen, self.named(chosen, values), scene or self.setup.scene))
+            shown = np.asarray(chosen.form.call(seen, p, scene or self.setup.scene))
             value = np.where(shown == seen, value, self.setup.to_muscle(shown))
         return value
