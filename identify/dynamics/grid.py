@@ -218,9 +218,12 @@ class Grid:
         at = np.stack([moved + whole, moved + whole + 1])
         return rows, late[rows], early[rows], moved, at, np.stack([1.0 - rest, rest])
 
-    def states(self, core: Core, drive_nm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Torque and rate at the ends of the intervals, from rest, shape (K + 1,) or (K + 1, M)."""
-        return boundary_states(*core, self.step_s, self.held(drive_nm))
+    def response(self, core: Core, delay_s: float, drive_nm: np.ndarray) -> np.ndarray:
+        """Interval means of the delayed response from rest to a drive on even slots, shape (K,) or (K, M), N·m."""
+        states = boundary_states(*core, self.step_s, self.held(drive_nm))
+        torque, rate = (np.ascontiguousarray(np.atleast_2d(state.T)) for state in states)
+        mean = read_means(torque, rate, *self.mean_weights(delay_s, self.curve(core)))
+        return mean[0] if drive_nm.ndim == 1 else mean.T
 
     def at_samples(
         self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, lag: float, core: Core | None = None
@@ -252,7 +255,14 @@ class Grid:
         if (delay_s, core) not in self._weights:
             if len(self._weights) >= 8:  # a fit needs the same weights several times, then never again
                 self._weights.clear()
-            self._weights[delay_s, core] = self._new_weights(delay_s, core)
+            places, place = self._places
+            shifted = places - delay_s / self.step_s
+            offset = np.floor(shifted).astype(np.int64)
+            four = curve_weights(shifted - offset, self.step_s, *(core or CUBIC))
+            interval, count = self.interval, self.count
+            if self._alike:  # one row holds for all intervals
+                place, interval, count = np.arange(places.size), np.zeros(places.size, np.int64), count[:1]
+            self._weights[delay_s, core] = mean_weights(four, offset, place, interval, count)
         return self._weights[delay_s, core]
 
     @cached_property
@@ -285,42 +295,9 @@ class Grid:
         quick_s = time_constant_s / (max(damping, 1.0) + np.sqrt(max(damping * damping - 1.0, 0.0)))
         return None if quick_s > LONG * self.step_s else core
 
-    def _new_weights(self, delay_s: float, core: Core | None) -> tuple[int, np.ndarray]:
-        places, place = self._places
-        shifted = places - delay_s / self.step_s
-        offset = np.floor(shifted).astype(np.int64)
-        four = curve_weights(shifted - offset, self.step_s, *(core or CUBIC))
-        if self._alike:  # one row holds for all intervals
-            only = np.zeros(places.size, np.int64)
-            return mean_weights(four, offset, np.arange(places.size), only, self.count[:1])
-        return mean_weights(four, offset, place, self.interval, self.count)
-
     @cached_property
     def _weights(self) -> dict[tuple[float, Core | None], tuple[int, np.ndarray]]:
         return {}
-
-    def block_mean(
-        self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, delay_s: float = 0.0, core: Core | None = None
-    ) -> np.ndarray:
-        """Mean over each interval's samples of the curve through boundary states.
-
-        Parameters
-        ----------
-        torque_nm, rate_nm_s : ndarray, shape (K + 1,) or (K + 1, M)
-            States at the ends of the intervals; before the first the torque is `torque_nm[0]`.
-        delay_s : float
-            Delay of the curve after the pulses, s; may be negative by less than a step.
-        core : (float, float) or None
-            As in `mean_weights`.
-
-        Returns
-        -------
-        ndarray, shape (K,) or (K, M)
-        """
-        first, weights = self.mean_weights(delay_s, core)
-        torque, rate = (np.ascontiguousarray(np.atleast_2d(state.T)) for state in (torque_nm, rate_nm_s))
-        mean = read_means(torque, rate, first, weights)
-        return mean[0] if torque_nm.ndim == 1 else mean.T
 
 
 def ends_of(parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
@@ -442,7 +419,6 @@ def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
 
 MOVED = 0.04
 """Share of the torque's range by which the rests before and after a gap differ if stimulation was cut out."""
-LONGEST_LATE_S = bounds.LARGEST["late_s"]
 LONGEST_DELAY_S = 0.25
 """Longest time from a pulse to the first response; a longer memory is part of the state."""
 
@@ -454,26 +430,19 @@ def check_arrays(record: Record) -> None:
     a day.
     """
     bounds.check_rate(record.pulse_rate_hz, "pulse_rate_hz")
-    columns = {"time_s": record.time_s, "pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
-    for name, column in columns.items():
-        finite = np.isfinite(column)
-        if not finite.all():
-            raise BadRecord(
-                "not finite",
-                place=f"{name}, sample {int(np.argmin(finite))}",
-                fix="Cut the record before this sample.",
-            )
-    if record.late_s is not None and (wild := np.flatnonzero(~(np.abs(record.late_s) <= LONGEST_LATE_S))).size:
-        raise BadRecord(
-            f"{record.late_s[wild[0]]:g} s late",
-            place=f"late_s, sample {int(wild[0])}",
-            fix="Give `late_s` in seconds.",
-        )
-    if np.any(record.pulse_width_us < 0):
-        place = f"pulse_width_us, sample {int(np.argmax(record.pulse_width_us < 0))}"
-        raise BadRecord("negative", place=place, fix="A pulse width is 0 (no pulse) or positive.")
-    if np.any(np.diff(record.time_s) <= 0):
-        place = f"time_s, sample {int(np.argmax(np.diff(record.time_s) <= 0)) + 1}"
-        raise BadRecord("time does not rise", place=place, fix="Sort the samples by time; each time once.")
+    for name in ("time_s", "pulse_width_us", "torque_nm"):
+        wrong = ~np.isfinite(getattr(record, name))
+        _refuse(name, wrong, "not finite", "Cut the record before this sample.")
+    if record.late_s is not None:
+        wrong = ~(np.abs(record.late_s) <= bounds.LARGEST["late_s"])
+        _refuse("late_s", wrong, f"{record.late_s[np.argmax(wrong)]:g} s late", "Give `late_s` in seconds.")
+    _refuse("pulse_width_us", record.pulse_width_us < 0, "negative", "A pulse width is 0 (no pulse) or positive.")
+    falling = np.r_[False, np.diff(record.time_s) <= 0]
+    _refuse("time_s", falling, "time does not rise", "Sort the samples by time; each time once.")
     if record.time_s[-1] - record.time_s[0] > bounds.LONGEST_S:
         raise BadRecord("longer than a day", place="time_s", fix="Give the time in seconds.")
+
+
+def _refuse(name: str, wrong: np.ndarray, message: str, fix: str) -> None:
+    if wrong.any():
+        raise BadRecord(message, place=f"{name}, sample {int(np.argmax(wrong))}", fix=fix)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,11 +43,8 @@ class SecondOrder:
 
     def bounded(self, delay_bounds_s: tuple[float, float]) -> SecondOrder:
         """Within the bounds of a search."""
-        return SecondOrder(
-            float(np.clip(self.time_constant_s, *TIME_CONSTANT_BOUNDS_S)),
-            float(np.clip(self.damping, *DAMPING_BOUNDS)),
-            float(np.clip(self.delay_s, *delay_bounds_s)),
-        )
+        bounds = zip(astuple(self), (TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS, delay_bounds_s), strict=True)
+        return SecondOrder(*(float(np.clip(value, *within)) for value, within in bounds))
 
     @property
     def memory_s(self) -> float:
@@ -57,8 +54,7 @@ class SecondOrder:
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
-        torque, rate = grid.states(self.core, drive_nm)
-        return grid.block_mean(torque, rate, self.delay_s, grid.curve(self.core))
+        return grid.response(self.core, self.delay_s, drive_nm)
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.
@@ -89,12 +85,7 @@ class SecondOrder:
         return np.real(1.0 + (q * np.exp(p * t) - p * np.exp(q * t)) / (p - q))
 
     def to_dict(self) -> dict:
-        return {
-            "kind": "second-order",
-            "time_constant_s": self.time_constant_s,
-            "damping": self.damping,
-            "delay_s": self.delay_s,
-        }
+        return {"kind": "second-order"} | asdict(self)
 
 
 @dataclass(frozen=True)
@@ -140,20 +131,22 @@ class Discrete:
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
-        felt = grid.held(drive_nm)
-        if abs(grid.step_s - self.step_s) > 1e-9:
-            return _resampled(self, grid, felt)
-        return self.filter(felt)
+        held = grid.held(drive_nm)
+        if abs(grid.step_s - self.step_s) <= 1e-9:
+            return self.filter(held)
+        # On a grid with another pulse interval it runs at its own, and is then interpolated.
+        own = np.arange(int(np.ceil(grid.size * grid.step_s / self.step_s))) * self.step_s
+        source = np.clip(np.floor((own + 1e-9) / grid.step_s).astype(np.int64), 0, grid.size - 1)
+        response = self.filter(held[source])
+        at = (np.arange(grid.size) + self.centre) * grid.step_s
+        columns = [np.interp(at, own + self.centre * self.step_s, column) for column in np.atleast_2d(response.T)]
+        return columns[0] if response.ndim == 1 else np.stack(columns, axis=1)
 
     def filter(self, drive_nm: np.ndarray) -> np.ndarray:
         """B(q)/A(q) applied along the first axis, from rest."""
         from scipy.signal import lfilter
 
         return np.asarray(lfilter(np.r_[np.zeros(self.delay_samples), self.b], self.a, drive_nm, axis=0))
-
-    def at_samples(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """The response at the record's samples, shape (N,)."""
-        return self.between(grid, self.on_grid(grid, drive_nm))
 
     def between(self, grid: Grid, mean: np.ndarray) -> np.ndarray:
         """Interval means interpolated to the record's samples by a cubic through their centres, shape (N,)."""
@@ -176,19 +169,6 @@ class Discrete:
 
     def to_dict(self) -> dict:
         return {"kind": "discrete", "step_s": self.step_s, "centre": self.centre}
-
-
-def _resampled(block: Discrete, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-    """A discrete block on a grid with another pulse interval: run at its own interval, then interpolated."""
-    size = int(np.ceil(grid.size * grid.step_s / block.step_s))
-    own = np.arange(size) * block.step_s
-    source = np.clip(np.floor((own + 1e-9) / grid.step_s).astype(np.int64), 0, grid.size - 1)
-    response = block.filter(drive_nm[source])
-    at = (np.arange(grid.size) + block.centre) * grid.step_s
-    if response.ndim == 1:
-        return np.interp(at, own + block.centre * block.step_s, response)
-    columns = [np.interp(at, own + block.centre * block.step_s, column) for column in response.T]
-    return np.stack(columns, axis=1)
 
 
 Linear = SecondOrder | Discrete
@@ -227,9 +207,3 @@ def run_narx(recipe: dict[str, Any], width_us: np.ndarray) -> np.ndarray:
             total += product
         torque[k] = min(max(total, -NARX_LIMIT), NARX_LIMIT)
     return np.array(torque[lead:]) * recipe["torque_scale_nm"]
-
-
-def narx_at_samples(recipe: dict[str, Any], grid: Grid, centre: float) -> np.ndarray:
-    """Free run at the record's samples, with its baseline, N·m, shape (N,)."""
-    means = run_narx(recipe, grid.held(grid.pulse_width_us)) + recipe["baseline_nm"]
-    return Discrete((1.0,), (1.0,), 0, grid.step_s, centre).between(grid, means)

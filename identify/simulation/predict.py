@@ -11,7 +11,7 @@ import numpy as np
 
 from stimrig.identify import model_schema
 from stimrig.identify.dynamics.grid import Grid, make_grid
-from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, narx_at_samples
+from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, run_narx
 from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadModel
@@ -70,9 +70,10 @@ def predict(model: Muscle, record: Record) -> np.ndarray:
 def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
     """As `predict`, for a record on its grid."""
     if isinstance(model.linear, Discrete):
-        if model.extra.get("narx"):
-            return narx_at_samples(model.extra["narx"], grid, model.linear.centre)
-        return model.linear.at_samples(grid, model.recruitment(grid.pulse_width_us)) + model.baseline_nm
+        linear, widths_us, narx = model.linear, grid.pulse_width_us, model.extra.get("narx")
+        if narx:
+            return linear.between(grid, run_narx(narx, grid.held(widths_us)) + narx["baseline_nm"])
+        return linear.between(grid, linear.on_grid(grid, model.recruitment(widths_us))) + model.baseline_nm
     problem, theta = problem_of(model, grid)
     whole, own = problem.at_samples(theta), unforeseen(model)
     if not own or not same_data(model, grid.record):
@@ -113,6 +114,7 @@ def problem_of(
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
     settings = model.effects[0].get("settings", {}) if model.effects else {}
+    own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     setup = Setup(
         grid=grid,
         target_nm=np.zeros(grid.size),
@@ -125,12 +127,10 @@ def problem_of(
         zero_nm=float(settings.get("zero_nm", 0.0)),
         sign=float(settings.get("sign", 1.0)),
         reference_s=float(settings.get("reference_s", 0.0)),
-        **_own_angles(model, grid.record, settings),
-        states={} if same_data(model, grid.record) else states_of(model),
+        **_own_angles(model, own_record, settings),
+        states={} if own_record else states_of(model),
     )
-    own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
-    effects = [(form.name, form) for form, _ in further if form.stage == "gain"]
-    parameters = [value for form, values in further if form.stage == "gain" for value in values]
+    acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]
     for entry in model.effects:
         own = Acting.of(entry)
         if not own.effect.predictable and not own_record:
@@ -140,13 +140,9 @@ def problem_of(
             if getattr(grid.record, need) is None:
                 fix = "Record this column, or fit without the effect."
                 raise BadModel(f"{own.effect.id} needs the column {need}", place=need, fix=fix)
-        effects.append((own.effect.id, own.form))
-        parameters += own.values.values()
-    for form, values in further:
-        if form.stage != "gain":
-            effects.append((form.name, form))
-            parameters += values
-    problem = Problem(setup, effects)
+        acting.append((own.effect.id, own.form, [*own.values.values()]))
+    acting += [(form.name, form, values) for form, values in further if form.stage != "gain"]
+    problem = Problem(setup, [(name, form) for name, form, _ in acting])
     values = np.zeros(problem.size)
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s
     values[list(problem.baselines)] = setup.to_muscle(np.asarray(baseline_nm))
@@ -155,18 +151,18 @@ def problem_of(
         values[np.array(problem.baselines)[grid.part[grid.starts[: len(parts)]]]] = setup.to_muscle(parts[:, 0])
         values[list(problem.initials)[: 2 * len(parts)]] = setup.sign * parts[:, 1:].ravel()
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
-    values[problem.coefficients.stop :] = parameters
+    values[problem.coefficients.stop :] = [value for *_, given in acting for value in given]
     return problem, problem.from_physical(values)
 
 
-def _own_angles(model: Muscle, record: Record, settings: Mapping[str, Any]) -> dict[str, Any]:
+def _own_angles(model: Muscle, own_record: bool, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The reference angle and the range of fitted angles; a model of an older version knows them of its own record.
 
     Raises BadModel: the model depends on the joint and does not say at which angle its curve holds.
     """
     if "reference_rad" in settings:
         return {"reference_rad": settings["reference_rad"], "angle_range_rad": angle_range(settings)}
-    if depend_on_joint(entry["id"] for entry in model.effects) and not same_data(model, record):
+    if depend_on_joint(entry["id"] for entry in model.effects) and not own_record:
         raise BadModel(
             "the model does not say at which angle its curve holds",
             place="effects.0.settings.reference_rad",
@@ -202,12 +198,8 @@ def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:
     if not same_data(model, grid.record):
         jacobian[problem.baselines.start] = jacobian[list(problem.baselines)].sum(axis=0)
         jacobian[problem.baselines.start + 1 : problem.initials.stop] = 0.0
-    place = {name: at for at, name in enumerate(problem.names)}
-    found = np.zeros((grid.size, len(names)))
-    for column, name in enumerate(names):
-        if name in place:
-            found[:, column] = jacobian[place[name]]
-    return found
+    known = dict(zip(problem.names, jacobian, strict=True))
+    return np.stack([known.get(name, np.zeros(grid.size)) for name in names], axis=1)
 
 
 def refuse_rate(model: Muscle, record: Record) -> None:

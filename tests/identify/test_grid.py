@@ -53,8 +53,8 @@ def test_block_means_match_fine_integration(rate_hz: int, delay_s: float) -> Non
     torque = np.interp(time_s - delay_s, np.arange(reference.size) / (PULSE_RATE_HZ * FINE), reference)
     grid = make_grid(Record.from_arrays(time_s, widths_us[slot], torque))
     assert np.array_equal(grid.pulse_width_us, widths_us[: grid.size])
-    states = boundary_states(time_constant_s, damping, grid.step_s, widths_us[: grid.size] / 40.0)
-    assert np.abs(grid.block_mean(*states, delay_s) - grid.torque_nm).max() < 2e-5
+    found = SecondOrder(time_constant_s, damping, delay_s).on_grid(grid, widths_us[: grid.size] / 40.0)
+    assert np.abs(found - grid.torque_nm).max() < 2e-5
 
 
 def test_a_clock_that_wanders_is_followed_at_a_bounded_price(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,7 +90,7 @@ def test_the_curve_is_exact_however_short_a_lag_is(time_constant_s: float, dampi
     linear = SecondOrder(time_constant_s, damping)
     drive = patient.recruitment(grid.pulse_width_us)
     assert np.abs(linear.on_grid(grid, drive) - grid.torque_nm).max() < 1e-6
-    at_samples = grid.at_samples(*grid.states(linear.core, drive), 0.0, grid.curve(linear.core))
+    at_samples = grid.at_samples(*boundary_states(*linear.core, grid.step_s, drive), 0.0, grid.curve(linear.core))
     assert np.abs(at_samples - torque[skipped:]).max() < 1e-6
 
 
@@ -133,7 +133,7 @@ def test_critical_damping_has_no_seam() -> None:
 def test_means_are_those_of_the_curve_at_the_samples_and_a_delay_shifts_them() -> None:
     grid = make_grid(Record.from_arrays(np.arange(4000) / 400, np.repeat(schedule()[:400], 10), np.zeros(4000)))
     states = boundary_states(0.3, 0.8, grid.step_s, grid.pulse_width_us)
-    at_once, late = grid.block_mean(*states), grid.block_mean(*states, grid.step_s)
+    at_once, late = (SecondOrder(0.3, 0.8, by_s).on_grid(grid, grid.pulse_width_us) for by_s in (0.0, grid.step_s))
     sampled = grid.at_samples(*states, 0.0).reshape(-1, 10).mean(axis=1)
     assert np.ptp(at_once) > 100.0
     np.testing.assert_allclose(at_once, sampled, atol=1e-9)
