@@ -418,10 +418,10 @@ def form(stage: str, equation: str, *parameters: Parameter, name: str = "", **mo
 
 def slow_gain(
     effect: str,
-    name: str,
-    equation: str,
     parameters: tuple[Parameter, ...],
     factor: Callable[[Values, np.ndarray], np.ndarray],
+    name: str,
+    equation: str,
     *,
     by_pulses: bool = False,
     constant: bool = False,

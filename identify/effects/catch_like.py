@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -19,11 +19,7 @@ _LENGTH = Parameter("length_s", "s", 0.08, 0.9, 0.3, (0.15, 0.4), "log", about="
 _RECOVERY = Parameter(
     "recovery_s", "s", 0.02, 4.0, 0.3, (0.1, 1.0), "log", about="time constant of recovery in silence"
 )
-
-
-def _depleting(name: str, equation: str, **more: Any) -> Form:
-    parameters = (_GAIN, _DECAY, _RECOVERY)
-    return slow_gain("catch_like", name, equation, parameters, lambda p, x: 1.0 + p["gain"] * (1.0 - x), **more)
+_depleting = partial(slow_gain, "catch_like", (_GAIN, _DECAY, _RECOVERY), lambda p, x: 1.0 + p["gain"] * (1.0 - x))
 
 
 def _trains(name: str, equation: str, least_gap_s: float) -> Form:

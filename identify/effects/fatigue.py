@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, slow_gain
+from stimrig.identify.effects.base import Effect, Parameter, slow_gain
 
 _DEPTH = Parameter("depth", "1", 0.0, 0.95, 0.0, (0.3, 0.6), about="largest share of torque that is lost")
 _ONSET = Parameter("onset_s", "s", 3.0, 250.0, 30.0, (15.0, 50.0), "log", about="time constant under full stimulation")
 _RECOVERY = Parameter("recovery_s", "s", 4.0, 400.0, 50.0, (40.0, 90.0), "log", about="time constant at rest")
-
-
-def _form(name: str, equation: str, **more: Any) -> Form:
-    parameters = (_DEPTH, _ONSET, _RECOVERY)
-    return slow_gain("fatigue", name, equation, parameters, lambda p, x: 1.0 - p["depth"] * x, **more)
+_form = partial(slow_gain, "fatigue", (_DEPTH, _ONSET, _RECOVERY), lambda p, x: 1.0 - p["depth"] * x)
 
 
 EFFECT = Effect(

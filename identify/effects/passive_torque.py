@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
 """Of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
@@ -66,26 +66,21 @@ _FREE = (
 )
 
 
-def _surface(_: None, p: Values, scene: Scene) -> np.ndarray:
+@form(
+    "additive",
+    "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
+    "inertia·acceleration, x: place in the fitted range, -1 to 1",
+    *_FREE,
+    fine=True,
+    source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
+)
+def surface(_: None, p: Values, scene: Scene) -> np.ndarray:
     velocity, place = scene.speed, scene.place
     elastic = sum(p[f"elastic_{i}_nm"] * bend for i, bend in enumerate(scene.bends(len(SIZES)), start=1))
     viscous = p["viscosity_nm_s_per_rad"] + p["tilt_nm_s_per_rad"] * place + p["bow_nm_s_per_rad"] * place**2
     acceleration = 0.0 if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
     dry = p["dry_nm"] * np.tanh(velocity / p["dry_below_rad_s"])
     return elastic + viscous * velocity + dry + p["inertia_nm_s2_per_rad"] * acceleration
-
-
-surface = Form(
-    "surface",
-    "additive",
-    "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
-    "inertia·acceleration, x: place in the fitted range, -1 to 1",
-    _FREE,
-    _surface,
-    batched=True,
-    fine=True,
-    source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
-)
 
 
 @njit(cache=True, nogil=True)
@@ -128,7 +123,7 @@ def relaxing(_: None, p: Values, scene: Scene) -> np.ndarray:
     begins = np.zeros(away.size, bool) if scene.begins is None else scene.begins
     time_constants, row = np.unique(p["relaxation_s"], return_inverse=True)
     followed = relaxed(away, scene.time_s, begins, time_constants)
-    return _surface(None, p, scene) + p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
+    return surface.call(None, p, scene) + p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
 
 
 EFFECT = Effect(

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, slow_gain
+from stimrig.identify.effects.base import Effect, Parameter, slow_gain
 
 _GAIN = Parameter("gain", "1", 0.0, 2.0, 0.0, (0.2, 0.5), about="largest share of torque that is gained")
 _ONSET = Parameter("onset_s", "s", 1.2, 80.0, 5.0, (4.0, 15.0), "log", about="time constant under full stimulation")
 _RECOVERY = Parameter("recovery_s", "s", 2.0, 400.0, 60.0, (20.0, 80.0), "log", about="time constant at rest")
-
-
-def _form(name: str, equation: str, **more: Any) -> Form:
-    parameters = (_GAIN, _ONSET, _RECOVERY)
-    return slow_gain("potentiation", name, equation, parameters, lambda p, x: 1.0 + p["gain"] * x, **more)
+_form = partial(slow_gain, "potentiation", (_GAIN, _ONSET, _RECOVERY), lambda p, x: 1.0 + p["gain"] * x)
 
 
 EFFECT = Effect(

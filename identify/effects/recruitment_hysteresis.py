@@ -57,10 +57,6 @@ def _direction(width: np.ndarray, p: Values) -> np.ndarray:
     return _dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
 
 
-def _direction_of_pulses(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    return _direction(np.broadcast_to(scene.pulse_width_us, drive.shape), p)
-
-
 @form("pulse_width", "w = f(p); p = max(u - r, min(u + r, p_before)), r = half_width", _HALF)
 def play(width: np.ndarray, p: Values, _scene: Scene) -> np.ndarray:
     half = p["half_width_us"][:, 0]
@@ -134,7 +130,7 @@ def difference(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     gap = np.zeros_like(drive)
     for i, centre in enumerate(_LEVELS):
         gap = gap + p[f"gap_{i}_nm"] * np.maximum(1.0 - np.abs(level - centre) / 0.15, 0.0)
-    return drive - _direction_of_pulses(drive, p, scene) * gap
+    return drive - _direction(np.broadcast_to(scene.pulse_width_us, drive.shape), p) * gap
 
 
 @form(
@@ -144,7 +140,7 @@ def difference(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     _REACH,
 )
 def gain(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    return drive * (1.0 - p["share"] * _direction_of_pulses(drive, p, scene))
+    return drive * (1.0 - p["share"] * _direction(np.broadcast_to(scene.pulse_width_us, drive.shape), p))
 
 
 EFFECT = Effect(

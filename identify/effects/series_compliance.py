@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 Motion = tuple[np.ndarray, np.ndarray]
 """Torque and its rate."""
@@ -78,7 +78,8 @@ def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarr
     return phi[:2, :2], phi[:2, 2:] @ cubic
 
 
-def _series(x: Motion, p: Values, scene: Scene) -> Motion:
+@form("filter", "z'' + 2 ζ ω z' + ω² z = ω² y", *_RESONANCE, restarts=_RESTARTS)
+def series(x: Motion, p: Values, scene: Scene) -> Motion:
     torque, rate = x
     frequency, damping = p["resonance_hz"][:, 0], p["damping"][:, 0]
     if np.all(np.isinf(frequency)):
@@ -87,9 +88,6 @@ def _series(x: Motion, p: Values, scene: Scene) -> Motion:
     known = {pair: _steps(*pair, scene.step_s) for pair in set(pairs)}
     phi, gamma = (np.stack(matrices) for matrices in zip(*(known[pair] for pair in pairs), strict=True))
     return _follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)
-
-
-series = Form("series", "filter", "z'' + 2 ζ ω z' + ω² z = ω² y", _RESONANCE, _series, batched=True, restarts=_RESTARTS)
 
 
 @form(
@@ -101,7 +99,7 @@ series = Form("series", "filter", "z'' + 2 ζ ω z' + ω² z = ω² y", _RESONAN
     restarts=_RESTARTS,
 )
 def partly(x: Motion, p: Values, scene: Scene) -> Motion:
-    torque, rate = _series(x, p, scene)
+    torque, rate = series.call(x, p, scene)
     share = p["share"]
     return x[0] + share * (torque - x[0]), x[1] + share * (rate - x[1])
 
@@ -116,7 +114,7 @@ def partly(x: Motion, p: Values, scene: Scene) -> Motion:
 def inertia(x: Motion, p: Values, scene: Scene) -> Motion:
     """The load cell also carries the mass: the torque that accelerates it is missing from the reading."""
     (y, y_rate), share = x, p["share"]
-    z, z_rate = _series(x, p, scene)
+    z, z_rate = series.call(x, p, scene)
     if z is y:
         return x
     omega, damping = 2 * np.pi * p["resonance_hz"], p["damping"]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 _PARABOLA = (
     Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
@@ -16,20 +16,17 @@ SIZES = (1.5, 1.5, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3, 0.25, 0.2)
 KNOTS = 8
 
 
-def _parabola(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
+@form(
+    "output",
+    "y (1 + slope·Δ + bend·Δ²), Δ = angle - reference angle",
+    *_PARABOLA,
+    source="Marion, Wexler, Hull: 1 - 4.49e-4 Δθ² + 0.0344 Δθ, in degrees",
+)
+def parabola(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     away = scene.away_rad
     return y * np.maximum(1.0 + p["slope_per_rad"] * away + p["bend_per_rad2"] * away * away, 0.0)
 
 
-parabola = Form(
-    "parabola",
-    "output",
-    "y (1 + slope·Δ + bend·Δ²), Δ = angle - reference angle",
-    _PARABOLA,
-    _parabola,
-    batched=True,
-    source="Marion, Wexler, Hull: 1 - 4.49e-4 Δθ² + 0.0344 Δθ, in degrees",
-)
 drive = replace(
     parabola,
     name="drive",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numba import njit
@@ -11,53 +12,78 @@ from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values
 
 MOST = 6
 """Largest number of bumps: more of them could imitate any error."""
-Match = tuple[float, float, int, float]
-"""How well a shape matches a residual: score, its duration, s, the interval at which it begins or lies, its height."""
-Propose = Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]]
+Kernels = dict[float, tuple[np.ndarray, int]]
+"""Shapes by their duration, s, each with the place in it that its `centre` is."""
 
 
 def _forms(
     name: str,
     equation: Callable[[int], str],
-    parts: Callable[[int], tuple[Parameter, ...]],
-    shared: Parameter,
     apply: Callable[[Values, Scene, int], np.ndarray],
-    propose: Callable[[int], Propose],
+    shared: Parameter,
+    own: tuple[Parameter, Parameter, Parameter],
+    kernels: Callable[[float], Kernels],
+    sign: float = 1.0,
+    proposals: int = 1,
 ) -> list[Form]:
-    """A chain of forms: one bump, two bumps, …, each of which has parameters of its own beside a shared one."""
-    return [
-        Form(
+    """A chain of forms: one bump, two bumps, …, each with parameters of its own beside a shared one.
+
+    Of a bump its `own` parameters are centre, duration and height; `kernels(step_s)` are the shapes that are looked for
+    in a residual, in the direction of `sign`.
+    """
+
+    def parts(i: int) -> tuple[Parameter, ...]:
+        return tuple(replace(p, name=p.name.format(i)) for p in own)
+
+    def form(count: int) -> Form:
+        centre, duration, height = (p.name for p in parts(count - 1))
+
+        def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
+            """The shapes that match the residual best."""
+            return [
+                {shared.name: shared.start[0]}
+                | dict(previous)
+                | {centre: float(scene.time_s[at]), duration: duration_s, height: sign * height_nm}
+                for _, duration_s, at, height_nm in _matches(residual_nm, sign, kernels(scene.step_s))[:proposals]
+            ]
+
+        def accept(p: dict[str, float], scene: Scene) -> bool:
+            """Only bumps in fitted rows: in other rows they could only repair errors in the rows beside them."""
+            if scene.fitted is None:
+                return True
+            at = np.array([p[own[0].name.format(i)] for i in range(count)])
+            place = np.clip(np.searchsorted(scene.time_s, at), 0, scene.time_s.size - 1)
+            return bool(np.all(scene.fitted[place]))
+
+        return Form(
             f"{name}_{count}",
             "additive",
             equation(count),
             (shared, *(p for i in range(count) for p in parts(i))),
-            lambda _, p, scene, count=count: apply(p, scene, count),
+            lambda _, p, scene: apply(p, scene, count),
             batched=True,
-            propose=propose(count - 1),
-            accept=_in_fitted_rows(count),
+            propose=propose,
+            accept=accept,
             grows=count > 1,
         )
-        for count in range(1, MOST + 1)
-    ]
+
+    return [form(count) for count in range(1, MOST + 1)]
 
 
-def _in_fitted_rows(count: int) -> Callable[[dict[str, float], Scene], bool]:
-    def accept(p: dict[str, float], scene: Scene) -> bool:
-        """Accept bumps in fitted rows only. In other rows a bump could only repair errors in the rows beside them."""
-        if scene.fitted is None:
-            return True
-        at = np.array([p[f"centre_{i}_s"] for i in range(count)])
-        place = np.clip(np.searchsorted(scene.time_s, at), 0, scene.time_s.size - 1)
-        return bool(np.all(scene.fitted[place]))
-
-    return accept
-
-
-def _best(match: np.ndarray, power: np.ndarray, duration_s: float) -> Match:
-    """The place at which a shape matches best, from its products with the residual and their expected power."""
-    score = np.where(match > 0, match**2 / power, 0.0)
-    at = int(np.argmax(score))
-    return float(score[at]), duration_s, at, float(match[at] / power[at])
+def _matches(residual_nm: np.ndarray, sign: float, kernels: Kernels) -> list[tuple[float, float, int, float]]:
+    """Score, duration, s, interval and height, N·m, of shapes where each matches a residual best; the best first."""
+    known = np.isfinite(residual_nm)
+    value = sign * np.where(known, residual_nm, 0.0)
+    found = []
+    for duration_s, (kernel, place) in kernels.items():
+        after = kernel.size - 1 - place
+        own = slice(after, after + known.size)  # not "same": of a record shorter than the kernel it is longer
+        match = np.convolve(value, kernel[::-1])[own]
+        power = np.convolve(known.astype(float), (kernel**2)[::-1])[own] + 0.3 * np.sum(kernel**2)
+        score = np.where(match > 0, match**2 / power, 0.0)
+        at = int(np.argmax(score))
+        found.append((float(score[at]), duration_s, at, float(match[at] / power[at])))
+    return [one for one in sorted(found, reverse=True) if one[0] > 0.0]
 
 
 # ---- bumps ----
@@ -88,44 +114,30 @@ def _bumps(p: Values, scene: Scene, count: int) -> np.ndarray:
     return _sum_of_bumps(scene.time_s, centre, width, height, p["flatness"][:, 0])
 
 
+def _bump_kernels(step_s: float) -> Kernels:
+    found = {}
+    for width_s in (0.2, 0.5, 1.2):
+        half = int(np.ceil(3 * width_s / step_s))
+        found[width_s] = np.exp(-0.5 * (np.arange(-half, half + 1) * step_s / width_s) ** 2), half
+    return found
+
+
 def _bump_forms(name: str, words: str, sign: float) -> list[Form]:
     low, high = (0.0, 0.9) if sign > 0 else (-0.9, 0.0)
-
-    def parts(i: int) -> tuple[Parameter, ...]:
-        return (
-            Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="middle"),
-            Parameter(f"width_{i}_s", "s", 0.14, 3.0, 0.5, (0.5,), "log", about="half-width"),
-            Parameter(f"height_{i}_nm", "N·m", low, high, 0.0, (0.1 * sign,), relative="torque", about="peak torque"),
-        )
-
-    def propose(i: int) -> Propose:
-        def proposed(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
-            """The two bumps that match the residual best, among a few widths."""
-            known = np.isfinite(residual_nm)
-            value = sign * np.where(known, residual_nm, 0.0)
-            found = []
-            for width_s in (0.2, 0.5, 1.2):
-                half = int(np.ceil(3 * width_s / scene.step_s))
-                kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * scene.step_s / width_s) ** 2)
-                own = slice(half, half + known.size)  # not "same": of a record shorter than the kernel it is longer
-                match = np.convolve(value, kernel)[own]
-                power = np.convolve(known.astype(float), kernel**2)[own] + 0.3 * np.sum(kernel**2)
-                found.append(_best(match, power, width_s))
-            return [
-                {"flatness": 2.0}
-                | dict(previous)
-                | {f"centre_{i}_s": float(scene.time_s[at]), f"width_{i}_s": width_s, f"height_{i}_nm": sign * height}
-                for score, width_s, at, height in sorted(found, reverse=True)[:2]
-                if score > 0.0
-            ]
-
-        return proposed
-
-    def equation(count: int) -> str:
-        return f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} bumps, {words}"
-
-    flatness = Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2: Gaussian; larger: flatter")
-    return _forms(name, equation, parts, flatness, _bumps, propose)
+    return _forms(
+        name,
+        lambda count: f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} bumps, {words}",
+        _bumps,
+        Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2: Gaussian; larger: flatter"),
+        (
+            Parameter("centre_{}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="middle"),
+            Parameter("width_{}_s", "s", 0.14, 3.0, 0.5, (0.5,), "log", about="half-width"),
+            Parameter("height_{}_nm", "N·m", low, high, 0.0, (0.1 * sign,), relative="torque", about="peak torque"),
+        ),
+        _bump_kernels,
+        sign,
+        proposals=2,
+    )
 
 
 # ---- spasms ----
@@ -144,34 +156,13 @@ def _spasms(p: Values, scene: Scene, count: int) -> np.ndarray:
     return total
 
 
-def _spasm_parts(i: int) -> tuple[Parameter, ...]:
-    return (
-        Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="start"),
-        Parameter(f"decay_{i}_s", "s", 0.15, 3.0, 0.6, (0.6,), "log", about="time constant of the decay"),
-        Parameter(f"height_{i}_nm", "N·m", 0.0, 0.9, 0.0, (0.1,), relative="torque", about="peak torque"),
-    )
-
-
-def _propose_spasm(i: int) -> Propose:
-    def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
-        """The burst that matches the residual best, among a few decay times."""
-        known = np.isfinite(residual_nm)
-        value = np.where(known, residual_nm, 0.0)
-        found = []
-        for decay_s in (0.3, 0.8, 1.8):
-            age = np.arange(int(np.ceil(4 * decay_s / scene.step_s))) * scene.step_s
-            kernel = np.exp(-age / decay_s) - np.exp(-age / (0.1 * decay_s))
-            kernel /= kernel.max()
-            match = np.convolve(value, kernel[::-1])[kernel.size - 1 :]
-            power = np.convolve(known.astype(float), (kernel**2)[::-1])[kernel.size - 1 :] + 0.3 * np.sum(kernel**2)
-            found.append(_best(match, power, decay_s))
-        score, decay_s, at, height = max(found)
-        if score <= 0.0:
-            return []
-        burst = {f"centre_{i}_s": float(scene.time_s[at]), f"decay_{i}_s": decay_s, f"height_{i}_nm": height}
-        return [{"rise_s": 0.07} | dict(previous) | burst]
-
-    return propose
+def _spasm_kernels(step_s: float) -> Kernels:
+    found = {}
+    for decay_s in (0.3, 0.8, 1.8):
+        age = np.arange(int(np.ceil(4 * decay_s / step_s))) * step_s
+        kernel = np.exp(-age / decay_s) - np.exp(-age / (0.1 * decay_s))
+        found[decay_s] = kernel / kernel.max(), 0
+    return found
 
 
 EFFECT = Effect(
@@ -183,10 +174,14 @@ EFFECT = Effect(
         *_forms(
             "spasms",
             lambda count: f"y + Σ height·(exp(-t/decay) - exp(-t/rise)), t since its start, {count} bursts",
-            _spasm_parts,
-            Parameter("rise_s", "s", 0.02, 0.14, 0.07, (0.07,), "log", about="time constant of the rise"),
             _spasms,
-            _propose_spasm,
+            Parameter("rise_s", "s", 0.02, 0.14, 0.07, (0.07,), "log", about="time constant of the rise"),
+            (
+                Parameter("centre_{}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="start"),
+                Parameter("decay_{}_s", "s", 0.15, 3.0, 0.6, (0.6,), "log", about="time constant of the decay"),
+                Parameter("height_{}_nm", "N·m", 0.0, 0.9, 0.0, (0.1,), relative="torque", about="peak torque"),
+            ),
+            _spasm_kernels,
         ),
     ),
     signature="Single bumps of torque, also at rest, at times that do not depend on the stimulation.",
