@@ -86,10 +86,10 @@ def _joint(model: Model, fitted: Fitted, matrix: np.ndarray) -> dict[str, Any]:
     if grid.angle_rad is None or grid.velocity_rad_s is None or Surfaces.of(model.effects) is None:
         return {}
     assert model.covariance is not None
-    wide = replace(model.covariance, matrix=matrix)
     level = np.abs(model.recruitment(grid.pulse_width_us[rows]))
     at_work = level > AT_WORK * float(level.max())
-    return joint_tables(model.effects, wide, grid.angle_rad[rows], grid.velocity_rad_s[rows], at_work)
+    motion = grid.angle_rad[rows], grid.velocity_rad_s[rows]
+    return joint_tables(model.effects, model.covariance.names, matrix, *motion, at_work)
 
 
 def _parts(fitted: Fitted) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -28,16 +28,6 @@ differentiation bend the angles a little, which no covariance of the parameters 
 INERTIA = "inertia_nm_s2_per_rad"
 STEP = 1e-4
 FORMULA = "T = baseline + g(x, v) y + h(x, v) + inertia a; y = G f(u); x: angle, v: velocity, a: acceleration"
-
-
-class Covariance(Protocol):
-    """What bands need of a covariance: the parameters' names, and the matrix."""
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-
-    @property
-    def matrix(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -175,7 +165,8 @@ class Surfaces:
 
 def joint_tables(
     effects: Sequence[Mapping[str, Any]],
-    covariance: Covariance | None,
+    names: Sequence[str],
+    matrix: np.ndarray,
     angle_rad: np.ndarray,
     velocity_rad_s: np.ndarray,
     at_work: np.ndarray,
@@ -186,8 +177,8 @@ def joint_tables(
     ----------
     effects : sequence of mapping
         Those of the model.
-    covariance : Covariance or None
-        Of its parameters; without it there are no bands.
+    names, matrix : sequence of str, and ndarray, shape (P, P)
+        Of its parameters and their covariance.
     angle_rad, velocity_rad_s : ndarray, shape (K,)
         Angle and velocity of each fitted pulse interval.
     at_work : ndarray of bool, shape (K,)
@@ -223,17 +214,15 @@ def joint_tables(
         "seen_g": _seen(angles, velocities, angle_rad[at_work], velocity_rad_s[at_work]),
         "seen_h": _seen(angles, velocities, angle_rad, velocity_rad_s),
     }
-    if covariance is not None:
-        found |= _bands(surfaces, covariance, x, v, found["g"], found["h_nm"])
-    return found
+    return found | _bands(surfaces, names, matrix, x, v, found["g"], found["h_nm"])
 
 
 def _bands(
-    surfaces: Surfaces, covariance: Covariance, x: np.ndarray, v: np.ndarray, g: np.ndarray, h_nm: np.ndarray
+    surfaces: Surfaces, names: Sequence[str], matrix: np.ndarray, x: np.ndarray, v: np.ndarray, g: Any, h_nm: Any
 ) -> dict[str, Any]:
-    rows = [place for place, name in enumerate(covariance.names) if "." in name]
-    matrix = covariance.matrix[np.ix_(rows, rows)]
-    slopes = surfaces.slopes([covariance.names[row] for row in rows], x, v)
+    rows = [place for place, name in enumerate(names) if "." in name]
+    matrix = matrix[np.ix_(rows, rows)]
+    slopes = surfaces.slopes([names[row] for row in rows], x, v)
     found: dict[str, Any] = {"level_percent": 95}
     for name, unit, value, slope in (("g", "", g, slopes[0]), ("h", "_nm", h_nm, slopes[1])):
         variance = np.einsum("iab,ij,jab->ab", slope, matrix, slope, optimize=True)

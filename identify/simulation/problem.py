@@ -21,8 +21,6 @@ from stimrig.identify.effects.base import Form, Parameter, Values
 from stimrig.identify.recruitment import Basis
 from stimrig.identify.simulation.setup import WITHIN, Setup
 
-_NONE = np.zeros((0, 1))
-
 
 @dataclass(frozen=True)
 class Chosen:
@@ -207,8 +205,9 @@ class _StagePass:
         return values
 
     def grown(self, rows: np.ndarray) -> np.ndarray:
-        """A copy of an array of an earlier stage, with the rows that have come since then."""
-        return rows[np.r_[np.arange(len(rows)), np.zeros(len(self.owners) + 1 - len(rows), np.int64)]]
+        """An array of an earlier stage, with the rows that have come since then."""
+        since = len(self.owners) + 1 - len(rows)
+        return rows[np.r_[np.arange(len(rows)), np.zeros(since, np.int64)]] if since else rows
 
     def forms(self, stage: str) -> list[Chosen]:
         return [chosen for chosen in self.problem.chosen if chosen.form.stage == stage]
@@ -254,7 +253,7 @@ class _StagePass:
 
     def recruit(self) -> np.ndarray:
         setup, problem = self.setup, self.problem
-        width = setup.grid.pulse_width_us[None, :]
+        width = setup.grid.pulse_width_us[None, :].copy()
         coefficients = self.value[problem.coefficients]
         for chosen, p in self.joined("pulse_width"):
             width = np.asarray(chosen.form.call(self.grown(width), p, setup.scene))
@@ -283,8 +282,8 @@ class _StagePass:
                 for new, factor in chosen.form.call(self.grown(part), p, self.setup.scene)
             ]
         branches = [(self.grown(part), self.grown(slower)) for part, slower in branches]
-        drive, self.cores, initial = self.grown(drive), self.grown(core), self.grown(initial)
-        law, given = np.zeros((len(drive), len(Lag), len(SpeedLaw))), []
+        self.cores, initial = self.grown(core), self.grown(initial)
+        law, given = np.zeros((len(initial), len(Lag), len(SpeedLaw))), []
         for chosen, values in speeds:
             p = self.named(chosen, self.grown(values))
             if not chosen.form.law:
@@ -293,12 +292,12 @@ class _StagePass:
                 if one.name in chosen.form.law:
                     value = p[one.name][:, 0]
                     law[:, *chosen.form.law[one.name]] += np.log(value) if one.scale == "log" else value
-        torque, rate = self.respond(branches, law, initial, _NONE)
+        torque, rate = self.respond(branches, law, initial, np.zeros((0, 1)))
         # A speed law given as a Python function needs the torque: it is iterated, starting from the torque without it.
         for _ in range(4 if given else 0):
+            drive, middle = self.grown(drive), 0.5 * (torque[:, 1:] + torque[:, :-1])
             factor = np.ones_like(drive)
             for form, p in given:
-                middle = 0.5 * (torque[:, 1:] + torque[:, :-1])
                 factor = factor * np.asarray(form.call((drive, middle), p, self.setup.scene))
             if np.all(factor == 1.0):
                 break
@@ -311,18 +310,9 @@ class _StagePass:
         """Sum of the responses of all branches; each starts with its share of the initial state."""
         setup, (time_constant_s, damping) = self.setup, np.ascontiguousarray(self.cores.T)
         begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
+        shared = law, multiplier, setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
         responses = [
-            run_core(
-                np.ascontiguousarray(part),
-                time_constant_s * slower[:, 0],
-                damping,
-                law,
-                multiplier,
-                setup.grid.starts,
-                begin,
-                setup.scale_nm,
-                setup.grid.step_s,
-            )
+            run_core(np.ascontiguousarray(part), time_constant_s * slower[:, 0], damping, *shared)
             for part, slower in branches
         ]
         if len(responses) == 1:
@@ -363,15 +353,16 @@ class _StagePass:
         scene = scene or self.setup.scene
         values = self.join(self.problem.baselines)
         value = self.grown(value) + (values if part is None else values[:, part])
-        for chosen, p in self.joined("additive"):
-            present, value = len(value), self.grown(value)
+        for chosen in self.forms("additive"):
+            present, values = len(value), self.join(chosen.places)
+            value = self.grown(value)
             if chosen.effect in skip:
                 continue
             # An added torque does not depend on the signal: rows with the same parameters share one evaluation.
             own = np.r_[0, np.arange(present, len(value))]
             fine = chosen.form.fine and scene is self.setup.scene
             at = self.setup.scene_within if fine else scene
-            added = np.asarray(chosen.form.call(None, {name: column[own] for name, column in p.items()}, at))
+            added = np.asarray(chosen.form.call(None, self.named(chosen, values[own]), at))
             if fine:
                 added = added.reshape(len(own), -1, WITHIN).mean(axis=2)
             value[:present] += added[:1]

@@ -143,15 +143,14 @@ class Setup:
         if velocity is None and angle is not None:
             velocity = np.gradient(angle, record.time_s)
         acceleration = None if velocity is None else self._acceleration(velocity)
+        motion = {"angle_rad": angle, "velocity_rad_s": velocity, "acceleration_rad_s2": acceleration}
         return Scene(
             time_s=time_s,
             pulse_width_us=width_us,
             step_s=grid.step_s,
             scale_nm=self.scale_nm,
             largest_us=self.basis.largest_us,
-            angle_rad=None if angle is None else np.interp(time_s, own, angle),
-            velocity_rad_s=None if velocity is None else np.interp(time_s, own, velocity),
-            acceleration_rad_s2=None if acceleration is None else np.interp(time_s, own, acceleration),
+            **{name: np.interp(time_s, own, one) for name, one in motion.items() if one is not None},
             reference_rad=self.reference_rad,
             angle_range_rad=self.angle_range_rad,
             begins=np.isin(np.arange(time_s.size), first),

@@ -21,7 +21,7 @@ from stimrig.api.cli.commands.test import through
 from stimrig.api.store import Store
 from stimrig.identify import paper
 from stimrig.identify.json_text import json_value
-from stimrig.identify.model import SCHEMA_VERSION, Covariance
+from stimrig.identify.model import SCHEMA_VERSION
 from stimrig.identify.simulation.joint_surface import joint_tables
 from tests.api.conftest import REAL, TOKEN, run_service
 from tests.harness import few_effects
@@ -66,9 +66,9 @@ def test_g_and_h_hold_to_the_models_schema(model: Path) -> None:
     settings = {"reference_rad": 1.5, "angle_range_rad": [1.0, 2.0], "scale_nm": 5.0, "sign": 1.0}
     values = {"slope_per_rad": 0.1, "bend_per_rad2": -0.4}
     bent = {"id": "torque_angle", "form": "parabola", "parameters": values, "settings": settings}
-    covariance = Covariance(tuple(f"torque_angle.{name}" for name in values), np.array([0.1, -0.4]), np.eye(2) * 1e-4)
+    names = [f"torque_angle.{name}" for name in values]
     angle_rad, work = np.linspace(1.0, 2.0, 50), np.ones(50, bool)
-    tables = joint_tables((bent,), covariance, angle_rad, np.full(50, 0.2), work)
+    tables = joint_tables((bent,), names, np.eye(2) * 1e-4, angle_rad, np.full(50, 0.2), work)
     document = json.loads(model.read_text())
     whole = document | {"joint": json_value(tables)}
     assert set(whole["joint"]) == set(ALL["model"]["properties"]["joint"]["properties"])
