@@ -75,15 +75,9 @@ def profile(
     if near.band <= 0.0:
         ar1, share, sd, log_likelihood = profile_noise(residual, *stretches, near.ar1, near.share, wide)
         return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood
-    x = np.array(
-        [
-            np.log(1.0 - min(near.ar1, 1.0 - SHORTEST)),
-            min(near.share / max(1.0 - near.band, 1e-9), 1.0),
-            near.turn,
-            np.log(1.0 - min(near.keep, 0.9999)),
-            near.band,
-        ]
-    )
+    slow, fading = np.log(1.0 - min(near.ar1, 1.0 - SHORTEST)), np.log(1.0 - min(near.keep, 0.9999))
+    share = min(near.share / max(1.0 - near.band, 1e-9), 1.0)
+    x = np.array([slow, share, near.turn, fading, near.band])
     return _search(residual, stretches, x, 0.15, 0.03, (near.slowest, near.fastest))
 
 

@@ -431,8 +431,7 @@ def check_arrays(record: Record) -> None:
     """
     bounds.check_rate(record.pulse_rate_hz, "pulse_rate_hz")
     for name in ("time_s", "pulse_width_us", "torque_nm"):
-        wrong = ~np.isfinite(getattr(record, name))
-        _refuse(name, wrong, "not finite", "Cut the record before this sample.")
+        _refuse(name, ~np.isfinite(getattr(record, name)), "not finite", "Cut the record before this sample.")
     if record.late_s is not None:
         wrong = ~(np.abs(record.late_s) <= bounds.LARGEST["late_s"])
         _refuse("late_s", wrong, f"{record.late_s[np.argmax(wrong)]:g} s late", "Give `late_s` in seconds.")

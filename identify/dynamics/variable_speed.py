@@ -206,8 +206,10 @@ def activate(
         for k in range(size):
             w, total = drive[m, k], 0.0
             for _ in range(parts):
-                level = 0.5 + 1.5 * min(abs(a) / full_nm, 1.2) if full_nm > 0.0 else 1.0
-                tau = rise_s[m] * level if w > a else fall_s[m] / level
+                tau = rise_s[m] if w > a else fall_s[m]
+                if full_nm > 0.0:
+                    level = 0.5 + 1.5 * min(abs(a) / full_nm, 1.2)
+                    tau = tau * level if w > a else tau / level
                 if tau <= 0.0:
                     a = w
                     total += w
