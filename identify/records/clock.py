@@ -5,7 +5,6 @@ rounding of the written times was taken away."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
+from stimrig.identify.records.file_content import FileContent
 from stimrig.identify.records.record import Record
 
 NEARLY = 0.9
@@ -35,12 +35,9 @@ def pulse_phase_s(record: Record) -> float:
         # Any phase but a sliver is explained by all changes: the sliver tells. It is the widest without a change.
         gaps = np.diff(np.r_[latest, latest[0] + step_s])
         widest = int(np.argmax(gaps))
-        first = latest[(widest + 1) % latest.size]
-        return (
-            0.0
-            if gaps[widest] < 0.5 * (step_s - sample_s) or min(first, step_s - first) < 1e-3 * step_s
-            else float(first)
-        )
+        first = float(latest[(widest + 1) % latest.size])
+        near = min(first, step_s - first) < 1e-3 * step_s
+        return 0.0 if near or gaps[widest] < 0.5 * (step_s - sample_s) else first
     trial = np.linspace(0.0, step_s, 401)[:-1]
     # How many changes each trial phase explains, with a tolerance of a hair for rounding.
     lag = np.mod(latest[:, None] - trial[None, :] + 1e-3 * sample_s, step_s)
@@ -125,8 +122,6 @@ BETTER = 0.98
 """The time stamps are taken as they are where torque is smoother over them by so much (mean square)."""
 SAME_RATE = 0.002
 INTERPOLATED = ("torque_nm", "angle_rad", "velocity_rad_s")
-Columns = dict[str, np.ndarray]
-At = Callable[[int], str]
 
 
 @dataclass(frozen=True)
@@ -140,83 +135,69 @@ class _Part:
     jitter_s: float = 0.0
 
 
-def regular(columns: Columns, at: At, told: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
-    """Columns with uniform times, and what of it was assumed.
+def regular(found: FileContent) -> FileContent:
+    """The same with uniform times, and with notes on what of it was assumed; where it is resampled, pulses stay.
 
-    Parameters
-    ----------
-    columns : dict of ndarray, shape (N,)
-        `time_s`, `pulse_width_us`, `torque_nm`, and any others, by row.
-    at : callable
-        How errors call a row.
-    told : callable
-        How notes call a row: without the file, which whoever shows them knows.
-    pulse_rate_hz : float
-        Pulses a second: when a record is resampled its pulses stay where they were.
-
-    Raises
-    ------
-    BadRecord
-        Time does not rise, too few samples, or a rate that can't be used.
+    Raises BadRecord: time does not rise, too few samples, or a rate that can't be used.
     """
-    time_s, notes = _finer(columns["time_s"])
-    columns = columns | {"time_s": time_s}
-    _check_rising(time_s, at)
-    edges = _pauses(time_s, columns["pulse_width_us"], at)
-    parts = [_part(time_s[a:b], columns["torque_nm"][a:b], a, at) for a, b in pairwise(edges)]
+    time_s, note = _finer(found.columns["time_s"])
+    found = found.noting(note, columns=found.columns | {"time_s": time_s})
+    _check_rising(found)
+    edges = _pauses(found)
+    parts = [_part(found, a, b) for a, b in pairwise(edges)]
     step_s = parts[0].step_s
     for part, edge in zip(parts, edges, strict=False):
-        bounds.check_sampling(1 / part.step_s, at(edge))
+        bounds.check_sampling(1 / part.step_s, found.at(edge))
         if abs(part.step_s - step_s) > SAME_RATE * step_s:
-            raise BadRecord(
-                f"sampled at {1 / part.step_s:.4g} Hz after a pause, {1 / step_s:.4g} Hz before it",
-                place=at(edge),
-                fix="Resample to one rate.",
-            )
+            message = f"sampled at {1 / part.step_s:.4g} Hz after a pause, {1 / step_s:.4g} Hz before it"
+            raise BadRecord(message, place=found.at(edge), fix="Resample to one rate.")
     even = [part.even_s for part in parts if part.even_s is not None]
     if len(even) < len(parts):
-        return _resampled(columns, step_s, at, told, pulse_rate_hz)
-    notes += _jitter_note(parts) + _lost_note(np.concatenate([part.lost for part in parts]), time_s, at, told)
-    return columns | {"time_s": np.concatenate(even)}, notes
+        return _resampled(found, step_s)
+    lost = _lost_note(found, np.concatenate([part.lost for part in parts]))
+    return found.noting(_jitter_note(parts), lost, columns=found.columns | {"time_s": np.concatenate(even)})
 
 
-def _check_rising(time_s: np.ndarray, at: At) -> None:
-    bounds.check_size(time_s.size, at(0))
+def _check_rising(found: FileContent) -> None:
+    time_s = found.columns["time_s"]
+    bounds.check_size(time_s.size, found.at(0))
     gaps = np.diff(time_s)
     backwards = np.flatnonzero(~(gaps > 0))
     if backwards.size:
         index = int(backwards[0]) + 1
         verb = "stands still" if gaps[index - 1] == 0 else "runs backwards"
         fix = "Sort the rows by time, once each."
-        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=at(index), fix=fix)
+        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=found.at(index), fix=fix)
 
 
-def _finer(time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Even times where the stamps are only too coarsely rounded for the samples, so that some are equal."""
+def _finer(time_s: np.ndarray) -> tuple[np.ndarray, str]:
+    """Even times where the stamps are only too coarsely rounded for the samples, so that some are equal; and a note."""
     if not np.any(np.diff(time_s) == 0):
-        return time_s, []
+        return time_s, ""
     line_s = np.linspace(time_s[0], time_s[-1], time_s.size)
     line_s += 0.5 * (np.max(time_s - line_s) + np.min(time_s - line_s))
     coarse_s = _resolution_s(time_s)
     if not 0.0 < np.max(np.abs(time_s - line_s)) <= NEAR * coarse_s or time_s[-1] <= time_s[0]:
-        return time_s, []
+        return time_s, ""
     rate_hz = (time_s.size - 1) / (line_s[-1] - line_s[0])
-    return line_s, [f"times are written to {1e3 * coarse_s:g} ms only: samples are taken as even, at {rate_hz:.5g} Hz"]
+    return line_s, f"times are written to {1e3 * coarse_s:g} ms only: samples are taken as even, at {rate_hz:.5g} Hz"
 
 
-def _pauses(time_s: np.ndarray, width_us: np.ndarray, at: At) -> list[int]:
+def _pauses(found: FileContent) -> list[int]:
     """Rows at which a part begins, and the number of rows: tests of one session may follow after a pause at rest."""
+    time_s, width_us = found.columns["time_s"], found.columns["pulse_width_us"]
     steps = np.diff(time_s)
     least_s = max(PAUSE_S, 20 * float(np.median(steps)))
     jumps = np.flatnonzero((steps >= least_s) & (width_us[:-1] == 0) & (width_us[1:] == 0)) + 1
     if jumps.size > MOST_PAUSES:
         fix = "Give a record without holes."
-        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=at(int(jumps[MOST_PAUSES])), fix=fix)
+        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=found.at(int(jumps[MOST_PAUSES])), fix=fix)
     return [0, *jumps.tolist(), time_s.size]
 
 
-def _part(time_s: np.ndarray, torque_nm: np.ndarray, first: int, at: At) -> _Part:
-    bounds.check_size(time_s.size, at(first))
+def _part(found: FileContent, first: int, end: int) -> _Part:
+    time_s, torque_nm = found.columns["time_s"][first:end], found.columns["torque_nm"][first:end]
+    bounds.check_size(time_s.size, found.at(first))
     gaps = np.diff(time_s)
     typical_s = float(np.median(gaps))
     near = np.abs(gaps - typical_s) <= NEAR * typical_s
@@ -236,11 +217,7 @@ def _part(time_s: np.ndarray, torque_nm: np.ndarray, first: int, at: At) -> _Par
         line_s, slope_s = start_s + slope_s * index, float(slope_s)
         if _roughness(time_s, torque_nm) > BETTER * _roughness(line_s, torque_nm):
             return _Part(line_s, slope_s, lost, jitter_s)
-    return _Part(None, _usual_step_s(gaps, typical_s), lost)
-
-
-def _usual_step_s(gaps: np.ndarray, typical_s: float) -> float:
-    return float(np.mean(gaps[gaps <= GAP_STEPS * typical_s]))
+    return _Part(None, float(np.mean(gaps[gaps <= GAP_STEPS * typical_s])), lost)
 
 
 def _resolution_s(time_s: np.ndarray) -> float:
@@ -259,32 +236,35 @@ def _roughness(time_s: np.ndarray, torque_nm: np.ndarray) -> float:
     return float(np.mean(error**2 / (1.0 + ahead**2 + (1.0 - ahead) ** 2)))
 
 
-def _jitter_note(parts: list[_Part]) -> list[str]:
+def _jitter_note(parts: list[_Part]) -> str:
     worst = max(parts, key=lambda part: part.jitter_s)
     if not worst.jitter_s:
-        return []
-    return [
+        return ""
+    return (
         f"time stamps jitter by up to {1e3 * worst.jitter_s:.3g} ms: samples are taken as even, at "
         f"{1 / worst.step_s:.5g} Hz, which suits the torque better"
-    ]
+    )
 
 
-def _lost_note(rows: np.ndarray, time_s: np.ndarray, at: At, told: At) -> list[str]:
+def _lost_note(found: FileContent, rows: np.ndarray) -> str:
+    time_s = found.columns["time_s"]
     if not rows.size:
-        return []
+        return ""
     if rows.size > max(MOST_PAUSES, MOST_GAPS * time_s.size):
-        place = at(int(rows[MOST_PAUSES]))
+        place = found.at(int(rows[MOST_PAUSES]))
         raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, fix="Give a record without holes.")
     longest_s = float(np.max(time_s[rows] - time_s[rows - 1]))
     places = "1 place" if rows.size == 1 else f"{rows.size} places"
-    return [f"samples are missing at {places} (first at {told(int(rows[0]))}; longest {longest_s:.3g} s): left as gaps"]
+    first = found.cell(int(rows[0]), "time_s")
+    return f"samples are missing at {places} (first at {first}; longest {longest_s:.3g} s): left as gaps"
 
 
-def _resampled(columns: Columns, step_s: float, at: At, told: At, pulse_rate_hz: float) -> tuple[Columns, list[str]]:
-    """Columns at a uniform rate: torque and movement on straight lines between samples, gaps left open."""
-    time_s = columns["time_s"]
+def _resampled(found: FileContent, step_s: float) -> FileContent:
+    """The same at a uniform rate: torque and movement on straight lines between samples, gaps left open."""
+    time_s, width_us = found.columns["time_s"], found.columns["pulse_width_us"]
     steps = np.diff(time_s)
-    gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1
+    gap = steps > GAP_STEPS * np.median(steps)
+    gaps, usual = np.flatnonzero(gap) + 1, steps[~gap]
     starts, ends = np.append(0, gaps), np.append(gaps, time_s.size) - 1
     first = np.ceil((time_s[starts] - time_s[0]) / step_s - 1e-6).astype(np.int64)
     count = np.maximum(np.floor((time_s[ends] - time_s[0]) / step_s + 1e-6).astype(np.int64) - first + 1, 0)
@@ -292,15 +272,14 @@ def _resampled(columns: Columns, step_s: float, at: At, told: At, pulse_rate_hz:
     even_s = time_s[0] + step_s * index
     before = np.clip(np.searchsorted(time_s, even_s + 1e-6 * step_s, side="right") - 1, 0, time_s.size - 2)
     share = np.clip((even_s - time_s[before]) / steps[before], 0.0, 1.0)
-    found = {
+    columns = {
         name: (1.0 - share) * column[before] + share * column[before + 1] if name in INTERPOLATED else column[before]
-        for name, column in columns.items()
+        for name, column in found.columns.items()
     }
-    width_us = width_in_slots(time_s, columns["pulse_width_us"], even_s, before, pulse_rate_hz)
-    found |= {"time_s": even_s, "pulse_width_us": width_us}
-    usual = steps[steps <= GAP_STEPS * np.median(steps)]
+    columns["time_s"] = even_s
+    columns["pulse_width_us"] = width_in_slots(time_s, width_us, even_s, before, found.pulse_rate_hz)
     note = (
         f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms): resampled to "
         f"{1 / step_s:.5g} Hz, torque on straight lines between samples"
     )
-    return found, [note, *_lost_note(gaps, time_s, at, told)]
+    return found.noting(note, _lost_note(found, gaps), columns=columns)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records.record import OPTIONAL
+from stimrig.identify.records.record import NEEDED, OPTIONAL
 
 _TIME = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "µs": 1e-6, "us": 1e-6, "min": 60.0}
 _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180}
@@ -53,7 +53,6 @@ def unit_factor(target: str, unit: str) -> float | None:
     return UNITS[target].get(plain_unit(unit))
 
 
-NEEDED = ("time_s", "pulse_width_us", "torque_nm")
 MAY_LACK = (*NEEDED, "angle_rad", "velocity_rad_s")
 """Columns in which a number may be missing: a row without one is left out."""
 TARGETS = (*NEEDED, "segment", *OPTIONAL)

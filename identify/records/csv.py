@@ -6,12 +6,11 @@ from __future__ import annotations
 
 import codecs
 import csv
-import hashlib
 import io
 import re
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
 
@@ -19,10 +18,11 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns, join
-from stimrig.identify.records.assemble import PULSE_RATE_HZ, FileContent, check_widths, optional, record_of
+from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.cells import as_written
 from stimrig.identify.records.columns import MAY_LACK, Column, Given
-from stimrig.identify.records.record import Record, Source, joined_source
+from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
+from stimrig.identify.records.record import Record
 
 LONGEST_LINE = 10_000
 """Characters; no row of numbers has as many."""
@@ -279,49 +279,47 @@ class Table:
         """Take all rows in. Raises BadRecord: with file, line and column."""
         source = iter(rows)
         while block := list(islice(source, BLOCK)):
-            self._take([row for _, row in block], [line for line, _ in block])
+            for column, values in self.numbers.items():
+                values.extend(self._column(block, column))
+            if self.cells:
+                self._take_parts(block)
+            if "segment" in self.columns:
+                self._take_segments(block)
+            self.lines.extend(line for line, _ in block)
 
-    def _take(self, rows: list[list[str]], lines: list[int]) -> None:
-        for column, values in self.numbers.items():
-            values.extend(self._column(rows, column, lines))
-        if self.cells:
-            self._take_parts(rows, lines)
-        if "segment" in self.columns:
-            self._take_segments(rows, lines)
-        self.lines.extend(lines)
-
-    def _take_segments(self, rows: list[list[str]], lines: list[int]) -> None:
+    def _take_segments(self, rows: list[Row]) -> None:
         at = self.columns["segment"].index
-        for row, line in zip(rows, lines, strict=True):
+        for line, row in rows:
             if len(row) <= at:
                 raise self._short(row, line, "segment")
             text = as_written(row[at].strip())
             code = self.names.get(text)
             self.segment.append(self._new_name(text, line) if code is None else code)
 
-    def _take_parts(self, rows: list[list[str]], lines: list[int]) -> None:
+    def _take_parts(self, rows: list[Row]) -> None:
         """Keep the cells of each row with which a part begins."""
         before = len(self.lines)
         number = np.array(self.numbers["part"][max(before - 1, 0) :])
         firsts = np.flatnonzero(np.diff(number)) + (0 if before else 1)
         for index in firsts.tolist() if before else [0, *firsts.tolist()]:
-            row = rows[index]
+            line, row = rows[index]
             if len(row) <= max(self.cells.values()):
-                raise self._short(row, lines[index], "pause_s")
+                raise self._short(row, line, "pause_s")
             self.parts[before + index] = {column: as_written(row[at].strip()) for column, at in self.cells.items()}
             if len(self.parts) > bounds.MOST_PARTS:
                 fix = f"At most {bounds.MOST_PARTS} in one record."
-                raise BadRecord("too many parts", place=self.at(lines[index], "part"), fix=fix)
+                raise BadRecord("too many parts", place=self.at(line, "part"), fix=fix)
 
-    def _column(self, rows: list[list[str]], column: str, lines: list[int]) -> np.ndarray:
+    def _column(self, rows: list[Row], column: str) -> np.ndarray:
         """The numbers of a column in its own unit; NaN where the file has none."""
         found = self.columns[column]
         try:
-            cells = [row[found.index] for row in rows]
+            cells = [row[found.index] for _, row in rows]
         except IndexError:
-            row, line = next(pair for pair in zip(rows, lines, strict=True) if len(pair[0]) <= found.index)
+            line, row = next((line, row) for line, row in rows if len(row) <= found.index)
             raise self._short(row, line, column) from None
         text = "".join(cells)
+        lines = [line for line, _ in rows]
         self._settle_decimal(text, cells, column, lines)
         if self.decimal == ",":
             cells, text = [cell.replace(",", ".") for cell in cells], text.replace(",", ".")
@@ -341,9 +339,8 @@ class Table:
             shown = _show_cell(cells[bad[0]].strip())
             fix = "Remove the row's cause, or cut the record before it; values must be finite."
             fix = bounds.fix_of(column, values[bad], fix)
-            raise BadRecord(
-                f"{shown} is no measurement" if shown else "empty", place=self.at(lines[bad[0]], column), fix=fix
-            )
+            message = f"{shown} is no measurement" if shown else "empty"
+            raise BadRecord(message, place=self.at(lines[bad[0]], column), fix=fix)
         return values
 
     def _settle_decimal(self, text: str, cells: list[str], column: str, lines: list[int]) -> None:
@@ -388,7 +385,7 @@ def _show_cell(cell: str) -> str:
     return cell if len(cell) <= 40 else f"{cell[:40]}…"
 
 
-def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, given: Given | None = None) -> Record:
+def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None, given: Given) -> Record:
     """A record of a table from its bytes; `path` is how it is called, `given` what `--map` says.
 
     Pulses come at 40 Hz, unless it or the caller says else. Raises BadRecord: with file, line and column, and what
@@ -396,29 +393,30 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None = None, giv
     """
     name = str(path)
     encoding, encoded = encoding_of(content, name)
-    layout = find_layout(content, encoding, given or {}, name)
-    known = columns.columns(layout.header, given or {}, layout.units, f"{name}, line {layout.line}")
+    layout = find_layout(content, encoding, given, name)
+    known = columns.columns(layout.header, given, layout.units, f"{name}, line {layout.line}")
     cells = _cells_of_parts(layout.header, known, f"{name}, line {layout.line}")
     table = Table(name, known, cells, commas=layout.separator != ",")
     table.fill(layout.rows)
     if not table.lines:
         place = f"{name}, line {layout.line + 1}"
         raise BadRecord("no row under the header", place=place, fix="Give a few seconds of data.")
-    source = Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=_notes(encoded, layout, table, known))
+    numbers = {column: np.array(values) for column, values in table.numbers.items()}
+    if "segment" in known:
+        numbers["segment"] = np.array(table.segment)
     found = FileContent(
-        columns={column: np.array(values) for column, values in table.numbers.items()},
-        segment=np.array(table.segment) if "segment" in known else None,
+        columns=numbers,
         names=list(table.names),
         name=name,
         cell=lambda row, column: f"line {table.lines[row]}, column {column}",
-        source=source,
+        source=file_source(content, path, known, encoded, _written(layout, table)),
         pulse_rate_hz=pulse_rate_hz or PULSE_RATE_HZ,
     )
-    return _joined(found, table, pulse_rate_hz) if cells else record_of(found)
+    return join.read_joined(found, table.parts, pulse_rate_hz) if cells else record_of(found)
 
 
-def _notes(encoded: str, layout: Layout, table: Table, known: Mapping[str, Column]) -> tuple[str, ...]:
-    """What was assumed of how the file is written, and of its columns."""
+def _written(layout: Layout, table: Table) -> str:
+    """What was assumed of how the table is written."""
     written = []
     if layout.separator != ",":
         written.append(f"{SEPARATORS[layout.separator]} between cells")
@@ -426,8 +424,7 @@ def _notes(encoded: str, layout: Layout, table: Table, known: Mapping[str, Colum
         written.append("decimal commas")
     if layout.line != 1:
         written.append(f"header in line {layout.line}" if layout.line else "no header")
-    columns = "; ".join(column.note for column in known.values() if column.note)
-    return tuple(note for note in (encoded, ", ".join(written), columns) if note)
+    return ", ".join(written)
 
 
 def _cells_of_parts(header: list[str], known: dict[str, Column], place: str) -> dict[str, int]:
@@ -440,27 +437,3 @@ def _cells_of_parts(header: list[str], known: dict[str, Column], place: str) -> 
         raise BadRecord(f"column {twice[0]} is there twice", place=place, fix="Keep one of them.")
     known["part"] = Column(header.index("part"))
     return {column: header.index(column) for column in join.CELLS if column in header}
-
-
-def _joined(found: FileContent, table: Table, pulse_rate_hz: float | None) -> Record:
-    """A record that was joined: its times are taken as they are written."""
-    for column, values in found.columns.items():
-        if (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[column]))).size:
-            place = found.at(int(bad[0]), column)
-            raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=join.FIX)
-    check_widths(found.columns, found.at)
-    time_s = found.columns["time_s"]
-    joined = join.parsed(found.columns, table.parts, table.lines, table.name)
-    bounds.check_span(time_s, found.at(time_s.size - 1, "time_s"))
-    source = joined_source(joined.sources, found.source.name, found.source.sha256)
-    return Record.from_arrays(
-        time_s,
-        found.columns["pulse_width_us"],
-        found.columns["torque_nm"],
-        found.segment,
-        segment_names=found.names,
-        pulse_rate_hz=pulse_rate_hz or joined.pulse_rate_hz or PULSE_RATE_HZ,
-        source=replace(source, notes=found.source.notes),
-        parts=joined.parts,
-        **optional(found.columns),
-    )

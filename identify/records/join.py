@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -17,7 +17,8 @@ from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
 from stimrig.identify.records.cells import quoted
 from stimrig.identify.records.clock import pulse_phase_s
-from stimrig.identify.records.record import OPTIONAL, Part, Pulses, Record, Source, joined_source
+from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, check_widths
+from stimrig.identify.records.record import NEEDED, OPTIONAL, Part, Pulses, Record, Source, joined_source
 
 CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "recording_id", "sha256")
 """Columns of which only a part's first row is filled; all but `pause_s` may be missing or empty."""
@@ -32,10 +33,11 @@ def write_joined(record: Record, path: Path) -> None:
     Raises BadRecord: the file would be larger than what can be read.
     """
     names = [_cell(name) for name in record.segment_names]
-    header = ("time_s", "pulse_width_us", "torque_nm", "segment", *record.columns(), "part", *CELLS)
-    numbers = (record.time_s, record.pulse_width_us, record.torque_nm, *record.columns().values())
-    columns: list[Iterator[str]] = [map(repr, np.asarray(column, float).tolist()) for column in numbers]
-    columns.insert(3, (names[index] for index in record.segment.tolist()))
+    header = (*NEEDED, "segment", *record.columns(), "part", *CELLS)
+    columns: list[Iterator[str]] = [
+        map(repr, np.asarray(column, float).tolist()) for column in record.samples().values()
+    ]
+    columns.insert(len(NEEDED), (names[index] for index in record.segment.tolist()))
     columns.append(map(str, record.part.tolist()))
     empty = "," * len(CELLS)
     described = {part.first: "," + cells for part, cells in zip(record.parts, _descriptions(record), strict=True)}
@@ -71,58 +73,50 @@ def _cell(text: str) -> str:
     return quoted("".join(sign for sign in text if sign.isprintable())[:LONGEST_TEXT])
 
 
-@dataclass(frozen=True)
-class Parts:
-    """What a file says of its parts."""
+def read_joined(found: FileContent, cells: Mapping[int, Mapping[str, str]], pulse_rate_hz: float | None) -> Record:
+    """The record of a file with the column `part` and the `cells` of each part's first row, by row.
 
-    parts: tuple[Part, ...]
-    sources: tuple[Source, ...]
-    pulse_rate_hz: float | None
-
-
-def parsed(
-    columns: Mapping[str, np.ndarray], cells: Mapping[int, Mapping[str, str]], lines: Sequence[int], name: str
-) -> Parts:
-    """The parts of a file from its columns `part` and `time_s` and the cells of each part's first row, by row.
-
-    Raises BadRecord: parts are not numbered 0, 1, 2…, time does not rise, or a cell is not what it must be.
+    Times are taken as they are written. Raises BadRecord: parts are not numbered 0, 1, 2…, time does not rise, or a
+    cell is not what it must be.
     """
-    time_s, found = columns["time_s"], []
-    _check_time(time_s, list(cells), lines, name)
-    for number, (row, texts) in enumerate(cells.items()):
+    for column, values in found.columns.items():
+        if column != "segment" and (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[column]))).size:
+            place = found.at(int(bad[0]), column)
+            raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=FIX)
+    check_widths(found)
+    _check_time(found, list(cells))
+    parts, sources, rates = zip(
+        *(_part(found, number, *cell) for number, cell in enumerate(cells.items())), strict=True
+    )
+    if len(set(rates)) > 1:
+        raise BadRecord("parts of different pulse rates", place=f"{found.name}, column pulse_rate_hz", fix=FIX)
+    time_s = found.columns["time_s"]
+    bounds.check_span(time_s, found.at(time_s.size - 1))
+    source = joined_source(sources, found.source.name, found.source.sha256)
+    return replace(
+        found,
+        columns={name: column for name, column in found.columns.items() if name != "part"},
+        source=replace(source, notes=found.source.notes),
+        pulse_rate_hz=pulse_rate_hz or rates[0] or PULSE_RATE_HZ,
+    ).record(parts=parts)
 
-        def at(column: str, row: int = row) -> str:
-            return f"{name}, line {lines[row]}, column {column}"
 
-        if columns["part"][row] != number:
-            raise BadRecord(f"{columns['part'][row]:g} where part {number} begins", place=at("part"), fix=FIX)
-        found.append(_part(row, texts, float(time_s[row]), at))
-        gap_s = time_s[row] - time_s[row - 1] if number else 0.0
-        if found[-1][0].folded_s > gap_s + 1e-6:
-            raise BadRecord("longer than the jump of the time", place=at("folded_s"), fix=FIX)
-    rates = {rate for *_, rate in found}
-    if len(rates) > 1:
-        raise BadRecord("parts of different pulse rates", place=f"{name}, column pulse_rate_hz", fix=FIX)
-    return Parts(tuple(part for part, *_ in found), tuple(source for _, source, _ in found), rates.pop())
-
-
-def _check_time(time_s: np.ndarray, firsts: Sequence[int], lines: Sequence[int], name: str) -> None:
-    """Times are taken as they are written: they must rise, and at a rate that can be used."""
+def _check_time(found: FileContent, firsts: Sequence[int]) -> None:
+    """Times must rise, and at a rate that can be used."""
+    time_s = found.columns["time_s"]
     backwards = np.flatnonzero(~(np.diff(time_s) > 0))
     if backwards.size:
         row = int(backwards[0]) + 1
-        place = f"{name}, line {lines[row]}, column time_s"
-        raise BadRecord(f"time does not rise at {time_s[row]:g} s", place=place, fix=FIX)
+        raise BadRecord(f"time does not rise at {time_s[row]:g} s", place=found.at(row), fix=FIX)
     for row, end in zip(firsts, [*firsts[1:], time_s.size], strict=True):
-        place = f"{name}, line {lines[row]}, column time_s"
         if end - row < 2:
-            raise BadRecord("a part of one sample", place=place, fix=FIX)
-        bounds.check_sampling(1 / float(np.median(np.diff(time_s[row:end]))), place)
+            raise BadRecord("a part of one sample", place=found.at(row), fix=FIX)
+        bounds.check_sampling(1 / float(np.median(np.diff(time_s[row:end]))), found.at(row))
 
 
-def _part(
-    row: int, texts: Mapping[str, str], time_s: float, at: Callable[[str], str]
-) -> tuple[Part, Source, float | None]:
+def _part(found: FileContent, wanted: int, row: int, texts: Mapping[str, str]) -> tuple[Part, Source, float | None]:
+    """A part, its source and its pulse rate from the cells of its first row."""
+
     def number(column: str, lowest: float, highest: float) -> float | None:
         text = texts.get(column, "")
         if not text:
@@ -132,29 +126,33 @@ def _part(
         except ValueError:
             value = np.nan
         if not (text.isascii() and "_" not in text and lowest <= value <= highest):
-            raise BadRecord(f"{text[:40]!r} is not {lowest:g} to {highest:g}", place=at(column), fix=FIX)
+            message = f"{text[:40]!r} is not {lowest:g} to {highest:g}"
+            raise BadRecord(message, place=found.at(row, column), fix=FIX)
         return value
 
     def text(column: str) -> str:
-        found = texts.get(column, "")
-        if len(found) > LONGEST_TEXT or not found.isprintable():
-            raise BadRecord("a name that cannot be", place=at(column), fix=FIX)
-        return found
+        cell = texts.get(column, "")
+        if len(cell) > LONGEST_TEXT or not cell.isprintable():
+            raise BadRecord("a name that cannot be", place=found.at(row, column), fix=FIX)
+        return cell
 
+    time_s, part = found.columns["time_s"], found.columns["part"][row]
+    if part != wanted:
+        raise BadRecord(f"{part:g} where part {wanted} begins", place=found.at(row, "part"), fix=FIX)
     pause_s = number("pause_s", 0.0, bounds.LONGEST_S)
     if pause_s is None:
-        raise BadRecord("empty", place=at("pause_s"), fix="Give the pause before each part, 0 if it isn't known.")
+        fix = "Give the pause before each part, 0 if it isn't known."
+        raise BadRecord("empty", place=found.at(row, "pause_s"), fix=fix)
     folded_s, latest_s = number("folded_s", 0.0, pause_s), bounds.LARGEST["time_s"]
+    folded_s = pause_s if folded_s is None else folded_s
     own_s = number("own_s", -latest_s, latest_s)
+    own_s = float(time_s[row]) if own_s is None else own_s
     rate_hz = number("pulse_rate_hz", *bounds.PULSE_RATES_HZ)
-    part = Part(
-        first=row,
-        own_s=time_s if own_s is None else own_s,
-        begun_s=number("begun_s", 0.0, LARGEST_UNIX_S),
-        pause_s=pause_s,
-        folded_s=pause_s if folded_s is None else folded_s,
-    )
-    return part, Source(text("name"), text("recording_id"), text("sha256")), rate_hz
+    begun_s = number("begun_s", 0.0, LARGEST_UNIX_S)
+    source = Source(text("name"), text("recording_id"), text("sha256"))
+    if folded_s > (time_s[row] - time_s[row - 1] if wanted else 0.0) + 1e-6:
+        raise BadRecord("longer than the jump of the time", place=found.at(row, "folded_s"), fix=FIX)
+    return Part(row, own_s, begun_s, pause_s, folded_s), source, rate_hz
 
 
 PAUSE_S = 30.0
@@ -177,9 +175,7 @@ class _Piece:
     """A time at which a pulse is due."""
     source: Source
     known_pause_s: float
-    """The pause before it, as the record that it was cut from has it."""
-    follows: bool
-    """Whether the piece before it in the list was before it in that record too."""
+    """The pause before it in the record that it was cut from; 0 for that one's first."""
 
     @property
     def begin_s(self) -> float:
@@ -235,7 +231,7 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
     if len(pieces) > bounds.MOST_PARTS:
         raise BadRecord(f"{len(pieces)} parts", fix=f"Join at most {bounds.MOST_PARTS}.")
     if all(piece.begun_s is not None for piece in pieces):
-        pieces = [replace(piece, follows=False) for piece in sorted(pieces, key=_order)]
+        pieces.sort(key=_order)
     return _joined(_at_one_rate(pieces, rate_hz), rate_hz)
 
 
@@ -262,29 +258,17 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
     edges = [*(part.first for part in record.parts), record.time_s.size]
     found = []
     for index, part in enumerate(record.parts):
-        rows = slice(part.first, edges[index + 1])
         # A plain record's clock is its own.
         shift_s = 0.0 if alone and part.begun_s is None else part.own_s - float(record.time_s[part.first])
-        names = record.segment[rows]
-        changes: dict[str, object] = {name: column[rows] for name, column in record.columns().items()}
-        if record.pulses is not None:
-            changes["pulses"] = _pulses(record.pulses, shift_s, -np.inf, np.inf)
-        changes |= {
-            "time_s": record.time_s[rows] + shift_s,
-            "pulse_width_us": record.pulse_width_us[rows],
-            "torque_nm": record.torque_nm[rows],
-            "segment": names - names[0],
-            "segment_names": record.segment_names[names[0] : names[-1] + 1],
-            "parts": (Part(),),
-        }
+        pulses = None if record.pulses is None else _pulses(record.pulses, shift_s, -np.inf, np.inf)
+        cut = record.take(np.arange(part.first, edges[index + 1]))
         found.append(
             _Piece(
-                record=replace(record, **changes),  # pyright: ignore[reportArgumentType]
+                record=replace(cut, time_s=cut.time_s + shift_s, pulses=pulses, parts=(Part(),)),
                 begun_s=begun_s if alone and part.begun_s is None else part.begun_s,
                 slot_s=slot_s + shift_s,
                 source=sources[index] if sources else replace(record.source, parts=()),
-                known_pause_s=part.pause_s,
-                follows=index > 0,
+                known_pause_s=part.pause_s if index else 0.0,
             )
         )
     return found
@@ -326,15 +310,13 @@ def _block_means(piece: _Piece, each: int, rate_hz: float) -> Record:
         pick[index] = starts[index] + int(np.argmax(record.held_out[starts[index] : starts[index] + count[index]]))
     pick = pick[whole]
     changes: dict[str, object] = {}
-    for name in ("time_s", "pulse_width_us", "torque_nm", *OPTIONAL):
-        column = getattr(record, name)
-        if column is not None:
-            if name in RESAMPLED:
-                changes[name] = (np.add.reduceat(column, starts) / count)[whole]
-            elif column.dtype == bool:
-                changes[name] = np.logical_or.reduceat(column, starts)[whole]
-            else:
-                changes[name] = column[pick]
+    for name, column in record.samples().items():
+        if name in RESAMPLED:
+            changes[name] = (np.add.reduceat(column, starts) / count)[whole]
+        elif column.dtype == bool:
+            changes[name] = np.logical_or.reduceat(column, starts)[whole]
+        else:
+            changes[name] = column[pick]
     kept = record.segment[pick]
     used, segment = np.unique(kept, return_inverse=True)
     names = tuple(record.segment_names[index] for index in used)
@@ -346,7 +328,7 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     total = sum(piece.record.time_s.size for piece in pieces)
     if total > bounds.LARGEST_ROWS:
         raise BadRecord(f"{total} samples together", fix=f"At most {bounds.LARGEST_ROWS} in one record.")
-    times, parts, codes, names, sources = [], [], [], [], []
+    moved, parts, codes, names, sources = [], [], [], [], []
     pulses: list[Pulses] = []
     first, ended, slot_s = 0, 0, pieces[0].slot_s
     for index, piece in enumerate(pieces):
@@ -357,7 +339,7 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
         start = ended + 1 + folded if index else own
         shift_s = slot_s + (start - own) / rate_hz - piece.slot_s
         ended = start + piece.interval(-1, rate_hz) - own
-        times.append(time_s + shift_s)
+        moved.append(replace(piece.record, time_s=time_s + shift_s))
         if piece.record.pulses is not None:
             pulses.append(_pulses(piece.record.pulses, shift_s, float(time_s[0]), float(time_s[-1])))
         codes.append(piece.record.segment + len(names))
@@ -365,17 +347,13 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
         sources.append(piece.source)
         parts.append(Part(first, float(time_s[0]), piece.begun_s, pause / rate_hz, folded / rate_hz))
         first += time_s.size
-    time_s = np.concatenate(times)
-    bounds.check_span(time_s, "the joined record")
-    columns: dict[str, np.ndarray | None] = {}
-    for name in OPTIONAL:
-        each = [column for piece in pieces if (column := _column(piece.record, name)) is not None]
-        whole = np.concatenate(each) if len(each) == len(pieces) else None
-        columns[name] = None if name in TOLD_WHERE_SO and whole is not None and not whole.any() else whole
+    columns: dict[str, np.ndarray] = {}
+    for name in (*NEEDED, *OPTIONAL):
+        each = [column for record in moved if (column := _column(record, name)) is not None]
+        if len(each) == len(pieces) and (name not in TOLD_WHERE_SO or any(column.any() for column in each)):
+            columns[name] = np.concatenate(each)
+    bounds.check_span(columns["time_s"], "the joined record")
     return Record(
-        time_s=time_s,
-        pulse_width_us=np.concatenate([piece.record.pulse_width_us for piece in pieces]),
-        torque_nm=np.concatenate([piece.record.torque_nm for piece in pieces]),
         segment=np.concatenate(codes),
         segment_names=tuple(names),
         pulses=_all_pulses(pulses) if len(pulses) == len(pieces) else None,
@@ -410,5 +388,5 @@ def _pause(before: _Piece, after: _Piece, rate_hz: float) -> int:
         last_s = before.begun_s + float(before.record.time_s[-1])
         pause_s = after.begin_s - last_s - 1 / before.record.sample_rate_hz
     else:
-        pause_s = after.known_pause_s if after.follows else 0.0
+        pause_s = after.known_pause_s
     return round(min(max(pause_s, 0.0), bounds.LONGEST_S) * rate_hz)

@@ -6,7 +6,6 @@ that are asked for are unpacked."""
 
 from __future__ import annotations
 
-import hashlib
 import math
 import struct
 from collections.abc import Iterator, Mapping
@@ -18,10 +17,11 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns
-from stimrig.identify.records.assemble import PULSE_RATE_HZ, FileContent, record_of
+from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, BadPiece, inflated
 from stimrig.identify.records.columns import Given
-from stimrig.identify.records.record import Record, Source
+from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
+from stimrig.identify.records.record import Record
 
 HEADER_BYTES = 128
 HEAD_BYTES = 4096
@@ -244,27 +244,22 @@ def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None, given: Giv
     found = columns.columns(header, given, [], f"{name}, {scope}" if scope else name)
     before = f"{scope}." if scope else ""
     of = {target: before + header[column.index] for target, column in found.items()}
-
-    def cell(row: int, column: str) -> str:
-        return f"{of[column]}({row + 1})"
-
     numbers: dict[str, np.ndarray] = {}
     for target, column in found.items():
         with _told(f"{name}, {of[target]}"):
             if target != "segment":
                 numbers[target] = known[header[column.index]].numbers() * column.factor
     _check_lengths(numbers, of, name)
-    segment, names = None, []
+    names: list[str] = []
     if "segment" in found:
         variable = known[header[found["segment"].index]]
-        segment, names = _segments(variable, numbers["time_s"].size, f"{name}, {of['segment']}")
+        numbers["segment"], names = _segments(variable, numbers["time_s"].size, f"{name}, {of['segment']}")
     if pulse_rate_hz is None and RATE in known:
         with _told(f"{name}, {RATE}"):
             pulse_rate_hz = float(known[RATE].numbers()[:1].sum())
         bounds.check_rate(pulse_rate_hz, f"{name}, {RATE}")
-    notes = "; ".join(column.note for column in found.values() if column.note)
-    source = Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=(notes,) if notes else ())
-    return record_of(FileContent(numbers, segment, names, name, cell, source, pulse_rate_hz or PULSE_RATE_HZ))
+    source, rate_hz = file_source(content, path, found), pulse_rate_hz or PULSE_RATE_HZ
+    return record_of(FileContent(numbers, names, name, lambda row, column: f"{of[column]}({row + 1})", source, rate_hz))
 
 
 def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, Mapping[str, Variable], Given]:

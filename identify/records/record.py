@@ -13,8 +13,9 @@ from stimrig.identify.summary import Sheet, Summarised, quantity
 
 HELD_OUT = "validate"
 """Rows of this segment are never used to fit or to choose an effect; they may only speak against one."""
+NEEDED = ("time_s", "pulse_width_us", "torque_nm")
 OPTIONAL = ("angle_rad", "velocity_rad_s", "late_s", "doubted")
-"""Every column that a record may have or not: what cuts, joins or copies records goes by this list and loses none."""
+"""Every column that a record may have or not: what cuts, joins or copies records goes by these lists and loses none."""
 FORGOTTEN_S = 1.5
 """So long after something unknown was applied a muscle still shows it: 7 time constants of 0.2 s, a slow muscle's."""
 
@@ -214,19 +215,20 @@ class Record(Summarised):
         found = {name: getattr(self, name) for name in OPTIONAL}
         return {name: column for name, column in found.items() if column is not None}
 
+    def samples(self) -> dict[str, np.ndarray]:
+        """Times, pulse widths, torques and the optional columns, by name."""
+        return {name: getattr(self, name) for name in NEEDED} | self.columns()
+
     def take(self, rows: np.ndarray) -> Record:
         """The record of some of its rows (bool or indices, rising), with every column it has, and its pulses."""
         return Record.from_arrays(
-            self.time_s[rows],
-            self.pulse_width_us[rows],
-            self.torque_nm[rows],
-            self.segment[rows],
+            **{name: column[rows] for name, column in self.samples().items()},
+            segment=self.segment[rows],
             segment_names=self.segment_names,
             pulses=self.pulses,
             pulse_rate_hz=self.pulse_rate_hz,
             source=self.source,
             parts=self._parts_of(np.arange(self.time_s.size)[rows]),
-            **{name: column[rows] for name, column in self.columns().items()},
         )
 
     def _parts_of(self, kept: np.ndarray) -> list[Part]:
