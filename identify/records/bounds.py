@@ -36,6 +36,7 @@ UNITS = {
 LARGEST_CALENDAR_S = 1e11
 """Times as they are read may be counted from 1970, or from 1904."""
 LONGEST_NAME = 100
+LONGEST_TEXT = 10_000
 MOST_SEGMENTS = 1000
 MOST_PARTS = 1000
 PULSE_RATES_HZ = (1.0, 200.0)

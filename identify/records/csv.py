@@ -55,11 +55,10 @@ def encoding_of(content: bytes, name: str) -> tuple[str, str]:
 
 
 def _is_utf8(content: bytes) -> bool:
-    decoder = codecs.getincrementaldecoder("utf-8")()
+    pieces = (content[start : start + PIECE_BYTES] for start in range(0, len(content), PIECE_BYTES))
     try:
-        for start in range(0, len(content), PIECE_BYTES):
-            decoder.decode(content[start : start + PIECE_BYTES])
-        decoder.decode(b"", final=True)
+        for _ in codecs.iterdecode(pieces, "utf-8"):
+            pass
     except UnicodeDecodeError:
         return False
     return True
@@ -103,31 +102,27 @@ def find_layout(content: bytes, encoding: str, given: Given, name: str) -> Layou
     """
     source = text_lines(content, encoding, name)
     before: list[str] = []
-    for number, line in enumerate(source, start=1):
+    closest: tuple[float, int, list[str]] = (0.0, 1, [])
+    for number, line in enumerate(islice(source, MOST_BEFORE + 1), start=1):
         before.append(line)
-        if number > MOST_BEFORE:
-            break
         for separator in SEPARATORS:
             cells = _cells(line, separator)
-            if len(cells) < len(columns.NEEDED) or not columns.complete(columns.places(cells, given)):
-                continue
-            if not _numbered(given):
-                return _below(
-                    Layout(separator, cells, number, _rows(source, separator, number + 1, name)), content, name
-                )
-            if _is_numbers(cells, given):
-                return Layout(separator, cells, 0, _rows(chain([line], source), separator, number, name))
-    raise _no_header(before, given, name)
+            found = columns.places(cells, given)
+            if number <= MOST_BEFORE and len(cells) >= len(columns.NEEDED) and columns.complete(found):
+                if not _numbered(given):
+                    rows = _rows(source, separator, number + 1, name)
+                    return _below(Layout(separator, cells, number, rows), content, name)
+                if all(is_number(cells[found[target][0]].replace(",", ".")) for target in columns.NEEDED):
+                    return Layout(separator, cells, 0, _rows(chain([line], source), separator, number, name))
+            score = len(found) + (0.5 if sum(map(_is_word, cells)) >= 3 else 0)
+            if score > closest[0]:
+                closest = (score, number, cells)
+    raise _no_header(before, closest[1], closest[2], given, name)
 
 
 def _numbered(given: Given) -> bool:
     """Whether columns are asked for by number, so that a header need not be."""
     return all(target in given and given[target].name.startswith("#") for target in columns.NEEDED)
-
-
-def _is_numbers(cells: list[str], given: Given) -> bool:
-    at = [columns.places(cells, given)[target][0] for target in columns.NEEDED]
-    return all(is_number(cells[index].replace(",", ".")) for index in at)
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -206,16 +201,8 @@ def _check_width(found: Layout, line: int, row: list[str], name: str) -> None:
     raise BadRecord(message, place=f"{name}, line {line}", fix=fix)
 
 
-def _no_header(before: list[str], given: Given, name: str) -> BadRecord:
-    """What is missing in the line that comes closest to a header."""
-    best: tuple[float, int, list[str]] = (0.0, 1, [])
-    for number, line in enumerate(before, start=1):
-        for separator in SEPARATORS:
-            cells = _cells(line, separator)
-            score = len(columns.places(cells, given)) + (0.5 if sum(map(_is_word, cells)) >= 3 else 0)
-            if score > best[0]:
-                best = (score, number, cells)
-    _, number, cells = best
+def _no_header(before: list[str], number: int, cells: list[str], given: Given, name: str) -> BadRecord:
+    """What is missing in the cells of the line that comes closest to a header."""
     fix = "The first line must be time_s,pulse_width_us,torque_nm,segment, or name your columns with --map."
     if not cells:
         filled = any(line.strip("\ufeff \t\r\n") for line in before)

@@ -15,7 +15,7 @@ import numpy as np
 from h5py import h5a, h5d, h5f, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records.bounds import LARGEST_ROWS, MOST_SEGMENTS, BadPiece, inflated
+from stimrig.identify.records.bounds import LARGEST_ROWS, LONGEST_TEXT, MOST_SEGMENTS, BadPiece, inflated
 
 LARGEST_CHUNK_BYTES = 16 * 2**20
 MOST_CHUNKS = 100_000
@@ -90,7 +90,6 @@ def fletcher32(data: Any) -> tuple[int, int]:
 
 
 FIX = "Give a sealed recording, as written by the rig at the end of a test."
-LONGEST_TEXT = 10_000
 ELSEWHERE = object()
 FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 
@@ -116,7 +115,7 @@ class StrictFile:
         """A text attribute of the root. Raises BadRecord: not there and no default, or no text."""
         value = self._attribute(name, default)
         if not isinstance(value, str | bytes) or len(value) > LONGEST_TEXT:
-            raise self._bad("no text, or one without an end", f"attribute {name}")
+            raise self.bad("no text, or one without an end", f"attribute {name}")
         return _sound(value)
 
     def number(self, name: str, default: float) -> float:
@@ -150,9 +149,16 @@ class StrictFile:
             kind = dataset.get_type()
             plain = kind.get_class() in (h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= 8
             if not plain or h5t.py_create(kind.dtype) != kind:
-                raise self._bad("no plain numbers", path)
+                raise self.bad("no plain numbers", path)
             size = self._size(dataset, path, LARGEST_ROWS)
             return np.asarray(self._values(dataset, path, kind.dtype, size), float)
+
+    def columns(self, group: str, names: Sequence[str], unequal: str) -> list[np.ndarray]:
+        """The datasets of a group, equally long, as float64. Raises BadRecord: as for `numbers`, or `unequal`."""
+        found = [self.numbers(f"{group}/{name}") for name in names]
+        if len({column.size for column in found}) > 1:
+            raise self.bad(unequal, group)
+        return found
 
     def names(self, path: str) -> list[str]:
         """A dataset of one dimension of texts. Raises BadRecord: as for `numbers`."""
@@ -160,15 +166,15 @@ class StrictFile:
         with self._asking(path):
             kind = dataset.get_type()
             if kind.get_class() != h5t.STRING:
-                raise self._bad("no texts", path)
+                raise self.bad("no texts", path)
             size = self._size(dataset, path, MOST_SEGMENTS)
             if not kind.is_variable_str():
                 if kind.get_size() > LONGEST_TEXT:
-                    raise self._bad("texts without an end", path)
+                    raise self.bad("texts without an end", path)
                 values = self._values(dataset, path, np.dtype(f"S{kind.get_size()}"), size)
                 return [_sound(bytes(value)) for value in values]
             if dataset.get_create_plist().get_nfilters():
-                raise self._bad("compressed texts", path)
+                raise self.bad("compressed texts", path)
             return [self._variable_text(dataset, index, path) for index in range(size)]
 
     def _variable_text(self, dataset: Any, index: int, path: str) -> str:
@@ -178,44 +184,44 @@ class StrictFile:
         found = np.empty(1, h5py.string_dtype())
         dataset.read(h5s.create_simple((1,)), selection, found)
         if len(found[0]) > LONGEST_TEXT:
-            raise self._bad("a text without an end", path)
+            raise self.bad("a text without an end", path)
         return _sound(found[0])
 
     def _attribute(self, name: str, default: Any) -> Any:
         with self._asking(f"attribute {name}"):
             if not h5a.exists(self._file, name.encode()):
                 if default is None:
-                    raise self._bad("is missing", f"attribute {name}")
+                    raise self.bad("is missing", f"attribute {name}")
                 return default
             attribute = h5a.open(self._file, name.encode())
             kind = attribute.get_type()
             known = kind.get_class() in (h5t.STRING, h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= 8 * LONGEST_TEXT
             if not known or attribute.get_space().get_simple_extent_type() != h5s.SCALAR:
-                raise self._bad("no single number or text", f"attribute {name}")
+                raise self.bad("no single number or text", f"attribute {name}")
             return h5py.File(self._file).attrs[name]
 
     def _dataset(self, path: str) -> Any:
         """The dataset of a path, its data inside this file."""
         here = self._find(path)
         if here is None:
-            raise BadRecord(f"incomplete recording (no {path})", place=self.name, fix=FIX)
+            raise self.bad(f"incomplete recording (no {path})")
         if here is ELSEWHERE:
-            raise self._bad("a link to somewhere else", path)
+            raise self.bad("a link to somewhere else", path)
         with self._asking(path):
             if not isinstance(here, h5d.DatasetID):
-                raise self._bad("no dataset", path)
+                raise self.bad("no dataset", path)
             plan = here.get_create_plist()
             if plan.get_layout() not in (h5d.CONTIGUOUS, h5d.CHUNKED) or plan.get_external_count():
-                raise self._bad("data that are not plainly in this file (virtual or external)", path)
+                raise self.bad("data that are not plainly in this file (virtual or external)", path)
             return here
 
     def _size(self, dataset: Any, path: str, most: int) -> int:
         space = dataset.get_space()
         if space.get_simple_extent_type() != h5s.SIMPLE or space.get_simple_extent_ndims() != 1:
-            raise self._bad("not of one dimension", path)
+            raise self.bad("not of one dimension", path)
         (size,) = space.get_simple_extent_dims()
         if not (0 <= size <= most):
-            raise self._bad(f"{size} values are declared, at most {most} are read", path)
+            raise self.bad(f"{size} values are declared, at most {most} are read", path)
         return int(size)
 
     def _values(self, dataset: Any, path: str, dtype: np.dtype, size: int) -> np.ndarray:
@@ -229,10 +235,10 @@ class StrictFile:
                 return np.frombuffer(piece, dtype)
             filters = [plan.get_filter(index)[0] for index in range(plan.get_nfilters())]
             if unknown := [number for number in filters if number not in FILTERS]:
-                raise self._bad(f"a filter (number {unknown[0]}) other than gzip, shuffle and fletcher32", path)
+                raise self.bad(f"a filter (number {unknown[0]}) other than gzip, shuffle and fletcher32", path)
             return read_chunks(self.content, dataset, plan.get_chunk()[0], filters, dtype, size)
         except BadPiece as error:
-            raise self._bad(str(error), path) from error
+            raise self.bad(str(error), path) from error
 
     @contextmanager
     def _asking(self, path: str) -> Iterator[None]:
@@ -242,9 +248,10 @@ class StrictFile:
         except BadRecord:
             raise
         except Exception as error:
-            raise self._bad("unreadable or half-written HDF5", path) from error
+            raise self.bad("unreadable or half-written HDF5", path) from error
 
-    def _bad(self, message: str, path: str) -> BadRecord:
+    def bad(self, message: str, path: str = "") -> BadRecord:
+        """The error that says what is wrong with the file, or with what stands in it at a path."""
         return BadRecord(message, place=f"{self.name}, {path}" if path else self.name, fix=FIX)
 
 

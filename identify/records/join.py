@@ -22,7 +22,6 @@ from stimrig.identify.records.record import NEEDED, OPTIONAL, Part, Pulses, Reco
 
 CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "recording_id", "sha256")
 """Columns of which only a part's first row is filled; all but `pause_s` may be missing or empty."""
-LARGEST_UNIX_S = 1e11
 LONGEST_TEXT = 300
 FIX = "Join the recordings again."
 
@@ -148,7 +147,7 @@ def _part(found: FileContent, wanted: int, row: int, texts: Mapping[str, str]) -
     own_s = number("own_s", -latest_s, latest_s)
     own_s = float(time_s[row]) if own_s is None else own_s
     rate_hz = number("pulse_rate_hz", *bounds.PULSE_RATES_HZ)
-    begun_s = number("begun_s", 0.0, LARGEST_UNIX_S)
+    begun_s = number("begun_s", 0.0, bounds.LARGEST_CALENDAR_S)
     source = Source(text("name"), text("recording_id"), text("sha256"))
     if folded_s > (time_s[row] - time_s[row - 1] if wanted else 0.0) + 1e-6:
         raise BadRecord("longer than the jump of the time", place=found.at(row, "folded_s"), fix=FIX)

@@ -18,7 +18,7 @@ import numpy as np
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns
 from stimrig.identify.records.assemble import record_of
-from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, BadPiece, inflated
+from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, LONGEST_TEXT, BadPiece, inflated
 from stimrig.identify.records.columns import Given
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
 from stimrig.identify.records.record import Record
@@ -34,7 +34,6 @@ NUMERIC = range(6, 16)
 COMPLEX = 0x0800
 KINDS = {3: "an object", 5: "a sparse matrix", 16: "a function handle", 17: "an object (table, string, datetime, …)"}
 MOST_VARIABLES = 10_000
-LONGEST_TEXT = 10_000
 FIX = "Save plain columns of numbers from MATLAB: save('record.mat', 'time_s', 'pulse_width_us', 'torque_nm', '-v7')."
 OBJECTS = "Turn it into plain numbers or texts first: seconds(t), cellstr(s), table2struct(T, 'ToScalar', true)."
 
@@ -263,42 +262,30 @@ def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None, given: Giv
 
 
 def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, Mapping[str, Variable], Given]:
-    """Where the columns are: among the variables themselves ("") or in one struct; and `--map` as it reads there."""
+    """Where the columns are: in one struct, else among the variables themselves (""); and `--map` as it reads there."""
     if columns.complete(columns.places(list(top), given)):
         return "", top, given
     scopes = []
     for title, variable in top.items():
-        try:
+        with _told(f"{name}, {title}", FIX):
             fields = variable.fields()
-        except BadPiece as error:
-            raise BadRecord(str(error), place=f"{name}, {title}", fix=FIX) from error
         inside = {target: replace(asked, text=asked.text.removeprefix(f"{title}.")) for target, asked in given.items()}
         if fields and columns.complete(columns.places(list(fields), inside)):
             scopes.append((title, fields, inside))
         if len(scopes) > 1:  # at once: each struct that is opened holds its unpacked bytes
             both = " and ".join(title for title, *_ in scopes)
             raise BadRecord(f"records in {both}", place=name, fix="Save each in a file of its own.")
-    if not scopes:
-        raise _nothing(top, given, name)
-    return scopes[0]
-
-
-def _nothing(top: Mapping[str, Variable], given: Given, name: str) -> BadRecord:
     if not top:
-        return BadRecord("no variable", place=name, fix=FIX)
-    try:
-        columns.columns(list(top), given, [], name)
-    except BadRecord as error:
-        return error
-    raise AssertionError("columns that could not be found can be read")
+        raise BadRecord("no variable", place=name, fix=FIX)
+    return scopes[0] if scopes else ("", top, given)
 
 
 @contextmanager
-def _told(place: str) -> Iterator[None]:
+def _told(place: str, fix: str = "") -> Iterator[None]:
     try:
         yield
     except BadPiece as error:
-        raise BadRecord(str(error).rstrip("."), place=place) from error
+        raise BadRecord(str(error).rstrip("."), place=place, fix=fix) from error
 
 
 def _check_lengths(numbers: Mapping[str, np.ndarray], of: Mapping[str, str], name: str) -> None:

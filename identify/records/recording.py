@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
-from stimrig.identify.records.hdf5 import FIX, StrictFile
+from stimrig.identify.records.hdf5 import StrictFile
 from stimrig.identify.records.record import FORGOTTEN_S, Pulses, Record, Source
 
 SENT_AND_ACKNOWLEDGED, DROPPED, REFUSED = 0, 2, 3
@@ -52,18 +51,18 @@ class _Sent:
         return (self.status == SENT_AND_ACKNOWLEDGED) & np.isfinite(self.written)
 
 
-def read_pulses(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: float) -> tuple[Pulses, np.ndarray]:
+def read_pulses(file: StrictFile, time_s: np.ndarray, pulse_rate_hz: float) -> tuple[Pulses, np.ndarray]:
     """The pulses on their even slots with what they were late, and the samples that are doubted, bool, (N,).
 
     Raises BadRecord: columns of different lengths, no widths, or out of order.
     """
-    sent = _sent(file, name, 1.0 / pulse_rate_hz)
+    sent = _sent(file, 1.0 / pulse_rate_hz)
     if not sent.planned.size:
         nothing = np.zeros(0)
         return Pulses(nothing, nothing, nothing, np.zeros(0, bool)), np.zeros(time_s.size, bool)
     sync = file.numbers("/torque/sync") if file.has("/torque/sync") else np.full(time_s.size, 255.0)
     if sync.size != time_s.size:
-        raise BadRecord("columns of different lengths", place=f"{name}, /torque/sync", fix=FIX)
+        raise file.bad("columns of different lengths", "/torque/sync")
     sound = sent.sound
     # Even slots, late by what the promptest pulses were late together.
     lag = float(np.quantile((sent.written - sent.planned)[sound], PROMPT)) if sound.any() else 0.0
@@ -80,19 +79,16 @@ def read_pulses(file: StrictFile, name: str, time_s: np.ndarray, pulse_rate_hz: 
     return Pulses(slot, sent.width, late, lost), _inside(time_s, *spans)
 
 
-def _sent(file: StrictFile, name: str, interval_s: float) -> _Sent:
-    columns = ("planned_time_s", "sent_pulse_width_us", "written_time_s", "status")
-    planned, sent, written, status = (file.numbers(f"/pulses/{column}") for column in columns)
-    path = "/pulses/acknowledged_time_s"
-    acknowledged = file.numbers(path) if file.has(path) else written
-    if not (planned.size == sent.size == written.size == status.size == acknowledged.size):
-        raise BadRecord("columns of different lengths", place=f"{name}, /pulses", fix=FIX)
+def _sent(file: StrictFile, interval_s: float) -> _Sent:
+    names = ["planned_time_s", "sent_pulse_width_us", "written_time_s", "status"]
+    names += ["acknowledged_time_s"] if file.has("/pulses/acknowledged_time_s") else []
+    planned, sent, written, status, *more = file.columns("/pulses", names, "columns of different lengths")
+    acknowledged = more[0] if more else written
     sent = np.where(np.isnan(sent), 0.0, sent)
     if (bad := np.flatnonzero(~((sent >= 0) & (sent <= bounds.LARGEST["pulse_width_us"])))).size:
-        place = f"{name}, /pulses/sent_pulse_width_us, pulse {bad[0]}"
-        raise BadRecord(f"{sent[bad[0]]:g} µs is no pulse width", place=place, fix=FIX)
+        raise file.bad(f"{sent[bad[0]]:g} µs is no pulse width", f"/pulses/sent_pulse_width_us, pulse {bad[0]}")
     if not (np.diff(planned) > 0).all() or not np.isfinite(planned).all():
-        raise BadRecord("pulses do not follow one another", place=f"{name}, /pulses/planned_time_s", fix=FIX)
+        raise file.bad("pulses do not follow one another", "/pulses/planned_time_s")
     written, acknowledged = (
         np.where(np.abs(t) <= bounds.LARGEST["time_s"], t, np.nan) for t in (written, acknowledged)
     )
@@ -219,70 +215,74 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     sensor's angles are brought to the times of the torque; rows in its long gaps are doubted. Raises BadRecord:
     unreadable, half-written, with data outside the file, or without samples.
     """
-    name = str(path)
-    file = StrictFile(content, name)
+    file = StrictFile(content, str(path))
     _check_format(file)
     rate = file.number("pulse_rate_hz", 40.0) if pulse_rate_hz is None else pulse_rate_hz
-    bounds.check_rate(rate, f"{name}, attribute pulse_rate_hz")
-    time_s, torque = _samples(file, name)
-    code, names = _segments(file, name, time_s)
+    bounds.check_rate(rate, f"{path}, attribute pulse_rate_hz")
+    time_s, torque = _samples(file)
+    code, names = _segments(file, time_s)
     inside = code >= 0
     if not inside.any():
-        raise BadRecord("no sample inside a segment", place=f"{name}, /segments", fix=FIX)
-    largest = bounds.LARGEST["torque_nm"]
-    if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= largest))).size:
+        raise file.bad("no sample inside a segment", "/segments")
+    if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= bounds.LARGEST["torque_nm"]))).size:
         what = "is not finite" if not np.isfinite(torque[bad[0]]) else f"{torque[bad[0]]:g} N·m is no measurement"
-        raise BadRecord(f"torque {what}", place=f"{name}, /torque/torque_nm, sample {bad[0]}", fix=FIX)
-    pulses, doubts = read_pulses(file, name, time_s, rate)
+        raise file.bad(f"torque {what}", f"/torque/torque_nm, sample {bad[0]}")
+    pulses, doubts = read_pulses(file, time_s, rate)
     width, late = _in_force(pulses, time_s, rate)
-    more, unknown, note = _read_angle(file, name, time_s, inside)
+    angles, unknown, note = _read_angle(file, time_s, inside)
     doubts = doubts | unknown
-    bounds.check_span(time_s[inside], f"{name}, /torque/time_s")
+    bounds.check_span(time_s[inside], f"{path}, /torque/time_s")
     identity, digest, whose = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
-    source = Source(path.name, identity, digest, notes=(note,) if note else (), participant=whose)
-    more |= {"late_s": late} if pulses.late_s.any() else {}
-    more |= {"doubted": doubts} if doubts.any() else {}
-    columns: dict[str, Any] = {label: column[inside] for label, column in more.items()}
+    columns = {"time_s": time_s, "pulse_width_us": width, "torque_nm": torque} | angles
+    columns |= {"late_s": late} if pulses.late_s.any() else {}
+    columns |= {"doubted": doubts} if doubts.any() else {}
     return Record.from_arrays(
-        time_s[inside], width[inside], torque[inside], code[inside], segment_names=names, pulse_rate_hz=rate,
-        source=source, pulses=pulses, **columns,
-    )  # fmt: skip
+        **{label: column[inside] for label, column in columns.items()},
+        segment=code[inside],
+        segment_names=names,
+        pulses=pulses,
+        pulse_rate_hz=rate,
+        source=Source(path.name, identity, digest, notes=(note,) if note else (), participant=whose),
+    )
 
 
 def _check_format(file: StrictFile) -> None:
     if file.text("format", "") != FORMAT:
-        raise BadRecord("HDF5, but no stimrig recording", place=file.name, fix=FIX)
+        raise file.bad("HDF5, but no stimrig recording")
     version = file.number("format_version", 0)
     if version != 1:
         message = f"format version {version:g}, this software reads 1"
         raise BadRecord(message, place=file.name, fix="Update the software.")
 
 
-def _samples(file: StrictFile, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _samples(file: StrictFile) -> tuple[np.ndarray, np.ndarray]:
     """Times, rising, and torques."""
-    time_s, torque = file.numbers("/torque/time_s"), file.numbers("/torque/torque_nm")
-    if time_s.size != torque.size or not time_s.size:
-        raise BadRecord("no torque sample", place=f"{name}, /torque", fix=FIX)
-    backwards = np.flatnonzero(~(np.diff(time_s) > 0))
-    if backwards.size:
-        raise BadRecord("time runs backwards", place=f"{name}, /torque/time_s, sample {backwards[0] + 1}", fix=FIX)
+    time_s, torque = file.columns("/torque", ("time_s", "torque_nm"), "no torque sample")
+    if not time_s.size:
+        raise file.bad("no torque sample", "/torque")
+    _check_rising(file, time_s, "/torque/time_s")
     if not (np.abs(time_s[[0, -1]]) <= bounds.LARGEST["time_s"]).all():
-        raise BadRecord("times that no clock shows", place=f"{name}, /torque/time_s", fix=FIX)
+        raise file.bad("times that no clock shows", "/torque/time_s")
     if time_s.size > 1:
-        bounds.check_sampling(1 / float(np.median(np.diff(time_s))), f"{name}, /torque/time_s")
+        bounds.check_sampling(1 / float(np.median(np.diff(time_s))), f"{file.name}, /torque/time_s")
     return time_s, torque
 
 
-def _segments(file: StrictFile, name: str, time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _check_rising(file: StrictFile, time_s: np.ndarray, path: str) -> None:
+    if (backwards := np.flatnonzero(~(np.diff(time_s) > 0))).size:
+        raise file.bad("time runs backwards", f"{path}, sample {backwards[0] + 1}")
+
+
+def _segments(file: StrictFile, time_s: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """For each sample the segment it lies in, −1 for none, and the segments' names."""
     starts, ends = file.numbers("/segments/start_s"), file.numbers("/segments/end_s")
     names = file.names("/segments/name")
     if not (starts.size == ends.size == len(names)):
-        raise BadRecord("names, starts and ends differ in number", place=f"{name}, /segments", fix=FIX)
+        raise file.bad("names, starts and ends differ in number", "/segments")
     if not ((np.diff(starts) >= 0).all() and (ends >= starts).all()):
-        raise BadRecord("segments do not follow one another", place=f"{name}, /segments", fix=FIX)
+        raise file.bad("segments do not follow one another", "/segments")
     for index, text in enumerate(names):
-        bounds.check_name(text, f"{name}, /segments/name, segment {index}")
+        bounds.check_name(text, f"{file.name}, /segments/name, segment {index}")
     if not names:
         return np.full(time_s.size, -1), names
     order = np.searchsorted(starts, time_s, side="right") - 1
@@ -302,7 +302,7 @@ def _in_force(pulses: Pulses, time_s: np.ndarray, pulse_rate_hz: float) -> tuple
 
 
 def _read_angle(
-    file: StrictFile, name: str, time_s: np.ndarray, inside: np.ndarray
+    file: StrictFile, time_s: np.ndarray, inside: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray, str]:
     """Angle and velocity at the torque's times, linear between the sensor's samples; rows without any; and a note.
 
@@ -311,27 +311,18 @@ def _read_angle(
     nothing = np.zeros(time_s.size, bool)
     if not file.has(GROUP):
         return {}, nothing, ""
-    at_s = file.numbers(f"{GROUP}/time_s")
-    angle, velocity = file.numbers(f"{GROUP}/angle_rad"), file.numbers(f"{GROUP}/velocity_rad_s")
-    _check_angle(at_s, angle, velocity, name)
+    names = ("time_s", "angle_rad", "velocity_rad_s")
+    columns = dict(zip(names, file.columns(GROUP, names, "times, angles and velocities differ in number"), strict=True))
+    _check_rising(file, columns["time_s"], f"{GROUP}/time_s")
+    for label, values in columns.items():
+        if (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[label]))).size:
+            raise file.bad(f"{label} {values[bad[0]]:g} is no measurement", f"{GROUP}/{label}, sample {bad[0]}")
+    at_s = columns.pop("time_s")
     unknown = _unknown(at_s, time_s)
     share = float(np.mean(unknown[inside]))
     if share > MOST_UNKNOWN:
         return {}, nothing, f"no angle: the angle sensor gave none in {share:.0%} of the record"
-    columns = {"angle_rad": angle, "velocity_rad_s": velocity}
     return {label: np.interp(time_s, at_s, values) for label, values in columns.items()}, unknown, ""
-
-
-def _check_angle(at_s: np.ndarray, angle: np.ndarray, velocity: np.ndarray, name: str) -> None:
-    if not (at_s.size == angle.size == velocity.size):
-        raise BadRecord("times, angles and velocities differ in number", place=f"{name}, {GROUP}", fix=FIX)
-    if (backwards := np.flatnonzero(~(np.diff(at_s) > 0))).size:
-        place = f"{name}, {GROUP}/time_s, sample {backwards[0] + 1}"
-        raise BadRecord("time runs backwards", place=place, fix=FIX)
-    for label, values in (("time_s", at_s), ("angle_rad", angle), ("velocity_rad_s", velocity)):
-        if (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[label]))).size:
-            place = f"{name}, {GROUP}/{label}, sample {bad[0]}"
-            raise BadRecord(f"{label} {values[bad[0]]:g} is no measurement", place=place, fix=FIX)
 
 
 def _unknown(at_s: np.ndarray, time_s: np.ndarray) -> np.ndarray:

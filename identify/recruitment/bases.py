@@ -64,10 +64,6 @@ class SplineBasis:
     def to_dict(self) -> dict:
         return {"kind": "cubic-spline", "knots_us": [float(u) for u in self.knots_us]}
 
-    @classmethod
-    def from_dict(cls, data: dict) -> SplineBasis:
-        return cls(np.asarray(data["knots_us"], float))
-
 
 def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 0) -> np.ndarray:
     """B-splines, or their derivative, by the recursion of Cox and de Boor (de Boor 1978, ch. X); shape (N, size).
@@ -147,10 +143,6 @@ class PowerBasis:
     def to_dict(self) -> dict:
         return {"kind": "power-series", "order": self.order, "scale_us": self.scale_us}
 
-    @classmethod
-    def from_dict(cls, data: dict) -> PowerBasis:
-        return cls(int(data["order"]), float(data["scale_us"]))
-
 
 @dataclass(frozen=True)
 class SigmoidBasis:
@@ -192,7 +184,3 @@ class SigmoidBasis:
 
     def to_dict(self) -> dict:
         return {"kind": "sigmoid", "a2_per_us": self.a2_per_us, "a3": self.a3, "largest_us": self.largest_us}
-
-    @classmethod
-    def from_dict(cls, data: dict) -> SigmoidBasis:
-        return cls(float(data["a2_per_us"]), float(data["a3"]), float(data.get("largest_us", 300.0)))
