@@ -29,7 +29,9 @@ def find_segments(time_s: np.ndarray, width_us: np.ndarray) -> tuple[np.ndarray,
     level = width_us[first]
     begin_s = np.append(time_s[first], time_s[-1])
     held_s = np.diff(begin_s)
-    resting = _resting(level, held_s)
+    lowest = level == level.min()
+    resting = lowest & (held_s >= REST_S)
+    resting[[0, -1]] |= lowest[[0, -1]] & (held_s[[0, -1]] >= EDGE_S)
     names: list[str] = []
     starts: list[int] = []
     edges = np.flatnonzero(np.diff(resting)) + 1
@@ -43,14 +45,6 @@ def find_segments(time_s: np.ndarray, width_us: np.ndarray) -> tuple[np.ndarray,
     lengths = np.diff([*starts, width_us.size])
     code = np.repeat([known.index(name) for name in names], lengths)
     return code, known, _note(names, time_s[starts], float(time_s[-1]), float(level.min()))
-
-
-def _resting(level: np.ndarray, held_s: np.ndarray) -> np.ndarray:
-    """For each run of one width whether it is rest."""
-    lowest = level == level.min()
-    resting = lowest & (held_s >= REST_S)
-    resting[[0, -1]] |= lowest[[0, -1]] & (held_s[[0, -1]] >= EDGE_S)
-    return resting
 
 
 def _active(level: np.ndarray, held_s: np.ndarray, offset: int, span_us: float) -> list[tuple[int, str]]:

@@ -57,26 +57,14 @@ EXPLAINED = 0.9
 """Share of the changes of width that one phase of the pulses must explain, or the pulses do not keep to the rate."""
 
 
-def width_in_slots(
-    time_s: np.ndarray, width_us: np.ndarray, at_s: np.ndarray, before: np.ndarray, pulse_rate_hz: float
-) -> np.ndarray:
-    """Pulse widths at `at_s`, shape (M,).
+def _width_in_slots(found: FileContent, at_s: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Pulse widths at the rising times `at_s`, shape (M,); `before` is the last sample at or before each.
 
     A change of width that a sample shows came with a pulse between it and the sample before. Pulses keep to their rate:
     all changes together tell when they come, far more closely than one. Where they do not, the last sample's width
     stands.
-
-    Parameters
-    ----------
-    time_s, width_us : ndarray, shape (N,)
-        Samples, and the width in force at each.
-    at_s : ndarray, shape (M,)
-        Times that are asked for, rising.
-    before : ndarray of int, shape (M,)
-        The last sample at or before each.
-    pulse_rate_hz : float
-        Pulses a second.
     """
+    time_s, width_us, pulse_rate_hz = found.columns["time_s"], found.columns["pulse_width_us"], found.pulse_rate_hz
     phase_s = _phase_s(time_s, width_us, pulse_rate_hz)
     if phase_s is None:
         return width_us[before]
@@ -261,7 +249,7 @@ def _lost_note(found: FileContent, rows: np.ndarray) -> str:
 
 def _resampled(found: FileContent, step_s: float) -> FileContent:
     """The same at a uniform rate: torque and movement on straight lines between samples, gaps left open."""
-    time_s, width_us = found.columns["time_s"], found.columns["pulse_width_us"]
+    time_s = found.columns["time_s"]
     steps = np.diff(time_s)
     gap = steps > GAP_STEPS * np.median(steps)
     gaps, usual = np.flatnonzero(gap) + 1, steps[~gap]
@@ -277,7 +265,7 @@ def _resampled(found: FileContent, step_s: float) -> FileContent:
         for name, column in found.columns.items()
     }
     columns["time_s"] = even_s
-    columns["pulse_width_us"] = width_in_slots(time_s, width_us, even_s, before, found.pulse_rate_hz)
+    columns["pulse_width_us"] = _width_in_slots(found, even_s, before)
     note = (
         f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms): resampled to "
         f"{1 / step_s:.5g} Hz, torque on straight lines between samples"

@@ -171,9 +171,7 @@ def columns(header: Sequence[str], given: Given, units_row: Sequence[str], place
             raise _twice(plain, target, indices, place)
         index = indices[0]
         below = units_row[index].strip() if index < len(units_row) else ""
-        if plain[index] == target and target not in given and not below:
-            columns[target] = Column(index)
-        elif (column := _convert_column(plain[index], target, index, below, given.get(target), place)) is not None:
+        if (column := _convert_column(plain[index], target, index, below, given.get(target), place)) is not None:
             columns[target] = column
     _refuse_shared(plain, columns, place)
     return columns
@@ -192,7 +190,9 @@ def _refuse_shared(cells: Sequence[str], columns: Mapping[str, Column], place: s
 def _convert_column(name: str, target: str, index: int, below: str, asked: Asked | None, place: str) -> Column | None:
     """A column in its unit; None where nobody asked for it and its unit is not said."""
     if target == "segment":
-        return Column(index, note="" if asked else f"segment is column {_short(name)!r}")
+        return Column(
+            index, note="" if asked or (name == target and not below) else f"segment is column {_short(name)!r}"
+        )
     wanted = asked.unit if asked is not None and not _is(name, asked.text) else ""
     written = below or _split(name, target)[1]
     unit = wanted or written

@@ -33,9 +33,8 @@ def write_joined(record: Record, path: Path) -> None:
     """
     names = [_cell(name) for name in record.segment_names]
     header = (*NEEDED, "segment", *record.columns(), "part", *CELLS)
-    columns: list[Iterator[str]] = [
-        map(repr, np.asarray(column, float).tolist()) for column in record.samples().values()
-    ]
+    numbers = (np.asarray(column, float).tolist() for column in record.samples().values())
+    columns: list[Iterator[str]] = [map(repr, column) for column in numbers]
     columns.insert(len(NEEDED), (names[index] for index in record.segment.tolist()))
     columns.append(map(str, record.part.tolist()))
     empty = "," * len(CELLS)
@@ -52,8 +51,6 @@ def write_joined(record: Record, path: Path) -> None:
 
 def _descriptions(record: Record) -> list[str]:
     """The last cells of each part's first row."""
-    alone = len(record.source.parts) != len(record.parts)
-    sources = [record.source] * len(record.parts) if alone else record.source.parts
     return [
         ",".join(
             [
@@ -63,7 +60,7 @@ def _descriptions(record: Record) -> list[str]:
                 *map(_cell, (source.name, source.recording_id, source.sha256)),
             ]
         )
-        for part, source in zip(record.parts, sources, strict=True)
+        for part, source in zip(record.parts, record.sources, strict=True)
     ]
 
 
@@ -253,10 +250,9 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
     """The parts of a record, each on its own clock."""
     slot_s = float(record.time_s[0]) + pulse_phase_s(record)
     alone = len(record.parts) == 1
-    sources = record.source.parts if len(record.source.parts) == len(record.parts) else ()
     edges = [*(part.first for part in record.parts), record.time_s.size]
     found = []
-    for index, part in enumerate(record.parts):
+    for index, (part, source) in enumerate(zip(record.parts, record.sources, strict=True)):
         # A plain record's clock is its own.
         shift_s = 0.0 if alone and part.begun_s is None else part.own_s - float(record.time_s[part.first])
         pulses = None if record.pulses is None else _pulses(record.pulses, shift_s, -np.inf, np.inf)
@@ -266,7 +262,7 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
                 record=replace(cut, time_s=cut.time_s + shift_s, pulses=pulses, parts=(Part(),)),
                 begun_s=begun_s if alone and part.begun_s is None else part.begun_s,
                 slot_s=slot_s + shift_s,
-                source=sources[index] if sources else replace(record.source, parts=()),
+                source=source,
                 known_pause_s=part.pause_s if index else 0.0,
             )
         )

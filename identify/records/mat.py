@@ -159,14 +159,13 @@ def _listed(tag: int, body: memoryview, order: str) -> tuple[str, Variable]:
     """Name and head of a variable; of a packed one, no more is unpacked than that takes."""
     if tag == MATRIX:
         return _matrix(body, order)
-    if tag != PACKED:
-        return "", Variable(0, (), 0, body, order)
-    head = memoryview(inflated(body, HEAD_BYTES, whole=False))
-    inside, _, _ = struct.unpack_from(order + "IIQ", head.tobytes().ljust(16, b"\0"))
-    if inside != MATRIX:
-        return "", Variable(0, (), 0, body, order)
-    title, variable = _matrix(head[8:], order)
-    return title, replace(variable, body=body, packed=True)
+    if tag == PACKED:
+        head = memoryview(inflated(body, HEAD_BYTES, whole=False))
+        inside, _, _ = struct.unpack_from(order + "IIQ", head.tobytes().ljust(16, b"\0"))
+        if inside == MATRIX:
+            title, variable = _matrix(head[8:], order)
+            return title, replace(variable, body=body, packed=True)
+    return "", Variable(0, (), 0, body, order)
 
 
 def _element(view: memoryview, place: int, order: str) -> tuple[int, memoryview, int]:

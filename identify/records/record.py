@@ -267,6 +267,12 @@ class Record(Summarised):
         return np.searchsorted(first, np.arange(self.time_s.size), side="right") - 1
 
     @property
+    def sources(self) -> tuple[Source, ...]:
+        """Where each of its parts came from."""
+        known = self.source.parts
+        return known if len(known) == len(self.parts) else (replace(self.source, parts=()),) * len(self.parts)
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What was assumed when it was read, in sentences; with the part's name where it is one of several."""
         of_parts = (f"{part.name}: {note}" for part in self.source.parts for note in part.notes)

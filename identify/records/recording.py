@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -146,14 +147,12 @@ def _matched(sent: _Sent, earliest: np.ndarray, newest: np.ndarray) -> tuple[np.
     centre = 0.5 * (earliest + newest)
     start = np.where(may, sent.written, -np.inf) - reach_s
     stop = np.where(np.isfinite(sent.acknowledged), sent.acknowledged, sent.written + sent.interval_s) + reach_s
-    first = np.searchsorted(centre, start)
-    place = np.minimum(first, centre.size - 1)
-    good = may & (first < centre.size) & (centre[place] <= stop)
-    edge = np.where(good, place, -1)
-    _, once = np.unique(edge, return_index=True)  # an edge is that of the first pulse that can have made it
-    alone = np.zeros(edge.size, bool)
-    alone[once] = True
-    edge = np.where(alone, edge, -1)
+    after = np.searchsorted(centre, start)
+    place = np.minimum(after, centre.size - 1)
+    good = may & (after < centre.size) & (centre[place] <= stop)
+    edge = np.full(place.size, -1)
+    found, first = np.unique(np.where(good, place, -1), return_index=True)
+    edge[first] = found  # an edge is that of the first pulse that can have made it
     left = np.setdiff1d(np.arange(centre.size), edge)
     asked = int(np.sum(may & sent.sound))
     shown = int(np.sum((edge >= 0) & sent.sound))
@@ -233,7 +232,7 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     doubts = doubts | unknown
     bounds.check_span(time_s[inside], f"{path}, /torque/time_s")
     identity, digest, whose = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
-    columns = {"time_s": time_s, "pulse_width_us": width, "torque_nm": torque} | angles
+    columns: dict[str, Any] = {"time_s": time_s, "pulse_width_us": width, "torque_nm": torque} | angles
     columns |= {"late_s": late} if pulses.late_s.any() else {}
     columns |= {"doubted": doubts} if doubts.any() else {}
     return Record.from_arrays(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -40,13 +40,9 @@ class Curve:
     basis: Basis
     coefficients_nm: np.ndarray
 
-    def __call__(self, pulse_width_us: np.ndarray) -> np.ndarray:
-        """Torque at steady state for pulse widths of any shape, N·m."""
-        return self.basis.design(np.asarray(pulse_width_us, float)) @ self.coefficients_nm
-
-    def slope(self, pulse_width_us: np.ndarray) -> np.ndarray:
-        """df/du, N·m/µs."""
-        return self.basis.design(np.asarray(pulse_width_us, float), 1) @ self.coefficients_nm
+    def __call__(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Torque at steady state for pulse widths of any shape, N·m, or a derivative by the pulse width, N·m/µs."""
+        return self.basis.design(np.asarray(pulse_width_us, float), derivative) @ self.coefficients_nm
 
     def table(self, tolerance: float = 2e-4, most: int = 2001) -> tuple[np.ndarray, np.ndarray]:
         """Pulse widths, µs, and torques, N·m, dense enough for linear interpolation.
@@ -90,11 +86,7 @@ class FixedShape:
     """A gain times a given curve, as a basis: for steps that estimate only the dynamics."""
 
     curve: Curve
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients."""
-        return 1
+    size: int = field(default=1, init=False)
 
     @property
     def largest_us(self) -> float:
@@ -103,9 +95,7 @@ class FixedShape:
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Shape (..., 1)."""
-        return (self.curve.basis.design(np.asarray(pulse_width_us, float), derivative) @ self.curve.coefficients_nm)[
-            ..., None
-        ]
+        return self.curve(pulse_width_us, derivative)[..., None]
 
     def to_dict(self) -> dict:
         return self.curve.to_dict()
@@ -150,7 +140,7 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
         place = np.array([at_us])
         # The width at which f(u) = share · plateau moves by the change of that difference over the curve's slope.
         moved = _sd(curve.basis.design(place)[0] - share * at_top, covariance_nm2)
-        slope = abs(float(curve.slope(place)[0]))
+        slope = abs(float(curve(place, 1)[0]))
         return _estimate(at_us, moved / slope if moved is not None and slope > 0.0 else None, "µs")
 
     return {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -108,40 +108,30 @@ def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 
 
 @dataclass(frozen=True)
 class PowerBasis:
-    """Powers 1 … order of u / scale.
+    """Powers 1 … size of u / largest_us.
 
     Parameters
     ----------
-    order : int
-        Highest power.
-    scale_us : float
-        Pulse width that is scaled to 1, so that all powers have a similar size, µs.
+    size : int
+        Highest power, and so the number of coefficients.
+    largest_us : float
+        Pulse width beyond which the curve is held, µs. It is scaled to 1, so that all powers have a similar size.
     """
 
-    order: int
-    scale_us: float
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients."""
-        return self.order
-
-    @property
-    def largest_us(self) -> float:
-        """Pulse width beyond which the curve is held, µs."""
-        return self.scale_us
+    size: int
+    largest_us: float
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """Powers (or a derivative) at pulse widths of any shape; shape (..., order)."""
-        u = np.clip(np.asarray(pulse_width_us, float), 0.0, self.scale_us) / self.scale_us
+        """Powers (or a derivative) at pulse widths of any shape; shape (..., size)."""
+        u = np.clip(np.asarray(pulse_width_us, float), 0.0, self.largest_us) / self.largest_us
         columns = []
-        for p in range(1, self.order + 1):
+        for p in range(1, self.size + 1):
             lead = float(np.prod(np.arange(p, p - derivative, -1))) if derivative else 1.0
-            columns.append(lead * u ** max(p - derivative, 0) / self.scale_us**derivative)
+            columns.append(lead * u ** max(p - derivative, 0) / self.largest_us**derivative)
         return np.stack(columns, axis=-1)
 
     def to_dict(self) -> dict:
-        return {"kind": "power-series", "order": self.order, "scale_us": self.scale_us}
+        return {"kind": "power-series", "order": self.size, "scale_us": self.largest_us}
 
 
 @dataclass(frozen=True)
@@ -161,11 +151,7 @@ class SigmoidBasis:
     a2_per_us: float
     a3: float
     largest_us: float = 300.0
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients."""
-        return 1
+    size: int = field(default=1, init=False)
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Shape (..., 1); derivatives by the closed form, up to the second."""
