@@ -89,7 +89,8 @@ VOCABULARY = (
     # limits
     "rig file", "%(least)s to %(most)s µs",
     # where in a file
-    "%(name)s, line %(line)s", "%(name)s, sample %(number)s", "%(name)s, attribute %(attribute)s", "attribute %(name)s",
+    "%(name)s, line %(line)s", "%(name)s, sample %(number)s", "%(name)s, pulse %(number)s",
+    "%(name)s, attribute %(attribute)s", "attribute %(name)s",
     "recording %(number)s", "%(unit)s (or %(others)s)", "negative",
     # thresholds; states of the rig and of the stimulator
     "comfort", "motor", "sensory", "arming", "calibrating", "disconnected", "latched", "ready", "stopping", "uncertain",

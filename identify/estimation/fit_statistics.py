@@ -177,7 +177,7 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     """The key `fit` of MODEL.json: errors, best-fit %, and the best fit that the noise allows."""
     setup = fitted.problem.setup
     grid = setup.grid
-    change = None if grid.record.has_held_out else held_out_change(fitted)
+    change = None if grid.record.held_out.any() else held_out_change(fitted)
     predicted, foreseen = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
     found = fit_statistics(grid, setup.fitted, predicted, noise, change, foreseen)

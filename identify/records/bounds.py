@@ -28,6 +28,8 @@ LARGEST = {
     "doubted": 1.0,
     "part": 1e3,
 }
+MAY_LACK = ("time_s", "pulse_width_us", "torque_nm", "angle_rad", "velocity_rad_s")
+"""Columns in which a number may be missing: a row without one is left out."""
 UNITS = {
     "angle_rad": "No joint turns so far. If these are degrees, say so: --map angle_rad=angle_rad:deg, and the same "
     "for a velocity."
@@ -83,9 +85,14 @@ def inflated(data: Any, most: int, damaged: str = DAMAGED, whole: bool = True) -
     return found
 
 
-def largest(column: str) -> float:
-    """What a number may be at most as it is read, in the column's own unit."""
-    return LARGEST_CALENDAR_S if column == "time_s" else LARGEST[column]
+def wrong_rows(column: str, values: np.ndarray) -> np.ndarray:
+    """Rows of a column as it was read, in its own unit, with a number that no measurement gives.
+
+    NaN stands where there is none, which columns of `MAY_LACK` may have.
+    """
+    largest = LARGEST_CALENDAR_S if column == "time_s" else LARGEST[column]
+    wrong = ~(np.abs(values) <= largest)
+    return np.flatnonzero(wrong & ~np.isnan(values) if column in MAY_LACK else wrong)
 
 
 def fix_of(column: str, wrong: np.ndarray, otherwise: str) -> str:

@@ -243,8 +243,11 @@ def _lost_note(found: FileContent, rows: np.ndarray) -> str:
         raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, fix="Give a record without holes.")
     longest_s = float(np.max(time_s[rows] - time_s[rows - 1]))
     places = "1 place" if rows.size == 1 else f"{rows.size} places"
-    first = found.cell(int(rows[0]), "time_s")
-    return f"samples are missing at {places} (first at {first}; longest {longest_s:.3g} s): left as gaps"
+    first = int(rows[0])
+    return (
+        f"samples are missing at {places} (first at {found.cell(first, 'time_s')}; longest {longest_s:.3g} s): "
+        "left as gaps"
+    )
 
 
 def _resampled(found: FileContent, step_s: float) -> FileContent:

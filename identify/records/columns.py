@@ -53,8 +53,6 @@ def unit_factor(target: str, unit: str) -> float | None:
     return UNITS[target].get(plain_unit(unit))
 
 
-MAY_LACK = (*NEEDED, "angle_rad", "velocity_rad_s")
-"""Columns in which a number may be missing: a row without one is left out."""
 TARGETS = (*NEEDED, "segment", *OPTIONAL)
 NAMES = {
     "time_s": "time t timestamp elapsed_time zeit temps tiempo tempo",

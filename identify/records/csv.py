@@ -20,7 +20,7 @@ from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns, join
 from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.cells import as_written
-from stimrig.identify.records.columns import MAY_LACK, Column, Given
+from stimrig.identify.records.columns import Column, Given
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
 from stimrig.identify.records.record import Record
 
@@ -320,9 +320,7 @@ class Table:
                 self._number(cell, column, line)
         if found.factor != 1.0:
             values *= found.factor
-        missing = np.isnan(values) if column in MAY_LACK else False
-        bad = np.flatnonzero(~(np.abs(values) <= bounds.largest(column)) & ~np.asarray(missing))
-        if bad.size:
+        if (bad := bounds.wrong_rows(column, values)).size:
             shown = _show_cell(cells[bad[0]].strip())
             fix = "Remove the row's cause, or cut the record before it; values must be finite."
             fix = bounds.fix_of(column, values[bad], fix)

@@ -11,7 +11,7 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
-from stimrig.identify.records.columns import MAY_LACK, Column
+from stimrig.identify.records.columns import Column
 from stimrig.identify.records.record import Record, Source
 
 LEAST_LARGEST_US = 1.0
@@ -72,15 +72,9 @@ def file_source(content: bytes, path: Path, known: Mapping[str, Column], *writte
 
 
 def check_numbers(found: FileContent) -> None:
-    """Refuse numbers that no measurement gives; NaN stands where there is none, in the columns that may lack one.
-
-    Raises BadRecord: infinite, or beyond what is measured.
-    """
+    """Refuse numbers that no measurement gives. Raises BadRecord: infinite, or beyond what is measured."""
     for name, column in found.columns.items():
-        if name == "segment":
-            continue
-        missing = np.isnan(column) if name in MAY_LACK else False
-        if (bad := np.flatnonzero(~(np.abs(column) <= bounds.largest(name)) & ~np.asarray(missing))).size:
+        if name != "segment" and (bad := bounds.wrong_rows(name, column)).size:
             fix = bounds.fix_of(name, column[bad], "Cut the record before it; values must be finite.")
             raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=found.at(int(bad[0]), name), fix=fix)
 

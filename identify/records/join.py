@@ -110,10 +110,10 @@ def _check_time(found: FileContent, firsts: Sequence[int]) -> None:
         bounds.check_sampling(1 / float(np.median(np.diff(time_s[row:end]))), found.at(row))
 
 
-def _part(found: FileContent, wanted: int, row: int, texts: Mapping[str, str]) -> tuple[Part, Source, float | None]:
+def _part(found: FileContent, number: int, row: int, texts: Mapping[str, str]) -> tuple[Part, Source, float | None]:
     """A part, its source and its pulse rate from the cells of its first row."""
 
-    def number(column: str, lowest: float, highest: float) -> float | None:
+    def figure(column: str, lowest: float, highest: float) -> float | None:
         text = texts.get(column, "")
         if not text:
             return None
@@ -132,21 +132,21 @@ def _part(found: FileContent, wanted: int, row: int, texts: Mapping[str, str]) -
             raise BadRecord("a name that cannot be", place=found.at(row, column), fix=FIX)
         return cell
 
-    time_s, part = found.columns["time_s"], found.columns["part"][row]
-    if part != wanted:
-        raise BadRecord(f"{part:g} where part {wanted} begins", place=found.at(row, "part"), fix=FIX)
-    pause_s = number("pause_s", 0.0, bounds.LONGEST_S)
+    time_s, part = found.columns["time_s"], found.columns["part"]
+    if part[row] != number:
+        raise BadRecord(f"{part[row]:g} where part {number} begins", place=found.at(row, "part"), fix=FIX)
+    pause_s = figure("pause_s", 0.0, bounds.LONGEST_S)
     if pause_s is None:
         fix = "Give the pause before each part, 0 if it isn't known."
         raise BadRecord("empty", place=found.at(row, "pause_s"), fix=fix)
-    folded_s, latest_s = number("folded_s", 0.0, pause_s), bounds.LARGEST["time_s"]
+    folded_s, latest_s = figure("folded_s", 0.0, pause_s), bounds.LARGEST["time_s"]
     folded_s = pause_s if folded_s is None else folded_s
-    own_s = number("own_s", -latest_s, latest_s)
+    own_s = figure("own_s", -latest_s, latest_s)
     own_s = float(time_s[row]) if own_s is None else own_s
-    rate_hz = number("pulse_rate_hz", *bounds.PULSE_RATES_HZ)
-    begun_s = number("begun_s", 0.0, bounds.LARGEST_CALENDAR_S)
+    rate_hz = figure("pulse_rate_hz", *bounds.PULSE_RATES_HZ)
+    begun_s = figure("begun_s", 0.0, bounds.LARGEST_CALENDAR_S)
     source = Source(text("name"), text("recording_id"), text("sha256"))
-    if folded_s > (time_s[row] - time_s[row - 1] if wanted else 0.0) + 1e-6:
+    if folded_s > (time_s[row] - time_s[row - 1] if number else 0.0) + 1e-6:
         raise BadRecord("longer than the jump of the time", place=found.at(row, "folded_s"), fix=FIX)
     return Part(row, own_s, begun_s, pause_s, folded_s), source, rate_hz
 
@@ -277,10 +277,8 @@ def _at_one_rate(pieces: list[_Piece], rate_hz: float) -> list[_Piece]:
         return pieces
     each = math.floor((1 + SAME_RATE) * lowest / rate_hz)
     if each < 2:
-        raise BadRecord(
-            f"sampled at {lowest:.4g} and {max(own):.4g} Hz",
-            fix=f"Recordings of different rates are joined from {2 * rate_hz:g} Hz on.",
-        )
+        fix = f"Recordings of different rates are joined from {2 * rate_hz:g} Hz on."
+        raise BadRecord(f"sampled at {lowest:.4g} and {max(own):.4g} Hz", fix=fix)
     return [
         replace(piece, record=_block_means(piece, each, rate_hz)) if own_hz > (1 + SAME_RATE) * lowest else piece
         for piece, own_hz in zip(pieces, own, strict=True)

@@ -112,8 +112,6 @@ class Variable:
         if self.kind != STRUCT or self.size != 1:
             return {}
         here = self._opened()
-        if here.kind != STRUCT or here.size != 1:
-            return {}
         _, length, place = _element(here.body, 0, here.order)
         _, names, place = _element(here.body, place, here.order)
         each = int.from_bytes(length[:4], "little" if here.order == "<" else "big")

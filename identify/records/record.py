@@ -169,12 +169,14 @@ class Record(Summarised):
         time_s = np.ascontiguousarray(time_s, float)
         size = time_s.size
         code, known = _coded(size, segment, segment_names)
-        columns = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": code}
+        columns = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": code, "angle_rad": angle_rad}
+        columns |= {"velocity_rad_s": velocity_rad_s, "late_s": late_s, "doubted": doubted}
+        optional: dict[str, np.ndarray] = {}
         for label, column in columns.items():
-            if np.shape(column) != (size,):
+            if column is not None and np.shape(column) != (size,):
                 raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
-        given = {"angle_rad": angle_rad, "velocity_rad_s": velocity_rad_s, "late_s": late_s, "doubted": doubted}
-        optional = {label: _checked(label, column, size) for label, column in given.items() if column is not None}
+            if column is not None and label in OPTIONAL:
+                optional[label] = _checked(label, column)
         if size == 0:
             raise BadRecord("the record holds no sample", fix="Give at least a few seconds of data.")
         changed = np.r_[True, code[1:] != code[:-1]]
@@ -278,20 +280,13 @@ class Record(Summarised):
         of_parts = (f"{part.name}: {note}" for part in self.source.parts for note in part.notes)
         return tuple(dict.fromkeys((*self.source.notes, *of_parts)))
 
-    @property
-    def has_held_out(self) -> bool:
-        """Whether the record has rows of `validate`."""
-        return HELD_OUT in self.segment_names
-
     def with_torque(self, torque_nm: np.ndarray) -> Record:
         """The same record with another torque, N·m, shape (N,)."""
         return replace(self, torque_nm=np.ascontiguousarray(torque_nm, float))
 
 
-def _checked(label: str, column: np.ndarray, size: int) -> np.ndarray:
-    """An optional column, of the right shape and finite; `doubted` as bool."""
-    if np.shape(column) != (size,):
-        raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
+def _checked(label: str, column: np.ndarray) -> np.ndarray:
+    """An optional column, finite; `doubted` as bool."""
     values = np.ascontiguousarray(column, float)
     finite = np.isfinite(values)
     if not finite.all():

@@ -217,7 +217,7 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     file = StrictFile(content, str(path))
     _check_format(file)
     rate = file.number("pulse_rate_hz", 40.0) if pulse_rate_hz is None else pulse_rate_hz
-    bounds.check_rate(rate, f"{path}, attribute pulse_rate_hz")
+    bounds.check_rate(rate, f"{file.name}, attribute pulse_rate_hz")
     time_s, torque = _samples(file)
     code, names = _segments(file, time_s)
     inside = code >= 0
@@ -230,7 +230,7 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     width, late = _in_force(pulses, time_s, rate)
     angles, unknown, note = _read_angle(file, time_s, inside)
     doubts = doubts | unknown
-    bounds.check_span(time_s[inside], f"{path}, /torque/time_s")
+    bounds.check_span(time_s[inside], f"{file.name}, /torque/time_s")
     identity, digest, whose = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
     columns: dict[str, Any] = {"time_s": time_s, "pulse_width_us": width, "torque_nm": torque} | angles
     columns |= {"late_s": late} if pulses.late_s.any() else {}

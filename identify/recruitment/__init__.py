@@ -136,16 +136,17 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
     def crossing(share: float) -> dict[str, Any]:
         at_us = _crossing(width_us, torque_nm, share * plateau_nm)
         if at_us is None:
-            return _estimate(None, None, "µs")
+            return {"value": None, "sd": None, "unit": "µs"}
         place = np.array([at_us])
         # The width at which f(u) = share · plateau moves by the change of that difference over the curve's slope.
         moved = _sd(curve.basis.design(place)[0] - share * at_top, covariance_nm2)
         slope = abs(float(curve(place, 1)[0]))
-        return _estimate(at_us, moved / slope if moved is not None and slope > 0.0 else None, "µs")
+        sd_us = moved / slope if moved is not None and slope > 0.0 else None
+        return {"value": at_us, "sd": sd_us, "unit": "µs"}
 
     return {
         "threshold_us": crossing(THRESHOLD_SHARE),
-        "plateau_nm": _estimate(plateau_nm, _sd(at_top, covariance_nm2), "N·m"),
+        "plateau_nm": {"value": plateau_nm, "sd": _sd(at_top, covariance_nm2), "unit": "N·m"},
         "saturation_us": crossing(1.0 - THRESHOLD_SHARE),
     }
 
@@ -164,10 +165,6 @@ def _crossing(width_us: np.ndarray, torque_nm: np.ndarray, level_nm: float) -> f
 
 def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:
     return None if covariance is None else float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
-
-
-def _estimate(value: float | None, sd: float | None, unit: str) -> dict[str, Any]:
-    return {"value": value, "sd": sd, "unit": unit}
 
 
 def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:

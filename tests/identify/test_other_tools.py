@@ -171,7 +171,7 @@ def test_segments_are_found_and_none_is_held_out(tmp_path: Path) -> None:
     path = tmp_path / "data.csv"
     path.write_text(table(OURS[:3], rows(measured(), segment=False)))
     record = identify.read(path)
-    assert not record.has_held_out
+    assert not record.held_out.any()
     true, found = np.array(names_of(measured())), np.array(names_of(record))
     for name in ("rest", "prbs", "ramp"):
         assert np.mean(found[true == name] == name) > 0.9, name
