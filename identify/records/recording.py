@@ -15,7 +15,7 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
-from stimrig.identify.records.hdf5 import StrictFile
+from stimrig.identify.records.hdf5 import FIX, StrictFile
 from stimrig.identify.records.record import FORGOTTEN_S, Pulses, Record, Source
 
 SENT_AND_ACKNOWLEDGED, DROPPED, REFUSED = 0, 2, 3
@@ -225,7 +225,7 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
         raise file.bad("no sample inside a segment", "/segments")
     if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= bounds.LARGEST["torque_nm"]))).size:
         what = "is not finite" if not np.isfinite(torque[bad[0]]) else f"{torque[bad[0]]:g} N·m is no measurement"
-        raise file.bad(f"torque {what}", f"/torque/torque_nm, sample {bad[0]}")
+        raise BadRecord(f"torque {what}", place=f"{file.name}, /torque/torque_nm, sample {bad[0]}", fix=FIX)
     pulses, doubts = read_pulses(file, time_s, rate)
     width, late = _in_force(pulses, time_s, rate)
     angles, unknown, note = _read_angle(file, time_s, inside)
