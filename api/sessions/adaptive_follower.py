@@ -39,11 +39,11 @@ SHORTEST_PIECE_S = 1.0
 
 @dataclass(frozen=True)
 class Answer:
-    """What the adviser says, when its newest sample was heard (monotonic, s), and the line that is kept of it."""
+    """What the adviser says, when its newest sample was heard (monotonic, s), and which decision it is."""
 
     said: dict[str, Any]
     heard_s: float
-    row: dict[str, Any]
+    number: int
 
 
 @dataclass
@@ -170,7 +170,7 @@ class Follower(Watcher):
         self._took_s = self.clock.monotonic_s() - heard_s
         answer = self._take(said, event, heard_s)
         if turn is not self._turn or turn.sent:
-            answer.row["late"] = True
+            self._write(answer, late=True)
             return
         turn.answer = answer
         if turn.asked == 2 or self._left_s(self._now_s()) <= SEND_S:
@@ -193,7 +193,12 @@ class Follower(Watcher):
             row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
         told.decisions.append(row)
         self.tell()
-        return Answer(said, heard_s, row)
+        return Answer(said, heard_s, len(told.decisions) - 1)
+
+    def _write(self, answer: Answer, **more: Any) -> None:
+        """More of a decision. Its line is replaced: a page's thread may be copying the old one."""
+        rows = self.told.decisions
+        rows[answer.number] = rows[answer.number] | more
 
     async def _carry_out(self, turn: Turn, answer: Answer) -> None:
         turn.sent = True
@@ -213,10 +218,10 @@ class Follower(Watcher):
             if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
                 raise
             del self._added[len(self._added) - len(widths) :]
-            answer.row["refused"] = error.detail
+            self._write(answer, refused=error.detail)
             log.info("not laid: %s", error.detail, extra={"test_id": test_id})
             return
-        answer.row["sample_to_plan_ms"] = round(1e3 * (self.clock.monotonic_s() - answer.heard_s), 1)
+        self._write(answer, sample_to_plan_ms=round(1e3 * (self.clock.monotonic_s() - answer.heard_s), 1))
         if ended:
             self.told.state, self.told.ended = "ending", self.told.ended or ended
         self.tell()
