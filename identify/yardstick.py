@@ -14,18 +14,31 @@ def repetition_sentences(figures: Mapping[str, Any]) -> list[str]:
     figures : Mapping
         Fit statistics; `repetition` as `identify.estimation.repetition` gives it. Models of older versions have none.
     """
-    found = figures.get("repetition")
+    return [*_repeating(figures.get("repetition")), *_unforeseen(figures.get("unforeseen_nm"))]
+
+
+def _unforeseen(left_nm: float | None) -> list[str]:
+    """What the model explains of its own record and leaves out where it predicts."""
+    if not left_nm:
+        return []
+    return [f"On held-out rows {left_nm:.3g} N·m cannot be foreseen (hum, slow zero, tremor, efforts): it is left out."]
+
+
+def _repeating(found: Mapping[str, Any] | None) -> list[str]:
     if not found:
         return []
     share, between = found["explained_percent"], f"{found['rms_nm'] or 0.0:.3g}"
     if found["found_by"] is None:
         return ["Nothing repeats, and the record rests too little: what no model can foresee is not known."]
     if found["found_by"] == "estimate":
-        lines = [f"Nothing repeats exactly; by the rests, an estimate, no model can foresee {between} N·m."]
-        return lines if share is None else [*lines, f"The model explains {share:.1f} % of the rest."]
+        lines = [
+            f"Nothing repeats exactly. At rest the mean of a pulse interval varies by {between} N·m: about so much no "
+            "model can foresee."
+        ]
+        return lines if share is None else [*lines, f"The model explains {share:.1f} % of all other variance."]
     lines = [f"Between {found['repeats']:.2g} repeats of the same pulses the torque differs by {between} N·m."]
     if share is not None:
-        lines.append(f"The model explains {share:.1f} % of what repeats.")
+        lines.append(f"The model explains {share:.1f} % of the variance that repeats.")
     if found["held_out_rms_nm"] is not None:
         plain, model = f"{found['held_out_rms_nm']:.3g}", f"{found['held_out_model_rms_nm']:.3g}"
         lines.append(f"Held out, the mean of the other repeats errs by {plain} N·m, the model by {model} N·m.")

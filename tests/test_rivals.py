@@ -19,7 +19,7 @@ def test_each_contender_predicts_a_record_or_is_told_as_not_installed(tmp_path: 
     only = "40 Hz,cascaded tanks,coupled drives"
     command = [sys.executable, "-m", "bench", "rivals", "--budget", "0", "--data", str(tmp_path), "--only", only]
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=280)
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     cells = dict(re.findall(r"^\| ([^|]+) \| [^|]+ \| ([^|]+) \|$", done.stdout, re.M))
     numbers = {name: float(cell.split(",")[0]) for name, cell in cells.items() if re.match(r"[\d.]", cell)}

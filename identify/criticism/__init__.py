@@ -23,6 +23,7 @@ from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Comparison
+from stimrig.identify.simulation.predict import same_data
 from stimrig.identify.yardstick import repetition_sentences
 
 POINTS = 4000
@@ -70,7 +71,8 @@ def compare(model: Model, record: Record) -> Comparison:
     left_out = _left_out(grid)
     said = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
     clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
-    again = {"repetition": repetition(clean, block_means(grid, residual), grid.fitted)}
+    own = model.fit.get("repetition") if same_data(model, record) else None  # by errors of left-out rows
+    again = {"repetition": own or repetition(clean, block_means(grid, residual), grid.fitted)}
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,

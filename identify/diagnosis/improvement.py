@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from stimrig.identify.diagnosis import structure_of
-from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful, search_effects
+from stimrig.identify.diagnosis.search import (
+    MOST,
+    EffectSearch,
+    Progress,
+    Step,
+    helpful,
+    required_errors,
+    search_effects,
+)
+from stimrig.identify.diagnosis.thresholds import RISE
 from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import words
@@ -21,7 +30,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Improvement
 
-COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent", "repetition")
+COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent", "repetition", "unforeseen_nm")
 
 
 def improve(
@@ -70,7 +79,7 @@ def improve(
     row, against = helpful(search)
     if max_effects is not None:
         row = row[: max_effects + 1]
-    reasons = [_reason(search, step) for step in row]
+    reasons = [_reason(search, step, before) for before, step in zip([row[0], *row], row, strict=False)]
     for effect in force:
         step = _forced(row[-1], effect, search.raw)
         if step is not None:
@@ -82,7 +91,7 @@ def improve(
         verdict=verdict.kind,
         steps=tuple(
             {"added": step.added}
-            | {key: step.statistics[key] for key in COLUMNS}
+            | {key: step.statistics.get(key) for key in COLUMNS}
             | {"model_id": model.model_id, "reason": reason, "ceiling_percent": step.statistics["ceiling_percent"]}
             for step, model, reason in zip(row, models, reasons, strict=True)
         ),
@@ -94,7 +103,7 @@ def improve(
 _PLAIN = "The plain structure: recruitment curve and linear dynamics."
 
 
-def _reason(search: EffectSearch, step: Step) -> str:
+def _reason(search: EffectSearch, step: Step, before: Step) -> str:
     if step.added is None:
         held = ", ".join(find_effect(name).name.lower() for name in effect_names(search.base))
         base = f"The given structure, with {held}." if held else _PLAIN
@@ -105,15 +114,21 @@ def _reason(search: EffectSearch, step: Step) -> str:
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
     seen = difference(search.left_out[number], search.left_out[number + 1])
     reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
-    return f"{reason} {_left_out(seen)}"
+    return " ".join([reason, _left_out(seen), *_rising(before.statistics, step.statistics)])
+
+
+def _rising(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    """What is said where the error on held-out rows rises and does not speak against the effect."""
+    rises = before["held_out_by"] == "validate" and after["held_out_rms_nm"] > RISE * before["held_out_rms_nm"]
+    return ["On held-out rows the error rises, but not by more than its standard error."] if rises else []
 
 
 def _left_out(seen: Difference) -> str:
     """What the error on left-out parts says of an effect, in words."""
     percent, errors = 100.0 * abs(1.0 - np.exp(-seen.gain)), abs(seen.errors)
     if seen.gain < 0.0:
-        return f"On parts of the record left out of the fit the error rises by {percent:.0f} % ({errors:.1f} sd)."
-    return f"On parts of the record left out of the fit the error falls by {percent:.0f} % ({errors:.1f} sd)."
+        return f"On parts left out of the fit the error rises by {percent:.0f} % ({errors:.1f} standard errors)."
+    return f"On parts left out of the fit the error falls by {percent:.0f} % ({errors:.1f} standard errors)."
 
 
 def refused(search: EffectSearch) -> list[dict[str, Any]]:
@@ -128,12 +143,13 @@ def refused(search: EffectSearch) -> list[dict[str, Any]]:
         if candidate.effect.id in present:
             continue
         if candidate.refused is not None:
-            reason = _left_out(candidate.refused)
+            needed = f"It must fall by {required_errors(search, candidate):g} standard errors at least."
+            reason = f"{_left_out(candidate.refused)} {needed}"
         elif candidate.gain <= 0.0:
             reason = f"The evidence is against it: log evidence changes by {candidate.gain:+.1f}."
         elif candidate.gain < margin:
             reason = (
-                f"Too little evidence: log evidence rises by {candidate.gain:.1f}; at least {margin:.0f} is required."
+                f"Too little evidence: log evidence rises by {candidate.gain:.1f}; at least {margin:g} is required."
             )
         else:
             reason = "Another effect explains the same error better."

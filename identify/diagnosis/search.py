@@ -37,7 +37,7 @@ from stimrig.identify.estimation.effect_fit import (
 )
 from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
-from stimrig.identify.estimation.left_out import Difference, LeftOut, difference, leave_out
+from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
 from stimrig.identify.estimation.plain import fit_plain, knows_joint, renewed_curve
 from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.noise import NoiseLevel
@@ -179,7 +179,7 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
             candidate = candidates[place] = _fitted_to_its_end(candidate)
         unseen = leave_out(candidate.fitted)
         seen = difference(search.left_out[-1], unseen)
-        if not allowed(search, candidate, seen):
+        if not seen.errors >= required_errors(search, candidate):
             candidates[place] = replace(candidate, refused=seen)
             continue
         able.append((seen.gain, candidate, unseen))
@@ -188,27 +188,25 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     if not able:
         return None
     _, candidate, unseen = max(able, key=lambda one: one[0])
-    # Where the likelihood decides nothing, one that is likelier is a rival, not more.
-    candidates[:] = [replace(one, gain=min(one.gain, candidate.gain)) for one in candidates]
     free = released(candidate.fitted)
     return (candidate, unseen) if free is candidate.fitted else (replace(candidate, fitted=free), leave_out(free))
 
 
-def allowed(search: EffectSearch, candidate: Candidate, seen: Difference) -> bool:
-    """Whether left-out blocks speak for an effect; of one that cannot be foreseen: whether they do not object.
+def required_errors(search: EffectSearch, candidate: Candidate) -> float:
+    """Standard errors by which the error on left-out blocks must fall with an effect.
 
-    More is asked of an effect that may only repair the inexact form of one that is there. A narrow band of noise is
-    not judged by blocks: it changes no prediction.
+    Of one that cannot be foreseen none, and where its likelihood can be trusted it may even rise by one. More is asked
+    of an effect that may only repair the inexact form of one that is there. A narrow band of noise is not judged by
+    blocks: it changes no prediction.
     """
     effect = candidate.effect
     if effect.band:
-        return True
+        return -np.inf
     if not effect.predictable:
-        return seen.errors >= thresholds.NO_WORSE
+        return 0.0 if search.last.distrusted else thresholds.NO_WORSE
     if resembles_earlier(search.last, effect, candidate.form.stage, search.detected):
-        return seen.errors >= thresholds.BETTER_THAN_ALIKE
-    weak = candidate.gain < thresholds.NEXT_MARGIN
-    return seen.errors >= (thresholds.BETTER_IF_WEAK if weak else thresholds.BETTER)
+        return thresholds.BETTER_THAN_ALIKE
+    return thresholds.BETTER_IF_WEAK if candidate.gain < thresholds.NEXT_MARGIN else thresholds.BETTER
 
 
 def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iterable[str]) -> bool:
@@ -405,7 +403,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
         found = _discounted(search, Candidate(described, own, fitted, gain, known | {own.name: gain}))
         unseen = leave_out(fitted)
         seen = difference(search.left_out[-1], unseen)
-        if found.gain < _margin(search, number) or not allowed(search, found, seen):
+        if found.gain < _margin(search, number) or not seen.errors >= required_errors(search, found):
             return  # beside the other effects it no longer gains enough
         # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
         most = found.gain - (won if number == index else 0.0)
@@ -460,11 +458,18 @@ def steps(search: EffectSearch) -> list[Step]:
 
 
 def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
-    """The steps up to the first that raises the error on held-out rows, and the effect refused for that reason."""
+    """The steps up to the first that raises the error on held-out rows, and the effects refused for that reason."""
     row = steps(search)
     for number in range(1 + len(search.detected), len(row)):
         errors = vetoed(row[number - 1].fitted, row[number].fitted)
-        if errors is not None:
-            reason = f"The error on held-out rows would rise from {errors[0]:.3g} to {errors[1]:.3g} N·m."
-            return row[:number], [{"effect": row[number].added, "log_evidence_gain": None, "reason": reason}]
+        if errors is None:
+            continue
+        first = find_effect(str(row[number].added)).name
+        reason = f"It was found beside another effect, against which held-out rows speak: {first}."
+        against = [{"effect": step.added, "log_evidence_gain": None, "reason": reason} for step in row[number:]]
+        old, new = (f"{error:.3g}" for error in errors)
+        against[0]["reason"] = (
+            f"On held-out rows with fitted pulse widths the error would rise from {old} to {new} N·m."
+        )
+        return row[:number], against
     return row, []

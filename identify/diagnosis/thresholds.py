@@ -1,4 +1,4 @@
-"""Every threshold that decides a verdict, with the reason for it.
+"""The thresholds of the search and of its verdict, with the reason for each.
 
 All were calibrated on development records only (seeds 0 to 99 of `bench.diagnosis`); docs/diagnosis.md gives the
 results on other records. Log evidence is a natural logarithm. A "sporadic" effect comes and goes by no
@@ -17,7 +17,7 @@ NEXT_MARGIN = 10.0
 NEAR_IDEAL = 30.0
 """Log-likelihood that the last model may fall short of the ideal by, where its residual is white: the size of the noise
 is known no better. Nothing further is then looked for."""
-JUDGED = 4
+JUDGED = 8
 """So many candidates of a round, the likeliest first, are judged by left-out blocks."""
 BETTER = 1.0
 """Standard errors by which the error on left-out blocks must fall with an effect."""

@@ -10,6 +10,7 @@ from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, vetoed
 from stimrig.identify.diagnosis.search import EffectSearch, resembles_earlier, seen_at_rest
 from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation.candidates import doubts
 from stimrig.identify.estimation.effect_fit import Candidate
 
 
@@ -27,13 +28,17 @@ class Verdict:
     notes: list[str] = field(default_factory=list)  # reasons, for people
 
 
-def shares(candidates: list[Candidate]) -> dict[str, float]:
-    """Probability of each candidate, and under the key "" that none of them is there."""
+def shares(candidates: list[Candidate], most: float = np.inf) -> dict[str, float]:
+    """Probability of each candidate, and under the key "" that none of them is there.
+
+    No gain counts for more than `most`, that of the effect which was added: where the likelihood decides nothing, one
+    that is likelier is a rival, not more.
+    """
     if not candidates:
         return {"": 1.0}
-    top = candidates[0].gain
+    top = min(candidates[0].gain, most)
     spread = thresholds.TEMPERATURE + thresholds.RELATIVE * max(top, 0.0)
-    weights = {c.effect.id: float(np.exp(max((c.gain - top) / spread, -60.0))) for c in candidates}
+    weights = {c.effect.id: float(np.exp(max((min(c.gain, most) - top) / spread, -60.0))) for c in candidates}
     # An effect whose gain equals the margin has a probability of one half.
     weights[""] = float(np.exp(np.clip(thresholds.FIRST_MARGIN - top, -60.0, 60.0)))
     total = sum(weights.values())
@@ -98,12 +103,13 @@ def judge(search: EffectSearch) -> Verdict:
     possible = max(left.ideal - first.log_likelihood, 1.0)
     explained = (last.log_likelihood - first.log_likelihood) / possible if effects else 0.0
     readings = search.raw.readings
-    notes = [] if readings is None else [readings.words]
+    notes = [*([] if readings is None else [readings.words]), *doubts(last)]
     found: dict[str, float] = dict.fromkeys(search.detected, 0.99)
     rivals: dict[str, dict[str, float]] = {}
     rounds = [[c for c in tried if c.refused is None] for tried in search.rounds]
     for number, effect in enumerate(search.added):
-        rivals[effect] = shares([c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added])
+        beside = [c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added]
+        rivals[effect] = shares(beside, next((c.gain for c in beside if c.effect.id == effect), np.inf))
         # A later effect is at most as probable as those before it.
         found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in search.added[:number] if e in found)])
         stage = dict(search.chain[number + 1].effects).get(effect, find_effect(effect).forms[0]).stage
@@ -113,7 +119,7 @@ def judge(search: EffectSearch) -> Verdict:
             found[effect] = min(found[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
         if vetoed(search.chain[number], search.chain[number + 1]) is not None:
             found[effect] = min(found[effect], thresholds.DOUBTED)
-            notes.append(f"{find_effect(effect).name}: it raises the error on held-out rows.")
+            notes.append(f"The error on held-out rows rises with this effect: {find_effect(effect).name}.")
     structure = left.ratio
     if last.noise.band > 0.0:
         # The narrow band itself is not structure: what counts is what remains beside it.
@@ -122,7 +128,7 @@ def judge(search: EffectSearch) -> Verdict:
     strange = readings is not None and readings.held_s > thresholds.LONGEST_HELD_S
     if effects:
         strange = strange or (explained < thresholds.LEAST_EXPLAINED and left.left)
-        lawless = search.free_gain > search.rounds[0][0].gain + thresholds.FREE_GAIN_MARGIN
+        lawless = any(search.free_gain > one[0].gain + thresholds.FREE_GAIN_MARGIN for one in search.rounds[:1])
         strange = strange or (lawless and explained < thresholds.EXPLAINED_BY_LAWS)
         if find_effect(effects[0]).band:
             strange = strange or (

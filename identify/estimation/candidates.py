@@ -57,13 +57,24 @@ def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
 
 
 def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
-    """What was chosen, in words; nothing where the noise is usual and all rows were fitted."""
+    """What was chosen and why, in words; nothing where the noise is usual and all rows were fitted."""
     own, found = fitted.problem.setup.fitted, []
     if own.sum() < rows.sum():
         count, all_rows = int(own.sum()), int(rows.sum())
         found.append(f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted.")
     if fitted.noise.held:
         found.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
+    return [*found, *doubts(fitted)]
+
+
+def doubts(fitted: Fitted) -> list[str]:
+    """Why the likelihood of a fit is no evidence, in words; nothing where it is."""
+    found = []
+    if fitted.noise.at_bound:
+        found.append("The slow noise is as slow as it may be: left-out parts of the record decide, not the likelihood.")
+    if fitted.heavy_tails:
+        kurtosis = f"{fitted.excess_kurtosis:.0f}"
+        found.append(f"A few jumps hold most of the noise: left-out parts decide (excess kurtosis {kurtosis}).")
     return found
 
 

@@ -18,6 +18,8 @@ CONSTANT = 1e-9
 """Torque whose standard deviation is below this (N·m, or share of its size) is constant, but for rounding."""
 NOISE_SHARE = 0.5
 """Torque whose standard deviation is below this share of that of the noise is constant, too."""
+BEYOND_NOISE = 1.5
+"""A residual of so many times the noise that the samples show is not noise alone, however white it is."""
 UNDEFINED = "not defined, since the torque is constant there"
 
 
@@ -46,9 +48,9 @@ def rms(residual_nm: np.ndarray) -> float:
 def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: float, white: bool) -> float:
     """White measurement noise at the record's own rate, N·m.
 
-    If the residual is white on the grid of pulses, and as large as white samples make it, the whole residual is used,
-    which is efficient. Otherwise it contains something slower (a missing effect, correlated noise, hum), and the noise
-    is estimated from second differences, which slow parts hardly change.
+    If the residual is white on the grid of pulses, as large as white samples make it, and hardly more than the samples
+    show before any fit, the whole residual is used, which is efficient. Otherwise it contains something else (a missing
+    effect, correlated noise, hum), and the noise is estimated from second differences, which slow parts hardly change.
 
     Parameters
     ----------
@@ -73,7 +75,8 @@ def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: 
         at = grid.readings.at
         jump, known = contrasts(at, residual[at], 2), rows[at]
     jump = jump[known[2:] & known[1:-1] & known[:-2]]
-    if white and abs(block_sd_nm * np.sqrt(grid.readings_in(grid.fitted)) / max(plain, 1e-300) - 1.0) < 0.2:
+    alike = abs(block_sd_nm * np.sqrt(grid.readings_in(grid.fitted)) / max(plain, 1e-300) - 1.0) < 0.2
+    if white and alike and plain < BEYOND_NOISE * grid.noise_sd_nm:
         return plain
     return plain if jump.size < 16 else float(min(np.sqrt(np.mean(jump**2)), plain))
 
@@ -117,7 +120,7 @@ def fit_statistics(
     sd_nm : float
         White noise of a sample, N·m.
     held_out_change : ndarray or None, shape (K,)
-        For a record without `validate`: see `held_out_change`, N·m.
+        Of fitted intervals where they are left out of the fit, N·m: see the function of that name.
     foreseen_nm : ndarray or None, shape (N,)
         Torque without what could not have been foreseen, N·m. By this the model is judged where rows are held out. What
         it leaves out there (`unforeseen_nm`) counts as noise in the ceiling: it is known, and of no muscle.
@@ -139,8 +142,9 @@ def fit_statistics(
         "segments": segment_statistics(grid, np.where(record.held_out, foreseen, predicted_nm), sd_nm),
     }
     left_out, by = foreseen, "validate"
-    if not held.any() and held_out_change is not None:
-        left_out, held, by = foreseen + held_out_change[grid.interval], used, "cross-validation"
+    if held_out_change is not None:
+        left_out = foreseen + held_out_change[grid.interval]
+        held, by = (held, by) if held.any() else (used, "cross-validation")
     if held.any():
         unforeseen = rms((predicted_nm - foreseen)[held])
         result |= figures(measured[held], left_out[held], float(np.hypot(sd_nm, unforeseen)), "held_out_")
@@ -177,7 +181,7 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     """The key `fit` of MODEL.json: errors, best-fit %, and the best fit that the noise allows."""
     setup = fitted.problem.setup
     grid = setup.grid
-    change = None if grid.record.held_out.any() else held_out_change(fitted)
+    change = held_out_change(fitted)
     predicted, foreseen = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
     found = fit_statistics(grid, setup.fitted, predicted, noise, change, foreseen)

@@ -97,11 +97,9 @@ class Fitted:
         return self.excess_kurtosis > HEAVY_TAILS
 
     @property
-    def distrusted(self) -> tuple[str, ...]:
-        """Why its likelihood is no evidence, in words; empty where nothing speaks against it."""
-        slow = "The slow noise is as slow as it may be: zero and slow shapes cost the likelihood nothing."
-        heavy = f"A few jumps decide the likelihood: excess kurtosis {self.excess_kurtosis:.0f}."
-        return (slow,) * self.noise.at_bound + (heavy,) * self.heavy_tails
+    def distrusted(self) -> bool:
+        """Whether its likelihood is no evidence."""
+        return self.noise.at_bound or self.heavy_tails
 
     @property
     def effects(self) -> list[tuple[str, Form]]:

@@ -173,8 +173,10 @@ def _allowed_nm(fitted: Fitted) -> tuple[float, float]:
     setup = fitted.problem.setup
     grid = setup.grid
     rest = setup.fitted & relaxed(grid, FORGOTTEN_S)
-    still = setup.target_nm[rest]
-    wander = 1.4826 * float(np.median(np.abs(still - np.median(still)))) if still.size else 0.0
+    still, part = setup.target_nm[rest], grid.part[rest]
+    for one in np.unique(part):  # each part has its own zero
+        still[part == one] -= np.median(still[part == one])
+    wander = 1.4826 * float(np.median(np.abs(still))) if still.size else 0.0
     if grid.angle_rad is not None and still.size and np.ptp(grid.angle_rad[rest]) > MOVED_RAD:
         wander = 0.0  # a joint that moves has its passive torque at rest
     return max(grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm), wander

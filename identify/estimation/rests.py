@@ -13,7 +13,7 @@ SLOW_S = 0.2
 LEAST_SHARE = 0.05
 """The zero is not taken as better known than this share of the torque's range: a residual state may hold it up."""
 IDLE_SHARE = 0.1
-"""Pulses of this share of the largest width are as good as none, where a record has no rest without pulses."""
+"""Pulses of this share of the largest width are as good as none, where no rest without any lasts for two seconds."""
 
 
 def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

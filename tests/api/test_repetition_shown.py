@@ -37,7 +37,7 @@ def test_a_report_and_the_command_line_have_it(made):
     record, model = made
     document = model.to_dict()
     page = comparison_html(document, clean(curves(model, record)), "a record")
-    assert "Of what repeats" in page
+    assert "Of variance that repeats" in page
     assert "Between 2 repeats of the same pulses the torque differs by" in page
     assert any(line.startswith("repetition     Between 2 repeats") for line in model_report(document))
 
@@ -59,4 +59,4 @@ def test_every_sentence_is_translated():
                 assert str(translated(line)) != line
     with language.using("de"):
         said = [str(translated(line)) for line in stored_model.repetition({"fit": {"repetition": FOUND}})["sentences"]]
-    assert said[1] == "Das Modell erklärt 93,0 % dessen, was sich wiederholt."
+    assert said[1] == "Das Modell erklärt 93,0 % der Varianz, die sich wiederholt."

@@ -12,6 +12,7 @@ import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -51,8 +52,10 @@ def records() -> dict[str, Record]:
 
 def answers(factor: float = 1.0) -> dict[str, dict[str, Any]]:
     """By record, its torque times a factor: the plain fit on its own rows, N·m, what it leaves, and added effects."""
-    side_by_side.WORKERS = 1
-    return {name: _answer(record.with_torque(factor * record.torque_nm), name) for name, record in records().items()}
+    with patch.object(side_by_side, "WORKERS", 1):
+        return {
+            name: _answer(record.with_torque(factor * record.torque_nm), name) for name, record in records().items()
+        }
 
 
 def _answer(record: Record, name: str) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def run(words: list[str], place: Path, effects: str = "", status: int = 0) -> st
     """What a command says, on standard output or, where it fails, in one line on standard error."""
     command = [str(Path(sys.executable).with_name("stimrig")), *words]
     environment = os.environ | {"STIMRIG_EFFECTS_DIR": effects}
-    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=280)
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=900)
     assert done.returncode == status, done.stderr
     if status == 0:
         return done.stdout

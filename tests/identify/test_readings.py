@@ -123,6 +123,13 @@ def test_units_sign_offset_and_scale_change_nothing():
         assert np.array_equal(again.at, first.at)
 
 
+def test_a_white_residual_far_above_the_noise_of_the_samples_is_not_noise():
+    """Readings held for two pulses: what that spoils is white, too, and was taken for the noise that it is not."""
+    record = made(82, rate_hz=200.0, change=held(10))
+    found = identify.fit(record)
+    assert found.fit["noise_sd_nm"] == pytest.approx(identify.diagnose(record).noise_sd_nm, rel=0.25)
+
+
 def test_a_held_record_has_a_ceiling_and_nothing_missing():
     record = made(81, change=held(5))
     found = identify.diagnose(record)

@@ -11,6 +11,7 @@ import pytest
 from stimrig import identify
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.estimation.repetition import repetition
+from stimrig.identify.estimation.samples import block_means
 from stimrig.identify.records.record import Record
 from stimrig.identify.yardstick import repetition_words
 from tests.harness.muscle import Patient
@@ -143,7 +144,7 @@ def test_what_never_repeats_claims_nothing_exact():
     assert found["found_by"] == "estimate"
     assert found["repeats"] is None and found["held_out_rms_nm"] is None
     assert found["rms_nm"] == pytest.approx(WHITE_NM / 10**0.5, rel=0.2)
-    assert "an estimate" in repetition_words(model.fit)
+    assert "about so much" in repetition_words(model.fit)
     # A width for each pulse and no rest: nothing is known.
     widths = rng.uniform(0.0, 300.0, 2000)
     torque = QUICK.torque(widths, 100.0)
@@ -161,6 +162,20 @@ def test_doubted_intervals_and_gaps_do_not_count():
     found = of(replace(record, doubted=doubted).with_torque(record.torque_nm + 9.0 * doubted))
     assert found["repeats"] == pytest.approx(3.0, abs=0.1)
     assert found["rms_nm"] == pytest.approx(WHITE_NM / 10**0.5, rel=0.1)
+
+
+def test_rows_that_were_fitted_are_judged_as_left_out():
+    """Repeats outside `validate`: the model's error there is that of a fit without them, in every report."""
+    widths = np.concatenate([REST, ramp(6), REST, ramp(6), REST, prbs(10, 300.0, np.random.default_rng(3))])
+    names = ["rest"] * 160 + ["ramp"] * 240 + ["rest"] * 160 + ["ramp"] * 240 + ["rest"] * 160
+    names += ["validate"] * (widths.size - len(names))
+    record, _ = make_record(QUICK, np.random.default_rng(4), rate_hz=100, noise_nm=0.5, pulses=(widths, names))
+    model = identify.fit(record)
+    found = model.fit["repetition"]
+    error_nm = block_means(make_grid(record), record.torque_nm - model.predict(record))
+    assert found["found_by"] == "exact repeats"
+    assert found["model_rms_nm"] > 1.001 * of(record, error_nm)["model_rms_nm"]
+    assert identify.compare(model, record).repetition == found
 
 
 def test_every_report_has_it():

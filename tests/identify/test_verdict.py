@@ -37,7 +37,7 @@ def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters
         log_likelihood=log_likelihood - 20.0,
         heavy_tails=False,
         effects=forms,
-        noise=SimpleNamespace(band=band),
+        noise=SimpleNamespace(band=band, at_bound=False),
         parameters_of=parameters_of,
         problem=SimpleNamespace(
             setup=SimpleNamespace(fitted=np.ones(4000, bool), grid=SimpleNamespace(step_s=0.025)),
@@ -282,7 +282,7 @@ def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
     assert found.found[SECOND] == 0.45
     assert found.found[FIRST] > 0.9
     assert len(found.notes) == 1
-    assert found.notes[0].startswith(find_effect(SECOND).name)
+    assert found.notes[0].endswith(f": {find_effect(SECOND).name}.")
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def improvement_lines(found: dict[str, Any]) -> list[str]:
     ]
     header = ("added", "fit %", "rms N·m", "held-out %", "held-out rms N·m")
     lines = [f"structure      {in_words(found['structure'])}", "", *table(header, rows), ""]
-    lines.append(f"noise          {number(found['noise_sd_nm'], 4)} N·m: what no model can explain")
+    lines.append(f"noise          {number(found['noise_sd_nm'], 4)} N·m: of a sample, which no model can explain")
     lines += repetition_lines(found["steps"][-1])
     lines.append(f"at first       {VERDICTS.get(found['verdict'], found['verdict'])}")
     refused = [f"{row['effect']}: {row['reason']}" for row in found.get("refused") or []]

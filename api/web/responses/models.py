@@ -148,6 +148,7 @@ class FiguresOut(Document):
     rms_nm: float | None = Field(None, description="N·m")
     held_out_rms_nm: float | None = Field(None, description="N·m")
     repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
+    unforeseen_nm: float | None = Field(None, description="of held-out rows, left out of predictions, N·m")
 
 
 class StepOut(FiguresOut):
