@@ -25,11 +25,14 @@ GROUP = "stimrig.effects"
 _NOT_EFFECTS = {"base", "own_file"}
 
 
+def _own() -> list[Effect]:
+    names = sorted(module.name for module in pkgutil.iter_modules(__path__) if module.name not in _NOT_EFFECTS)
+    return [importlib.import_module(f"{__name__}.{name}").EFFECT for name in names]
+
+
 @lru_cache(maxsize=8)
 def _everything(folder: str) -> dict[str, Effect]:
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__) if module.name not in _NOT_EFFECTS)
-    own = (importlib.import_module(f"{__name__}.{name}").EFFECT for name in names)
-    found = {effect.id: effect for effect in own}
+    found = {effect.id: effect for effect in _own()}
     added = [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]
     places: dict[str, str] = {}
     for place, effect in added:
