@@ -34,6 +34,17 @@ def text(value: Any, place: str) -> None:
         raise BadModel(f"{_short(value)} is not a text, or too long", place=place, fix=FIX)
 
 
+def one_of(*known: Any) -> Check:
+    """One of some values; not a boolean."""
+
+    def check(value: Any, place: str) -> None:
+        if isinstance(value, bool | list | dict) or value not in known:
+            listed = " or ".join("null" if one is None else str(one) for one in known)
+            raise BadModel(f"{_short(value)} is not {listed}", place=place, fix=FIX)
+
+    return check
+
+
 def anything(value: Any, place: str) -> None:
     """Any value."""
 
@@ -117,6 +128,7 @@ def _short(value: Any) -> str:
 ANY = number(-1e300, 1e300)
 WIDTH = number(0.0, 1e6)
 STATISTIC = maybe(ANY)
+NOT_NEGATIVE = number(0.0, 1e300)
 STATISTICS = (
     "fit_percent", "ceiling_percent", "rms_nm", "noise_sd_nm", "held_out_fit_percent", "held_out_ceiling_percent",
     "held_out_rms_nm",
@@ -164,12 +176,6 @@ def pair(value: Any, place: str) -> None:
         several(STATISTIC, 2, 2)(value, place)
 
 
-def sign(value: Any, place: str) -> None:
-    """1 or -1."""
-    if isinstance(value, bool) or value not in (1, -1):
-        raise BadModel(f"{_short(value)} is not 1 or -1", place=place, fix=FIX)
-
-
 def parameter_value(value: Any) -> Any:
     """The number of a parameter, which is given alone or as {"value", "sd", "unit"}."""
     return value["value"] if isinstance(value, dict) and "value" in value else value
@@ -179,7 +185,7 @@ SETTINGS = {
     "scale_nm": number(1e-9, PLAUSIBLE),
     "noise_sd_nm": number(0.0, PLAUSIBLE),
     "zero_nm": number(-PLAUSIBLE, PLAUSIBLE),
-    "sign": sign,
+    "sign": one_of(1, -1),
     "reference_s": number(-PLAUSIBLE, PLAUSIBLE),
 }
 JOINT_SETTINGS = {
@@ -246,6 +252,16 @@ def joint(value: Any, place: str) -> None:
             raise BadModel(f"not {rows} rows of {columns}", place=f"{place}.{name}", fix=FIX)
 
 
+REPETITION = fields(
+    {"found_by": one_of(None, "exact repeats", "estimate"), "explained_percent": maybe(number(0.0, 100.0))}
+    | dict.fromkeys(
+        ("repeats", "seconds", "rms_nm", "model_rms_nm", "held_out_rms_nm", "held_out_model_rms_nm"),
+        maybe(NOT_NEGATIVE),
+    )
+)
+FIT = dict.fromkeys(STATISTICS, STATISTIC) | {
+    "unexplained_nm": NOT_NEGATIVE, "unforeseen_nm": NOT_NEGATIVE, "repetition": maybe(REPETITION),
+}  # fmt: skip
 MODEL = fields(
     {
         "method": text,
@@ -262,7 +278,7 @@ MODEL = fields(
         "effects": several(EFFECT, most=50),
         "joint": joint,
         "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),
-        "fit": fields({}, dict.fromkeys(STATISTICS, STATISTIC) | {"unexplained_nm": number(0.0, 1e300)}),
+        "fit": fields({}, FIT),
         "residual_tests": each(each(anything)),
         "valid_for": each(pair),
         "quality": fields(

@@ -36,11 +36,12 @@ def _repeating(found: Mapping[str, Any] | None) -> list[str]:
             "model can foresee."
         ]
         return lines if share is None else [*lines, f"The model explains {share:.1f} % of all other variance."]
-    lines = [f"Between {found['repeats']:.2g} repeats of the same pulses the torque differs by {between} N·m."]
+    lines = [f"Between {found['repeats'] or 0.0:.2g} repeats of the same pulses the torque differs by {between} N·m."]
     if share is not None:
         lines.append(f"The model explains {share:.1f} % of the variance that repeats.")
-    if found["held_out_rms_nm"] is not None:
-        plain, model = f"{found['held_out_rms_nm']:.3g}", f"{found['held_out_model_rms_nm']:.3g}"
+    errors = [found["held_out_rms_nm"], found["held_out_model_rms_nm"]]
+    if None not in errors:
+        plain, model = (f"{error:.3g}" for error in errors)
         lines.append(f"Held out, the mean of the other repeats errs by {plain} N·m, the model by {model} N·m.")
     return lines
 

@@ -72,12 +72,12 @@ def compare(model: Model, record: Record) -> Comparison:
     said = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
     clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
     own = model.fit.get("repetition") if same_data(model, record) else None  # by errors of left-out rows
-    again = {"repetition": own or repetition(clean, block_means(grid, residual), grid.fitted)}
+    again = own or repetition(clean, block_means(grid, residual), grid.fitted)
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
         noise_sd_nm=noise,
-        repetition=again["repetition"],
+        repetition=again,
         fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
         by=_error_shares(record, residual, noise, counted),
@@ -85,7 +85,7 @@ def compare(model: Model, record: Record) -> Comparison:
         where=tuple(places),
         left_out=left_out,
         series=_series(model, record, predicted, noise),
-        plain=(*_plain(whole, held_out, noise, tests, places), *repetition_sentences(again), *said, *outside),
+        plain=(*_plain(whole, held_out, noise, tests, places), *repetition_sentences({"repetition": again}), *said, *outside),
     )
 
 

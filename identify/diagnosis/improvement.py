@@ -14,7 +14,6 @@ from stimrig.identify.diagnosis.search import (
     Progress,
     Step,
     helpful,
-    required_errors,
     search_effects,
 )
 from stimrig.identify.diagnosis.thresholds import RISE
@@ -131,6 +130,13 @@ def _left_out(seen: Difference) -> str:
     return f"On parts left out of the fit the error falls by {percent:.0f} % ({errors:.1f} standard errors)."
 
 
+def _needed(errors: float) -> str:
+    """By how many standard errors the error on left-out parts had to fall, in words."""
+    if errors > 0.0:
+        return f"It must fall by {errors:g} of its standard errors at least."
+    return f"It may rise by {-errors:g} of its standard errors at most." if errors < 0.0 else "It must not rise."
+
+
 def refused(search: EffectSearch) -> list[dict[str, Any]]:
     """Effects that were tried on the last model and not added, best first, each with the reason."""
     present = set(effect_names(search.last))
@@ -143,8 +149,7 @@ def refused(search: EffectSearch) -> list[dict[str, Any]]:
         if candidate.effect.id in present:
             continue
         if candidate.refused is not None:
-            needed = f"It must fall by {required_errors(search, candidate):g} standard errors at least."
-            reason = f"{_left_out(candidate.refused)} {needed}"
+            reason = f"{_left_out(candidate.refused)} {_needed(candidate.required)}"
         elif candidate.gain <= 0.0:
             reason = f"The evidence is against it: log evidence changes by {candidate.gain:+.1f}."
         elif candidate.gain < margin:

@@ -164,9 +164,9 @@ def _add_detected(search: EffectSearch) -> Fitted:
 def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tuple[Candidate, LeftOut] | None:
     """The likeliest candidate of a round that predicts left-out blocks better; None if none does."""
     before = search.rounds[0] if search.rounds else []
-    listed, least = _worth_a_fit(search.last)
+    listed, least = _worth_a_fit(search)
     tried = _scan(search.last, listed, least, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
-    candidates = sorted((_discounted(search, c) for c in tried), key=lambda c: -c.gain)
+    candidates = sorted((_discounted(search, c) for c in tried), key=_by_gain)
     search.rounds.append(candidates)
     if not number and (lawless := try_effect(FREE_GAIN, search.last)) is not None:
         search.free_gain = lawless.gain
@@ -178,13 +178,14 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
         if candidate.gain < least:
             candidate = candidates[place] = _fitted_to_its_end(candidate)
         unseen = leave_out(candidate.fitted)
-        seen = difference(search.left_out[-1], unseen)
-        if not seen.errors >= required_errors(search, candidate):
-            candidates[place] = replace(candidate, refused=seen)
+        seen, required = difference(search.left_out[-1], unseen), required_errors(search, candidate)
+        if not seen.errors >= required:
+            candidates[place] = replace(candidate, refused=seen, required=required)
             continue
         able.append((seen.gain, candidate, unseen))
         if not search.last.distrusted:
             break
+    candidates.sort(key=_by_gain)  # a fit that was continued gains more
     if not able:
         return None
     _, candidate, unseen = max(able, key=lambda one: one[0])
@@ -231,15 +232,19 @@ def released(fitted: Fitted) -> Fitted:
 # ---- one round: every effect of the library tried on a model -----------------------------------------------------
 
 
-def _worth_a_fit(base: Fitted) -> tuple[list[Effect], float]:
-    """Effects that can be tried on a model, and the gain below which a fit need not be continued to its end.
+def _worth_a_fit(search: EffectSearch) -> tuple[list[Effect], float]:
+    """Effects that can be tried on the last model, and the gain below which a fit need not be continued to its end.
 
     One step of each effect's first form shows what the best one gains at least. What gains far less is no rival of it.
+    Where none can gain enough, that is not asked.
     """
+    base = search.last
     present = effect_names(base)
     listed = [effect for effect in registry().values() if _applicable(effect, base, present)]
     # Slow ones first, so that all processes end at about the same time.
     listed.sort(key=lambda effect: -len(effect.forms))
+    if _exhausted(search):
+        return listed, WORTHLESS
     firsts = [fit_form(e, e.forms[0], base, base.residual_nm, {}, np.inf) for e in listed if not e.band]
     gains = [found.log_evidence - base.log_evidence for found in firsts if found is not None]
     return listed, max(WORTHLESS, NO_RIVAL * max(gains, default=0.0))
@@ -273,7 +278,12 @@ def _scan(
             added = [] if effect.band else [(effect.id, effect.form(name))]
             problem = Problem(base.problem.setup, [*base.effects, *added])
             found.append(Candidate(effect, effect.form(name), replace(fitted, problem=problem), gain, forms))
-    return sorted(found, key=lambda candidate: (-candidate.gain, candidate.effect.id))
+    return sorted(found, key=_by_gain)
+
+
+def _by_gain(candidate: Candidate) -> tuple[float, str]:
+    """The best first."""
+    return -candidate.gain, candidate.effect.id
 
 
 def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
@@ -408,7 +418,7 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
         # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
         most = found.gain - (won if number == index else 0.0)
         rivals = [replace(c, gain=min(c.gain, most)) for c in tried[number] if c.effect.id != effect]
-        search.rounds.append(sorted([found, *rivals], key=lambda c: -c.gain))
+        search.rounds.append(sorted([found, *rivals], key=_by_gain))
         search.margins.append(_margin(search, number))
         search.append(fitted, effect, unseen)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 from stimrig.identify.effects.base import STAGES, Effect, Form, Parameter, Scene
 from stimrig.identify.errors import IdentifyError
 
@@ -119,6 +120,10 @@ def _check_form(form: Form, place: str, path: Path | None) -> None:
         raise BadEffect(f"two parameters are called {twice[0]!r}", place=where, fix="Name each parameter once.")
     for parameter in form.parameters:
         _check_parameter(parameter, where)
+    for name, pair in form.law.items():
+        if name not in names or not (isinstance(pair, tuple) and [*map(type, pair)] == [Lag, SpeedLaw]):
+            fix = "Give law={parameter: (Lag, SpeedLaw)}, both from stimrig.identify.dynamics.variable_speed."
+            raise BadEffect(f"law {name!r}: {pair!r}", place=where, fix=fix)
     if form.apply is None and not form.law:
         raise BadEffect("no apply", place=where, fix="Give apply=, a function of (x, p, scene).")
     if form.apply is not None and form.stage not in ("speed", "branch", "filter"):

@@ -46,6 +46,8 @@ class Candidate:
         Gain by form.
     refused : Difference or None
         What left-out blocks say, where they refuse it; None of one that they were not asked about, or that they allow.
+    required : float
+        Standard errors by which the error on those blocks had to fall, where they refuse it.
     """
 
     effect: Effect
@@ -54,6 +56,7 @@ class Candidate:
     gain: float
     forms: dict[str, float]
     refused: Difference | None = None
+    required: float = 0.0
 
 
 def try_effect(

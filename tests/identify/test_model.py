@@ -90,6 +90,33 @@ def test_bad_models_are_refused(case):
             identify.Model.from_json(spoiled)
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"unforeseen_nm": -1.0}, r"fit\.unforeseen_nm: -1\.0 is not a number"),
+        ({"unforeseen_nm": True}, r"fit\.unforeseen_nm: True is not a number"),
+        ({"repetition": []}, r"fit\.repetition: a list is not a JSON object"),
+        ({"repetition": {"found_by": "hearsay"}}, r"fit\.repetition\.found_by: 'hearsay' is not null or exact repeats"),
+        ({"explained_percent": 100.1}, r"fit\.repetition\.explained_percent: 100\.1 is not a number from 0 to 100"),
+        ({"rms_nm": "0.1"}, r"fit\.repetition\.rms_nm: '0\.1' is not a number"),
+    ],
+)
+def test_what_repeats_is_checked_before_it_is_told(change: dict[str, object], says: str) -> None:
+    document = fitted(40)[1].to_dict()
+    own = document["fit"]["repetition"]
+    outside = change if change.keys() <= {"unforeseen_nm", "repetition"} else {"repetition": own | change}
+    with pytest.raises(identify.BadModel, match=says):
+        identify.Model.from_dict(document | {"fit": document["fit"] | outside})
+
+
+@pytest.mark.parametrize("found_by", ["exact repeats", "estimate", None])
+def test_a_repetition_of_which_little_is_known_is_told(found_by: str | None) -> None:
+    document = fitted(40)[1].to_dict()
+    little = dict.fromkeys(document["fit"]["repetition"]) | {"found_by": found_by}
+    model = identify.Model.from_dict(document | {"fit": document["fit"] | {"repetition": little}})
+    assert "epeat" in str(model)
+
+
 @pytest.mark.parametrize("delay_s", [0.0, 0.004, 0.025, 0.06])
 @pytest.mark.parametrize("damping", [0.3, 1.0, 2.5])
 def test_discrete_coefficients_are_exact_for_a_held_input(delay_s, damping):

@@ -134,6 +134,7 @@ def told(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> str:
         ("EFFECT = Effect(", "EFFEKT = Effect(", "no EFFECT in it"),
         ("EFFECT = Effect(", "EFFECT = dict(", "EFFECT is a dict, not an Effect"),
         ("        apply=swing,\n", "", "no apply"),
+        ("apply=swing", 'law={"period_s": 5}', "law 'period_s': 5. Give law={parameter: (Lag, SpeedLaw)}"),
     ],
 )
 def test_what_cannot_be_an_effect_is_told_with_its_file(tmp_path, monkeypatch, old: str, new: str, says: str) -> None:
