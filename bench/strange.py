@@ -29,6 +29,7 @@ from stimrig import identify
 from stimrig.hardware_sim.bout_records import Peculiar, record_of_bouts
 from stimrig.hardware_sim.physics_records import DISTURBED, SETS, record_of_physics
 from stimrig.identify.diagnosis import side_by_side as workers
+from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
 from tests.harness.carried_sessions import as_record
 
 NUDGE = 1.0 + 1e-9
@@ -71,6 +72,12 @@ def score(made: dict[str, Any], model: identify.Model) -> float:
     return rms(off - np.mean(off[unseen["time_s"] < REST_S])) / made["truth"]["noise_sd_nm"]
 
 
+def stated(made: dict[str, Any], model: identify.Model) -> float:
+    """The standard deviation that the model states of its prediction of the second record, over the noise."""
+    lower, upper = prediction_band(model, as_record(made["unseen"]))
+    return rms(upper - lower) / (2.0 * POINTWISE * made["truth"]["noise_sd_nm"])
+
+
 def repeated(made: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the unseen ramp and its decay, and the mean of the other three there."""
     bouts = [np.flatnonzero(made["bout"] == made["bout"][-1] - back) for back in range(4)]
@@ -98,6 +105,7 @@ def look(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
         "disturbed": made["truth"].get("disturbed", []),
         "plain": score(made, plain),
         "improved": score(made, improved.models[-1] if improved else plain),
+        "stated": stated(made, improved.models[-1] if improved else plain) if "unseen" in made else 0.0,
         "added": [step["added"] for step in (improved.steps if improved else ()) if step["added"]],
         "named": named,
         "untrue": [name for name, sure in named.items() if sure >= SURE and name not in made["true"]],
@@ -152,6 +160,8 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
+    beyond = np.sum(improved > plain + [max(row["stated"], 0.02 * row["plain"]) for row in rows])
+    yield f"… and by more than the standard error that it states of itself: {beyond} of {len(rows)}"
     yield f"improved better by 10 % and more: {np.sum(improved <= 0.9 * plain)} of {len(rows)}"
     yield f"records with a name that is untrue with {SURE} and more: {sum(bool(row['untrue']) for row in rows)}"
     if kind in ARMS:
