@@ -273,7 +273,7 @@ def _from_dict(data: dict[str, Any]) -> Model:
         sample_rate_hz=float(data.get("record_rate_hz", data["sample_rate_hz"])),
         baseline_nm=float(data.get("baseline_nm", 0.0)),
         initial=(float(data.get("initial", (0, 0))[0]), float(data.get("initial", (0, 0))[1])),
-        noise=Noise(**data.get("noise", {})),
+        noise=Noise(**{key: data["noise"][key] for key in vars(Noise()) if data.get("noise", {}).get(key) is not None}),
         effects=tuple(data.get("effects", ())),
         covariance=_covariance(uncertainty.get("covariance")),
         bands=uncertainty.get("bands", {}),

@@ -259,6 +259,10 @@ REPETITION = fields(
         maybe(NOT_NEGATIVE),
     )
 )
+NOISE = {
+    "white_sd_nm": maybe(NOT_NEGATIVE), "block_sd_nm": maybe(NOT_NEGATIVE), "ar1": maybe(number(-1.0, 1.0)),
+    "delta_bic": STATISTIC,
+}  # fmt: skip
 FIT = dict.fromkeys(STATISTICS, STATISTIC) | {
     "unexplained_nm": NOT_NEGATIVE, "unforeseen_nm": NOT_NEGATIVE, "repetition": maybe(REPETITION),
 }  # fmt: skip
@@ -274,7 +278,7 @@ MODEL = fields(
         "record_rate_hz": number(0.1, 1e5),
         "baseline_nm": ANY,
         "initial": several(ANY, 2, 2),
-        "noise": each(maybe(ANY)),
+        "noise": fields({}, NOISE),
         "effects": several(EFFECT, most=50),
         "joint": joint,
         "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),

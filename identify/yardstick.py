@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+TOO_LARGE = "Beside the torque that is too much to tell a share that the model explains."
+
 
 def repetition_sentences(figures: Mapping[str, Any]) -> list[str]:
     """What repetition says cannot be better, and how much of what repeats the model explains.
@@ -32,13 +34,12 @@ def _repeating(found: Mapping[str, Any] | None) -> list[str]:
         return ["Nothing repeats, and the record rests too little: what no model can foresee is not known."]
     if found["found_by"] == "estimate":
         lines = [
-            f"Nothing repeats exactly. At rest the mean of a pulse interval varies by {between} N·m: about so much no "
-            "model can foresee."
+            f"Nothing repeats exactly. At rest the model errs by {between} N·m in the mean of a pulse interval: so much is "
+            "taken for what no model can foresee."
         ]
-        return lines if share is None else [*lines, f"The model explains {share:.1f} % of all other variance."]
-    lines = [f"Between {found['repeats'] or 0.0:.2g} repeats of the same pulses the torque differs by {between} N·m."]
-    if share is not None:
-        lines.append(f"The model explains {share:.1f} % of the variance that repeats.")
+        return [*lines, TOO_LARGE if share is None else f"The model explains {share:.1f} % of all other variance."]
+    lines = [f"Between {found['repeats'] or 0.0:.3g} repeats of the same pulses the torque differs by {between} N·m."]
+    lines.append(TOO_LARGE if share is None else f"The model explains {share:.1f} % of the variance that repeats.")
     errors = [found["held_out_rms_nm"], found["held_out_model_rms_nm"]]
     if None not in errors:
         plain, model = (f"{error:.3g}" for error in errors)

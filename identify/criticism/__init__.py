@@ -85,7 +85,12 @@ def compare(model: Model, record: Record) -> Comparison:
         where=tuple(places),
         left_out=left_out,
         series=_series(model, record, predicted, noise),
-        plain=(*_plain(whole, held_out, noise, tests, places), *repetition_sentences({"repetition": again}), *said, *outside),
+        plain=(
+            *_plain(whole, held_out, noise, tests, places),
+            *repetition_sentences({"repetition": again}),
+            *said,
+            *outside,
+        ),
     )
 
 

@@ -18,8 +18,8 @@ from stimrig.identify.records.record import FORGOTTEN_S
 EXACT, ESTIMATE = "exact repeats", "estimate"
 LEAST_S = 1.0
 """Less time, in which the same input came again or in which the muscle rests, tells nothing."""
-LEAST_SHARE = 0.1
-"""If less than this share of the variance repeats, a share of it says nothing."""
+LEAST_SHARE = 0.75
+"""If less than this share of the variance repeats, what differs may hide any error: no share of it is told."""
 UNKNOWN: dict[str, Any] = dict.fromkeys(
     ("found_by", "repeats", "seconds", "rms_nm", "model_rms_nm", "explained_percent", "held_out_rms_nm",
      "held_out_model_rms_nm")

@@ -139,6 +139,7 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
         torque = torque - line(hum, own_s)
         torque = torque - hum_variation(record, torque, hum["frequency_hz"], known)
     noise, readings = white_noise(record, kept, torque)
+    noise = min(noise, float(np.std(torque[kept])))  # jumps alone may seem more
     return Raw(torque, noise, hum, ceiling, None if floor is None else -floor, readings)
 
 

@@ -30,6 +30,7 @@ SHORT = 8
 """Rests of no more intervals say nothing of the noise."""
 EASED = 0.995
 """Share of the penalty that is removed to see how far it holds the curve back."""
+PLACES = 481
 DRAWS = 256
 POINTS = 41
 DYNAMICS = ("time_constant_s", "damping", "delay_s")
@@ -83,7 +84,8 @@ def _block_gradients(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
 def _held_back(fitted: Fitted) -> np.ndarray:
     """How far the penalty may hold the curve back: its coefficients' change without most of it, shape (P,).
 
-    To first order, and as far as it is more than the noise gives a curve that is as smooth as the penalty says.
+    To first order, and as far as it is more than the noise gives a curve that is as smooth as the penalty says. Below
+    the smallest width played no further than a rising curve can be from zero.
     """
     mean, precision = fitted.problem.prior
     at, found = fitted.problem.coefficients, np.zeros(fitted.theta.size)
@@ -98,8 +100,24 @@ def _held_back(fitted: Fitted) -> np.ndarray:
     values, vectors = np.linalg.eigh(usual[at, at])
     told = values > NEGLIGIBLE * max(float(values.max()), 1e-300)
     ratio = float(np.mean((vectors.T @ change)[told] ** 2 / values[told])) if told.any() else 0.0
-    found[at] = change * scale[at] * np.sqrt(max(1.0 - 1.0 / max(ratio, 1.0), 0.0))
+    change *= scale[at] * np.sqrt(max(1.0 - 1.0 / max(ratio, 1.0), 0.0))
+    found[at] = _below_played(fitted, change) if change.any() else change
     return found
+
+
+def _below_played(fitted: Fitted, change: np.ndarray) -> np.ndarray:
+    """A change of the coefficients, with that of widths below the smallest one played no larger than the torque there.
+
+    There the data say next to nothing, and without its penalty a spline may go anywhere.
+    """
+    setup = fitted.problem.setup
+    played = setup.grid.pulse_width_us[setup.fitted & (setup.grid.pulse_width_us > 0.0)]
+    first, basis = float(played.min(initial=setup.basis.largest_us)), setup.basis
+    most = np.abs(basis.design(np.array([first])) @ np.c_[fitted.theta[fitted.problem.coefficients], change]).sum()
+    at_us = np.linspace(0.0, basis.largest_us, PLACES)
+    design = basis.design(at_us)
+    value = design @ change
+    return np.linalg.lstsq(design, np.where(at_us < first, np.clip(value, -most, most), value), rcond=None)[0]
 
 
 def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
