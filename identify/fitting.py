@@ -93,9 +93,8 @@ def fit(
                 return _fit_auto(grid, raw, wanted, rows, options, tell)
             return _fit_effects(grid, raw, wanted, rows, options, tell)
     except np.linalg.LinAlgError as error:
-        raise NotIdentifiable(
-            f"{method} finds no solution on this record ({error})", fix="Check that torque follows the pulses."
-        ) from error
+        fix = "Check that torque follows the pulses."
+        raise NotIdentifiable(f"{method} finds no solution on this record ({error})", fix=fix) from error
     except (TypeError, ValueError) as error:
         if options:
             given = ", ".join(f"{key}={value}" for key, value in options.items())
@@ -109,16 +108,12 @@ def _fit_auto(
     """Maximum likelihood with the effects that the evidence asks for."""
     if len(wanted) > 1:
         others = ", ".join(name for name in wanted if name != AUTO)
-        raise BadRequest(
-            f"{AUTO} chooses the effects itself, but {others} is given as well",
-            place="effects",
-            fix=f"Give {AUTO}, or a list of effects.",
-        )
+        fix = f"Give {AUTO}, or a list of effects."
+        raise BadRequest(f"{AUTO} chooses the effects itself, but {others} is given as well", place="effects", fix=fix)
     if options:
         given = ", ".join(sorted(options))
-        raise BadRequest(
-            f"{AUTO} takes no options, but {given} is given", place="effects", fix="Leave out the options."
-        )
+        fix = "Leave out the options."
+        raise BadRequest(f"{AUTO} takes no options, but {given} is given", place="effects", fix=fix)
     from stimrig.identify.diagnosis.search import helpful, search_effects  # here: a fit without a search needs it not
 
     search = search_effects(grid, raw, rows, progress)

@@ -173,11 +173,8 @@ class Model(Summarised):
             raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
         version = str(data.get("schema_version", ""))[:20]
         if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
-            raise BadModel(
-                f"schema version {version or 'missing'}, this software reads {SCHEMA_VERSION}",
-                place="schema_version",
-                fix="Fit the record again with this version.",
-            )
+            message = f"schema version {version or 'missing'}, this software reads {SCHEMA_VERSION}"
+            raise BadModel(message, place="schema_version", fix="Fit the record again with this version.")
         model_schema.MODEL(data, "")
         try:
             model = _from_dict(data)
@@ -262,9 +259,8 @@ def _from_dict(data: dict[str, Any]) -> Model:
     basis = basis_from_dict(recruitment["basis"])
     coefficients = np.asarray(recruitment["basis"]["coefficients_nm"], float)
     if coefficients.shape != (basis.size,):
-        raise BadModel(
-            f"{coefficients.size} coefficients for a basis of {basis.size}", place="recruitment.basis.coefficients_nm"
-        )
+        message = f"{coefficients.size} coefficients for a basis of {basis.size}"
+        raise BadModel(message, place="recruitment.basis.coefficients_nm")
     return Model(
         method=str(data["method"]),
         recruitment=Curve(basis, coefficients),

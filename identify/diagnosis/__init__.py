@@ -67,11 +67,8 @@ def structure_of(model: Model | None) -> list[str]:
     if model is None:
         return []
     if not isinstance(model.linear, SecondOrder):
-        raise BadRequest(
-            f"effects cannot be added to a model of {model.method}",
-            place="model",
-            fix="Give a model of maximum-likelihood or two-stage.",
-        )
+        fix = "Give a model of maximum-likelihood or two-stage."
+        raise BadRequest(f"effects cannot be added to a model of {model.method}", place="model", fix=fix)
     return [f"{effect['id']}:{effect.get('form', '')}" for effect in model.effects]
 
 

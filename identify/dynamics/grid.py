@@ -320,10 +320,8 @@ def make_grid(record: Record) -> Grid:
     step_s = 1.0 / record.pulse_rate_hz
     rate_hz = record.sample_rate_hz
     if not rate_hz >= 0.999 * record.pulse_rate_hz:
-        raise BadRecord(
-            f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second",
-            fix="Record at 40 Hz or faster.",
-        )
+        fix = "Record at 40 Hz or faster."
+        raise BadRecord(f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second", fix=fix)
     start_s = record.time_s[0] + pulse_phase_s(record)
     # A small shift, so that a sample taken at the pulse itself falls into the interval that starts with the pulse.
     position = (record.time_s - start_s) / step_s + 1e-6 + 1e-3 * min(1.0, record.pulse_rate_hz / rate_hz)

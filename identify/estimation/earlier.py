@@ -120,11 +120,8 @@ class Earlier:
 
     def __post_init__(self) -> None:
         if not isinstance(self.model.linear, SecondOrder) or _curve_marks(self.model) is None:
-            raise BadRequest(
-                "the earlier model has no second-order dynamics or no rising curve",
-                place="earlier",
-                fix="Give a model of the method maximum-likelihood, or none.",
-            )
+            message = "the earlier model has no second-order dynamics or no rising curve"
+            raise BadRequest(message, place="earlier", fix="Give a model of the method maximum-likelihood, or none.")
 
     @property
     def linear(self) -> SecondOrder:

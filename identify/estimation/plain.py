@@ -137,10 +137,8 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
     largest = float(np.max(grid.pulse_width_us))
     seen = grid.pulse_width_us[rows]
     if not largest > 0 or np.ptp(seen) <= 0:
-        raise NotIdentifiable(
-            "the pulse width never changes in the fitted rows" if largest > 0 else "the record has no pulse",
-            fix="Record a PRBS and a ramp.",
-        )
+        message = "the pulse width never changes in the fitted rows" if largest > 0 else "the record has no pulse"
+        raise NotIdentifiable(message, fix="Record a PRBS and a ramp.")
     if np.ptp(grid.torque_nm[rows]) <= 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
     basis = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))

@@ -160,11 +160,8 @@ def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     finite = bool(np.all(np.isfinite(table))) and spread < 50 * max(seen, 1e-12)
     if not finite:
         return _gate(False, "refuse", "the recruitment curve is far outside the measured torque")
-    return _gate(
-        spread > 4 * model.noise.block_sd_nm,
-        "refuse",
-        "stimulation hardly changes the torque: check electrodes, current and load cell",
-    )
+    says = "stimulation hardly changes the torque: check electrodes, current and load cell"
+    return _gate(spread > 4 * model.noise.block_sd_nm, "refuse", says)
 
 
 def _monotone(model: Model) -> dict[str, Any]:
@@ -173,20 +170,14 @@ def _monotone(model: Model) -> dict[str, Any]:
     sign = 1.0 if abs(table.max()) >= abs(table.min()) else -1.0
     dip = float(np.max(np.maximum.accumulate(sign * table) - sign * table))
     share = dip / max(float(np.ptp(table)), 1e-12)
-    return _gate(
-        share <= LARGEST_DIP,
-        "care",
-        f"the recruitment curve falls by {100 * share:.0f} % of its range at one place: its inverse jumps there",
-    )
+    says = f"the recruitment curve falls by {100 * share:.0f} % of its range at one place: its inverse jumps there"
+    return _gate(share <= LARGEST_DIP, "care", says)
 
 
 def _range(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     widths = np.unique(grid.pulse_width_us[rows])
-    return _gate(
-        widths.size >= 8,
-        "care",
-        f"only {widths.size} pulse widths were fitted: between them the recruitment curve is a guess; record a ramp",
-    )
+    says = f"only {widths.size} pulse widths were fitted: between them the recruitment curve is a guess; record a ramp"
+    return _gate(widths.size >= 8, "care", says)
 
 
 def _ceiling(model: Model) -> dict[str, Any]:

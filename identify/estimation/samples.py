@@ -81,9 +81,8 @@ def prepare(record: Record) -> tuple[Grid, Raw]:
 def refuse_few(rows: np.ndarray) -> None:
     """Refuse too few rows to fit. Raises NotIdentifiable: with their number."""
     if rows.sum() < LEAST_ROWS:
-        raise NotIdentifiable(
-            f"only {int(rows.sum())} pulse intervals may be fitted", fix="Give rows of segments other than `validate`."
-        )
+        fix = "Give rows of segments other than `validate`."
+        raise NotIdentifiable(f"only {int(rows.sum())} pulse intervals may be fitted", fix=fix)
 
 
 def rows_of(grid: Grid, names: Sequence[str]) -> np.ndarray:

@@ -46,15 +46,12 @@ class Plant:
         """Of a model, for a reference. Raises BadModel and BadRequest as `invert`."""
         rate_hz = reference.pulse_rate_hz
         if not isinstance(model.linear, SecondOrder):
-            raise BadModel(
-                f"{model.method} has no second-order dynamics", place="linear", fix="Fit with maximum-likelihood."
-            )
+            fix = "Fit with maximum-likelihood."
+            raise BadModel(f"{model.method} has no second-order dynamics", place="linear", fix=fix)
         if not abs(rate_hz / model.pulse_rate_hz - 1.0) <= LARGEST_RATE_CHANGE:
-            raise BadModel(
-                f"the model holds for {model.pulse_rate_hz:g} pulses a second, the reference has {rate_hz:g}",
-                place="pulse_rate_hz",
-                fix=f"Give it at {model.pulse_rate_hz:g} pulses a second, or fit a model at that rate.",
-            )
+            message = f"the model holds for {model.pulse_rate_hz:g} pulses a second, the reference has {rate_hz:g}"
+            fix = f"Give it at {model.pulse_rate_hz:g} pulses a second, or fit a model at that rate."
+            raise BadModel(message, place="pulse_rate_hz", fix=fix)
         for name, limit in (("largest_us", largest_us), ("rise_us", rise_us)):
             if limit is not None and not 0.0 < limit < np.inf:
                 raise BadRequest(f"{limit:g} µs", place=name, fix="Give a positive number, or leave it out.")
@@ -139,9 +136,8 @@ def _curve(model: Model, largest_us: float | None, whole: bool) -> tuple[float, 
     torque_nm = np.r_[torque_nm[inside], np.interp(widest_us, width_us, torque_nm)]
     width_us = np.r_[width_us[inside], widest_us]
     if not np.max(sign * torque_nm) > 1e-9:
-        raise BadModel(
-            f"the model gives no torque up to {widest_us:g} µs", place="largest_us", fix="Allow wider pulses."
-        )
+        fix = "Allow wider pulses."
+        raise BadModel(f"the model gives no torque up to {widest_us:g} µs", place="largest_us", fix=fix)
     return sign, width_us, sign * torque_nm
 
 

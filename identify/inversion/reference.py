@@ -81,11 +81,8 @@ class Reference:
             Empty, too long, not finite, times that do not rise, another number of times than torques.
         """
         if not RATES_HZ[0] <= pulse_rate_hz <= RATES_HZ[1]:
-            raise BadRequest(
-                f"{pulse_rate_hz:g} pulses a second",
-                place="pulse_rate_hz",
-                fix=f"Give {RATES_HZ[0]:g} to {RATES_HZ[1]:g}, the rate at which the model was identified.",
-            )
+            fix = f"Give {RATES_HZ[0]:g} to {RATES_HZ[1]:g}, the rate at which the model was identified."
+            raise BadRequest(f"{pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", fix=fix)
         torque = _column(torque_nm, name)
         _refuse_larger(torque, LARGEST_NM, "N·m", name, f"At most {LARGEST_NM:g} N·m; is it in mN·m?")
         angle = None
@@ -114,11 +111,8 @@ def _column(values: object, name: str) -> np.ndarray:
         raise BadRequest(f"{column.size} numbers", place=name, fix=f"Give at most {MOST_SAMPLES}.")
     bad = np.flatnonzero(~np.isfinite(column))
     if bad.size:
-        raise BadRequest(
-            f"{column[bad[0]]} is not a number that can be followed",
-            place=f"{name}[{bad[0]}]",
-            fix="Give a finite number at every place.",
-        )
+        fix = "Give a finite number at every place."
+        raise BadRequest(f"{column[bad[0]]} is not a number that can be followed", place=f"{name}[{bad[0]}]", fix=fix)
     return column
 
 
@@ -149,11 +143,8 @@ def _times(values: object, size: int, name: str) -> np.ndarray:
     wrong = np.flatnonzero(~((step_s >= LEAST_GAP_S) & (step_s <= LONGEST_GAP_S)))
     if wrong.size:
         at = wrong[0] + 1
-        raise BadRequest(
-            f"{time_s[at]:.9g} s after {time_s[at - 1]:.9g} s",
-            place=f"time_s[{at}]",
-            fix=f"Times must rise, by at least {LEAST_GAP_S:g} s and at most {LONGEST_GAP_S:g} s.",
-        )
+        fix = f"Times must rise, by at least {LEAST_GAP_S:g} s and at most {LONGEST_GAP_S:g} s."
+        raise BadRequest(f"{time_s[at]:.9g} s after {time_s[at - 1]:.9g} s", place=f"time_s[{at}]", fix=fix)
     if time_s[-1] - time_s[0] > LONGEST_S:
         raise _too_long(time_s[-1] - time_s[0], "time_s")
     return time_s

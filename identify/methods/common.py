@@ -14,10 +14,9 @@ def segment_rows(grid: Grid, names: tuple[str, ...], method_id: str) -> np.ndarr
     there = tuple(dict.fromkeys(grid.record.segment_names))
     rows = grid.fitted & rows_of(grid, names)
     if not rows.any():
-        raise NotIdentifiable(
-            f"{method_id} needs a segment {' or '.join(names)}; the record has {', '.join(there)}",
-            fix="Name the segments to use with fit_on, or use maximum-likelihood, which takes any.",
-        )
+        message = f"{method_id} needs a segment {' or '.join(names)}; the record has {', '.join(there)}"
+        fix = "Name the segments to use with fit_on, or use maximum-likelihood, which takes any."
+        raise NotIdentifiable(message, fix=fix)
     return rows
 
 
@@ -74,11 +73,8 @@ def order_option(value: object) -> str | tuple[int, int, int]:
         poles = -1
         zeros = delay = 0
     if not (1 <= poles <= 6 and 0 <= zeros <= 6 and 0 <= delay <= 40):
-        raise BadRequest(
-            f"invalid order {value!r}",
-            place="order",
-            fix="Give second-order, auto, or poles,zeros,delay such as 2,1,1.",
-        )
+        fix = "Give second-order, auto, or poles,zeros,delay such as 2,1,1."
+        raise BadRequest(f"invalid order {value!r}", place="order", fix=fix)
     return poles, zeros, delay
 
 

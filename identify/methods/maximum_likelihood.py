@@ -142,11 +142,8 @@ def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fit
         size = solution.projection.basis.size
         reason = f"spline of {size} coefficients, smoothed to {solution.freedom:.1f} effective ones"
     else:
-        raise BadRequest(
-            f"unknown recruitment {kind!r}",
-            place="recruitment",
-            fix="Give spline, power-series, sigmoid or near-sigmoid.",
-        )
+        fix = "Give spline, power-series, sigmoid or near-sigmoid."
+        raise BadRequest(f"unknown recruitment {kind!r}", place="recruitment", fix=fix)
     if flag(options.get("monotone", False), "monotone"):
         fitted = to_fitted(solution, rows, most=0, coefficients=monotone(solution))
         return fitted, [reason, "recruitment constrained to be monotone"]

@@ -32,14 +32,12 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     """Fit; `fit_on` names the ramp if it is not called `ramp`."""
     frequency = float(options.get("natural_frequency_rad_s", NATURAL_FREQUENCY_RAD_S))
     if not 0.05 <= frequency <= 100.0:
-        raise BadRequest(
-            f"{frequency:g} rad/s is out of range", place="natural_frequency_rad_s", fix="Give 0.05 to 100 rad/s."
-        )
+        fix = "Give 0.05 to 100 rad/s."
+        raise BadRequest(f"{frequency:g} rad/s is out of range", place="natural_frequency_rad_s", fix=fix)
     ramp = segment_rows(grid, fit_on or ("ramp",), METHOD.id)
     if np.unique(grid.pulse_width_us[ramp]).size < 8:
-        raise NotIdentifiable(
-            "the ramp has fewer than 8 pulse widths", fix="Record a triangular ramp over the whole range."
-        )
+        fix = "Record a triangular ramp over the whole range."
+        raise NotIdentifiable("the ramp has fewer than 8 pulse widths", fix=fix)
     linear = SecondOrder(1.0 / frequency, 1.0)
     drive, baseline = deconvolved(grid, ramp, linear)
     width, slope = grid.pulse_width_us, np.gradient(grid.pulse_width_us)

@@ -36,10 +36,8 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         raise BadRequest(f"{taps} taps is out of range", place="taps", fix="Give 2 to 2000.")
     rows = fitted_rows(grid, fit_on)
     if rows.sum() <= taps + 4:
-        raise NotIdentifiable(
-            f"{int(rows.sum())} pulse intervals are too few for {taps} taps",
-            fix="Record longer, or use fewer taps.",
-        )
+        fix = "Record longer, or use fewer taps."
+        raise NotIdentifiable(f"{int(rows.sum())} pulse intervals are too few for {taps} taps", fix=fix)
     seen = grid.pulse_width_us[rows]
     if not np.ptp(seen) > 0:
         raise NotIdentifiable("the pulse width never changes", fix="Record a PRBS and a ramp.")

@@ -226,11 +226,8 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     """Fit; the first name of `fit_on` is the segment for the dynamics, the others for the recruitment."""
     names = fit_on or ("prbs", "ramp")
     if len(names) < 2:
-        raise BadRequest(
-            "two-stage needs two segments, the first for the dynamics, the second for the recruitment",
-            place="fit_on",
-            fix="Give, for example, prbs,ramp.",
-        )
+        message = "two-stage needs two segments, the first for the dynamics, the second for the recruitment"
+        raise BadRequest(message, place="fit_on", fix="Give, for example, prbs,ramp.")
     prbs = segment_rows(grid, names[:1], METHOD.id)
     ramp = segment_rows(grid, names[1:], METHOD.id)
     iterations = int(options.get("iterations", 1))

@@ -79,9 +79,8 @@ class Variable:
         if self.flags & COMPLEX:
             raise BadPiece("complex numbers. Give real ones.")
         if max(self.shape, default=0) != self.size or self.size > LARGEST_ROWS:
-            raise BadPiece(
-                f"{'×'.join(map(str, self.shape))} numbers. Give one row or column of at most {LARGEST_ROWS}."
-            )
+            message = f"{'×'.join(map(str, self.shape))} numbers. Give one row or column of at most {LARGEST_ROWS}."
+            raise BadPiece(message)
         here = self._opened(8 * self.size + HEAD_BYTES)
         tag, data, _ = _element(here.body, 0, here.order)
         if tag not in NUMBERS or len(data) != here.size * np.dtype(NUMBERS[tag]).itemsize:

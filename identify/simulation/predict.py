@@ -163,11 +163,8 @@ def _own_angles(model: Muscle, own_record: bool, settings: Mapping[str, Any]) ->
     if "reference_rad" in settings:
         return {"reference_rad": settings["reference_rad"], "angle_range_rad": angle_range(settings)}
     if depend_on_joint(entry["id"] for entry in model.effects) and not own_record:
-        raise BadModel(
-            "the model does not say at which angle its curve holds",
-            place="effects.0.settings.reference_rad",
-            fix="Fit its record again with this version.",
-        )
+        message = "the model does not say at which angle its curve holds"
+        raise BadModel(message, place="effects.0.settings.reference_rad", fix="Fit its record again with this version.")
     return {}
 
 

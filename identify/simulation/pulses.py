@@ -81,9 +81,8 @@ def above_rest(
     rest = round(REST_S * pulse_rate_hz)
     widths = np.asarray(pulse_width_us, float)
     if motion is None and Surfaces.of(model.effects) is not None:
-        raise BadModel(
-            "the model depends on the angle of the joint", place="angle_rad", fix="Give the angle at each pulse."
-        )
+        fix = "Give the angle at each pulse."
+        raise BadModel("the model depends on the angle of the joint", place="angle_rad", fix=fix)
 
     def torque_of(widths_us: np.ndarray, moved: Motion | None) -> np.ndarray:
         held = np.repeat(np.r_[np.zeros(rest), widths_us], SAMPLES_A_PULSE)

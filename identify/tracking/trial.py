@@ -169,9 +169,8 @@ def look(model: Model, expected: State, record: Record) -> Seen:
     """
     grid = make_grid(record)
     if not np.sum(grid.fitted) * grid.step_s >= SHORTEST_S:
-        raise BadRecord(
-            f"less than {SHORTEST_S:g} s that can be used", fix="Play a longer trial; rows of `validate` do not count."
-        )
+        fix = "Play a longer trial; rows of `validate` do not count."
+        raise BadRecord(f"less than {SHORTEST_S:g} s that can be used", fix=fix)
     asked = _asked(model, expected, grid)
     start, expected_nm = expected.mean[expected.seen], _expected(model)
     first = found = _fitted(asked, start)
