@@ -21,33 +21,19 @@ LOWEST_HZ, HIGHEST_HZ = 2.8, 14.5
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """Noise of the interval means.
+    """Noise of the interval means."""
 
-    Parameters
-    ----------
-    ar1 : float
-        Correlation of neighbours of the slow part.
-    share : float
-        Share of the variance that is slow. Above 1: all of it is slow, and smoothed by the mean over an interval.
-    sd_nm : float
-        Total standard deviation of an interval's mean, N·m.
-    turn, keep, band : float
-        Of a narrow band: angle per step, rad, decay factor per step, and share of the variance (0: no band).
-    slowest, fastest : float
-        Bounds of the angle, rad.
-    held : bool
-        Whether it is white whatever the residual looks like: all of a wrong structure's error counts then.
-    """
-
-    ar1: float
+    ar1: float  # correlation of neighbours of the slow part
     share: float
-    sd_nm: float
-    turn: float = 0.0
-    keep: float = 0.0
-    band: float = 0.0
-    slowest: float = 0.02
-    fastest: float = 2.6
+    """Share of the variance that is slow. Above 1: all of it is slow, and smoothed by the mean over an interval."""
+    sd_nm: float  # total standard deviation of an interval's mean, N·m
+    turn: float = 0.0  # of a narrow band: angle per step, rad
+    keep: float = 0.0  # of it: decay factor per step
+    band: float = 0.0  # of it: share of the variance; 0: no band
+    slowest: float = 0.02  # smallest angle, rad
+    fastest: float = 2.6  # largest angle, rad
     held: bool = False
+    """Whether it is white whatever the residual looks like: all of a wrong structure's error counts then."""
 
     @property
     def at_bound(self) -> bool:

@@ -38,62 +38,27 @@ LONG = 8.0
 
 @dataclass(frozen=True)
 class Grid:
-    """A record on the grid of its pulses.
+    """A record on the grid of its pulses."""
 
-    Parameters
-    ----------
-    record : Record
-        The record.
-    start_s : float
-        Time of the first pulse slot, s.
-    step_s : float
-        Pulse interval, s.
-    pulse_width_us : ndarray, shape (K,)
-        Width held in each interval, µs.
-    torque_nm : ndarray, shape (K,)
-        Mean of the samples in each interval, N·m.
-    count : ndarray of int, shape (K,)
-        Samples in each interval. Where it is 0, the torque is NaN and the interval is never fitted.
-    interval, fraction : ndarray, shape (N,)
-        For each sample: its interval, and its place within it, 0 to 1.
-    held_out : ndarray of bool, shape (K,)
-        Intervals with any held-out sample.
-    segment : ndarray of int, shape (K,)
-        Index into the record's `segment_names`.
-    angle_rad, velocity_rad_s : ndarray or None, shape (K,)
-        Means over each interval.
-    late_s : ndarray or None, shape (K,)
-        Delay of each interval's pulse after its slot, s; None if none was late.
-    doubted : ndarray of bool, shape (K,)
-        Intervals in which the stimulation is not known.
-    part : ndarray of int, shape (K,)
-        Index into the record's `parts`; a pause belongs to the part before it.
-    resumed : ndarray of int
-        Intervals at whose start the muscle's state is not known, since the stimulation before is not known.
-    noise_sd_nm : float
-        White noise of a sample, estimated from the samples, N·m; 0 if it was not estimated.
-    readings : Readings or None
-        The readings behind the samples, if they are fewer or coarse.
-    """
-
-    record: Record
-    start_s: float
-    step_s: float
-    pulse_width_us: np.ndarray
-    torque_nm: np.ndarray
-    count: np.ndarray
-    interval: np.ndarray
-    fraction: np.ndarray
-    held_out: np.ndarray
-    segment: np.ndarray
-    angle_rad: np.ndarray | None
-    velocity_rad_s: np.ndarray | None
-    late_s: np.ndarray | None
-    doubted: np.ndarray
-    part: np.ndarray
+    record: Record  # that was put on the grid
+    start_s: float  # time of the first pulse slot, s
+    step_s: float  # pulse interval, s
+    pulse_width_us: np.ndarray  # width held in each interval, µs, shape (K,)
+    torque_nm: np.ndarray  # mean of the samples in each interval, N·m, shape (K,)
+    count: np.ndarray  # samples in each interval, int, shape (K,); at 0 the torque is NaN, and it is never fitted
+    interval: np.ndarray  # of each sample, shape (N,)
+    fraction: np.ndarray  # place of each sample within its interval, 0 to 1, shape (N,)
+    held_out: np.ndarray  # intervals with any held-out sample, bool, shape (K,)
+    segment: np.ndarray  # index into the record's `segment_names`, int, shape (K,)
+    angle_rad: np.ndarray | None  # mean over each interval, shape (K,)
+    velocity_rad_s: np.ndarray | None  # mean over each interval, shape (K,)
+    late_s: np.ndarray | None  # delay of each interval's pulse after its slot, s, shape (K,); None if none was late
+    doubted: np.ndarray  # intervals in which the stimulation is not known, bool, shape (K,)
+    part: np.ndarray  # index into the record's `parts`; a pause belongs to the part before it, int, shape (K,)
     resumed: np.ndarray
-    noise_sd_nm: float = 0.0
-    readings: Readings | None = None
+    """Intervals at whose start the muscle's state is not known, since the stimulation before is not known; int."""
+    noise_sd_nm: float = 0.0  # white noise of a sample, estimated from the samples, N·m; 0 if it was not estimated
+    readings: Readings | None = None  # the readings behind the samples, if they are fewer or coarse
 
     def readings_in(self, rows: np.ndarray) -> float:
         """Readings in one of these intervals, at least 1: held samples are not averaged."""

@@ -31,15 +31,9 @@ NEAR_SIGMOID_OPTIONS = {"recruitment", "earlier", "order"}
 
 @dataclass(frozen=True)
 class Averaged(Fitted):
-    """A solved problem whose parameters are the mean of draws.
+    """A solved problem whose parameters are the mean of draws."""
 
-    Parameters
-    ----------
-    shown : float
-        Effective number of parameters that the data determine.
-    """
-
-    shown: float = 0.0
+    shown: float = 0.0  # effective number of parameters that the data determine
 
     @property
     def freedom(self) -> float:

@@ -28,47 +28,23 @@ LARGEST_LOG = 3.0
 
 @dataclass(frozen=True)
 class Quadratic:
-    """The data: -2 log likelihood = x'Gx - 2 b'x + energy, with x = (steps of the curve, further parameters).
+    """The data: -2 log likelihood = x'Gx - 2 b'x + energy, with x = (steps of the curve, further parameters)."""
 
-    Parameters
-    ----------
-    gram : ndarray, shape (N, N)
-        G, of whitened rows.
-    moment : ndarray, shape (N,)
-        b.
-    energy : float
-        Sum of the whitened target's squares.
-    mean, precision : ndarray, shape (N - n,), (N - n, N - n)
-        Prior of the further parameters.
-    """
-
-    gram: np.ndarray
-    moment: np.ndarray
-    energy: float
-    mean: np.ndarray
-    precision: np.ndarray
+    gram: np.ndarray  # G, of whitened rows, shape (N, N)
+    moment: np.ndarray  # b, shape (N,)
+    energy: float  # sum of the whitened target's squares
+    mean: np.ndarray  # of the prior of the further parameters, shape (N - n,)
+    precision: np.ndarray  # of that prior, shape (N - n, N - n)
 
 
 @dataclass(frozen=True)
 class Mode:
-    """The most probable unknowns for one kind of deviation.
+    """The most probable unknowns for one kind of deviation."""
 
-    Parameters
-    ----------
-    kind : int
-        Index of the kind of the curve's deviation.
-    z : ndarray
-        Unknowns.
-    log_evidence : float
-        By Laplace's approximation.
-    root : ndarray
-        Lower Cholesky root of the information at the mode.
-    """
-
-    kind: int
-    z: np.ndarray
-    log_evidence: float
-    root: np.ndarray
+    kind: int  # index of the kind of the curve's deviation
+    z: np.ndarray  # unknowns
+    log_evidence: float  # by Laplace's approximation
+    root: np.ndarray  # lower Cholesky root of the information at the mode
 
 
 class CurvePosterior:

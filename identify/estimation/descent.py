@@ -13,48 +13,27 @@ Trial = Callable[[float], Point | None]
 
 @dataclass(frozen=True)
 class Damping:
-    """How a search is damped.
+    """How a search is damped."""
 
-    Parameters
-    ----------
-    first : float
-        At the first step.
-    less, least : float
-        It is divided by `less` after a step that helped, to `least` at the smallest.
-    more, raised : float
-        It is multiplied by `more` after one that did not, to `raised` at least.
-    patience : int
-        Steps in a row that do not help, after which the search ends; it also ends where the damping is above 1e8.
-    """
-
-    first: float
-    less: float
-    more: float
-    least: float = 0.0
-    raised: float = 0.0
+    first: float  # at the first step
+    less: float  # a step that helped divides it by this
+    more: float  # one that did not help multiplies it by this
+    least: float = 0.0  # after a step that helped it is this at the smallest
+    raised: float = 0.0  # after one that did not help it is this at least
     patience: int = 1000
+    """Steps in a row that do not help, after which the search ends; it also ends where the damping is above 1e8."""
 
 
 @dataclass(frozen=True)
 class Search(Generic[Point]):
-    """What is searched.
+    """What is searched."""
 
-    Parameters
-    ----------
-    damping : Damping
-        Of its steps.
-    trials : callable
-        From a point, the number of the step and the damping to the trial steps there; None where the search ends.
-    gain : callable
-        What a trial gains over the point before; None where it is worse.
-    settled : callable
-        Whether the search ends after a step that gained so much; with the step's number. By default it never does.
-    """
-
-    damping: Damping
+    damping: Damping  # of its steps
     trials: Callable[[Point, int, float], Trial[Point] | None]
-    gain: Callable[[Point, Point], float | None]
+    """From a point, the number of the step and the damping to the trial steps there; None where the search ends."""
+    gain: Callable[[Point, Point], float | None]  # what a trial gains over the point before; None where it is worse
     settled: Callable[[float, int], bool] = lambda _gained, _step: False
+    """Whether the search ends after a step that gained so much; with the step's number. By default it never does."""
 
 
 def descend(search: Search[Point], at: Point, most: int) -> tuple[Point, int]:

@@ -28,28 +28,14 @@ MOST_DOUBT = 1.5
 
 @dataclass(frozen=True)
 class Change:
-    """Standard deviations of what changes from one session to the next.
+    """Standard deviations of what changes from one session to the next."""
 
-    Parameters
-    ----------
-    gain_log : float
-        Of the log of the curve's gain.
-    middle_us : float
-        Of the pulse width in the middle of the rise, µs.
-    width_log : float
-        Of the log of the width of the rise.
-    time_constant_log, damping_log : float
-        Of the logs of T and ζ.
-    sessions : int
-        Number of earlier models that it was learnt from; 0 for the default.
-    """
-
-    gain_log: float = 0.25
-    middle_us: float = 12.0
-    width_log: float = 0.12
-    time_constant_log: float = 0.12
-    damping_log: float = 0.10
-    sessions: int = 0
+    gain_log: float = 0.25  # of the log of the curve's gain
+    middle_us: float = 12.0  # of the pulse width in the middle of the rise, µs
+    width_log: float = 0.12  # of the log of the width of the rise
+    time_constant_log: float = 0.12  # of the log of T
+    damping_log: float = 0.10  # of the log of ζ
+    sessions: int = 0  # number of earlier models that it was learnt from; 0 for the default
 
 
 USUAL = Change()
@@ -102,21 +88,11 @@ def _curve_marks(model: Model) -> tuple[float, float, float, float] | None:
 class Earlier:
     """A person as known before a session.
 
-    Parameters
-    ----------
-    model : Model
-        The last approved one, with second-order dynamics.
-    change : Change
-        By how much it is widened.
-
-    Raises
-    ------
-    BadRequest
-        The model is of another kind, or its curve does not rise.
+    Raises BadRequest: the model is of another kind, or its curve does not rise.
     """
 
-    model: Model
-    change: Change = USUAL
+    model: Model  # the last approved one, with second-order dynamics
+    change: Change = USUAL  # by how much it is widened
 
     def __post_init__(self) -> None:
         if not isinstance(self.model.linear, SecondOrder) or _curve_marks(self.model) is None:

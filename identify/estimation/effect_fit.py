@@ -30,33 +30,15 @@ BAND_COST = 16.0
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect added to a model.
+    """One effect added to a model."""
 
-    Parameters
-    ----------
-    effect : Effect
-        The effect.
-    form : Form
-        Its most likely form.
-    fitted : Fitted
-        The model with it.
-    gain : float
-        Log evidence gained over the model without it, with the effect's prior odds.
-    forms : dict
-        Gain by form.
-    refused : Difference or None
-        What left-out blocks say, where they refuse it; None of one that they were not asked about, or that they allow.
-    required : float
-        Standard errors by which the error on those blocks had to fall, where they refuse it.
-    """
-
-    effect: Effect
-    form: Form
-    fitted: Fitted
-    gain: float
-    forms: dict[str, float]
-    refused: Difference | None = None
-    required: float = 0.0
+    effect: Effect  # the effect
+    form: Form  # its most likely form
+    fitted: Fitted  # the model with it
+    gain: float  # log evidence gained over the model without it, with the effect's prior odds
+    forms: dict[str, float]  # gain by form
+    refused: Difference | None = None  # what left-out blocks say where they refuse it; None: not asked, or allowed
+    required: float = 0.0  # standard errors by which the error on those blocks had to fall, where they refuse it
 
 
 def try_effect(

@@ -42,39 +42,17 @@ OPTIMISM = 3.0
 
 @dataclass(frozen=True)
 class Fitted:
-    """A problem solved: its most probable parameters, and what follows from them.
+    """A problem solved: its most probable parameters, and what follows from them."""
 
-    Parameters
-    ----------
-    problem : Problem
-        The model's stages and parameters.
-    theta : ndarray, shape (P,)
-        Parameters, on the scale on which they are varied.
-    noise : NoiseLevel
-        The most likely noise.
-    log_likelihood : float
-        At the optimum.
-    log_evidence : float
-        By Laplace's approximation, with the prior `Problem.prior`.
-    residual_nm : ndarray, shape (K,)
-        Target minus prediction in all intervals, N·m.
-    slopes : ndarray, shape (P, K)
-        Derivatives of the interval means by the parameters.
-    hessian : ndarray, shape (P, P)
-        Of minus the log posterior.
-    converged : bool
-        Whether the iteration ended because there was no further gain.
-    """
-
-    problem: Problem
-    theta: np.ndarray
-    noise: NoiseLevel
-    log_likelihood: float
-    log_evidence: float
-    residual_nm: np.ndarray
-    slopes: np.ndarray
-    hessian: np.ndarray
-    converged: bool = True
+    problem: Problem  # the model's stages and parameters
+    theta: np.ndarray  # parameters, on the scale on which they are varied, shape (P,)
+    noise: NoiseLevel  # the most likely noise
+    log_likelihood: float  # at the optimum
+    log_evidence: float  # by Laplace's approximation, with the prior `Problem.prior`
+    residual_nm: np.ndarray  # target minus prediction in all intervals, N·m, shape (K,)
+    slopes: np.ndarray  # derivatives of the interval means by the parameters, shape (P, K)
+    hessian: np.ndarray  # of minus the log posterior, shape (P, P)
+    converged: bool = True  # whether the iteration ended because there was no further gain
 
     @property
     def freedom(self) -> float:

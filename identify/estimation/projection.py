@@ -32,30 +32,15 @@ RATE_S = 0.2
 
 @dataclass
 class Projection:
-    """One record and one basis: all that does not change while the dynamics are searched.
+    """One record and one basis: all that does not change while the dynamics are searched."""
 
-    Parameters
-    ----------
-    grid : Grid
-        The record on the grid of pulses.
-    basis : Basis
-        Basis of the recruitment curve.
-    roughness : ndarray, shape (P, P)
-        Penalty on the coefficients.
-    rows : ndarray of bool, shape (K,)
-        Rows that are fitted.
-    delay_s : float or None
-        A fixed delay; None to estimate it.
-    rests : tuple of ndarray, optional
-        Zero of each part as its rests show it, and its sd, N·m, where they are known already (`rest_levels`).
-    """
-
-    grid: Grid
-    basis: Basis
-    roughness: np.ndarray
-    rows: np.ndarray
-    delay_s: float | None = None
+    grid: Grid  # the record on the grid of pulses
+    basis: Basis  # basis of the recruitment curve
+    roughness: np.ndarray  # penalty on the coefficients, shape (P, P)
+    rows: np.ndarray  # rows that are fitted, bool, shape (K,)
+    delay_s: float | None = None  # a fixed delay; None to estimate it
     rests: tuple[np.ndarray, np.ndarray] = ()  # type: ignore[assignment]
+    """Zero of each part as its rests show it, and its sd, N·m, where they are known already (`rest_levels`)."""
     stretches: list[slice] = field(init=False)
 
     def __post_init__(self) -> None:

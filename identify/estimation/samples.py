@@ -31,28 +31,14 @@ MOST_HARMONICS = 8
 
 @dataclass(frozen=True)
 class Raw:
-    """What the samples of a record show.
+    """What the samples of a record show."""
 
-    Parameters
-    ----------
-    torque_nm : ndarray, shape (N,)
-        Torque without mains hum, N·m.
-    noise_sd_nm : float
-        White noise of a sample, N·m.
-    hum : dict or None
-        Parameters of the effect `mains_hum`; None if there is no hum.
-    ceiling_nm, floor_nm : float or None
-        Levels at which the sensor clips, N·m; None if it does not.
-    readings : Readings or None
-        The readings behind the samples, if they are fewer or coarse.
-    """
-
-    torque_nm: np.ndarray
-    noise_sd_nm: float
-    hum: dict[str, float] | None
-    ceiling_nm: float | None
-    floor_nm: float | None
-    readings: Readings | None = None
+    torque_nm: np.ndarray  # torque without mains hum, N·m, shape (N,)
+    noise_sd_nm: float  # white noise of a sample, N·m
+    hum: dict[str, float] | None  # parameters of the effect `mains_hum`; None if there is no hum
+    ceiling_nm: float | None  # largest torque that the sensor shows, N·m; None if it does not clip there
+    floor_nm: float | None  # smallest torque that the sensor shows, N·m; None if it does not clip there
+    readings: Readings | None = None  # the readings behind the samples, if they are fewer or coarse
 
 
 def block_means(grid: Grid, torque_nm: np.ndarray) -> np.ndarray:

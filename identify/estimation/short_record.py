@@ -32,54 +32,22 @@ from stimrig.identify.recruitment.near_shape import (
 
 @dataclass(frozen=True)
 class Short:
-    """What a short record shows.
+    """What a short record shows."""
 
-    Parameters
-    ----------
-    grid : Grid
-        The record on the grid of pulses.
-    rows : ndarray of bool, shape (K,)
-        Intervals that were fitted.
-    basis : SplineBasis
-        Of the curve.
-    sign : float
-        1 where stimulation raises the record's torque, -1 where it lowers it.
-    linear : SecondOrder
-        The most probable dynamics.
-    coefficients_nm : ndarray, shape (S, n)
-        Draws of the curve's coefficients, positive as the muscle pulls, N·m.
-    dynamics : ndarray, shape (S, 3)
-        Draws of T, s, ζ and the delay, s.
-    others_nm : ndarray, shape (S, E)
-        Draws of the baselines and initial states (torque, N·m, and rate, N·m/s).
-    modes : tuple of Mode
-        One for each kind of the curve's deviation from the known shape.
-    weights : ndarray, shape (M,)
-        Their probabilities.
-    noise : NoiseLevel
-        Of the intervals' means.
-    likely : ndarray, shape (n + E,)
-        Steps of the curve, baselines and initial states at the most probable mode.
-    rise_us : float
-        Rise from 10 to 90 % for which the knots were made, µs.
-    strange : float
-        Probability that the curve is far from the known shape.
-    """
-
-    grid: Grid
-    rows: np.ndarray
-    basis: SplineBasis
-    sign: float
-    linear: SecondOrder
-    coefficients_nm: np.ndarray
-    dynamics: np.ndarray
-    others_nm: np.ndarray
-    modes: tuple[Mode, ...]
-    weights: np.ndarray
-    noise: NoiseLevel
-    likely: np.ndarray
-    rise_us: float
-    strange: float
+    grid: Grid  # the record on the grid of pulses
+    rows: np.ndarray  # intervals that were fitted, bool, shape (K,)
+    basis: SplineBasis  # of the curve
+    sign: float  # 1 where stimulation raises the record's torque, -1 where it lowers it
+    linear: SecondOrder  # the most probable dynamics
+    coefficients_nm: np.ndarray  # draws of the curve's coefficients, positive as the muscle pulls, N·m, shape (S, n)
+    dynamics: np.ndarray  # draws of T, s, ζ and the delay, s, shape (S, 3)
+    others_nm: np.ndarray  # draws of the baselines and initial states (torque, N·m, and rate, N·m/s), shape (S, E)
+    modes: tuple[Mode, ...]  # one for each kind of the curve's deviation from the known shape
+    weights: np.ndarray  # their probabilities, shape (M,)
+    noise: NoiseLevel  # of the intervals' means
+    likely: np.ndarray  # steps of the curve, baselines and initial states at the most probable mode, shape (n + E,)
+    rise_us: float  # rise from 10 to 90 % for which the knots were made, µs
+    strange: float  # probability that the curve is far from the known shape
 
     @property
     def largest_us(self) -> float:

@@ -23,31 +23,16 @@ PULSE_RATE_HZ = 40.0
 
 @dataclass(frozen=True)
 class FileContent:
-    """What a file of another tool holds.
-
-    Parameters
-    ----------
-    columns : dict of ndarray, shape (N,)
-        In our units, by our names; NaN where the file has no number. A `segment`, where it has one, is an index into
-        `names` for each row.
-    names : sequence of str
-        Segments.
-    name : str
-        How messages call the file.
-    cell : callable
-        How messages call a cell in it, by row and column.
-    source : Source
-        The file, with notes on how it was read.
-    pulse_rate_hz : float
-        Pulses a second.
-    """
+    """What a file of another tool holds."""
 
     columns: dict[str, np.ndarray]
-    names: Sequence[str]
-    name: str
-    cell: Callable[[int, str], str]
-    source: Source
-    pulse_rate_hz: float = PULSE_RATE_HZ
+    """In our units, by our names, each of shape (N,); NaN where the file has no number. A `segment`, where it has one,
+    is an index into `names` for each row."""
+    names: Sequence[str]  # segments
+    name: str  # how messages call the file
+    cell: Callable[[int, str], str]  # how messages call a cell in it, by row and column
+    source: Source  # the file, with notes on how it was read
+    pulse_rate_hz: float = PULSE_RATE_HZ  # pulses a second
 
     def at(self, row: int, column: str = "time_s") -> str:
         """How errors call a cell: with the file."""

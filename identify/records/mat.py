@@ -42,18 +42,12 @@ OBJECTS = "Turn it into plain numbers or texts first: seconds(t), cellstr(s), ta
 class Variable:
     """A variable that was not looked at closely yet."""
 
-    kind: int
-    """MATLAB's class."""
-    shape: tuple[int, ...]
-    """Its dimensions, as declared."""
-    flags: int
-    """Whether it is complex."""
-    body: memoryview
-    """What follows its name."""
-    order: str
-    """"<" or ">"."""
-    packed: bool = False
-    """Whether `body` holds the whole element as it was packed, its head included."""
+    kind: int  # MATLAB's class
+    shape: tuple[int, ...]  # its dimensions, as declared
+    flags: int  # whether it is complex
+    body: memoryview  # what follows its name
+    order: str  # "<" or ">"
+    packed: bool = False  # whether `body` holds the whole element as it was packed, its head included
 
     @property
     def size(self) -> int:

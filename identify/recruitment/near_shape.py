@@ -23,18 +23,11 @@ KNOTS, FINE_KNOTS = 61, 121
 
 @dataclass(frozen=True)
 class Deviation:
-    """One kind of deviation of the log density from the shape.
+    """One kind of deviation of the log density from the shape."""
 
-    Parameters
-    ----------
-    sd : float
-        Its standard deviation.
-    smooth_share : float
-        Share of its variance that is smooth; the rest is rough, as from single large units or at a sudden beginning.
-    """
-
-    sd: float
+    sd: float  # its standard deviation
     smooth_share: float
+    """Share of its variance that is smooth; the rest is rough, as from single large units or at a sudden beginning."""
 
 
 DEVIATIONS = (Deviation(0.05, 1.0), Deviation(0.4, 0.8), Deviation(1.1, 0.8), Deviation(1.6, 0.0), Deviation(3.2, 0.2))
@@ -63,36 +56,18 @@ LOGISTIC_RISE = 4.394
 
 @dataclass(frozen=True)
 class NearShape:
-    """The prior of a curve on a spline basis.
+    """The prior of a curve on a spline basis."""
 
-    Parameters
-    ----------
-    basis : SplineBasis
-        Of the curve; its coefficients are the running sums of the steps.
-    shape : callable
-        The shape in standard units, from 0 to 1: `logistic`, or an earlier curve.
-    mean : ndarray, shape (3,)
-        Of log gain (N·m), middle (µs) and log width (µs).
-    precision : ndarray, shape (3, 3)
-        Of those three.
-    plateau : tuple of float
-        Mean and standard deviation of the log of the plateau, N·m: the sum of all steps, with their deviations.
-    rise_us : float
-        Rise from 10 to 90 %, µs: the scale of the deviation.
-    deviations : tuple of Deviation
-        Kinds of the log density's deviation that are averaged over.
-    doubt : ndarray, shape (n, n), optional
-        Covariance of the logs of the steps of the shape itself, where the shape is an estimate.
-    """
-
-    basis: SplineBasis
-    shape: Shape
-    mean: np.ndarray
-    precision: np.ndarray
+    basis: SplineBasis  # of the curve; its coefficients are the running sums of the steps
+    shape: Shape  # the shape in standard units, from 0 to 1: `logistic`, or an earlier curve
+    mean: np.ndarray  # of log gain (N·m), middle (µs) and log width (µs), shape (3,)
+    precision: np.ndarray  # of those three, shape (3, 3)
     plateau: tuple[float, float]
-    rise_us: float
-    deviations: tuple[Deviation, ...] = DEVIATIONS
+    """Mean and standard deviation of the log of the plateau, N·m: the sum of all steps, with their deviations."""
+    rise_us: float  # rise from 10 to 90 %, µs: the scale of the deviation
+    deviations: tuple[Deviation, ...] = DEVIATIONS  # kinds of the log density's deviation that are averaged over
     doubt: np.ndarray | None = None
+    """Covariance of the logs of the steps of the shape itself, where the shape is an estimate; shape (n, n)."""
 
     @cached_property
     def places_us(self) -> np.ndarray:

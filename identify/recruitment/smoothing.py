@@ -108,18 +108,10 @@ TILT = 1e-3
 
 @dataclass(frozen=True)
 class Choice:
-    """A penalty's weight.
+    """A penalty's weight."""
 
-    Parameters
-    ----------
-    weight : float
-        Factor of the roughness in the sum of squares, N²m² per unit of roughness.
-    variance : float
-        Noise variance at that weight, N²m².
-    """
-
-    weight: float
-    variance: float
+    weight: float  # factor of the roughness in the sum of squares, N²m² per unit of roughness
+    variance: float  # noise variance at that weight, N²m²
 
 
 def straight_lines(roughness: np.ndarray) -> int:

@@ -59,18 +59,10 @@ class Acting:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """g and h of a model, to be asked at any angles and velocities.
+    """g and h of a model, to be asked at any angles and velocities."""
 
-    Parameters
-    ----------
-    acting : tuple
-        The model's effects that depend on the joint.
-    settings : mapping
-        Those that the effects were fitted with.
-    """
-
-    acting: tuple[Acting, ...]
-    settings: Mapping[str, Any]
+    acting: tuple[Acting, ...]  # the model's effects that depend on the joint
+    settings: Mapping[str, Any]  # those that the effects were fitted with
 
     @classmethod
     def of(cls, effects: Sequence[Mapping[str, Any]]) -> Surfaces | None:

@@ -18,16 +18,10 @@ SAMPLES_A_PULSE = 8
 
 @dataclass(frozen=True)
 class Motion:
-    """How the joint moves during a trial.
+    """How the joint moves during a trial."""
 
-    Parameters
-    ----------
-    angle_rad, velocity_rad_s : ndarray, shape (K,)
-        Mean in each pulse's period, rad and rad/s.
-    """
-
-    angle_rad: np.ndarray
-    velocity_rad_s: np.ndarray
+    angle_rad: np.ndarray  # mean in each pulse's period, rad, shape (K,)
+    velocity_rad_s: np.ndarray  # the same, rad/s
 
     @classmethod
     def of(cls, angle_rad: np.ndarray, pulse_rate_hz: float) -> Motion:

@@ -22,64 +22,32 @@ ACCELERATION_S = 0.05
 
 @dataclass(frozen=True)
 class Setup:
-    """A record prepared for fitting.
+    """A record prepared for fitting."""
 
-    Parameters
-    ----------
-    grid : Grid
-        The record on the grid of pulses.
-    target_nm : ndarray, shape (K,)
-        Torque to be explained, N·m: without hum, relative to `zero_nm`, and positive in the direction in which the
-        muscle pulls; NaN where there is none.
-    fitted : ndarray of bool, shape (K,)
-        Intervals that are fitted.
-    basis : Basis
-        Of the recruitment curve, common to all candidates.
-    roughness : ndarray, shape (n, n)
-        Prior precision of its coefficients, 1/(N·m)²; it limits how much the curve bends.
-    scale_nm : float
-        Largest torque, smoothed, N·m.
-    noise_sd_nm : float
-        White noise of a sample, N·m.
-    delay_bounds_s : tuple of float
-        Bounds of the delay that every candidate has: about one sample in both directions.
-    zero_nm : float
-        Zero of the record's torque, N·m.
-    sign : float
-        1 where stimulation raises the record's torque, -1 where it lowers it.
-    spread : ndarray, shape (K,), or float
-        Noise of each interval, divided by the mean noise: each part of a record has its own noise.
-    reference_s : float
-        Time at which the recruitment curve holds, if an effect makes it drift, s.
-    curve_nm : ndarray, shape (n,), or float
-        Prior mean of the curve's coefficients, N·m.
-    reference_rad : float or None
-        Angle at which the curve holds as it stands, rad (`Scene.reference_rad`).
-    angle_range_rad : tuple of float or None
-        Smallest and largest angle that was fitted, rad.
-    rests_nm : tuple of ndarray, or None
-        Zero of each part as its rests show it, as the target is given, and its sd; None where they say nothing.
-    states : mapping of str to float
-        By effect id, where its slow state begins; 0 (rested) where there is none.
-    """
-
-    grid: Grid
+    grid: Grid  # the record on the grid of pulses
     target_nm: np.ndarray
-    fitted: np.ndarray
-    basis: Basis
+    """Torque to be explained, N·m, shape (K,): without hum, relative to `zero_nm`, and positive in the direction in
+    which the muscle pulls; NaN where there is none."""
+    fitted: np.ndarray  # intervals that are fitted, bool, shape (K,)
+    basis: Basis  # of the recruitment curve, common to all candidates
     roughness: np.ndarray
-    scale_nm: float
-    noise_sd_nm: float
+    """Prior precision of its coefficients, 1/(N·m)²; it limits how much the curve bends; shape (n, n)."""
+    scale_nm: float  # largest torque, smoothed, N·m
+    noise_sd_nm: float  # white noise of a sample, N·m
     delay_bounds_s: tuple[float, float]
-    zero_nm: float = 0.0
-    sign: float = 1.0
+    """Bounds of the delay that every candidate has: about one sample in both directions."""
+    zero_nm: float = 0.0  # zero of the record's torque, N·m
+    sign: float = 1.0  # 1 where stimulation raises the record's torque, -1 where it lowers it
     spread: np.ndarray | float = 1.0
-    reference_s: float = 0.0
-    curve_nm: np.ndarray | float = 0.0
-    reference_rad: float | None = None
-    angle_range_rad: tuple[float, float] | None = None
+    """Noise of each interval, shape (K,), divided by the mean noise: each part of a record has its own noise."""
+    reference_s: float = 0.0  # time at which the recruitment curve holds, if an effect makes it drift, s
+    curve_nm: np.ndarray | float = 0.0  # prior mean of the curve's coefficients, N·m, shape (n,), or of each
+    reference_rad: float | None = None  # angle at which the curve holds as it stands, rad (`Scene.reference_rad`)
+    angle_range_rad: tuple[float, float] | None = None  # smallest and largest angle that was fitted, rad
     rests_nm: tuple[np.ndarray, np.ndarray] | None = None
+    """Zero of each part as its rests show it, as the target is given, and its sd; None where they say nothing."""
     states: Mapping[str, float] = field(default_factory=dict)
+    """By effect id, where its slow state begins; 0 (rested) where there is none."""
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
