@@ -18,16 +18,7 @@ from stimrig.identify.estimation.earlier import Earlier
 from stimrig.identify.estimation.projection import Projection
 from stimrig.identify.noise import NoiseLevel, profile, whitened
 from stimrig.identify.recruitment.bases import SplineBasis
-from stimrig.identify.recruitment.near_shape import (
-    FINE_KNOTS,
-    KNOTS,
-    LOGISTIC_RISE,
-    PLATEAU_LOG_SD,
-    NearShape,
-    dense_knots,
-    logistic,
-    new_person,
-)
+from stimrig.identify.recruitment.near_shape import FINE_KNOTS, KNOTS, LOGISTIC_RISE, NearShape, dense_knots, new_person
 
 
 @dataclass(frozen=True)
@@ -216,9 +207,7 @@ class _Search:
             basis, rise = self.near.basis, self.near.rise_us
         else:
             self.near = None
-        mean, precision = new_person(self.largest_us, self.scale_nm)
-        plateau = float(np.log(self.scale_nm)) + 0.1, PLATEAU_LOG_SD
-        return NearShape(basis, logistic, mean, precision, plateau, rise)
+        return new_person(basis, rise, self.scale_nm)
 
     def _on(self, basis: SplineBasis) -> bool:
         """Whether the fit before this one has as many knots up to the same width."""

@@ -4,25 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis, SplineBasis
-
-
-class Basis(Protocol):
-    """The basis functions of one kind of recruitment curve; all are zero at zero pulse width."""
-
-    @property
-    def size(self) -> int: ...
-
-    @property
-    def largest_us(self) -> float: ...
-
-    def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray: ...
-
-    def to_dict(self) -> dict: ...
 
 
 @dataclass(frozen=True)
@@ -99,6 +85,10 @@ class FixedShape:
 
     def to_dict(self) -> dict:
         return self.curve.to_dict()
+
+
+Basis = SplineBasis | PowerBasis | SigmoidBasis | FixedShape
+"""The basis functions of one kind of recruitment curve; all are zero at zero pulse width."""
 
 
 def basis_from_dict(data: dict[str, Any]) -> Basis:

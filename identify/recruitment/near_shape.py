@@ -136,7 +136,9 @@ PLATEAU_LOG_SD = 0.4
 """A plateau is hardly ever more than twice the largest torque that was seen."""
 
 
-def new_person(largest_us: float, scale_nm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and precision of (log gain, middle, log width) of somebody who was never tested."""
+def new_person(basis: SplineBasis, rise_us: float, scale_nm: float) -> NearShape:
+    """The prior of the curve of somebody who was never tested; `scale_nm` is the largest torque seen, N·m."""
+    largest_us = basis.largest_us
     mean = np.array([np.log(scale_nm), 0.45 * largest_us, np.log(largest_us / 20.0)])
-    return mean, np.diag(1.0 / np.array([1.0, 0.35 * largest_us, 1.0]) ** 2)
+    precision = np.diag(1.0 / np.array([1.0, 0.35 * largest_us, 1.0]) ** 2)
+    return NearShape(basis, logistic, mean, precision, (float(np.log(scale_nm)) + 0.1, PLATEAU_LOG_SD), rise_us)
