@@ -134,16 +134,13 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
 
     Raises NotIdentifiable: the pulse width or the torque never changes.
     """
-    largest = float(np.max(grid.pulse_width_us))
     seen = grid.pulse_width_us[rows]
-    if not largest > 0 or np.ptp(seen) <= 0:
-        message = "the pulse width never changes in the fitted rows" if largest > 0 else "the record has no pulse"
-        raise NotIdentifiable(message, fix="Record a PRBS and a ramp.")
+    if np.ptp(seen) <= 0:
+        raise NotIdentifiable("the pulse width never changes in the fitted rows", fix="Record a PRBS and a ramp.")
     if np.ptp(grid.torque_nm[rows]) <= 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
-    basis = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
-    order = bending_order(grid.pulse_width_us[rows])
-    projection = Projection(grid, basis, spline_roughness(basis, order=order), rows, delay_s)
+    basis = SplineBasis(np.linspace(0.0, float(np.max(grid.pulse_width_us)), PILOT_KNOTS))
+    projection = Projection(grid, basis, spline_roughness(basis, order=bending_order(seen)), rows, delay_s)
     delay = 0.0 if delay_s is None else delay_s
     starts = [Solution(projection, bounded(projection, SecondOrder(t, 0.9, delay))) for t in STARTS_S]
     best = min(starts, key=lambda start: start.cost)
@@ -224,11 +221,7 @@ def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
 
 
 def to_fitted(
-    solution: Solution,
-    rows: np.ndarray,
-    most: int = 20,
-    white: bool = False,
-    coefficients: np.ndarray | None = None,
+    solution: Solution, rows: np.ndarray, most: int = 20, white: bool = False, coefficients: np.ndarray | None = None
 ) -> Fitted:
     """The solution of the joint problem on some rows, with white and slow noise, started from a projected solution.
 

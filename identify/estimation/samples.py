@@ -80,33 +80,18 @@ def rows_of(grid: Grid, names: Sequence[str]) -> np.ndarray:
 def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
     """Rows to fit: those of the named segments and the rests, which determine the baseline; never held-out rows.
 
-    Raises
-    ------
-    BadRequest
-        A named segment is not in the record, or is the held-out one.
-    NotIdentifiable
-        Fewer than eight pulse intervals are left to fit.
-    """
-    if fit_on is not None:
-        check_segments(grid, fit_on)
-        rows = grid.fitted & rows_of(grid, (*fit_on, "rest"))
-    else:
-        rows = grid.fitted
-    refuse_few(rows)
-    return rows
-
-
-def check_segments(grid: Grid, names: Sequence[str]) -> None:
-    """Refuse names of segments that the record does not have, and the held-out one.
-
-    Raises BadRequest: with the names that can be used.
+    Raises BadRequest: a named segment is not in the record (with those that are), or is the held-out one.
+    NotIdentifiable: fewer than eight pulse intervals are left to fit.
     """
     there = tuple(dict.fromkeys(grid.record.segment_names))
-    for name in names:
+    for name in fit_on or ():
         if name == HELD_OUT:
             raise BadRequest("rows of `validate` are never fitted", place="fit_on", fix="Name other segments.")
         if name not in there:
             raise BadRequest(f"no segment {name!r} in the record", place="fit_on", fix=f"It has: {', '.join(there)}.")
+    rows = grid.fitted if fit_on is None else grid.fitted & rows_of(grid, (*fit_on, "rest"))
+    refuse_few(rows)
+    return rows
 
 
 def inspect(record: Record, start_s: float | None = None) -> Raw:

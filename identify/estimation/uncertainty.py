@@ -6,6 +6,7 @@ contains the whole true curve in 95 % of records; its width is found by drawing 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -177,14 +178,10 @@ def bands(model: Model) -> dict[str, Any]:
 def recruitment_slopes(basis: Basis, covariance: Covariance, width_us: np.ndarray) -> np.ndarray:
     """Derivatives of f(u) by all parameters, shape (len(width_us), P)."""
     found = np.zeros((width_us.size, len(covariance.names)))
-    found[:, _coefficients(basis, covariance)] = basis.design(width_us)
-    return found
-
-
-def _coefficients(basis: Basis, covariance: Covariance) -> slice:
-    """Place of f's coefficients: after the dynamics, before the effects (`effect.parameter`)."""
+    # f's coefficients stand after the dynamics, before the effects (`effect.parameter`).
     last = len(covariance.names) - sum("." in name for name in covariance.names)
-    return slice(last - basis.size, last)
+    found[:, last - basis.size : last] = basis.design(width_us)
+    return found
 
 
 def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray) -> np.ndarray:
@@ -192,9 +189,10 @@ def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray)
     slopes = np.zeros((time_s.size, len(covariance.names)))
     for name in DYNAMICS:
         if name in covariance.names:
-            up, down, width = _neighbours(linear, name)
-            change = up.step_response(time_s) - down.step_response(time_s)
-            slopes[:, covariance.names.index(name)] = change / width
+            value = getattr(linear, name)
+            step = 1e-5 if name == "delay_s" else 1e-4 * value
+            up, down = (replace(linear, **{name: near}).step_response(time_s) for near in (value + step, value - step))
+            slopes[:, covariance.names.index(name)] = (up - down) / (2 * step)
     return slopes
 
 
@@ -204,10 +202,7 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     It contains the uncertainty of the model, what its structure leaves (`unexplained`) and, where it was not fitted,
     the size of what cannot be foreseen; not the noise of the measurement.
 
-    Raises
-    ------
-    ValueError
-        The model has no covariance (another method).
+    Raises ValueError: the model has no covariance (another method).
     """
     covariance, linear = model.covariance, model.linear
     if covariance is None or not isinstance(linear, SecondOrder):
@@ -221,14 +216,6 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     half = POINTWISE * np.hypot(np.interp(record.time_s, middle, sd), np.where(seen, 0.0, share))
     predicted = model.predict(record)
     return predicted - half, predicted + half
-
-
-def _neighbours(linear: SecondOrder, name: str) -> tuple[SecondOrder, SecondOrder, float]:
-    values = {key: getattr(linear, key) for key in DYNAMICS}
-    step = 1e-5 if name == "delay_s" else 1e-4 * values[name]
-    up = SecondOrder(**(values | {name: values[name] + step}))
-    down = SecondOrder(**(values | {name: values[name] - step}))
-    return up, down, 2 * step
 
 
 def _sd(slopes: np.ndarray, covariance: Covariance) -> np.ndarray:
