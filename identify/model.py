@@ -162,13 +162,7 @@ class Model(Summarised):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Model:
-        """The model that `to_dict` wrote.
-
-        Raises
-        ------
-        BadModel
-            A key is missing, or its value is not valid.
-        """
+        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid."""
         if not isinstance(data, dict):
             raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
         version = str(data.get("schema_version", ""))[:20]
@@ -193,10 +187,7 @@ class Model(Summarised):
     def from_json(cls, text: str | bytes) -> Model:
         """The model in a MODEL.json text.
 
-        Raises
-        ------
-        BadModel
-            Not JSON, too long, too deep, with a duplicate key or an invalid number, or not a model.
+        Raises BadModel: not JSON, too long, too deep, with a duplicate key or an invalid number, or not a model.
         """
         if len(text) > LARGEST_TEXT:
             raise BadModel(f"more than {LARGEST_TEXT} characters", fix="Give a file written by `stimrig fit -o`.")

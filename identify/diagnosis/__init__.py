@@ -59,10 +59,7 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
 def structure_of(model: Model | None) -> list[str]:
     """The effects of a model as `search_effects` takes them ("id:form"); an empty list for the plain structure.
 
-    Raises
-    ------
-    BadRequest
-        The model's dynamics are not of second order.
+    Raises BadRequest: the model's dynamics are not of second order.
     """
     if model is None:
         return []

@@ -66,22 +66,13 @@ def _from_folder(folder: Path) -> Iterator[tuple[str, Effect]]:
 def registry() -> dict[str, Effect]:
     """All effects by id: the library's, those of entry points, those in the user's folder.
 
-    Raises
-    ------
-    BadEffect
-        A user's folder is not there, or one of the files cannot be loaded or used.
+    Raises BadEffect: a user's folder is not there, or one of the files cannot be loaded or used.
     """
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 
 
 def find_effect(effect_id: str) -> Effect:
-    """One effect by its id.
-
-    Raises
-    ------
-    BadRequest
-        No effect has this id.
-    """
+    """One effect by its id. Raises BadRequest: no effect has this id."""
     effects = registry()
     if effect_id not in effects:
         raise BadRequest(f"unknown effect {effect_id!r}", fix=f"Known: {', '.join(sorted(effects))}.")
@@ -106,15 +97,6 @@ def library() -> list[dict[str, Any]]:
 
 
 __all__ = [
-    "BadEffect",
-    "Effect",
-    "Form",
-    "Parameter",
-    "Scene",
-    "depend_on_joint",
-    "find_effect",
-    "form",
-    "known_form",
-    "library",
-    "registry",
-]
+    "BadEffect", "Effect", "Form", "Parameter", "Scene", "depend_on_joint", "find_effect", "form", "known_form",
+    "library", "registry",
+]  # fmt: skip

@@ -78,11 +78,7 @@ def _used_up(
 
 
 @form(
-    "gain",
-    "w = (1 + gain·exp(-x)) f(u); x' = 1/decay under pulses, -x/recovery in silence",
-    _GAIN,
-    _QUICK,
-    _RECOVERY,
+    "gain", "w = (1 + gain·exp(-x)) f(u); x' = 1/decay under pulses, -x/recovery in silence", _GAIN, _QUICK, _RECOVERY
 )
 def counts(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     x = _used_up(scene.on, p["decay_s"][:, 0], p["recovery_s"][:, 0], scene.step_s)

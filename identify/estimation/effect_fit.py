@@ -91,12 +91,7 @@ def try_band(effect: Effect, base: Fitted) -> Candidate | None:
 
 
 def fit_form(
-    effect: Effect,
-    form: Form,
-    base: Fitted,
-    residual: np.ndarray,
-    previous: dict[str, float],
-    floor: float = -np.inf,
+    effect: Effect, form: Form, base: Fitted, residual: np.ndarray, previous: dict[str, float], floor: float = -np.inf
 ) -> Fitted | None:
     """Add one form to a model, from each of its starting values, and return the best fit.
 
@@ -134,12 +129,8 @@ def effect_names(fitted: Fitted) -> list[str]:
 def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     """The model with one more effect, in the named form or in its most likely one.
 
-    Raises
-    ------
-    BadRequest
-        The effect has no such form.
-    NotIdentifiable
-        It needs a column that the record does not have, or its fit finds nothing to start from.
+    Raises BadRequest: the effect has no such form. NotIdentifiable: it needs a column that the record does not have, or
+    its fit finds nothing to start from.
     """
     for need in effect.needs:
         if getattr(base.problem.setup.grid.record, need) is None:

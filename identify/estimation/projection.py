@@ -296,12 +296,7 @@ LEAST_BEND = 0.05
 
 
 def search(
-    projection: Projection,
-    start: SecondOrder,
-    *,
-    ar1: float = 0.0,
-    most: int = 25,
-    variance: float | None = None,
+    projection: Projection, start: SecondOrder, *, ar1: float = 0.0, most: int = 25, variance: float | None = None
 ) -> Solution:
     """Newton's method on the dynamics with the coefficients projected out, damped where a step fails.
 
@@ -439,14 +434,7 @@ def whiten(rows: np.ndarray, stretches: list[slice], ar1: float) -> np.ndarray:
 def log_likelihood(residual: np.ndarray, stretches: list[slice], ar1: float) -> float:
     """Exact Gaussian AR(1) log-likelihood with the innovation's variance profiled out.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (K,)
-        Residual on the grid, N·m.
-    stretches : list of slice
-        Runs of fitted rows.
-    ar1 : float
-        Correlation of neighbours.
+    `residual`, N·m, has shape (K,); all is as in `whiten`.
     """
     white = whiten(residual, stretches, ar1)
     variance = max(float(white @ white) / white.size, 1e-24)
@@ -476,12 +464,7 @@ def best_ar1(residual: np.ndarray, stretches: list[slice]) -> float:
 def ar1_or_white(residual: np.ndarray, stretches: list[slice]) -> tuple[float, float]:
     """Choose AR(1) or white noise: the correlation (0 for white), and ΔBIC (positive in favour of AR(1)).
 
-    Parameters
-    ----------
-    residual : ndarray, shape (K,)
-        Residual on the grid, N·m.
-    stretches : list of slice
-        Runs of fitted rows.
+    `residual`, N·m, has shape (K,); all is as in `whiten`.
     """
     ar1 = best_ar1(residual, stretches)
     rows = sum(s.stop - s.start for s in stretches)

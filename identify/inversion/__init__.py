@@ -30,14 +30,7 @@ TOLERANCE = 0.02
 """A torque that is missed by less of the largest torque counts as reached."""
 JOINED = 3
 """Stretches of one reason with fewer pulses between them are one."""
-REASONS = (
-    "above-plateau",
-    "below-zero",
-    "rises-too-fast",
-    "falls-too-fast",
-    "under-threshold",
-    "not-followed",
-)
+REASONS = ("above-plateau", "below-zero", "rises-too-fast", "falls-too-fast", "under-threshold", "not-followed")
 """Too high for the largest width; the wrong sign, a muscle only pulls; faster than the muscle, or than the rise limit
 allows; a pulse there gives too little or too much; the rest, for example an effect that cannot be undone."""
 
@@ -177,17 +170,12 @@ def _judged(
     `needed_nm` is what the muscle itself has to give: the reference, but for what the joint adds and takes.
     """
     wanted = plant.sign * reference.torque_nm
-    tolerance_nm = TOLERANCE * plant.largest_nm
-    missed = np.abs(wanted - got_nm) > tolerance_nm
+    error_nm, tolerance_nm = np.abs(wanted - got_nm), TOLERANCE * plant.largest_nm
+    missed = error_nm > tolerance_nm
     reasons = _reasons(plant, needed_nm, demand_nm, missed, wanted > got_nm, tolerance_nm)
     step_s = 1.0 / reference.pulse_rate_hz
     stretches = [
-        Stretch(
-            float(run.start * step_s),
-            float(run.stop * step_s),
-            reason,
-            float(np.max(np.abs(wanted - got_nm)[run])),
-        )
+        Stretch(float(run.start * step_s), float(run.stop * step_s), reason, float(np.max(error_nm[run])))
         for index, reason in enumerate(REASONS)
         for run in runs(_joined(reasons == index))
     ]

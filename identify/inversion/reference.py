@@ -25,12 +25,7 @@ LEAST_GAP_S, LONGEST_GAP_S = 1e-9, 1.0
 wish of anybody's."""
 RATES_HZ = (10.0, 100.0)
 FIX = "Give a header time_s,torque_nm (or torque_nm alone) and one row of numbers a line."
-NAMES = {
-    "time_s": "time_s",
-    "torque_nm": "torque_nm",
-    "reference_torque_nm": "torque_nm",
-    "angle_rad": "angle_rad",
-}
+NAMES = {"time_s": "time_s", "torque_nm": "torque_nm", "reference_torque_nm": "torque_nm", "angle_rad": "angle_rad"}
 
 
 @dataclass(frozen=True)

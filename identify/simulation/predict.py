@@ -58,10 +58,8 @@ def predict(model: Muscle, record: Record) -> np.ndarray:
     No measured torque is used: a controller would predict the same. What cannot be foreseen (`unforeseen`) is included
     only on the rows that it was fitted on.
 
-    Raises
-    ------
-    BadModel
-        The pulse rate differs too much, an effect or its form is unknown here, or the record lacks a column it needs.
+    Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, or the record lacks a
+    column it needs.
     """
     refuse_rate(model, record)
     return predict_on(model, make_grid(record))

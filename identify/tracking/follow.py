@@ -243,10 +243,7 @@ def passed(model: Model, state: State, record: Record, rest_s: float | None = No
 
     For a record that teaches nothing else: the test before the session, or a trial that cannot be followed.
 
-    Raises
-    ------
-    BadModel, BadRecord
-        As `stimrig.identify.tracking.trial.look`, of any pulse rate.
+    Raises BadModel, BadRecord: as `stimrig.identify.tracking.trial.look`, of any pulse rate.
     """
     if not slow_forms(model):
         return state
@@ -301,10 +298,7 @@ def moved_model(
     """The model with the levels of `values`, with `curve_nm` added to the coefficients of its curve, and its effects
     where `effects` says that they begin.
 
-    Raises
-    ------
-    BadModel
-        The model's dynamics are not of second order.
+    Raises BadModel: the model's dynamics are not of second order.
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics are tracked", fix="Fit with maximum-likelihood.")
