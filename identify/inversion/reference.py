@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.errors import BadRecord, BadRequest
+from stimrig.identify.records.cells import is_number
 from stimrig.identify.records.csv import COMMENTS, encoding_of, text_lines
 from stimrig.identify.simulation.pulses import Motion
 
@@ -223,10 +224,7 @@ def _number(cell: str, separator: str, place: str) -> float:
     written = cell.strip().strip('"')
     if separator != ",":
         written = written.replace(",", ".")
-    try:
-        value = float(written) if written.isascii() and "_" not in written else np.nan
-    except ValueError:
-        value = np.nan
+    value = float(written) if is_number(written) else np.nan
     if not np.isfinite(value):
         raise BadRecord(f"{written[:20]!r} is not a finite number", place=place, fix=FIX)
     return value

@@ -1,4 +1,4 @@
-"""Cells of tables that leave: a spreadsheet must not compute what somebody called a segment, a file or a person.
+"""Cells of tables: what is a number, and what a spreadsheet must not compute: a segment's, file's or person's name.
 
 A text that begins like a formula gets an apostrophe, by which a spreadsheet takes it for text (OWASP, CSV injection).
 So does one behind a comma or semicolon, where a spreadsheet of another language separates. Our readers take it off.
@@ -34,6 +34,15 @@ def cell(value: str | float | None) -> str:
     if isinstance(value, str):
         return cell_text(value)
     return f"{value:.8g}" if isinstance(value, float) else str(value)
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell is a number as a measuring tool writes it: no digits of other scripts, no underscores."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return cell.isascii() and "_" not in cell
 
 
 def lines(rows: Iterable[Iterable[str | float | None]], end: str = "\n") -> Iterator[str]:

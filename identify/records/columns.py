@@ -113,7 +113,7 @@ def parsed(given: Mapping[str, str] | Iterable[str] | None) -> Given:
     for target, text in pairs:
         if target not in TARGETS:
             fix = f"Give one of {', '.join(TARGETS)}, for instance --map torque_nm=Moment:Nm."
-            raise BadRecord(f"no column is called {_short(target)!r}", place="--map", fix=fix)
+            raise BadRecord(f"no column is called {short(target)!r}", place="--map", fix=fix)
         if target in found:
             raise BadRecord(f"{target} is given twice", place="--map", fix="Give each column once.")
         if not str(text).strip():
@@ -126,7 +126,7 @@ def _pair(text: str) -> tuple[str, str]:
     target, equals, name = text.partition("=")
     if not equals:
         fix = "Give TARGET=NAME:UNIT, for instance --map torque_nm=Moment:Nm."
-        raise BadRecord(f"{_short(text)!r} has no '='", place="--map", fix=fix)
+        raise BadRecord(f"{short(text)!r} has no '='", place="--map", fix=fix)
     return target.strip(), name
 
 
@@ -180,7 +180,7 @@ def _refuse_shared(cells: Sequence[str], columns: Mapping[str, Column], place: s
     owner: dict[int, str] = {}
     for target, column in columns.items():
         if column.index in owner:
-            message = f"column {_short(cells[column.index])} is asked for twice, as {owner[column.index]} and {target}"
+            message = f"column {short(cells[column.index])} is asked for twice, as {owner[column.index]} and {target}"
             raise BadRecord(message, place=place, fix="Name another column for one of them with --map.")
         owner[column.index] = target
 
@@ -188,9 +188,8 @@ def _refuse_shared(cells: Sequence[str], columns: Mapping[str, Column], place: s
 def _convert_column(name: str, target: str, index: int, below: str, asked: Asked | None, place: str) -> Column | None:
     """A column in its unit; None where nobody asked for it and its unit is not said."""
     if target == "segment":
-        return Column(
-            index, note="" if asked or (name == target and not below) else f"segment is column {_short(name)!r}"
-        )
+        note = "" if asked or (name == target and not below) else f"segment is column {short(name)!r}"
+        return Column(index, note=note)
     wanted = asked.unit if asked is not None and not _is(name, asked.text) else ""
     written = below or _split(name, target)[1]
     unit = wanted or written
@@ -198,16 +197,16 @@ def _convert_column(name: str, target: str, index: int, below: str, asked: Asked
         return Column(index)
     if not unit and asked is not None:
         own = SHOWN.get(target, ("1",))[0]
-        return Column(index, note=f"{target} is {_short(name)!r}, taken in {own} as no unit is given")
+        return Column(index, note=f"{target} is {short(name)!r}, taken in {own} as no unit is given")
     if not unit and target not in NEEDED:
         return None
     factor = unit_factor(target, unit) if unit else None
     if factor is None or (name == target and not wanted and factor != 1.0):
         raise _unit(name, target, unit, place)
     if not wanted:
-        return Column(index, factor, "" if name == target else f"{target} is {_short(name)!r} in {_short(unit)}")
+        return Column(index, factor, "" if name == target else f"{target} is {short(name)!r} in {short(unit)}")
     if written and unit_factor(target, written) not in (None, factor):
-        return Column(index, factor, f"{target} is taken in {unit} as --map says; its name says {_short(written)}")
+        return Column(index, factor, f"{target} is taken in {unit} as --map says; its name says {short(written)}")
     return Column(index, factor)
 
 
@@ -252,9 +251,9 @@ def _asked_for(cells: Sequence[str], asked: Asked) -> list[int]:
 
 
 def _missing(cells: Sequence[str], missing: Sequence[str], given: Given, place: str) -> BadRecord:
-    here = ", ".join(_short(cell) for cell in cells[:MOST_SHOWN] if cell) + (", …" if len(cells) > MOST_SHOWN else "")
+    here = ", ".join(short(cell) for cell in cells[:MOST_SHOWN] if cell) + (", …" if len(cells) > MOST_SHOWN else "")
     if asked := next((given[target] for target in missing if target in given), None):
-        return BadRecord(f"no column {_short(asked.text)!r} for {asked.target}", place=place, fix=f"It has: {here}.")
+        return BadRecord(f"no column {short(asked.text)!r} for {asked.target}", place=place, fix=f"It has: {here}.")
     target = missing[0]
     unit = SHOWN[target][0]
     fix = f"Say which it is, for instance --map {target}=NAME:{unit}; it has: {here}."
@@ -264,22 +263,23 @@ def _missing(cells: Sequence[str], missing: Sequence[str], given: Given, place: 
 def _twice(cells: Sequence[str], target: str, indices: Sequence[int], place: str) -> BadRecord:
     first, second = (cells[index] for index in indices[:2])
     if first == second:
-        return BadRecord(f"column {_short(first)} is there twice", place=place, fix="Keep one of them.")
-    fix = f"Say which, for instance --map {target}={_short(first)}."
-    return BadRecord(f"{target} may be {_short(first)!r} or {_short(second)!r}", place=place, fix=fix)
+        return BadRecord(f"column {short(first)} is there twice", place=place, fix="Keep one of them.")
+    fix = f"Say which, for instance --map {target}={short(first)}."
+    return BadRecord(f"{target} may be {short(first)!r} or {short(second)!r}", place=place, fix=fix)
 
 
 def _unit(name: str, target: str, unit: str, place: str) -> BadRecord:
     known = SHOWN.get(target, ("1",))
-    shown = _short(_split(name, target)[0] or name)
+    shown = short(_split(name, target)[0] or name)
     fix = f"Give --map {target}={shown}:{known[0]}" + (f" (or {', '.join(known[1:])})." if known[1:] else ".")
     if target == "torque_nm" and plain_unit(unit) in ("n", "kg", "kn", "v", "mv"):
         fix = "Torque is asked for: multiply by the lever arm or the sensor's scale first."
-    said = f"its unit {_short(unit)!r} is not known" if unit else "its unit is not said"
+    said = f"its unit {short(unit)!r} is not known" if unit else "its unit is not said"
     if unit and unit_factor(target, unit) is not None:
-        said = f"below it stands {_short(unit)!r}"
-    return BadRecord(f"column {_short(name)!r} is taken for {target}, but {said}", place=place, fix=fix)
+        said = f"below it stands {short(unit)!r}"
+    return BadRecord(f"column {short(name)!r} is taken for {target}, but {said}", place=place, fix=fix)
 
 
-def _short(text: str) -> str:
+def short(text: str) -> str:
+    """A text as messages quote it."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}…"

@@ -19,7 +19,7 @@ import numpy as np
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns, join
 from stimrig.identify.records.assemble import record_of
-from stimrig.identify.records.cells import as_written
+from stimrig.identify.records.cells import as_written, is_number
 from stimrig.identify.records.columns import Column, Given
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
 from stimrig.identify.records.record import Record
@@ -31,7 +31,6 @@ MOST_BEFORE = 100
 BLANKS = " "
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", BLANKS: "blanks"}
 COMMENTS = ("#", "%", "//")
-PIECE_BYTES = 2**20
 Row = tuple[int, list[str]]
 
 
@@ -55,7 +54,7 @@ def encoding_of(content: bytes, name: str) -> tuple[str, str]:
 
 
 def _is_utf8(content: bytes) -> bool:
-    pieces = (content[start : start + PIECE_BYTES] for start in range(0, len(content), PIECE_BYTES))
+    pieces = (content[start : start + bounds.PIECE_BYTES] for start in range(0, len(content), bounds.PIECE_BYTES))
     try:
         for _ in codecs.iterdecode(pieces, "utf-8"):
             pass
@@ -221,15 +220,6 @@ def _is_word(cell: str) -> bool:
     return bool(cell) and not is_number(cell.replace(",", "."))
 
 
-def is_number(cell: str) -> bool:
-    """Whether a cell is a number as a measuring tool writes it: no digits of other scripts, no underscores."""
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return cell.isascii() and "_" not in cell
-
-
 BLOCK = 4096
 CUT = "Every row needs every column; was the file cut off?"
 MISSING = {"", "nan", "na", "n/a", "n.a.", "#n/a", "#nv", "null", "none", "-", "--"}
@@ -321,7 +311,7 @@ class Table:
         if found.factor != 1.0:
             values *= found.factor
         if (bad := bounds.wrong_rows(column, values)).size:
-            shown = _show_cell(cells[bad[0]].strip())
+            shown = columns.short(cells[bad[0]].strip())
             fix = "Remove the row's cause, or cut the record before it; values must be finite."
             fix = bounds.fix_of(column, values[bad], fix)
             message = f"{shown} is no measurement" if shown else "empty"
@@ -338,7 +328,7 @@ class Table:
                 continue
             cell, line = next(pair for pair in zip(cells, lines, strict=True) if sign in pair[0])
             other = f"after numbers with a decimal {'comma' if sign == '.' else 'point'}"
-            message = f"{_show_cell(cell)!r} {other if self.decimal else 'between separating commas'}"
+            message = f"{columns.short(cell)!r} {other if self.decimal else 'between separating commas'}"
             fix = "Write all numbers with a decimal point, without signs between thousands."
             raise BadRecord(message, place=self.at(line, column), fix=fix)
 
@@ -348,7 +338,7 @@ class Table:
             return np.nan
         if is_number(cell):
             return float(cell)
-        message, fix = f"{_show_cell(cell)!r} is no number", "Give a number with a decimal point."
+        message, fix = f"{columns.short(cell)!r} is no number", "Give a number with a decimal point."
         raise BadRecord(message, place=self.at(line, column), fix=fix)
 
     def _new_name(self, text: str, line: int) -> int:
@@ -364,10 +354,6 @@ class Table:
     def at(self, line: int, column: str) -> str:
         """How messages call a cell."""
         return f"{self.name}, line {line}, column {column}"
-
-
-def _show_cell(cell: str) -> str:
-    return cell if len(cell) <= 40 else f"{cell[:40]}…"
 
 
 def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None, given: Given) -> Record:

@@ -15,7 +15,7 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
-from stimrig.identify.records.cells import quoted
+from stimrig.identify.records.cells import is_number, quoted
 from stimrig.identify.records.clock import pulse_phase_s
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, check_widths
 from stimrig.identify.records.record import NEEDED, OPTIONAL, Part, Pulses, Record, Source, joined_source
@@ -81,9 +81,8 @@ def read_joined(found: FileContent, cells: Mapping[int, Mapping[str, str]], puls
             raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=FIX)
     check_widths(found)
     _check_time(found, list(cells))
-    parts, sources, rates = zip(
-        *(_part(found, number, *cell) for number, cell in enumerate(cells.items())), strict=True
-    )
+    described = (_part(found, number, *cell) for number, cell in enumerate(cells.items()))
+    parts, sources, rates = zip(*described, strict=True)
     if len(set(rates)) > 1:
         raise BadRecord("parts of different pulse rates", place=f"{found.name}, column pulse_rate_hz", fix=FIX)
     time_s = found.columns["time_s"]
@@ -117,11 +116,8 @@ def _part(found: FileContent, number: int, row: int, texts: Mapping[str, str]) -
         text = texts.get(column, "")
         if not text:
             return None
-        try:
-            value = float(text)
-        except ValueError:
-            value = np.nan
-        if not (text.isascii() and "_" not in text and lowest <= value <= highest):
+        value = float(text) if is_number(text) else np.nan
+        if not lowest <= value <= highest:
             message = f"{text[:40]!r} is not {lowest:g} to {highest:g}"
             raise BadRecord(message, place=found.at(row, column), fix=FIX)
         return value
