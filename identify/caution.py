@@ -34,10 +34,8 @@ def caution(found: Mapping[str, Any]) -> str:
     if found["verdict"] != "nothing_missing":
         return ""
     best = only_open(found)
-    return _beyond_noise(found) if best is None else _open(best)
-
-
-def _open(best: Mapping[str, Any]) -> str:
+    if best is None:
+        return _beyond_noise(found)
     return (
         f"{best['effect']}: log evidence would rise by {best['log_evidence_gain']:.0f} with it, too little to name it "
         "and too much to exclude it. This record cannot tell whether it is missing."

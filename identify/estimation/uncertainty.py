@@ -20,9 +20,9 @@ from stimrig.identify.estimation.rests import RELAXED_S, since_pulse
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Basis
+from stimrig.identify.simulation.joint_surface import POINTWISE
 from stimrig.identify.simulation.predict import same_data, slopes, unforeseen
 
-POINTWISE = 1.959964
 BLOCK_S = 3.0
 """Longer than a contraction's rise: within a block, what is wrong stays wrong."""
 NEGLIGIBLE = 1e-4

@@ -59,19 +59,17 @@ def best_demand(
         Largest rise of the demand to each pulse from the one before, N·m; the first from 0.
     """
     size = target_nm.size
-    scale = largest_nm
     A, B = Banded(a, size), Banded(b, size)
     bend = Banded(np.convolve(a, [1.0, -2.0, 1.0]), size)
-    bands = max(len(a) + 2, int(np.ptp(B.used)) + 1 if B.used else 1)
-    bands = min(bands, size)
+    bands = min(max(len(a) + 2, int(np.ptp(B.used)) + 1 if B.used else 1), size)
     smooth = np.full(size, BEND)
     smooth[:2] = 0.0  # the first pulse may begin anywhere
     P = B.gram(np.ones(size), bands) + bend.gram(smooth, bands) + A.gram(np.full(size, RIDGE), bands)
-    q = -B.transposed(target_nm / scale)
+    q = -B.transposed(target_nm / largest_nm)
     sides = [(A, 1.0, np.ones(size)), (A, -1.0, np.zeros(size))]
     if rise_nm is not None:
-        sides.append((Banded(np.convolve(a, [1.0, -1.0]), size), 1.0, rise_nm / scale))
-    return np.clip(scale * A(_Programme(P, q, sides, bands).solve()), 0.0, scale)
+        sides.append((Banded(np.convolve(a, [1.0, -1.0]), size), 1.0, rise_nm / largest_nm))
+    return np.clip(largest_nm * A(_Programme(P, q, sides, bands).solve()), 0.0, largest_nm)
 
 
 class _Programme:
