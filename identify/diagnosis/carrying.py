@@ -114,16 +114,8 @@ class Judged:
 def still_needed(plain: Fitted, model: Model, raw: Raw, say: Progress) -> tuple[Fitted, dict[str, Judged]]:
     """The plain model with those effects of an earlier one that the record asks for, and the verdict on each.
 
-    Parameters
-    ----------
-    plain : Fitted
-        The plain structure on the new record.
-    model : Model
-        The earlier model. It lends its effects and their forms.
-    raw : Raw
-        What the samples of the new record show before any fit.
-    say : callable
-        Called with the share done and a line of text.
+    `plain` is the plain structure on the new record, `raw` what its samples show before any fit; `model`, the earlier
+    one, lends its effects and their forms.
     """
     judged: dict[str, Judged] = {}
     full = _add_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))

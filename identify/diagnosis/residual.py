@@ -37,15 +37,7 @@ class ResidualStructure:
 
 
 def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
-    """Compare a model's residual at work and at rest.
-
-    Parameters
-    ----------
-    fitted : Fitted
-        The model.
-    quiet : ndarray of bool, shape (K,)
-        Intervals in which the muscle rests.
-    """
+    """Compare a model's residual at work and at rest: `quiet`, bool, shape (K,), are intervals in which it rests."""
     setup = fitted.problem.setup
     residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
     white = max(setup.grid.mean_noise_nm(setup.fitted), 1e-6 * setup.scale_nm)
@@ -123,20 +115,14 @@ class HeldOutError:
 
 
 def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | None = None) -> HeldOutError | None:
-    """The error on the held-out intervals; None if there are too few, or if there is a tremor.
+    """The error of a model on the held-out intervals; None if there are too few, or if there is a tremor.
 
     Only rows count whose pulse widths, and those of the seconds before, are near fitted ones: elsewhere the recruitment
     curve is a guess. Efforts cannot be predicted, but they are rare: if one of the models has one, the median of the
     error counts instead of its root mean square.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The model.
-    form : float
-        Error allowed because the model's form is inexact, as a share of the largest torque.
-    beside : Fitted or None
-        A model that this one is compared with.
+    `form` is the error allowed because the model's form is inexact, as a share of the largest torque, `beside` a model
+    that this one is compared with.
     """
     setup = fitted.problem.setup
     rows = np.isfinite(hold_out(fitted).error_nm)

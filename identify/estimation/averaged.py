@@ -44,12 +44,7 @@ class Averaged(Fitted):
 def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
     """The solved problem of a fit by draws, in the parameters of `simulation.problem`.
 
-    Parameters
-    ----------
-    short : Short
-        The fit.
-    mean_of_draws : bool
-        The parameters are the mean of the draws; else the most probable ones.
+    These are the mean of the draws; without `mean_of_draws` the most probable ones.
     """
     setup = _setup(short)
     draws = _parameters(short, setup)

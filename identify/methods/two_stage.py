@@ -194,12 +194,8 @@ def choose_order(
 ) -> tuple[OutputError, list[str]]:
     """(l, n, d) with the smallest BIC among l = 1 … 3 poles, n = l - 1 zeros and a few delays, with the reasons.
 
-    Parameters
-    ----------
-    torque, drive, rows : ndarray, shape (K,)
-        As for `output_error`.
-    earliest : int
-        Smallest possible delay: 1 for a sample taken at the pulse, 0 for means over the interval.
+    `earliest` is the smallest possible delay: 1 for a sample taken at the pulse, 0 for means over the interval; the
+    rest is as for `output_error`.
     """
     tried: dict[tuple[int, int, int], OutputError] = {}
     for poles in (1, 2, 3):
@@ -260,14 +256,8 @@ def physical(
 ) -> tuple[Solution, list[str]]:
     """Two stages with the linear part in physical terms.
 
-    Parameters
-    ----------
-    grid : Grid
-        The record.
-    prbs, ramp : ndarray of bool, shape (K,)
-        Rows for the dynamics and for the recruitment.
-    iterations, knots : int
-        See `METHOD.options`.
+    `prbs` and `ramp`, bool, shape (K,), are the rows for the dynamics and for the recruitment; of `iterations` and
+    `knots` see `METHOD.options`.
     """
     largest = float(np.max(grid.pulse_width_us))
     # Two levels only, so f can be taken as a straight line through both (15).
