@@ -15,7 +15,9 @@ from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import search, thresholds
 from stimrig.identify.diagnosis.residual import vetoed
 from stimrig.identify.diagnosis.search import required_errors
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation import left_out
 from stimrig.identify.estimation.candidates import alike_rows, words
 from stimrig.identify.estimation.effect_fit import Candidate, fitted_with
 from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, hold_out, leave_out
@@ -42,6 +44,14 @@ def pair(old: list[float], new: list[float], floor_nm: float = 0.0, wander_nm: f
     shape = rng.standard_normal((len(old), 50))
     shape -= shape.mean(axis=1, keepdims=True)
     return [LeftOut((np.array(sd)[:, None] * shape + offset).ravel(), block, floor_nm, wander_nm) for sd in (old, new)]
+
+
+def test_many_short_bouts_are_joined():
+    """Each would be a fit of all others: time grew with the square of their number."""
+    widths = np.tile(np.r_[np.full(12, 250.0), np.zeros(48)], 120)
+    grid = make_grid(identify.Record.from_arrays(np.arange(widths.size) / 40.0, widths, widths))
+    numbers, rows = np.unique(blocks(grid, grid.fitted), return_counts=True)
+    assert 5 <= numbers.size <= 2 * left_out.PIECES and rows.min() >= 0.5 * widths.size / left_out.PIECES
 
 
 def test_blocks_are_whole_bouts_or_pieces_of_them_and_follow_from_the_pulses_alone(plain_record):

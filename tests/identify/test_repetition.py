@@ -85,6 +85,19 @@ def test_what_the_model_explains_of_what_repeats():
     assert of(record, 3.0 * shape)["explained_percent"] == 0.0
 
 
+def test_no_share_is_told_where_what_differs_may_hide_any_error():
+    """One of six bouts without torque: any model errs no more than such repeats do."""
+    rng = np.random.default_rng(20)
+    parts = parts_of(rng, 6)
+    record = simulated(parts, rng)
+    ends = np.cumsum([width.size for _, width in parts]) / 40.0
+    dead = (ends[4] < record.time_s) & (record.time_s < ends[6])
+    assert [parts[place][0] for place in (5, 6)] == ["ramp", "rest"]
+    found = of(record.with_torque(np.where(dead, 0.0, record.torque_nm)), 2.0)
+    assert found["found_by"] == "exact repeats" and found["explained_percent"] is None
+    assert "too much to tell a share" in repetition_words({"repetition": found})
+
+
 def test_offset_sign_scale_and_rate_change_nothing():
     parts = parts_of(np.random.default_rng(6), 4)
     record = simulated(parts, np.random.default_rng(7), 0.1)
@@ -144,7 +157,7 @@ def test_what_never_repeats_claims_nothing_exact():
     assert found["found_by"] == "estimate"
     assert found["repeats"] is None and found["held_out_rms_nm"] is None
     assert found["rms_nm"] == pytest.approx(WHITE_NM / 10**0.5, rel=0.2)
-    assert "about so much" in repetition_words(model.fit)
+    assert "so much is taken for" in repetition_words(model.fit)
     # A width for each pulse and no rest: nothing is known.
     widths = rng.uniform(0.0, 300.0, 2000)
     torque = QUICK.torque(widths, 100.0)
