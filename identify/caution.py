@@ -48,6 +48,6 @@ def _beyond_noise(found: Mapping[str, Any]) -> str:
     if error_nm is None or not error_nm > WITHIN_NOISE * noise_nm > 0.0:
         return ""
     return (
-        f"On rows that were not fitted the error is {error_nm / noise_nm:.1f} times the noise: this record is too "
-        "short or too poor to show whether something is missing. Record PRBS, ramp and validate."
+        f"On rows that were not fitted the error is {error_nm / noise_nm:.1f} times the noise, and no effect of the "
+        "library predicts them better. A longer record with PRBS, ramp and validate may show what is missing."
     )

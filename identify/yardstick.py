@@ -34,8 +34,8 @@ def _repeating(found: Mapping[str, Any] | None) -> list[str]:
         return ["Nothing repeats, and the record rests too little: what no model can foresee is not known."]
     if found["found_by"] == "estimate":
         lines = [
-            f"Nothing repeats exactly. At rest the model errs by {between} N·m in the mean of a pulse interval: so "
-            "much is taken for what no model can foresee."
+            f"Nothing repeats exactly. At rest the torque scatters by {between} N·m in the mean of a pulse interval: "
+            "so much at least no model can foresee."
         ]
         return [*lines, TOO_LARGE if share is None else f"The model explains {share:.1f} % of all other variance."]
     lines = [f"Between {found['repeats'] or 0.0:.3g} repeats of the same pulses the torque differs by {between} N·m."]

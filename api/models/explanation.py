@@ -114,8 +114,8 @@ def _nothing(
         return "unsure", untold, _("%(name)s explains too little to be named, and too much to be excluded. A longer "
                                    "test can decide.", name=name)  # fmt: skip
     if caution(diagnosis):
-        return "unsure", untold, _("It is too short or too poor to show it. Record random pulses, a ramp and a check "
-                                   "(segments prbs, ramp, validate).")  # fmt: skip
+        return "unsure", untold, _("Its error is larger than the noise, and no effect of the library predicts it "
+                                   "better. A longer test may show what is missing.")  # fmt: skip
     if leaves_structure or noisy(comparison or {}):
         title = _("No effect of the library has enough evidence in this recording")
         if effects:
@@ -340,13 +340,15 @@ def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> s
     """Why the recording does not ask for an effect; None where it does, or cannot tell it from one it asks for."""
     for entry in diagnosis.get("missing") or []:
         if entry["effect"] == effect:
-            return None
+            return entry.get("objection")
         if effect in (entry.get("confused_with") or []) and entry["effect"] not in present:
             return None
     rows = [row for rows in diagnosis.get("candidates") or [] for row in rows if row["effect"] == effect]
     if not rows:
         return "it was not tested on this recording: the recording lacks the columns that it needs."
     gain = rows[-1]["log_evidence_gain"]
+    if rows[-1].get("refusal"):
+        return rows[-1]["refusal"]
     if gain <= 0:
         return f"the recording speaks against it (log evidence {gain:+.1f})."
     better = [entry for entry in diagnosis.get("missing") or [] if entry["effect"] != effect]

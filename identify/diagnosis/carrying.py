@@ -192,11 +192,8 @@ def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted
 
 def rise(before: Fitted, after: Fitted) -> Reason | None:
     """The error on held-out rows as a reason if it rises; else None."""
-    errors = vetoed(before, after)
-    if errors is None:
-        return None
-    text = f"The error on held-out rows rises from {errors[0]:.3g} to {errors[1]:.3g} N·m."
-    return Reason("held-out-error", text)
+    objection = vetoed(before, after)
+    return objection and Reason("held-out-error", objection)
 
 
 def _undecided(verdict: Judged) -> Judged:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from stimrig.identify.diagnosis import structure_of
 from stimrig.identify.diagnosis.search import (
     MOST,
@@ -23,7 +21,7 @@ from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.left_out import Difference, difference
+from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
@@ -113,28 +111,14 @@ def _reason(search: EffectSearch, step: Step, before: Step) -> str:
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
     seen = difference(search.left_out[number], search.left_out[number + 1])
     reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
-    return " ".join([reason, _left_out(seen), *_rising(before.statistics, step.statistics)])
+    unasked = [] if find_effect(step.added).predictable else ["It cannot be foreseen: it need not predict."]
+    return " ".join([reason, seen.words, *unasked, *_rising(before.statistics, step.statistics)])
 
 
 def _rising(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
     """What is said where the error on held-out rows rises and does not speak against the effect."""
     rises = before["held_out_by"] == "validate" and after["held_out_rms_nm"] > RISE * before["held_out_rms_nm"]
     return ["On held-out rows the error rises, but not by more than its standard error."] if rises else []
-
-
-def _left_out(seen: Difference) -> str:
-    """What the error on left-out parts says of an effect, in words."""
-    percent, errors = 100.0 * abs(1.0 - np.exp(-seen.gain)), abs(seen.errors)
-    if seen.gain < 0.0:
-        return f"On parts left out of the fit the error rises by {percent:.0f} % ({errors:.1f} standard errors)."
-    return f"On parts left out of the fit the error falls by {percent:.0f} % ({errors:.1f} standard errors)."
-
-
-def _needed(errors: float) -> str:
-    """By how many standard errors the error on left-out parts had to fall, in words."""
-    if errors > 0.0:
-        return f"It must fall by {errors:g} of its standard errors at least."
-    return f"It may rise by {-errors:g} of its standard errors at most." if errors < 0.0 else "It must not rise."
 
 
 def refused(search: EffectSearch) -> list[dict[str, Any]]:
@@ -148,8 +132,8 @@ def refused(search: EffectSearch) -> list[dict[str, Any]]:
     for candidate in search.rounds[number]:
         if candidate.effect.id in present:
             continue
-        if candidate.refused is not None:
-            reason = f"{_left_out(candidate.refused)} {_needed(candidate.required)}"
+        if candidate.refusal is not None:
+            reason = candidate.refusal
         elif candidate.gain <= 0.0:
             reason = f"The evidence is against it: log evidence changes by {candidate.gain:+.1f}."
         elif candidate.gain < margin:

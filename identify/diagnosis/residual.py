@@ -139,8 +139,8 @@ def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | No
     return HeldOutError(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
 
 
-def vetoed(before: Fitted, after: Fitted) -> tuple[float, float] | None:
-    """Errors on held-out rows without and with an effect, N·m, where these rows speak against it; else None.
+def vetoed(before: Fitted, after: Fitted) -> str | None:
+    """What held-out rows say against an effect, in words; None where they do not.
 
     They speak against it where the error rises, and by more than its standard error over pieces of the rows. They
     never speak for one.
@@ -148,4 +148,5 @@ def vetoed(before: Fitted, after: Fitted) -> tuple[float, float] | None:
     old, new = hold_out(before), hold_out(after)
     if difference(old, new).errors > thresholds.VETO or not new.rms_nm > thresholds.RISE * old.rms_nm:
         return None
-    return old.rms_nm, new.rms_nm
+    errors = f"{old.rms_nm:.3g}", f"{new.rms_nm:.3g}"
+    return f"On held-out rows with fitted pulse widths the error would rise from {errors[0]} to {errors[1]} N·m."

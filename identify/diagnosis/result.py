@@ -68,9 +68,9 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
 
 
 def _ranked(search: EffectSearch, verdict: Verdict) -> list[str]:
-    """Effects by importance: those that the samples show, then by the log evidence lost without each."""
+    """Effects by probability, those that the samples show first; then by the log evidence lost without each."""
     return sorted(
-        verdict.found, key=lambda e: (e not in search.detected, -search.losses.get(e, 0.0), -verdict.found[e])
+        verdict.found, key=lambda e: (e not in search.detected, -verdict.found[e], -search.losses.get(e, 0.0))
     )
 
 
@@ -103,6 +103,7 @@ def _missing(
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
         "parameters": dict(list(own.items())[:MOST_PARAMETERS]),
+        "objection": verdict.objections.get(effect),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }
@@ -142,6 +143,7 @@ def _candidate(one: Candidate) -> dict[str, Any]:
         "log_evidence_gain": one.gain,
         "rms_nm": one.fitted.rms_nm,
         "forms": one.forms,
+        "refusal": one.refusal,
     }
 
 

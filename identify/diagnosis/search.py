@@ -471,15 +471,12 @@ def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
     """The steps up to the first that raises the error on held-out rows, and the effects refused for that reason."""
     row = steps(search)
     for number in range(1 + len(search.detected), len(row)):
-        errors = vetoed(row[number - 1].fitted, row[number].fitted)
-        if errors is None:
+        objection = vetoed(row[number - 1].fitted, row[number].fitted)
+        if objection is None:
             continue
         first = find_effect(str(row[number].added)).name
         reason = f"It was found beside another effect, against which held-out rows speak: {first}."
         against = [{"effect": step.added, "log_evidence_gain": None, "reason": reason} for step in row[number:]]
-        old, new = (f"{error:.3g}" for error in errors)
-        against[0]["reason"] = (
-            f"On held-out rows with fitted pulse widths the error would rise from {old} to {new} N·m."
-        )
+        against[0]["reason"] = objection
         return row[:number], against
     return row, []

@@ -26,6 +26,7 @@ class Verdict:
     probability: float  # of the verdict as a whole
     held_out_error: HeldOutError | None = None  # of the last model; None if held-out rows tell nothing
     notes: list[str] = field(default_factory=list)  # reasons, for people
+    objections: dict[str, str] = field(default_factory=dict)  # by effect: what held-out rows say against it
 
 
 def shares(candidates: list[Candidate], most: float = np.inf) -> dict[str, float]:
@@ -106,6 +107,7 @@ def judge(search: EffectSearch) -> Verdict:
     notes = [*([] if readings is None else [readings.words]), *doubts(last)]
     found: dict[str, float] = dict.fromkeys(search.detected, 0.99)
     rivals: dict[str, dict[str, float]] = {}
+    objections: dict[str, str] = {}
     rounds = [[c for c in tried if c.refused is None] for tried in search.rounds]
     for number, effect in enumerate(search.added):
         beside = [c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added]
@@ -117,7 +119,8 @@ def judge(search: EffectSearch) -> Verdict:
             found[effect] = min(found[effect], thresholds.REPAIR_PROBABILITY)
         if _only_at_work(search, number):
             found[effect] = min(found[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
-        if vetoed(search.chain[number], search.chain[number + 1]) is not None:
+        if objection := vetoed(search.chain[number], search.chain[number + 1]):
+            objections[effect] = objection
             found[effect] = min(found[effect], thresholds.DOUBTED)
             notes.append(f"The error on held-out rows rises with this effect: {find_effect(effect).name}.")
     structure = left.ratio
@@ -156,4 +159,5 @@ def judge(search: EffectSearch) -> Verdict:
         kind, probability = "effect_missing", max(found.values())
     else:
         kind, probability = "nothing_missing", _nothing(search.rounds[0] if search.rounds else [])
-    return Verdict(kind, found, rivals, float(explained), float(structure), float(probability), after, notes)
+    told = float(explained), float(structure), float(probability)
+    return Verdict(kind, found, rivals, *told, after, notes, objections)

@@ -148,7 +148,11 @@ class Earlier:
         return replace(prior, doubt=self._doubt(prior))
 
     def _doubt(self, prior: NearShape) -> np.ndarray | None:
-        """Covariance of the logs of the steps, from that of the last curve's coefficients."""
+        """Covariance of the logs of the steps, from that of the last curve's coefficients.
+
+        Where a step may as well be many times as large, as below the widths that were played, its logarithm has no
+        such covariance: there the prior's own doubt of the shape is all.
+        """
         known = self.model.covariance
         if known is None:
             return None
@@ -157,9 +161,9 @@ class Earlier:
         slopes = np.diff(own.design(np.minimum(prior.places_us, own.largest_us)), axis=0)
         covariance = slopes @ known.matrix[np.ix_(chosen, chosen)] @ slopes.T
         steps = np.exp(prior.log_steps(prior.mean))
-        size = np.maximum(prior.blurred(steps), np.sqrt(np.maximum(np.diag(covariance), 0.0)) / MOST_DOUBT)
-        size = np.maximum(size, 1e-9 * steps.sum())
-        return covariance / size[:, None] / size[None, :]
+        size = np.maximum(prior.blurred(steps), 1e-9 * steps.sum())
+        told = np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= MOST_DOUBT * size
+        return np.where(told[:, None] & told[None, :], covariance / size[:, None] / size[None, :], 0.0)
 
     def dynamics(self, delay_sd_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean and precision of (log T, log ζ, delay)."""

@@ -40,6 +40,18 @@ class Candidate:
     refused: Difference | None = None  # what left-out blocks say where they refuse it; None: not asked, or allowed
     required: float = 0.0  # standard errors by which the error on those blocks had to fall, where they refuse it
 
+    @property
+    def refusal(self) -> str | None:
+        """What left-out blocks say and what was required, in words; None of a candidate that they do not refuse."""
+        if self.refused is None:
+            return None
+        needed = "It must not rise."
+        if self.required > 0.0:
+            needed = f"It must fall by {self.required:g} of its standard errors at least."
+        elif self.required < 0.0:
+            needed = f"It may rise by {-self.required:g} of its standard errors at most."
+        return f"{self.refused.words} {needed}"
+
 
 def try_effect(
     effect: Effect, base: Fitted, forms: Iterable[Form] | None = None, least: float = WORTHLESS

@@ -123,7 +123,8 @@ def fit_statistics(
         Of fitted intervals where they are left out of the fit, N·m: see the function of that name.
     foreseen_nm : ndarray or None, shape (N,)
         Torque without what could not have been foreseen, N·m. By this the model is judged where rows are held out. What
-        it leaves out there (`unforeseen_nm`) counts as noise in the ceiling: it is known, and of no muscle.
+        it leaves out there (`unforeseen_nm`) counts as noise in the ceiling: it is known, and of no muscle. It is never
+        more than the error there leaves beside the noise: an effect that goes astray there excuses nothing.
     """
     record = grid.record
     measured = record.torque_nm
@@ -146,7 +147,8 @@ def fit_statistics(
         left_out = foreseen + held_out_change[grid.interval]
         held, by = (held, by) if held.any() else (used, "cross-validation")
     if held.any():
-        unforeseen = rms((predicted_nm - foreseen)[held])
+        beside_noise = rms((measured - left_out)[held]) ** 2 - sd_nm**2
+        unforeseen = min(rms((predicted_nm - foreseen)[held]), float(np.sqrt(max(beside_noise, 0.0))))
         result |= figures(measured[held], left_out[held], float(np.hypot(sd_nm, unforeseen)), "held_out_")
         result |= {"held_out_by": by, "held_out_samples": int(held.sum())}
         result |= {"unforeseen_nm": unforeseen} if unforeseen > 0.0 else {}

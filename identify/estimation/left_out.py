@@ -225,6 +225,14 @@ class Difference:
         """The gain in standard errors; 0 where hardly more than one block tells anything."""
         return self.gain / max(self.sd, 1e-9) if self.blocks > LEAST_BLOCKS else 0.0
 
+    @property
+    def words(self) -> str:
+        """What the error on left-out parts says of an effect."""
+        percent, errors = 100.0 * abs(1.0 - np.exp(-self.gain)), abs(self.errors)
+        if self.gain < 0.0:
+            return f"On parts left out of the fit the error rises by {percent:.0f} % ({errors:.1f} standard errors)."
+        return f"On parts left out of the fit the error falls by {percent:.0f} % ({errors:.1f} standard errors)."
+
 
 def difference(before: LeftOut, after: LeftOut) -> Difference:
     """Compare two models of one record, block by block of the second.

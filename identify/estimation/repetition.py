@@ -3,7 +3,8 @@
 Where the same pulse widths came several times (`dynamics/repeats.py`) the torque's variance between the repeats is what
 no model can take away whose output follows from the pulse widths of the last seconds. It holds noise, a wandering zero
 and the muscle's own whims; and slow changes such as fatigue, of which a model with an effect may explain a part. Where
-nothing repeats, the residual at rest stands for it, as an estimate: what varies only at work is not in it.
+nothing repeats, the scatter of the torque at rest stands for it, whatever the model: at least so much no model can
+foresee. What varies only at work, or from rest to rest, is not in it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.estimation.rests import scatter_at_rest, since_pulse
 from stimrig.identify.records.record import FORGOTTEN_S
 
 EXACT, ESTIMATE = "exact repeats", "estimate"
@@ -34,7 +36,8 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
     plain repetition predicts an interval of `validate` as the mean of the others of its group: from n - 1 of them it
     errs by √(1 + 1/(n-1)) s, if all vary alike. `explained_percent` is 100 (1 - (e² - s²) / v), between 0 and 100: e is
     the model's error, v the variance that repeats: that of the groups' means, less s²/n for their own error. Of
-    `validate` alone if enough of it repeats. In an estimate v is the variance of the torque less s².
+    `validate` alone if enough of it repeats. In an estimate s² is the torque's variance about straight lines in the
+    rests, and v is the variance of the torque less s².
 
     Parameters
     ----------
@@ -66,12 +69,13 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
         repeating = float(np.var(mean[group[at]]) - variance * np.mean(1.0 / size[group[at]]))
         found |= _plain_repetition(grid, error_nm, group, least)
     else:
-        memory = round(FORGOTTEN_S / grid.step_s)
-        rests = usable & ~grid.held_out & (np.convolve(grid.pulse_width_us > 0, np.ones(memory))[: grid.size] < 0.5)
+        lowest_us = float(grid.pulse_width_us.min())  # taken as rest where the width never becomes 0
+        rests = usable & ~grid.held_out & (grid.step_s * since_pulse(grid, lowest_us) >= FORGOTTEN_S)
         at = _unseen(grid, np.flatnonzero(usable & ~rests), least)
-        if rests.sum() < least or not at.size:
+        variance, free = scatter_at_rest(grid, rests, grid.torque_nm)
+        if free < least or not at.size:
             return dict(UNKNOWN)
-        variance, found = float(np.var(error_nm[rests])), UNKNOWN | {"found_by": ESTIMATE}
+        found = UNKNOWN | {"found_by": ESTIMATE}
         repeating = float(np.var(grid.torque_nm[at])) - variance
     model = float(np.mean(error_nm[at] ** 2))
     if repeating > LEAST_SHARE * float(np.var(grid.torque_nm[at])):

@@ -12,6 +12,8 @@ SLOW_S = 0.2
 """Time constant of a slow muscle: what it may still pull that long after its last pulse widens the zero's sd."""
 LEAST_SHARE = 0.05
 """The zero is not taken as better known than this share of the torque's range: a residual state may hold it up."""
+SHORT = 8
+"""Rests of no more intervals say nothing of the noise."""
 IDLE_SHARE = 0.1
 """Pulses of this share of the largest width are as good as none, where no rest without any lasts for two seconds."""
 
@@ -67,3 +69,11 @@ def since_pulse(grid: Grid, strongest_us: float = 0.0) -> np.ndarray:
     last = np.where(grid.pulse_width_us > strongest_us, at, -1)
     last[grid.starts] = np.maximum(last[grid.starts], grid.starts - 1)
     return at - np.maximum.accumulate(last)
+
+
+def scatter_at_rest(grid: Grid, rests: np.ndarray, values_nm: np.ndarray) -> tuple[float, int]:
+    """Variance of some values about a straight line in each rest, (N·m)², and from how many free rows; 0 from none."""
+    own = [rest for rest in grid.stretches(rests) if rest.stop - rest.start > SHORT]
+    left = [np.polyfit(grid.time_s[rest], values_nm[rest], 1, full=True)[1].sum() for rest in own]
+    free = sum(rest.stop - rest.start - 2 for rest in own)
+    return (float(sum(left)) / free if free else 0.0), free

@@ -16,7 +16,7 @@ from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.fit_statistics import held_out_change
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.rests import RELAXED_S, since_pulse
+from stimrig.identify.estimation.rests import RELAXED_S, scatter_at_rest, since_pulse
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Basis
@@ -27,8 +27,6 @@ BLOCK_S = 3.0
 """Longer than a contraction's rise: within a block, what is wrong stays wrong."""
 NEGLIGIBLE = 1e-4
 """Directions in which a change varies by less than this share of the largest are ignored."""
-SHORT = 8
-"""Rests of no more intervals say nothing of the noise."""
 EASED = 0.995
 """Share of the penalty that is removed to see how far it holds the curve back."""
 PLACES = 481
@@ -151,11 +149,9 @@ def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:
     if noise.is_white:
         return most, most * np.sqrt(2.0 / count)
     relaxed = rows & (grid.step_s * since_pulse(grid, 0.0) > RELAXED_S)
-    rests = [rest for rest in grid.stretches(relaxed) if rest.stop - rest.start > SHORT]
     least = setup.noise_sd_nm**2 / float(np.median(grid.count[rows]))
-    left = [np.polyfit(grid.time_s[rest], fitted.residual_nm[rest], 1, full=True)[1].sum() for rest in rests]
-    free = sum(rest.stop - rest.start - 2 for rest in rests)
-    found = float(np.clip(sum(left) / free, least, most)) if free else least
+    at_rest, free = scatter_at_rest(grid, relaxed, fitted.residual_nm)
+    found = float(np.clip(at_rest, least, most)) if free else least
     return found, found * float(np.sqrt(2.0 / count + 2.0 / max(single * free, 1.0)))
 
 

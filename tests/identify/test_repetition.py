@@ -157,7 +157,7 @@ def test_what_never_repeats_claims_nothing_exact():
     assert found["found_by"] == "estimate"
     assert found["repeats"] is None and found["held_out_rms_nm"] is None
     assert found["rms_nm"] == pytest.approx(WHITE_NM / 10**0.5, rel=0.2)
-    assert "so much is taken for" in repetition_words(model.fit)
+    assert "so much at least" in repetition_words(model.fit)
     # A width for each pulse and no rest: nothing is known.
     widths = rng.uniform(0.0, 300.0, 2000)
     torque = QUICK.torque(widths, 100.0)

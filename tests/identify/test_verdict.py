@@ -103,10 +103,10 @@ class Made:
         assert holder is self.work.chain[self.work.added.index(effect) + 1]
         return self.at_rest
 
-    def _rise(self, before: Any, after: Any) -> tuple[float, float] | None:
+    def _rise(self, before: Any, after: Any) -> str | None:
         number = self.work.chain.index(before)
         assert after is self.work.chain[number + 1]
-        return (1.0, 2.0) if number in self.rises else None
+        return "the error would rise" if number in self.rises else None
 
     def _unseen(self, fit: Any, form: float, beside: Any) -> HeldOutError | None:
         assert beside is self.work.last

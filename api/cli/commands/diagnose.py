@@ -50,10 +50,13 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
 
     base, verdict, doubt = found["base"], found["verdict"], caution(found)
     said = str(VERDICTS.get(verdict, verdict)).rstrip(".")
+    certainty = f" (probability {probability(found['probability'])})"
+    if doubt:
+        said, certainty = "This record cannot tell whether something is missing", ""
     if verdict == "effect_missing":
         said = said.replace(" is ", f" is {sure(found['probability'])} ", 1)
     lines = [
-        f"{said} (probability {probability(found['probability'])}).",
+        f"{said}{certainty}.",
         *([doubt] if doubt else []),
         "",
         f"structure      {in_words(found['structure'])}",
