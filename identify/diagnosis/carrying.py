@@ -193,7 +193,7 @@ def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted
 def rise(before: Fitted, after: Fitted) -> Reason | None:
     """The error on held-out rows as a reason if it rises; else None."""
     objection = vetoed(before, after)
-    return objection and Reason("held-out-error", objection)
+    return Reason("held-out-error", objection) if objection else None
 
 
 def _undecided(verdict: Judged) -> Judged:

@@ -23,7 +23,9 @@ from stimrig.identify.simulation.problem import Problem
 APART_S = 1.0
 """A pause that separates two bouts of stimulation; the zeros of a PRBS are shorter."""
 PIECES, LEAST_S = 10, 2.0
-"""A block has about this part of the rows at most, unless that is less than so many seconds; half of it at least."""
+"""A block has about this part of the rows at most, unless that is less than so many seconds."""
+MOST_BOUTS = 2 * PIECES
+"""Of more bouts neighbours are joined: each block is a fit."""
 START_S = 0.3
 """Rows after a start that stay in the fit: they alone tell the state that the record begins with."""
 NEAR = 0.02
@@ -62,13 +64,14 @@ def bouts(grid: Grid) -> np.ndarray:
 def blocks(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """The number of each interval's block, shape (K,); -1 where `rows` is false.
 
-    Whole bouts; short ones are joined, long ones cut into pieces of about equal numbers of rows. They depend on the
-    pulses alone, so that all models of a record share them.
+    Whole bouts; long ones are cut into pieces of about equal numbers of rows, and of very many neighbours are joined.
+    They depend on the pulses alone, so that all models of a record share them.
     """
     ends, count = np.r_[np.flatnonzero(np.diff(bouts(grid))) + 1, grid.size], np.r_[0, np.cumsum(rows)]
     piece, edges = max(count[-1] / PIECES, LEAST_S / grid.step_s), [0]
+    least = 0.5 * piece if ends.size > MOST_BOUTS else 0.0
     for end in ends.tolist():
-        if count[end] - count[edges[-1]] >= 0.5 * piece:
+        if count[end] - count[edges[-1]] >= least:
             edges.append(end)
     edges = [*edges[: max(len(edges) - 1, 1)], grid.size]
     found = [np.array(edges)]
