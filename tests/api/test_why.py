@@ -12,6 +12,7 @@ import h5py
 import httpx
 import pytest
 
+from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.hardware_sim import hidden_records
 from tests.api.conftest import Service, csrf, run_test, signed_in, soon, wait_done
@@ -260,6 +261,19 @@ def test_a_page_that_says_that_structure_is_left_does_not_say_that_it_is_noise()
     assert explanation.headline(diagnosis, [], quiet, [])["kind"] == "nothing"
     checked = explanation.headline(diagnosis, [], quiet, [], leaves_structure=True)
     assert checked["kind"] == "unsure" and checked["title"].startswith("No effect of the library has enough evidence")
+
+
+def test_what_left_out_or_held_out_rows_say_is_the_reason_at_every_door() -> None:
+    """Of an effect with log evidence 87 the page said that the evidence was too weak, and it added what rows of
+    `validate` objected to."""
+    tried = {"effect": "tremor", "log_evidence_gain": 86.8, "refusal": "The error rises."}
+    objected = {**FATIGUE, "objection": "On held-out rows the error would rise."}
+    diagnosis = {"missing": [objected], "candidates": [[tried]]}
+    assert explanation.refusal(diagnosis, [], "tremor") == "The error rises."
+    assert explanation.refusal(diagnosis, [], "fatigue") == "On held-out rows the error would rise."
+    with pytest.raises(ApiError, match="evidence"):
+        explanation.require_evidence(diagnosis, [], ["fatigue"])
+    assert explanation.refusal({"missing": [FATIGUE], "candidates": [[tried]]}, [], "fatigue") is None
 
 
 def test_only_what_is_likely_missing_is_advised() -> None:
