@@ -164,7 +164,7 @@ def _try_out(form: Form, where: str, path: Path | None) -> None:
         place = where if path is None else f"{_place(path, error)}, form {form.name!r}"
         raise BadEffect(f"apply fails: {in_one_line(error)}", place=place, fix=FIX) from error
     if found.shape not in ((1, ROWS), (1, 1)):
-        message = f"apply gives an array of shape {found.shape[1:]}, not one value for each of {ROWS} pulses"
+        message = f"apply gives {found.size} numbers, not one for each of {ROWS} pulses"
         raise BadEffect(message, place=where, fix=FIX)
     if not np.isfinite(found).all():
         raise BadEffect("apply gives numbers that are none", place=where, fix="Check it at the starting values.")
