@@ -292,6 +292,8 @@ def model_report(document: dict[str, Any]) -> list[str]:
         f"recruitment    threshold {number(curve['threshold_us'], 0)} µs (5 % of the rise), "
         f"plateau {number(curve['plateau_nm'])} N·m (95 % at {number(curve['saturation_us'], 0)} µs)"
     )
-    lines += [f"{'' if number else 'chosen':15}{reason}" for number, reason in enumerate(document["reasons"][1:])]
+    lines += [
+        f"{'' if number else 'chosen':15}{reason}" for number, reason in enumerate((document.get("reasons") or [])[1:])
+    ]
     lines.append(f"quality        {judged['verdict']}: {judged['words']}")
     return [*lines, *(f"               also: {reason}" for reason in judged["reasons"][1:])]
