@@ -73,7 +73,7 @@ def blocks(grid: Grid, rows: np.ndarray) -> np.ndarray:
     for end in ends.tolist():
         if count[end] - count[edges[-1]] >= least:
             edges.append(end)
-    edges = [*edges[: max(len(edges) - 1, 1)], grid.size]
+    edges = [*edges[: max(len(edges) - 1, 1)], grid.size]  # a short rest of the record belongs to the last block
     found = [np.array(edges)]
     for start, stop in pairwise(edges):
         pieces = max(round((count[stop] - count[start]) / piece), 1)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
-from stimrig.identify.estimation.rests import scatter_at_rest, since_pulse
+from stimrig.identify.estimation.rests import relaxed, scatter_at_rest
 from stimrig.identify.records.record import FORGOTTEN_S
 
 EXACT, ESTIMATE = "exact repeats", "estimate"
@@ -70,7 +70,7 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
         found |= _plain_repetition(grid, error_nm, group, least)
     else:
         lowest_us = float(grid.pulse_width_us.min())  # taken as rest where the width never becomes 0
-        rests = usable & ~grid.held_out & (grid.step_s * since_pulse(grid, lowest_us) >= FORGOTTEN_S)
+        rests = usable & ~grid.held_out & relaxed(grid, FORGOTTEN_S, lowest_us)
         at = _unseen(grid, np.flatnonzero(usable & ~rests), least)
         variance, free = scatter_at_rest(grid, rests, grid.torque_nm)
         if free < least or not at.size:

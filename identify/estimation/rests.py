@@ -58,9 +58,9 @@ def _level(torque_nm: np.ndarray, since_s: np.ndarray, rows: np.ndarray) -> tupl
     return level_nm, max(float(np.hypot(scatter_nm, share * (high_nm - low_nm))), 1e-9)
 
 
-def relaxed(grid: Grid, after_s: float) -> np.ndarray:
-    """bool, shape (K,): intervals that begin so long after the last pulse, s."""
-    return grid.step_s * since_pulse(grid) >= after_s
+def relaxed(grid: Grid, after_s: float, strongest_us: float = 0.0) -> np.ndarray:
+    """bool, shape (K,): intervals that begin so long, s, after the last pulse that is stronger."""
+    return grid.step_s * since_pulse(grid, strongest_us) >= after_s
 
 
 def since_pulse(grid: Grid, strongest_us: float = 0.0) -> np.ndarray:

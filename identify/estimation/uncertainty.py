@@ -116,7 +116,8 @@ def _below_played(fitted: Fitted, change: np.ndarray) -> np.ndarray:
     at_us = np.linspace(0.0, basis.largest_us, PLACES)
     design = basis.design(at_us)
     value = design @ change
-    return np.linalg.lstsq(design, np.where(at_us < first, np.clip(value, -most, most), value), rcond=None)[0]
+    held = np.where(at_us < first, np.clip(value, -most, most), value)
+    return change if np.array_equal(held, value) else np.linalg.lstsq(design, held, rcond=None)[0]
 
 
 def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
