@@ -49,5 +49,5 @@ def _beyond_noise(found: Mapping[str, Any]) -> str:
         return ""
     return (
         f"On rows that were not fitted the error is {error_nm / noise_nm:.1f} times the noise, and no effect of the "
-        "library predicts them better. A longer record with PRBS, ramp and validate may show what is missing."
+        "library has enough evidence. A longer record with PRBS, ramp and validate may show what is missing."
     )

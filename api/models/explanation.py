@@ -114,8 +114,8 @@ def _nothing(
         return "unsure", untold, _("%(name)s explains too little to be named, and too much to be excluded. A longer "
                                    "test can decide.", name=name)  # fmt: skip
     if caution(diagnosis):
-        return "unsure", untold, _("Its error is larger than the noise, and no effect of the library predicts it "
-                                   "better. A longer test may show what is missing.")  # fmt: skip
+        return "unsure", untold, _("Its error is larger than the noise, and no effect of the library has "
+                                   "enough evidence. A longer test may show what is missing.")  # fmt: skip
     if leaves_structure or noisy(comparison or {}):
         title = _("No effect of the library has enough evidence in this recording")
         if effects:
@@ -337,7 +337,10 @@ def require_evidence(diagnosis: dict[str, Any], present: Sequence[str], added: S
 
 
 def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> str | None:
-    """Why the recording does not ask for an effect; None where it does, or cannot tell it from one it asks for."""
+    """Why the recording does not ask for an effect; None where it does, or cannot tell it from one it asks for.
+
+    It speaks against one that it asks for where rows of `validate` object.
+    """
     for entry in diagnosis.get("missing") or []:
         if entry["effect"] == effect:
             return entry.get("objection")

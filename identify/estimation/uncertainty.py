@@ -30,6 +30,7 @@ NEGLIGIBLE = 1e-4
 EASED = 0.995
 """Share of the penalty that is removed to see how far it holds the curve back."""
 PLACES = 481
+"""Widths at which a change of the curve is looked at: several between any two knots."""
 DRAWS = 256
 POINTS = 41
 DYNAMICS = ("time_constant_s", "damping", "delay_s")

@@ -271,8 +271,9 @@ def test_what_left_out_or_held_out_rows_say_is_the_reason_at_every_door() -> Non
     diagnosis = {"missing": [objected], "candidates": [[tried]]}
     assert explanation.refusal(diagnosis, [], "tremor") == "The error rises."
     assert explanation.refusal(diagnosis, [], "fatigue") == "On held-out rows the error would rise."
-    with pytest.raises(ApiError, match="evidence"):
+    with pytest.raises(ApiError) as refused:
         explanation.require_evidence(diagnosis, [], ["fatigue"])
+    assert refused.value.detail.startswith("fatigue: On held-out rows the error would rise.")
     assert explanation.refusal({"missing": [FATIGUE], "candidates": [[tried]]}, [], "fatigue") is None
 
 
