@@ -264,6 +264,7 @@ def repetition_lines(fit: Mapping[str, Any]) -> list[str]:
 def model_report(document: dict[str, Any]) -> list[str]:
     """What a person reads off a model."""
     from stimrig.api.models import stored_model
+    from stimrig.identify.summary import one_line
 
     fit, judged = stored_model.figures(document), stored_model.quality(document)
     dynamics, curve = stored_model.dynamics(document), stored_model.recruitment(document)
@@ -292,8 +293,7 @@ def model_report(document: dict[str, Any]) -> list[str]:
         f"recruitment    threshold {number(curve['threshold_us'], 0)} µs (5 % of the rise), "
         f"plateau {number(curve['plateau_nm'])} N·m (95 % at {number(curve['saturation_us'], 0)} µs)"
     )
-    lines += [
-        f"{'' if number else 'chosen':15}{reason}" for number, reason in enumerate((document.get("reasons") or [])[1:])
-    ]
+    chosen = (document.get("reasons") or [])[1:]
+    lines += [f"{'' if number else 'chosen':15}{one_line(reason)}" for number, reason in enumerate(chosen)]
     lines.append(f"quality        {judged['verdict']}: {judged['words']}")
     return [*lines, *(f"               also: {reason}" for reason in judged["reasons"][1:])]

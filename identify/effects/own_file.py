@@ -120,6 +120,8 @@ def _check_form(form: Form, place: str, path: Path | None) -> None:
         raise BadEffect(f"two parameters are called {twice[0]!r}", place=where, fix="Name each parameter once.")
     for parameter in form.parameters:
         _check_parameter(parameter, where)
+    if not isinstance(form.law, dict):
+        raise BadEffect(f"law is a {type(form.law).__name__}", place=where, fix="Give a dictionary, or leave it out.")
     for name, pair in form.law.items():
         if name not in names or not (isinstance(pair, tuple) and [*map(type, pair)] == [Lag, SpeedLaw]):
             fix = "Give law={parameter: (Lag, SpeedLaw)}, both from stimrig.identify.dynamics.variable_speed."

@@ -135,6 +135,7 @@ def told(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> str:
         ("EFFECT = Effect(", "EFFECT = dict(", "EFFECT is a dict, not an Effect"),
         ("        apply=swing,\n", "", "no apply"),
         ("    return torque_nm * (1", "    return torque_nm, (1", "apply gives 160 numbers, not one for each of 80"),
+        ("apply=swing", "law=[1]", "law is a list. Give a dictionary, or leave it out."),
         ("apply=swing", 'law={"period_s": 5}', "law 'period_s': 5. Give law={parameter: (Lag, SpeedLaw)}"),
     ],
 )
