@@ -29,16 +29,17 @@ def _unforeseen(left_nm: float | None) -> list[str]:
 def _repeating(found: Mapping[str, Any] | None) -> list[str]:
     if not found:
         return []
-    share, between = found["explained_percent"], f"{found['rms_nm'] or 0.0:.3g}"
-    if found["found_by"] is None:
+    needed = ("rms_nm",) if found["found_by"] == "estimate" else ("found_by", "rms_nm", "repeats")
+    if None in map(found.get, needed):
         return ["Nothing repeats, and the record rests too little: what no model can foresee is not known."]
+    share, between = found["explained_percent"], f"{found['rms_nm']:.3g}"
     if found["found_by"] == "estimate":
         lines = [
             f"Nothing repeats exactly. At rest the torque scatters by {between} N·m in the mean of a pulse interval: "
             "so much at least no model can foresee."
         ]
         return [*lines, TOO_LARGE if share is None else f"The model explains {share:.1f} % of all other variance."]
-    lines = [f"Between {found['repeats'] or 0.0:.3g} repeats of the same pulses the torque differs by {between} N·m."]
+    lines = [f"Between {found['repeats']:.3g} repeats of the same pulses the torque differs by {between} N·m."]
     lines.append(TOO_LARGE if share is None else f"The model explains {share:.1f} % of the variance that repeats.")
     errors = [found["held_out_rms_nm"], found["held_out_model_rms_nm"]]
     if None not in errors:
