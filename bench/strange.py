@@ -1,6 +1,6 @@
 """What is learnt of muscles that no library holds, and of records as they are: error on what no fit was given.
 
-    python -m bench.strange --set physics|further|arms|idle|sealed|plain --seeds 1000:1004 [--nudge] [--processor]
+    python -m bench.strange --set physics|further|places|arms|idle|sealed|plain --seeds 1000:1004 [--nudge]
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. Of `sealed` only sums are told: nobody who tunes should
 learn what is in it. Errors are over the noise's standard deviation, on a second record of the muscle that no fit was

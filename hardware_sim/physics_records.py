@@ -8,28 +8,21 @@ noise-free torque. Seeds take the kinds of a set in turn. Seeds 0 to 99 are for 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from stimrig.hardware_sim.hidden.base import Base, draw_base, recruit
-from stimrig.hardware_sim.hidden.chain import Chain, simulate
+from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, Design, levels, make_design
-from stimrig.hardware_sim.hidden.kernels import Floats, Stage
-from stimrig.hardware_sim.hidden.physics import FURTHER, PHYSICS, Mechanism
-from stimrig.hardware_sim.hidden.physics_held_back import SEALED
+from stimrig.hardware_sim.hidden.kernels import Floats
+from stimrig.hardware_sim.hidden.other_physics import SETS, SIMULATION_HZ, PhysicsMuscle, draw_muscle
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
-SETS: dict[str, dict[str, Mechanism]] = {"physics": PHYSICS, "further": FURTHER, "sealed": SEALED, "plain": {}}
-"""Kinds of muscles; those of `plain` are of the library's own structure, and lack nothing."""
 DISTURBED = {"hum": "mains_hum", "slow zero": "baseline_drift", "breath": ""}
 """What may lie over a record, and the library's name of it, where it has one."""
 NOISE_SD_NM = 0.05
-RATE_HZ, SIMULATION_HZ = 400, 1600
+RATE_HZ = 400
 UNSEEN_S = 22.0
-STRENGTH = 0.6
-"""Largest torque over that of a drawn plain muscle: 1.8 to 9 N·m."""
 
 
 def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -50,52 +43,40 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     dict
         `time_s`, `pulse_width_us`, `torque_nm`, `segment`, shape (n,), at 400 Hz; `unseen`, the same columns of the
         second record, whose torque has neither noise nor zero; `truth`: `kind`, `numbers`, `true` (names that are no
-        mistake), `disturbed`, `noise_sd_nm`.
+        mistake), `enters` and `driven_by` (right answers to where the muscle departs from the plain structure, and by
+        what; none of `plain`), `disturbed`, `noise_sd_nm`.
 
     Raises
     ------
     ValueError
         No such set or disturbance.
     """
-    if kinds not in SETS:
-        raise ValueError(f"set {kinds!r}: one of {', '.join(SETS)}")
     rng = rng_of(seed, "physics", kinds)
-    base = draw_base(rng)
-    names = list(SETS[kinds])
-    name = names[seed % len(names)] if names else "plain"
-    stages, numbers = base.stages(), {}
-    if names:
-        mechanism = SETS[kinds][name]
-        numbers = mechanism.draw(rng, base)
-        stages = _scaled(base, mechanism, tuple(numbers.values()))
-    top_us = float(base.largest_width_us)
+    muscle = draw_muscle(kinds, seed, rng)
+    top_us = float(muscle.base.largest_width_us)
     design = make_design("full", rng, top_us)
-    made = _columns(design, base, stages)
+    made = _columns(design, muscle)
     chance = rng.random(2)
     over = disturbed if disturbed is not None else _which(kinds, seed, chance)
     made["torque_nm"] = made["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, made["torque_nm"].size)
     for one in over:
         made["torque_nm"] += disturbance_nm(one, seed, made["time_s"])
-    truth = {"kind": name, "seed": seed, "numbers": numbers, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
-    truth["true"] = sorted({*(SETS[kinds][name].true if names else ()), *(DISTURBED[one] for one in over)} - {""})
-    return made | {"unseen": _columns(unseen_design(seed, top_us), base, stages), "truth": truth}
+    told = _truth(kinds, muscle) | {"seed": seed, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
+    told["true"] = sorted({*told["true"], *(DISTURBED[one] for one in over)} - {""})
+    return made | {"unseen": _columns(unseen_design(seed, top_us), muscle), "truth": told}
+
+
+def _truth(kinds: str, muscle: PhysicsMuscle) -> dict[str, Any]:
+    """What is right to say of the muscle alone."""
+    kind = SETS[kinds].get(muscle.kind)
+    right = {key: sorted(getattr(kind, key)) if kind else [] for key in ("true", "enters", "driven_by")}
+    return {"kind": muscle.kind, "numbers": muscle.numbers} | right
 
 
 def _which(kinds: str, seed: int, chance: Floats) -> tuple[str, ...]:
     if kinds == "plain":
         return (*((one,) for one in DISTURBED), tuple(DISTURBED))[seed % (len(DISTURBED) + 1)]
     return tuple(one for one, drawn in zip(("hum", "slow zero"), chance, strict=True) if drawn < 1.0 / 3.0)
-
-
-def _scaled(base: Base, mechanism: Mechanism, numbers: tuple[float, ...]) -> list[Stage]:
-    """Recruitment and mechanism, such that a fresh train of the largest pulses reaches this share of the largest."""
-    count = 3 * SIMULATION_HZ
-    width_us, pulse, still = np.full(count, float(base.largest_width_us)), np.zeros(count), np.zeros(count)
-    pulse[:: SIMULATION_HZ // PULSES_PER_S] = 1.0
-    stage = Stage(mechanism.kernel, (1.0, *numbers))
-    chain = Chain([Stage(recruit, base.table_nm), stage], base.largest_nm, 1.0 / SIMULATION_HZ)
-    most_nm = float(np.max(chain.run(width_us, pulse, still, still)))
-    return [Stage(recruit, base.table_nm), replace(stage, parameters=(STRENGTH * base.largest_nm / most_nm, *numbers))]
 
 
 def unseen_design(seed: int, top_us: float) -> Design:
@@ -108,9 +89,9 @@ def unseen_design(seed: int, top_us: float) -> Design:
     return Design(width, np.full(width.size, "validate", "U12"))
 
 
-def _columns(design: Design, base: Base, stages: list[Stage]) -> dict[str, Any]:
+def _columns(design: Design, muscle: PhysicsMuscle) -> dict[str, Any]:
     """The columns of the muscle's record of this design, without noise."""
-    torque = simulate(base, stages, design, 1.0 / SIMULATION_HZ)[:: SIMULATION_HZ // RATE_HZ]
+    torque = simulate(muscle.base, muscle.stages(), design, 1.0 / SIMULATION_HZ)[:: SIMULATION_HZ // RATE_HZ]
     repeated = RATE_HZ // PULSES_PER_S
     return {
         "time_s": np.arange(torque.size) / RATE_HZ,

@@ -1,50 +1,18 @@
 """Muscles of other physics than recruitment and second-order dynamics: whole mechanisms, not effects on a plain muscle.
 
-Each is one kernel between the recruited torque (a share of the largest, pulse by pulse) and the torque, with its draws
-and the names that a diagnosis may give it without being wrong. `PHYSICS` are those of the yardstick, `FURTHER` come
-from elsewhere in the literature. Nothing here is fitted to a measured muscle: numbers lie about those of the papers,
-slowed where a whole arm is slower than a fibre.
+`PHYSICS` are those of the yardstick, `FURTHER` come from elsewhere in the literature; `physics_places` has those of
+other places than the muscle. Nothing here is fitted to a measured muscle: numbers lie about those of the papers, slowed
+where a whole arm is slower than a fibre.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
-from numpy.random import Generator
-
-from stimrig.hardware_sim.hidden.base import Base, lag_after
-from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US, Kernel, helper, kernel
-
-
-@dataclass(frozen=True)
-class Mechanism:
-    """A kernel whose p[0] scales its torque, p[1:] are drawn between bounds (log-uniform where both are positive).
-
-    `true` are the effects of a library that are in it by its equations; another name is untrue.
-    """
-
-    kernel: Kernel
-    source: str
-    draws: Mapping[str, tuple[float, float]]
-    true: frozenset[str] = field(default_factory=frozenset)
-
-    def draw(self, rng: Generator, base: Base) -> dict[str, float]:
-        """Its numbers; a draw whose name ends in `_us_share` is between the widths of 10 and of 90 % recruitment."""
-        low_us, high_us = base.rise_us()
-        found = {}
-        for name, (low, high) in self.draws.items():
-            value = math.exp(rng.uniform(math.log(low), math.log(high))) if low > 0.0 else rng.uniform(low, high)
-            found[name] = float(low_us + value * (high_us - low_us) if name.endswith("_us_share") else value)
-        return found
-
-
-def mechanism(source: str, true: str, **draws: tuple[float, float]) -> Callable[[Callable[..., float]], Mechanism]:
-    """Make a function the kernel of a mechanism."""
-    return lambda function: Mechanism(kernel("dynamics")(function), source, draws, frozenset(true.split()))
-
+from stimrig.hardware_sim.hidden.base import lag_after
+from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US, helper
+from stimrig.hardware_sim.hidden.mechanism import mechanism
 
 _ding: Any = {
     "calcium_s": (0.011, 0.03),
@@ -74,6 +42,8 @@ def calcium_of(p: Any, s: Any, c: Any) -> float:
 @mechanism(
     "Ding, Wexler and Binder-Macleod 2003; recruitment 2007",
     "catch_like asymmetric_relaxation activation_dependent_speed",
+    "drive, rate of rise, rate of fall",
+    "activation, time since",
     **_ding,
 )
 def ding(x, p, s, c):
@@ -89,6 +59,8 @@ def ding(x, p, s, c):
 @mechanism(
     "Ding, Wexler and Binder-Macleod 2003, with fatigue of A, τ1 and Km",
     "catch_like asymmetric_relaxation activation_dependent_speed fatigue",
+    "drive, rate of rise, rate of fall",
+    "activation, time since, sum of the past",
     **_ding,
     loss=(0.25, 0.7),
     slowing=(0.1, 0.8),
@@ -123,6 +95,8 @@ def lengthening(tension: float, active: float, fastest: float, curved: float) ->
 @mechanism(
     "Hill 1938 with a series spring that stiffens; activation as in Winters and Thelen",
     "asymmetric_relaxation series_compliance activation_dependent_speed",
+    "rate of rise, rate of fall",
+    "activation, torque",
     rise_s=(0.02, 0.08),
     fall_s=(0.05, 0.2),
     fastest_per_s=(1.0, 4.0),
@@ -145,6 +119,8 @@ def hill_series(x, p, s, c):
 @mechanism(
     "fast fibres that tire beside slow ones that hardly do, each with thresholds of its own; Burke 1973",
     "mixed_fibres fatigue",
+    "drive, rate of rise, rate of fall",
+    "width, activation, sum of the past",
     share=(0.35, 0.65),
     fast_s=(0.04, 0.09),
     slow_s=(0.15, 0.35),
@@ -178,6 +154,8 @@ def two_populations(x, p, s, c):
 @mechanism(
     "Huxley 1957, bridges over their strain, against a series spring; activation by two lags",
     "asymmetric_relaxation series_compliance activation_dependent_speed",
+    "rate of rise, rate of fall",
+    "activation, torque",
     activation_s=(0.02, 0.07),
     attach_per_s=(10.0, 40.0),
     detach_per_s=(6.0, 20.0),
@@ -220,6 +198,8 @@ def huxley(x, p, s, c):
 @mechanism(
     "a pool of 40 units, small ones slow: twitches that fuse by their own time, sag of the fast; Fuglevand 1993",
     "mixed_fibres catch_like asymmetric_relaxation",
+    "drive, rate of rise, rate of fall",
+    "width, activation, time since",
     sizes=(5.0, 40.0),
     fastest_s=(0.03, 0.06),
     slower_by=(2.0, 4.0),
@@ -258,6 +238,8 @@ def unit_pool(x, p, s, c):
 @mechanism(
     "a viscoelastic tendon that is slack at rest, behind a second-order muscle; Zajac 1989",
     "series_compliance electromechanical_delay asymmetric_relaxation",
+    "rate of rise, rate of fall, output",
+    "torque",
     active_s=(0.04, 0.12),
     slack=(0.1, 0.6),
     stretch=(0.2, 0.8),
@@ -285,6 +267,8 @@ def slack_tendon(x, p, s, c):
 @mechanism(
     "calcium bound by troponin and, slowly, by parvalbumin, which fills in a train; Baylor and Hollingworth 1998",
     "asymmetric_relaxation potentiation catch_like",
+    "drive, rate of fall",
+    "time since, sum of the past",
     pump_s=(0.008, 0.03),
     troponin_per_s=(60.0, 200.0),
     parvalbumin=(0.5, 3.0),
@@ -316,6 +300,8 @@ def two_buffers(x, p, s, c):
 @mechanism(
     "bridges that hold the filament open: attachment grows with force, detachment falls; Campbell 1997",
     "activation_dependent_speed asymmetric_relaxation",
+    "rate of rise, rate of fall",
+    "activation, torque",
     activation_s=(0.02, 0.06),
     on_per_s=(3.0, 10.0),
     off_per_s=(8.0, 25.0),

@@ -1,0 +1,116 @@
+"""Muscles whose departure from the plain structure lies elsewhere than in the muscle: spinal cord, electrode, fixture.
+
+As `physics`; the muscle itself is two lags.
+"""
+
+from __future__ import annotations
+
+import math
+
+from stimrig.hardware_sim.hidden.base import lag_after
+from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, helper
+from stimrig.hardware_sim.hidden.mechanism import mechanism
+
+_muscle = {"first_s": (0.03, 0.08), "second_s": (0.08, 0.25)}
+
+
+@helper
+def two_lags(drive, p, s, c):
+    """The muscle of all here: p[1], p[2] its time constants, s[0], s[1] its state."""
+    before = s[0]
+    s[0] = lag_after(drive, drive, before, p[1], c[STEP_S])
+    s[1] = lag_after(before, s[0], s[1], p[2], c[STEP_S])
+    return s[1]
+
+
+@helper
+def share_above(width_us, half_us, spread_us):
+    """Share of axons that a pulse of this width reaches: a logistic curve; none without a pulse."""
+    return 1.0 / (1.0 + math.exp(-(width_us - half_us) / spread_us)) if width_us > 0.0 else 0.0
+
+
+@mechanism(
+    "wide pulses reach sensory axons, whose motoneurons go on by plateau potentials that warm up: Dean, Yates and"
+    " Collins 2007; Bennett and others 1998",
+    "recruitment_hysteresis mixed_fibres potentiation asymmetric_relaxation",
+    "drive, rate of fall",
+    "width, sum of the past",
+    **_muscle,
+    central=(0.25, 0.5),
+    afferents_at_us_share=(0.3, 0.9),
+    spread_us=(8.0, 30.0),
+    volley_s=(0.05, 0.2),
+    persists=(0.6, 1.2),
+    warms_s=(0.8, 2.5),
+)
+def central_plateau(x, p, s, c):
+    """p: scale, τ s twice, central share, width at half of the afferents µs, spread µs, volley s, persistence, warms s.
+
+    s: two lags, volley, warmth; s[10:30]: plateau of each of 20 motoneurons, 0 or 1 at rest. A plateau holds itself
+    while persistence × warmth exceeds what its motoneuron needs; warmth follows the volley, and so it ends.
+    """
+    count, central, step = 20, 0.0, c[STEP_S]
+    s[2] += (share_above(c[WIDTH_US], p[4], p[5]) - s[2]) * (1.0 - math.exp(-step / p[6]))
+    s[3] += (s[2] - s[3]) * (1.0 - math.exp(-step / p[8]))
+    for k in range(count):
+        needs = 0.2 + 0.65 * k / (count - 1.0)
+        excess = s[2] + p[7] * s[3] * s[10 + k] - needs
+        target = min(max(0.5 + excess / 0.08, 0.0), 1.0)
+        s[10 + k] += (target - s[10 + k]) * (1.0 - math.exp(-step / 0.05))
+        central += s[10 + k] / count
+    drive = (1.0 - p[3]) * x / c[LARGEST_NM] + p[3] * central
+    return p[0] * c[LARGEST_NM] * two_lags(drive, p, s, c)
+
+
+@mechanism(
+    "the bulging muscle carries the nerve away from the electrode: position-dependent recruitment, Grill 2006",
+    "asymmetric_relaxation catch_like",
+    "drive",
+    "torque",
+    **_muscle,
+    half_at_us_share=(0.3, 0.8),
+    spread_us=(15.0, 40.0),
+    moves=(0.35, 0.9),
+    tissue_s=(0.1, 0.6),
+)
+def moving_electrode(x, p, s, c):
+    """p: scale, τ s twice, width at half of the axons µs, spread µs, by how much of it torque moves it, tissue s.
+
+    s: two lags, what the tissue has moved. The loop's gain stays below 6, under the 8 from which three lags swing on.
+    """
+    half = p[3] * (1.0 + p[5] * s[2])
+    torque = two_lags(share_above(c[WIDTH_US], half, p[4]), p, s, c)
+    s[2] += (torque - s[2]) * (1.0 - math.exp(-c[STEP_S] / p[6]))
+    return p[0] * c[LARGEST_NM] * torque
+
+
+@mechanism(
+    "the forearm on a viscoelastic cushion, held back by a strap's dry friction: Zener's solid; Dahl 1968",
+    "series_compliance",
+    "output, zero",
+    "torque, sum of the past",
+    **_muscle,
+    lasting=(0.4, 0.8),
+    creep_s=(0.5, 4.0),
+    dry=(0.04, 0.15),
+    builds_over=(0.03, 0.15),
+    viscous_s=(0.01, 0.04),
+)
+def dry_cushion(x, p, s, c):
+    """p: scale, τ s twice, stiffness that lasts, creep s, friction, travel over which it builds, viscosity s.
+
+    s: two lags, travel, that of the creeping part, friction. The cell feels the cushion, the strap takes the friction.
+    """
+    torque = two_lags(x / c[LARGEST_NM], p, s, c)
+    step = 0.125 * c[STEP_S]
+    felt = 0.0
+    for _ in range(8):
+        felt = p[3] * s[2] + (1.0 - p[3]) * (s[2] - s[3])
+        speed = (torque - felt - s[4]) / p[7]
+        s[2] += step * speed
+        s[3] += step * (s[2] - s[3]) / p[4]
+        s[4] += step * (p[5] * speed - abs(speed) * s[4]) / p[6]
+    return p[0] * c[LARGEST_NM] * felt
+
+
+PLACES = {one.kernel.function.__name__: one for one in (central_plateau, moving_electrode, dry_cushion)}
