@@ -27,7 +27,7 @@ def make_devices(
     Parameters
     ----------
     settings : Settings
-        Its `patient` is a name, the path of a file, or `hidden:SEED`.
+        Its `patient` is a name, the path of a file, `hidden:SEED`, or `SET:SEED` of other physics.
     arm : str, optional
         As `--arm` takes it: a mode with settings, or a file; for a hidden patient also `design`. None: the joint is
         held still and has no sensor.
@@ -55,7 +55,7 @@ def _hidden_seed(patient: str) -> int | None:
 
 def _muscle(patient: str) -> Muscle:
     file = Path(patient)
-    if patient not in patients.PATIENTS and (file.suffix.lower() in {".toml", ".json"} or file.exists()):
+    if patient not in patients.NAMES and (file.suffix.lower() in {".toml", ".json"} or file.exists()):
         return patients.from_file(file)
     return patients.make(patient)
 

@@ -15,7 +15,7 @@ from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS
 from stimrig.hardware_sim.errors import SettingsError
 from stimrig.hardware_sim.load_cells import CELLS, TRANSPORTS
 from stimrig.hardware_sim.load_cells.cells import WithAngle
-from stimrig.hardware_sim.patients import PATIENTS
+from stimrig.hardware_sim.patients import NAMES
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators import STIMULATORS
 
@@ -77,8 +77,8 @@ def _who(group: argparse._ArgumentGroup) -> None:
         "--patient",
         default=DEFAULTS.patient,
         metavar="NAME|FILE",
-        help=f"{', '.join(PATIENTS)}, or a TOML or JSON file with 'patient' and a table 'parameters' "
-        "(default: %(default)s)",
+        help=f"{', '.join(NAMES)}, or a TOML or JSON file with 'patient' and a table 'parameters', or SET:SEED, "
+        "one of those that the bench draws (default: %(default)s)",
     )
     who.add_argument(
         "--hidden",

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
+from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.chain import Chain, split
-from stimrig.hardware_sim.hidden.kernels import Floats
-from stimrig.hardware_sim.hidden.scenario import Scenario
+from stimrig.hardware_sim.hidden.kernels import Floats, Stage
 
 STEPS_PER_S = 1600.0
 PULSE_PERIOD_S = 0.025
@@ -18,21 +19,34 @@ REMEMBERED_STEPS = 64
 _Saved = tuple[Floats, Floats, float]
 
 
+class Staged(Protocol):
+    """What is made of stages: a scenario, or a muscle of other physics."""
+
+    @property
+    def base(self) -> Base:
+        """The muscle without effects; its largest torque is what shares are of."""
+        ...
+
+    def stages(self) -> list[Stage]:
+        """All stages of the muscle."""
+        ...
+
+
 class HiddenMuscle:
-    """A muscle with hidden effects; it implements the `Muscle` protocol. Its joint is still unless a limb tells it.
+    """A muscle made of stages; it implements the `Muscle` protocol. Its joint is still unless a limb tells it.
 
     A pulse's width is held for 25 ms. Jitter leaves gaps between two holds; a gap of up to 5 ms is closed by going back
     to its beginning. Another current than 20 mA scales the width by charge.
 
     Parameters
     ----------
-    scenario
-        The base muscle and its hidden effects.
+    staged
+        The base muscle and its stages.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
-        before, after = split(scenario.stages())
-        largest_nm = scenario.base.largest_nm
+    def __init__(self, staged: Staged) -> None:
+        before, after = split(staged.stages())
+        largest_nm = staged.base.largest_nm
         self._muscle = Chain(before, largest_nm, 1.0 / STEPS_PER_S)
         self._converter = Chain(after, largest_nm, 1.0 / STEPS_PER_S) if after else None
         self._done = 0  # steps simulated; the state is that at `_done` / STEPS_PER_S
@@ -104,10 +118,13 @@ class HiddenMuscle:
         return self._joints[step % REMEMBERED_STEPS]
 
     def _input(self) -> tuple[float, float]:
-        """Mean width over the next step, and whether a pulse arrives in it."""
+        """Mean width over the next step, and whether it is the first that a pulse drives from beginning to end.
+
+        What a pulse recruits is taken from that step's width by muscles that keep it until the next pulse.
+        """
         start, end = float(self._done), self._done + 1.0
         pulse = 0.0
-        if self._arrivals and self._arrivals[0] < end:
+        if self._arrivals and self._arrivals[0] <= start + 1e-6:
             self._arrivals.pop(0)
             pulse = 1.0
         if not self._edges or self._edges[0][0] >= end:
