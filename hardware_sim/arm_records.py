@@ -27,13 +27,25 @@ from stimrig.hardware_sim.hidden.scenario import rng_of
 __all__ = ["KINDS", "arm_patient", "changed", "held_angles_rad", "record"]
 
 RATE_HZ, ANGLE_HZ = 400, 200
-VELOCITY_WINDOW_S, ENCODER_STEP_DEG, ENCODER_NOISE_DEG = 0.060, 360.0 / 2**13, 0.02
+VELOCITY_WINDOW_S = 0.060
 SIMULATION_HZ = 1600
 LARGEST_COMPLIANCE_RAD_PER_NM = 0.003
 Parts = list[tuple[str, Floats]]
 """Segments in order: name, and pulse widths at 40 pulses/s, µs."""
 Moves = list[tuple[float, str, dict[str, Any]]]
 """From this time on, s, this mode of the arm with these settings."""
+
+
+@dataclass(frozen=True)
+class AngleSensor:
+    """Of the joint's angle, read at `ANGLE_HZ`: white noise, then steps; and how much too late its times are."""
+
+    noise_deg: float = 0.02
+    step_deg: float = 360.0 / 2**13
+    delay_s: float = 0.0
+
+
+ENCODER = AngleSensor()
 
 
 @dataclass(frozen=True)
@@ -198,6 +210,7 @@ def record(
     protocol: str = "prbs",
     duration_s: float | None = None,
     parts: Parts | None = None,
+    sensor: AngleSensor = ENCODER,
 ) -> dict[str, Any]:
     """One record of an arm.
 
@@ -217,6 +230,8 @@ def record(
     parts
         Of `held` or `moving`: segments in order, each a name and its pulse widths at 40 pulses/s, µs, instead of the
         kind's own.
+    sensor
+        What reads the angle; by default a good encoder.
 
     Returns
     -------
@@ -243,7 +258,7 @@ def record(
     every = SIMULATION_HZ // RATE_HZ
     rows = {name: column[::every] for name, column in clean.items()}
     time_s = np.arange(rows["torque_nm"].size) / RATE_HZ
-    angle, velocity = _measured(rng, clean["angle_rad"], time_s)
+    angle, velocity = _measured(rng, clean["angle_rad"], time_s, sensor)
     held = (time_s * PULSES_PER_S + 1e-9).astype(int)
     return {
         "time_s": time_s,
@@ -306,14 +321,14 @@ def _simulated(patient: ArmPatient, design: ArmDesign) -> dict[str, Floats]:
     }
 
 
-def _measured(rng: Generator, angle_rad: Floats, time_s: Floats) -> tuple[Floats, Floats]:
-    """What encoder and rig make of the true angles, at the torque's times."""
+def _measured(rng: Generator, angle_rad: Floats, time_s: Floats, sensor: AngleSensor) -> tuple[Floats, Floats]:
+    """What sensor and rig make of the true angles, at the torque's times."""
     every = SIMULATION_HZ // ANGLE_HZ
     first = int(rng.integers(every))
     true_deg = np.degrees(angle_rad[first::every])
-    read_deg = np.round((true_deg + rng.normal(0.0, ENCODER_NOISE_DEG, true_deg.size)) / ENCODER_STEP_DEG)
-    read_rad = np.radians(read_deg * ENCODER_STEP_DEG)
-    at_s = (first + every * np.arange(read_rad.size)) / SIMULATION_HZ
+    read_deg = np.round((true_deg + rng.normal(0.0, sensor.noise_deg, true_deg.size)) / sensor.step_deg)
+    read_rad = np.radians(read_deg * sensor.step_deg)
+    at_s = (first + every * np.arange(read_rad.size)) / SIMULATION_HZ + sensor.delay_s
     window = 2 * round(0.5 * VELOCITY_WINDOW_S * ANGLE_HZ) + 1
     velocity = np.asarray(savgol_filter(read_rad, window, 2, deriv=1, delta=1.0 / ANGLE_HZ), float)
     return np.interp(time_s, at_s, read_rad), np.interp(time_s, at_s, velocity)
