@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -188,6 +188,12 @@ class Scene:
         return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
 
 
+def weighted(weights: Sequence[Any], columns: np.ndarray) -> np.ndarray:
+    """Sum of columns (n, K) by n weights, each of shape (M, 1), or a number: shape (M, K), or (K,)."""
+    found = np.array(weights, float)
+    return (found if found.ndim == 1 else found[:, :, 0].T) @ columns
+
+
 Values = dict[str, Any]
 """Parameters by name, each of shape (M, 1), or a number where a form is called row by row."""
 Apply = Callable[[Any, Values, Scene], Any]
@@ -238,6 +244,8 @@ class Form:
         Whether the form is the next in a chain. It is tried only while the forms before it gain.
     fixed : bool
         Whether its parameters are found in the samples before the fit, and the torque is corrected for it then.
+    scales : bool
+        For "output" only: whether it multiplies the torque by what does not depend on it; x may then be 1.
     fine : bool
         For "additive" only: whether it is averaged over each pulse interval in the fit, not taken in its middle.
     source : str
@@ -259,6 +267,7 @@ class Form:
     accept: Callable[[dict[str, float], Scene], bool] | None = None
     restarts: tuple[dict[str, float], ...] = ()
     fixed: bool = False
+    scales: bool = False
     fine: bool = False
     source: str = ""
     state: Callable[[np.ndarray, dict[str, Any], Scene], np.ndarray] | None = None

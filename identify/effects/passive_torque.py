@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form, weighted
 
 SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
 """Of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
@@ -76,11 +76,13 @@ _FREE = (
 )
 def surface(_: None, p: Values, scene: Scene) -> np.ndarray:
     velocity, place = scene.speed, scene.place
-    elastic = sum(p[f"elastic_{i}_nm"] * bend for i, bend in enumerate(scene.bends(len(SIZES)), start=1))
-    viscous = p["viscosity_nm_s_per_rad"] + p["tilt_nm_s_per_rad"] * place + p["bow_nm_s_per_rad"] * place**2
-    acceleration = 0.0 if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
-    dry = p["dry_nm"] * np.tanh(velocity / p["dry_below_rad_s"])
-    return elastic + viscous * velocity + dry + p["inertia_nm_s2_per_rad"] * acceleration
+    acceleration = np.zeros_like(velocity) if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
+    names = [f"elastic_{i}_nm" for i in range(1, len(SIZES) + 1)]
+    names += ["viscosity_nm_s_per_rad", "tilt_nm_s_per_rad", "bow_nm_s_per_rad", "inertia_nm_s2_per_rad"]
+    columns = [*scene.bends(len(SIZES)), velocity, place * velocity, place**2 * velocity, acceleration]
+    below_rad_s, row = np.unique(p["dry_below_rad_s"], return_inverse=True)
+    dry = np.tanh(velocity / below_rad_s[:, None])[row.ravel()]
+    return weighted([p[name] for name in names], np.stack(columns)) + p["dry_nm"] * dry
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form, weighted
 
 _PARABOLA = (
     Parameter("slope_per_rad", "1/rad", -4.0, 4.0, 0.0, (0.3, -0.3), about="slope at the reference angle"),
@@ -21,6 +21,7 @@ KNOTS = 8
     "y (1 + slope·Δ + bend·Δ²), Δ = angle - reference angle",
     *_PARABOLA,
     source="Marion, Wexler, Hull: 1 - 4.49e-4 Δθ² + 0.0344 Δθ, in degrees",
+    scales=True,
 )
 def parabola(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     away = scene.away_rad
@@ -31,6 +32,7 @@ drive = replace(
     parabola,
     name="drive",
     stage="gain",
+    scales=False,
     equation="w = f(u) (1 + slope·Δ + bend·Δ²): acts on the force, before the dynamics",
     source="",
 )
@@ -41,6 +43,7 @@ drive = replace(
     "y (1 + slope·Δ + bend·Δ² + twist·Δ³)",
     *_PARABOLA,
     Parameter("twist_per_rad3", "1/rad³", -12.0, 12.0, 0.0, (0.0,), about="third-order part"),
+    scales=True,
 )
 def cubic(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     away = scene.away_rad
@@ -54,6 +57,7 @@ def cubic(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     Parameter("sharpness_per_rad2", "1/rad²", 0.0, 8.0, 0.0, (0.5,), about="sharpness of the length-tension curve"),
     Parameter("best_rad", "rad", -1.5, 1.5, 0.0, (0.5, -0.5), about="optimal angle, from the reference angle"),
     source="Gaussian active force-length curve, Thelen 2003",
+    scales=True,
 )
 def bell(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     best = p["best_rad"]
@@ -68,6 +72,7 @@ def bell(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
         for i in range(KNOTS)
     ),
     source="Murray, Delp, Buchanan 1995: moment arms vary freely with the angle",
+    scales=True,
 )
 def curve(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     """Linear between knots over the fitted angles."""
@@ -86,10 +91,11 @@ def curve(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
         for i, size in enumerate(SIZES, start=1)
     ),
     source="shape free; Murray, Delp, Buchanan 1995; Thelen 2003 for what it has to follow",
+    scales=True,
 )
 def smooth(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    bends = scene.bends(len(SIZES))
-    return y * np.maximum(1.0 + sum(p[f"bend_{i}"] * bend for i, bend in enumerate(bends, start=1)), 0.0)
+    bent = weighted([p[f"bend_{i}"] for i in range(1, len(SIZES) + 1)], scene.bends(len(SIZES)))
+    return y * np.maximum(1.0 + bent, 0.0)
 
 
 EFFECT = Effect(

@@ -11,7 +11,7 @@ _SHAPE = Parameter("shape", "1", 0.1, 2.0, 0.25, (0.25,), "log", about="Hill's a
 _TOP = Parameter("top", "1", 1.05, 1.9, 1.4, (1.4,), about="largest torque when lengthening, divided by isometric")
 
 
-@form("output", "y (1 - slope·velocity)", _SIDE)
+@form("output", "y (1 - slope·velocity)", _SIDE, scales=True)
 def linear(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     return y * np.maximum(1.0 - p["slope_s_per_rad"] * scene.speed, 0.0)
 
@@ -32,6 +32,7 @@ def _hyperbola(y: np.ndarray, p: Values, v: np.ndarray) -> np.ndarray:
     _SHAPE,
     _TOP,
     source="Hill 1938; Thelen 2003",
+    scales=True,
 )
 def hill(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     return _hyperbola(y, p, p["slope_s_per_rad"] * scene.speed)
@@ -46,6 +47,7 @@ def hill(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     _SHAPE,
     _TOP,
     source="Hill 1938; Thelen 2003; Marion et al. 2010 for the dependence on the angle",
+    scales=True,
 )
 def surface(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     """As `hill`, its slope another one at each angle: moment arm and fibre length change with it."""
@@ -73,6 +75,7 @@ def marion(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     _SIDE,
     Parameter("decay_per_rad", "1/rad", 0.3, 4.0, 1.3, (1.3,), "log", about="V2"),
     source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ', as a share of the torque",
+    scales=True,
 )
 def bell(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     """As `marion`, but as a share of the torque; the slope is the largest one over all angles."""

@@ -237,8 +237,11 @@ class _StagePass:
         torque, rate = torque[owned], rate[owned]
         for chosen, p in self.joined("filter"):
             torque, rate = chosen.form.call((self.grown(torque), self.grown(rate)), p, self.setup.scene_at_ends)
-        for chosen, p in self.joined("output"):
-            torque, rate = self.bend(chosen.form, self.grown(torque), self.grown(rate), p)
+        for chosen in self.forms("output"):
+            present, values = len(self.owners) + 1, self.join(chosen.places)
+            torque, rate = self.grown(torque), self.grown(rate)
+            bend = self.scale if chosen.form.scales else self.bend
+            torque, rate = bend(chosen, torque, rate, values, present)
         return torque, rate, self.grown(delay), np.arange(len(torque))
 
     def gained(self, states: dict[str, float] | None = None) -> np.ndarray:
@@ -319,9 +322,25 @@ class _StagePass:
             return responses[0]
         return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore[return-value]
 
-    def bend(self, form: Form, torque: np.ndarray, rate: np.ndarray, p: Values) -> tuple[np.ndarray, np.ndarray]:
+    def scale(
+        self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray, present: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """An output stage that multiplies: rows with the same parameters, the first `present` ones, share a factor."""
+        ends, own = self.setup.scene_at_ends, np.r_[0, np.arange(present, len(values))]
+        factor = np.asarray(chosen.form.call(np.ones((1, ends.time_s.size)), self.named(chosen, values[own]), ends))
+        scaled = []
+        for rows in (torque, rate):
+            rows = rows.copy()
+            rows[:present] *= factor[:1]
+            rows[present:] *= factor[1:]
+            scaled.append(rows)
+        return scaled[0], scaled[1]
+
+    def bend(
+        self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray, _present: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """A static output stage at the boundary states; the rate follows by a numerical chain rule."""
-        ends = self.setup.scene_at_ends
+        form, ends, p = chosen.form, self.setup.scene_at_ends, self.named(chosen, values)
         bent = np.asarray(form.call(torque, p, ends))
         if np.array_equal(bent, torque):
             return bent, rate
