@@ -50,8 +50,8 @@ class Grid:
     fraction: np.ndarray  # place of each sample within its interval, 0 to 1, shape (N,)
     held_out: np.ndarray  # intervals with any held-out sample, bool, shape (K,)
     segment: np.ndarray  # index into the record's `segment_names`, int, shape (K,)
-    angle_rad: np.ndarray | None  # mean over each interval, shape (K,)
-    velocity_rad_s: np.ndarray | None  # mean over each interval, shape (K,)
+    angle_rad: np.ndarray | None  # of the joint, smoothed, mean over each interval, shape (K,)
+    velocity_rad_s: np.ndarray | None  # the same; of a record without an angle as recorded, shape (K,)
     late_s: np.ndarray | None  # delay of each interval's pulse after its slot, s, shape (K,); None if none was late
     doubted: np.ndarray  # intervals in which the stimulation is not known, bool, shape (K,)
     part: np.ndarray  # index into the record's `parts`; a pause belongs to the part before it, int, shape (K,)
@@ -318,6 +318,8 @@ def make_grid(record: Record) -> Grid:
         late_s[pause] = 0.0
     if record.doubted is not None:
         doubted |= np.bincount(interval, record.doubted, minlength=size) > 0
+    motion = record.motion
+    velocity = record.velocity_rad_s if motion is None else motion.velocity_rad_s
     return Grid(
         record=record,
         start_s=start_s,
@@ -329,8 +331,8 @@ def make_grid(record: Record) -> Grid:
         fraction=np.clip((record.time_s - start_s) / step_s - interval, 0.0, 1.0),
         held_out=np.bincount(interval, record.held_out, minlength=size) > 0,
         segment=record.segment[middle],
-        angle_rad=None if record.angle_rad is None else mean(record.angle_rad),
-        velocity_rad_s=None if record.velocity_rad_s is None else mean(record.velocity_rad_s),
+        angle_rad=None if motion is None else mean(motion.angle_rad),
+        velocity_rad_s=None if velocity is None else mean(velocity),
         late_s=late_s,
         doubted=doubted,
         part=part,

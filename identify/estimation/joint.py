@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects import find_effect, registry
+from stimrig.identify.effects import depend_on_joint, find_effect, registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.noise import NoiseLevel, band_part, profile
@@ -119,6 +119,11 @@ class Fitted:
     def written(self) -> Fitted:
         """With the narrow band of its noise written as the effect `tremor`; itself without a band."""
         return band_as_effect(self)
+
+
+def knows_joint(fitted: Fitted) -> bool:
+    """Whether an effect of the model depends on the joint."""
+    return depend_on_joint(name for name, _ in fitted.effects)
 
 
 def _penalty(problem: Problem, theta: np.ndarray) -> float:

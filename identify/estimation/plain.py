@@ -13,10 +13,9 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.effects import depend_on_joint
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.candidates import chosen
-from stimrig.identify.estimation.joint import Fitted, gram, solve
+from stimrig.identify.estimation.joint import Fitted, gram, knows_joint, solve
 from stimrig.identify.estimation.projection import (
     Projection,
     Solution,
@@ -60,10 +59,10 @@ def still_rows(grid: Grid, rows: np.ndarray) -> np.ndarray:
 
     Where the joint never moved, where there is no angle, or where too little was stimulated at any one angle: all.
     """
-    if grid.angle_rad is None or not moves(grid, rows):
+    if grid.angle_rad is None or grid.velocity_rad_s is None or not moves(grid, rows):
         return rows
     own = np.zeros(grid.size, bool)
-    still = rows & (np.abs(_velocity(grid)) < STILL_RAD_S)
+    still = rows & (np.abs(grid.velocity_rad_s) < STILL_RAD_S)
     if still.any():
         own = still & (np.abs(grid.angle_rad - _middle(grid.angle_rad, still, grid.pulse_width_us)) < ONE_ANGLE_RAD)
     widths_us = grid.pulse_width_us[own & (grid.pulse_width_us > 0)]
@@ -86,9 +85,9 @@ def joint_of(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     The reference is the angle at which most was stimulated while the joint was still, else the median while stimulated:
     it does not depend on where the record begins.
     """
-    if grid.angle_rad is None:
+    if grid.angle_rad is None or grid.velocity_rad_s is None:
         return {}
-    still = rows & (np.abs(_velocity(grid)) < STILL_RAD_S) & (grid.pulse_width_us > 0)
+    still = rows & (np.abs(grid.velocity_rad_s) < STILL_RAD_S) & (grid.pulse_width_us > 0)
     stimulated = rows & (grid.pulse_width_us > 0)
     if still.any():
         reference = _middle(grid.angle_rad, still, grid.pulse_width_us)
@@ -108,13 +107,6 @@ def _middle(angle_rad: np.ndarray, still: np.ndarray, width_us: np.ndarray) -> f
     ends = np.searchsorted(at, at + 2 * ONE_ANGLE_RAD, side="right")
     first = int(np.argmax(ends - np.arange(at.size)))
     return float(np.median(at[first : ends[first]]))
-
-
-def _velocity(grid: Grid) -> np.ndarray:
-    assert grid.angle_rad is not None
-    if grid.velocity_rad_s is not None:
-        return np.nan_to_num(grid.velocity_rad_s)
-    return np.gradient(np.nan_to_num(grid.angle_rad), grid.step_s)
 
 
 STARTS_S = (0.12, 0.4)
@@ -355,11 +347,6 @@ def renewed_curve(base: Fitted) -> Fitted:
                 break
             base = found
     return base
-
-
-def knows_joint(fitted: Fitted) -> bool:
-    """Whether an effect of the model depends on the joint."""
-    return depend_on_joint(name for name, _ in fitted.effects)
 
 
 def _can_be_renewed(base: Fitted) -> bool:

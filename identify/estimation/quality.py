@@ -84,10 +84,10 @@ def range_warnings(model: Model, record: Record) -> list[str]:
 
 def _joint_warnings(model: Model, record: Record) -> list[str]:
     """Warnings if the joint was where, or moved as, it did not in the fitted rows."""
-    found = []
+    found, motion = [], record.motion
     for column, slack, name, unit in (
         (record.angle_rad, ANGLE_SLACK_RAD, "angle", "rad"),
-        (record.velocity_rad_s, VELOCITY_SLACK_RAD_S, "velocity", "rad/s"),
+        (record.velocity_rad_s if motion is None else motion.velocity_rad_s, VELOCITY_SLACK_RAD_S, "velocity", "rad/s"),
     ):
         span = model.valid_for.get(f"{name}_{unit.replace('/', '_')}")
         if column is None or span is None:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
+from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.summary import Sheet, Summarised, quantity
 
 HELD_OUT = "validate"
@@ -109,7 +110,7 @@ class Record(Summarised):
     segment_names : tuple of str
         One name for each contiguous run of rows; a name may occur several times.
     angle_rad, velocity_rad_s : ndarray or None, shape (N,)
-        Joint angle, rad, and angular velocity, rad/s, where the record has them.
+        Joint angle, rad, and angular velocity, rad/s, as they were recorded: `motion` is what is reckoned with.
     late_s : ndarray or None, shape (N,)
         By how much later than its even slot the pulse in force was felt, s; may be slightly negative.
     doubted : ndarray of bool or None, shape (N,)
@@ -255,6 +256,17 @@ class Record(Summarised):
         steps = np.diff(self.time_s)
         steps = steps[steps < 1.5 * np.median(steps)]
         return steps.size / float(np.sum(steps))
+
+    @cached_property
+    def motion(self) -> JointMotion | None:
+        """How the joint moved, by the angles alone, each part smoothed by itself; None without an angle."""
+        if self.angle_rad is None:
+            return None
+        return JointMotion.of(self.time_s, self.angle_rad, [part.first for part in self.parts])
+
+    def knows(self, name: str) -> bool:
+        """Whether it has an optional column; the velocity of the joint follows from its angle."""
+        return getattr(self, name) is not None or (name == "velocity_rad_s" and self.angle_rad is not None)
 
     @cached_property
     def held_out(self) -> np.ndarray:

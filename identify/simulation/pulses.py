@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.errors import BadModel
+from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.predict import Muscle, predict
@@ -25,10 +26,10 @@ class Motion:
 
     @classmethod
     def of(cls, angle_rad: np.ndarray, pulse_rate_hz: float) -> Motion:
-        """From the angles alone: the velocity is their slope, over two periods in the middle."""
+        """From the angles alone, planned or measured in an earlier trial: smoothed both ways."""
         angle = np.asarray(angle_rad, float)
-        slope = np.gradient(angle, 1.0 / pulse_rate_hz) if angle.size > 1 else np.zeros(angle.size)
-        return cls(angle, slope)
+        found = JointMotion.of(np.arange(angle.size) / pulse_rate_hz, angle)
+        return cls(found.angle_rad, found.velocity_rad_s)
 
     @classmethod
     def held(cls, angle_rad: float, size: int) -> Motion:

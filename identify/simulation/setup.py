@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.effects.base import Scene
 from stimrig.identify.noise import NoiseLevel, whitened
+from stimrig.identify.records.joint_motion import MOTION, JointMotion
 from stimrig.identify.recruitment import Basis
 
 WITHIN = 5
 """A joint that turns round within a pulse interval has dry friction on both sides: the middle knows one of them."""
-ACCELERATION_S = 0.05
-"""Time over which the slope of the velocity is taken: two pulse intervals."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +47,8 @@ class Setup:
     """Zero of each part as its rests show it, as the target is given, and its sd; None where they say nothing."""
     states: Mapping[str, float] = field(default_factory=dict)
     """By effect id, where its slow state begins; 0 (rested) where there is none."""
+    angle_late_s: float = 0.0  # by how much later than it was the sensor tells the angle, s
+    motion: JointMotion | None = None  # in place of the record's own
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:
@@ -105,20 +106,14 @@ class Setup:
         return self._scene(time_s, grid.pulse_width_us[grid.interval], first)
 
     def _scene(self, time_s: np.ndarray, width_us: np.ndarray, first: np.ndarray) -> Scene:
-        grid, record = self.grid, self.grid.record
-        angle, velocity = record.angle_rad, record.velocity_rad_s
-        own = record.time_s - grid.start_s
-        if velocity is None and angle is not None:
-            velocity = np.gradient(angle, record.time_s)
-        acceleration = None if velocity is None else self._acceleration(velocity)
-        motion = {"angle_rad": angle, "velocity_rad_s": velocity, "acceleration_rad_s2": acceleration}
+        grid = self.grid
         return Scene(
             time_s=time_s,
             pulse_width_us=width_us,
             step_s=grid.step_s,
             scale_nm=self.scale_nm,
             largest_us=self.basis.largest_us,
-            **{name: np.interp(time_s, own, one) for name, one in motion.items() if one is not None},
+            **self._motion_at(time_s + grid.start_s),
             reference_rad=self.reference_rad,
             angle_range_rad=self.angle_range_rad,
             begins=np.isin(np.arange(time_s.size), first),
@@ -127,18 +122,17 @@ class Setup:
             reference_s=self.reference_s,
         )
 
-    def _acceleration(self, velocity_rad_s: np.ndarray) -> np.ndarray:
-        """Slope of the velocity over `ACCELERATION_S`, rad/s², each part of the record by itself, shape (N,)."""
+    def _motion_at(self, time_s: np.ndarray) -> dict[str, Any]:
+        """Angle, velocity and acceleration of the joint at times of the record, as far as they are known."""
         record = self.grid.record
-        edges = [*(part.first for part in record.parts), record.time_s.size]
-        reach = max(1, round(ACCELERATION_S * record.sample_rate_hz / 2))
-        slopes = []
-        for begin, end in pairwise(edges):
-            at = np.arange(end - begin)
-            low, high = np.maximum(at - reach, 0), np.minimum(at + reach, at.size - 1)
-            own, time_s = velocity_rad_s[begin:end], record.time_s[begin:end]
-            slopes.append((own[high] - own[low]) / np.maximum(time_s[high] - time_s[low], 1e-9))
-        return np.concatenate(slopes)
+        motion = self.motion or record.motion or record
+        first = np.array([part.first for part in record.parts])
+        starts_s, ends_s = record.time_s[first], record.time_s[np.r_[first[1:], record.time_s.size] - 1]
+        part = np.maximum(np.searchsorted(starts_s, time_s, side="right") - 1, 0)
+        # What was read at a time had been so before; a delay leads out of no part.
+        read_s = np.clip(time_s + self.angle_late_s, starts_s[part], ends_s[part])
+        columns = {name: getattr(motion, name, None) for name in MOTION}
+        return {name: np.interp(read_s, record.time_s, one) for name, one in columns.items() if one is not None}
 
     @cached_property
     def design(self) -> np.ndarray:

@@ -251,7 +251,7 @@ def test_a_record_where_the_joint_was_not_is_told():
     made = as_record(recorded_tests()[0])
     assert made.angle_rad is not None and made.velocity_rad_s is not None
     assert range_warnings(model(), made) == []
-    far = replace(made, angle_rad=made.angle_rad + 2.0, velocity_rad_s=made.velocity_rad_s + 9.0)
+    far = replace(made, angle_rad=made.angle_rad + 2.0 + 9.0 * made.time_s)
     told = " ".join(range_warnings(model(), far))
     assert "angle" in told and "velocity" in told
     isometric = identify.fit(made)

@@ -1,0 +1,239 @@
+"""How the joint moved: angle, velocity and acceleration out of an angle with noise, by a filter whose jerk is white.
+
+A velocity that is recorded beside an angle is a slope of the same noisy readings: the angle alone decides. Each part of
+a record has its own intensity of the jerk, and its own noise, by maximum likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numba import njit
+
+MOTION = ("angle_rad", "velocity_rad_s", "acceleration_rad_s2")
+BLOCK_S = 0.01
+"""Readings so close together are averaged where noise is asked for: a column that was interpolated between them says
+little of noise from row to row."""
+UNKNOWN = 1e14
+"""Variance of a state before anything is measured, over that of the noise."""
+LEAST_BLOCKS = 8
+LEAST_NOISE_RAD = 2e-6
+"""Even an angle without noise is written with so many digits."""
+RATIOS = tuple(np.linspace(np.log(1e-3), np.log(1e14), 30).tolist())
+"""Logarithms of the jerk's intensity over the noise's variance, 1/s⁵, between which the likeliest is sought."""
+HELD_S = 0.1
+"""A first or last reading that is repeated for less was there once: a reader continues a column by it."""
+GOLDEN, SEARCHES = 0.381966, 10
+PLATEAU = 3
+"""So many equal angles in a row are one step of the sensor, also where a column was interpolated."""
+LEAST_STEPS, WHOLE = 5, 0.05
+"""Different plateaus from which steps are seen, and by how much of one their distances may miss a whole number."""
+FEW_STEPS, RESTS = 6.5, 0.8
+"""A joint that moves over no more steps, and whose angle is the one before in such a share of readings, is held:
+when it went from one step to the next says nothing of its velocity."""
+UNIFORM = 1.0 / np.sqrt(12.0)
+"""Standard deviation of what lies evenly within a step."""
+LARGEST_STEP_RAD = 0.035
+
+
+@njit(cache=True, nogil=True)
+def _forward(time_s, angle_rad, noise, jerk, states, spreads, told):  # pragma: no cover
+    """Kalman filter of (angle, velocity, acceleration); a reading that is NaN is left out.
+
+    Writes the filtered `states` (N, 3), `spreads` (N, 6): their covariance; `told` (N, 5): innovation, its variance,
+    gains. Returns the sum of log variances and of squared innovations over their variance, and the count.
+    """
+    keep = states.shape[0] > 0
+    x, v, a = 0.0, 0.0, 0.0
+    for k in range(time_s.size):
+        if angle_rad[k] == angle_rad[k]:
+            x = angle_rad[k]
+            break
+    # Before anything is measured velocity and acceleration may be whatever they are.
+    wide = UNKNOWN * noise[0]
+    pxx, pxv, pxa, pvv, pva, paa = wide, 0.0, 0.0, wide, 0.0, 100.0 * wide
+    logs, squares, count = 0.0, 0.0, 0
+    for k in range(time_s.size):
+        if k:
+            t = time_s[k] - time_s[k - 1]
+            h = 0.5 * t * t
+            x, v = x + t * v + h * a, v + t * a
+            # F P F' with F = [[1, t, h], [0, 1, t], [0, 0, 1]], and what white jerk adds over t
+            bx, bv, ba = pxx + t * pxv + h * pxa, pxv + t * pvv + h * pva, pxa + t * pva + h * paa
+            cv, ca = pvv + t * pva, pva + t * paa
+            pxx = bx + t * bv + h * ba + jerk * t**5 / 20.0
+            pxv = bv + t * ba + jerk * t**4 / 8.0
+            pxa = ba + jerk * t**3 / 6.0
+            pvv = cv + t * ca + jerk * t**3 / 3.0
+            pva = ca + jerk * t * t / 2.0
+            paa = paa + jerk * t
+        e, s, gx, gv, ga = 0.0, 0.0, 0.0, 0.0, 0.0
+        if angle_rad[k] == angle_rad[k]:
+            e, s = angle_rad[k] - x, pxx + noise[k]
+            gx, gv, ga = pxx / s, pxv / s, pxa / s
+            if count > 3:  # what comes before tells of the start alone
+                logs += np.log(s)
+                squares += e * e / s
+            count += 1
+            x, v, a = x + gx * e, v + gv * e, a + ga * e
+            paa -= ga * pxa
+            pva -= gv * pxa
+            pvv -= gv * pxv
+            pxx, pxv, pxa = pxx * (1.0 - gx), pxv * (1.0 - gx), pxa * (1.0 - gx)
+        if keep:
+            states[k, 0], states[k, 1], states[k, 2] = x, v, a
+            spreads[k, 0], spreads[k, 1], spreads[k, 2] = pxx, pxv, pxa
+            spreads[k, 3], spreads[k, 4], spreads[k, 5] = pvv, pva, paa
+            told[k, 0], told[k, 1], told[k, 2], told[k, 3], told[k, 4] = e, s, gx, gv, ga
+    return logs, squares, max(count - 4, 0)
+
+
+@njit(cache=True, nogil=True)
+def _backward(time_s, states, spreads, told):  # pragma: no cover
+    """What the later readings say of each state (Bryson and Frazier's smoother), in place of the filtered ones."""
+    lx, lv, la = 0.0, 0.0, 0.0
+    for k in range(time_s.size - 1, -1, -1):
+        xx, xv, xa, vv, va, aa = spreads[k]
+        states[k, 0] -= xx * lx + xv * lv + xa * la
+        states[k, 1] -= xv * lx + vv * lv + va * la
+        states[k, 2] -= xa * lx + va * lv + aa * la
+        e, s, gx, gv, ga = told[k]
+        if s > 0.0:
+            lx -= gx * lx + gv * lv + ga * la + e / s
+        if k:
+            t = time_s[k] - time_s[k - 1]
+            lv, la = lv + t * lx, la + t * lv + 0.5 * t * t * lx
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """How the joint moved, and what its sensor is like.
+
+    Parameters
+    ----------
+    angle_rad, velocity_rad_s, acceleration_rad_s2 : ndarray, shape (N,)
+        At the record's samples.
+    noise_rad : ndarray, shape (P,)
+        White noise of a sample's angle in each part, rad.
+    jerk : ndarray, shape (P,)
+        Intensity of the white jerk in each part, rad²/s⁵.
+    step_rad : float
+        Steps in which the sensor tells the angle, rad; 0 where none are seen.
+    """
+
+    angle_rad: np.ndarray
+    velocity_rad_s: np.ndarray
+    acceleration_rad_s2: np.ndarray
+    noise_rad: np.ndarray
+    jerk: np.ndarray
+    step_rad: float = 0.0
+
+    @classmethod
+    def of(
+        cls, time_s: np.ndarray, angle_rad: np.ndarray, first: Sequence[int] = (0,), causal: bool = False
+    ) -> JointMotion:
+        """From angles, of which any may be NaN; each part, from its `first` reading on, by itself.
+
+        `causal`: from the readings until then alone, as a controller has them.
+        """
+        parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
+        step_rad = step_of([angle_rad[own] for own in parts])
+        read_rad = np.concatenate([_without_held(time_s[own], angle_rad[own]) for own in parts])
+        sensors = [sensor_of(time_s[own], read_rad[own], step_rad) for own in parts]
+        noise_rad, jerk = np.array(sensors).T
+        begun = cls(read_rad, read_rad, read_rad, noise_rad, jerk, step_rad)
+        return begun._smoothed(time_s, read_rad, first, causal)
+
+    def read_again(self, time_s: np.ndarray, first: Sequence[int], seed: int = 0) -> JointMotion:
+        """The same movement as the same sensor would tell it another time: what its error does to a model."""
+        read_rad = self.angle_rad + np.random.default_rng(seed).normal(size=time_s.size) * np.repeat(
+            self.noise_rad, np.diff([*first, time_s.size])
+        )
+        return self._smoothed(time_s, read_rad, first, False)
+
+    def _smoothed(self, time_s: np.ndarray, read_rad: np.ndarray, first: Sequence[int], causal: bool) -> JointMotion:
+        parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
+        sensors = zip(parts, self.noise_rad, self.jerk, strict=True)
+        found = [smooth(time_s[own], read_rad[own], noise, jerk, causal) for own, noise, jerk in sensors]
+        angle, velocity, acceleration = np.concatenate(found).T.copy()
+        return replace(self, angle_rad=angle, velocity_rad_s=velocity, acceleration_rad_s2=acceleration)
+
+
+def smooth(
+    time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: float, causal: bool = False
+) -> np.ndarray:
+    """Angle, velocity and acceleration at each reading, from all readings, or from those until then; shape (N, 3)."""
+    size = time_s.size
+    states, spreads, told = np.empty((size, 3)), np.empty((size, 6)), np.empty((size, 5))
+    _forward(time_s, angle_rad, np.full(size, noise_rad**2), jerk, states, spreads, told)
+    if not causal:
+        _backward(time_s, states, spreads, told)
+    return states
+
+
+def sensor_of(time_s: np.ndarray, angle_rad: np.ndarray, step_rad: float = 0.0) -> tuple[float, float]:
+    """Noise of a reading, rad, and intensity of the jerk, rad²/s⁵, that make one part's angles most likely.
+
+    The noise is at least that of even places within a step: what rests on one step shows none.
+    """
+    known = np.isfinite(angle_rad)
+    at_s, read_rad = time_s[known], angle_rad[known]
+    block = np.floor((at_s - at_s[:1]) / BLOCK_S + 1e-3)  # no rounding of times decides
+    first = np.flatnonzero(np.diff(block, prepend=-1.0) > 0)
+    count = np.diff(np.r_[first, at_s.size])
+    least = max(LEAST_NOISE_RAD, UNIFORM * step_rad) ** 2
+    if first.size <= LEAST_BLOCKS or _rests(read_rad, step_rad):
+        return float(np.sqrt(least)), 0.0
+    at_s, mean_rad = np.add.reduceat(at_s, first) / count, np.add.reduceat(read_rad, first) / count
+    nothing = np.empty((0, 3)), np.empty((0, 6)), np.empty((0, 5))
+
+    def unlikely(log_ratio: float) -> tuple[float, float, float]:
+        logs, squares, told = _forward(at_s, mean_rad, 1.0 / count, float(np.exp(log_ratio)), *nothing)
+        variance = max(squares / told, least)
+        return logs + told * np.log(variance) + squares / variance, log_ratio, variance
+
+    at = int(np.argmin([unlikely(ratio)[0] for ratio in RATIOS]))
+    low, high = RATIOS[max(at - 1, 0)], RATIOS[min(at + 1, len(RATIOS) - 1)]
+    for _ in range(SEARCHES):
+        sooner, later = low + GOLDEN * (high - low), high - GOLDEN * (high - low)
+        low, high = (low, later) if unlikely(sooner) < unlikely(later) else (sooner, high)
+    _, log_ratio, variance = unlikely(0.5 * (low + high))
+    return float(np.sqrt(variance)), float(np.exp(log_ratio) * variance)
+
+
+def step_of(parts_rad: Sequence[np.ndarray]) -> float:
+    """Steps in which angles are told, rad, by the plateaus on which they rest; 0 where none are seen."""
+    levels = []
+    for angle_rad in parts_rad:
+        ends = np.flatnonzero(np.diff(angle_rad, append=np.nan) != 0)
+        levels.append(angle_rad[ends[np.diff(ends, prepend=-1) >= PLATEAU]])
+    apart: np.ndarray = np.diff(np.sort(np.concatenate(levels)))
+    apart = apart[apart > 2 * LEAST_NOISE_RAD]
+    if apart.size < LEAST_STEPS - 1:
+        return 0.0
+    whole = np.round(apart / np.min(apart))
+    step_rad = float(np.median(apart / whole))
+    even = np.all(np.abs(apart / step_rad - whole) < WHOLE)
+    return step_rad if even and step_rad < LARGEST_STEP_RAD else 0.0
+
+
+def _rests(angle_rad: np.ndarray, step_rad: float) -> bool:
+    """Whether a part shows no more than on which of a few steps the joint was held."""
+    few = np.ptp(angle_rad) <= FEW_STEPS * step_rad
+    return bool(few and np.mean(np.diff(angle_rad) == 0) > RESTS)
+
+
+def _without_held(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """The angles, NaN where a part's first or last reading was only repeated for a while where there was none."""
+    found, moved = angle_rad, np.flatnonzero(angle_rad[1:] != angle_rad[:-1])
+    if moved.size:
+        first, last = moved[0], moved[-1] + 1
+        found = angle_rad.copy()
+        if time_s[first] - time_s[0] < HELD_S:
+            found[:first] = np.nan
+        if time_s[-1] - time_s[last] < HELD_S:
+            found[last + 1 :] = np.nan
+    return found
