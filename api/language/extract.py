@@ -27,7 +27,7 @@ SENTENCES = (
     "identify/estimation/quality.py", "identify/effects/*.py", "identify/experiments/*.py", "identify/records/*.py",
     "identify/fitting.py", "identify/dynamics/grid.py", "identify/estimation/plain.py",
     "identify/estimation/candidates.py", "identify/estimation/effect_fit.py", "identify/estimation/samples.py",
-    "identify/estimation/averaged.py", "identify/estimation/left_out.py",
+    "identify/estimation/averaged.py", "identify/estimation/left_out.py", "identify/estimation/joint_sensor.py",
     "identify/methods/**/*.py", "identify/yardstick.py",
     "identify/simulation/joint_surface.py", "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/adapters/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py",

@@ -296,7 +296,7 @@ def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     record, jumps = grid.record, base.heavy_tails and grid.readings is not None
     asked = not effect.raw and effect.id not in present
     asked = asked and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
-    return asked and all(getattr(record, need) is not None for need in effect.needs)
+    return asked and all(record.knows(need) for need in effect.needs)
 
 
 def _likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:

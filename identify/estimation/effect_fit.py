@@ -10,7 +10,9 @@ import numpy as np
 from stimrig.identify.effects import find_effect, registry
 from stimrig.identify.effects.base import STAGES, Effect, Form, Scene
 from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.candidates import trusted_joint
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
+from stimrig.identify.estimation.joint_sensor import with_angle_delay
 from stimrig.identify.estimation.left_out import Difference
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
@@ -145,7 +147,7 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     its fit finds nothing to start from.
     """
     for need in effect.needs:
-        if getattr(base.problem.setup.grid.record, need) is None:
+        if not base.problem.setup.grid.record.knows(need):
             raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, fix="Record this column.")
     forms = [_form(effect, form)] if form else list(effect.forms)
     for identifier, seen, values in detected_effects(raw):
@@ -187,13 +189,14 @@ def add_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[s
         if tell is not None:
             tell(identifier)
         base = add_effect(base, find_effect(identifier), forms[0], raw)
+    base = with_angle_delay(trusted_joint(base))
     for identifier, forms in chosen:
         for form in forms[1:]:
             if tell is not None:
                 tell(identifier)
             other = in_form(base, identifier, form)
             base = max(base, other, key=lambda fitted: fitted.log_evidence)
-    return base
+    return with_angle_delay(trusted_joint(base))
 
 
 def in_form(base: Fitted, effect: str, form: str) -> Fitted:

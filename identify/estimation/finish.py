@@ -14,6 +14,7 @@ from stimrig.identify.dynamics.grid import Grid, runs
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
 from stimrig.identify.estimation.fit_statistics import evaluate, fit_statistics, white_sd
 from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.joint_sensor import sensor_of, words
 from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
@@ -71,7 +72,9 @@ def finish(
         reasons=tuple(reasons),
         extra=_parts(written),
     )
-    model = _named(model, setup.grid)
+    model, sensor = _named(model, setup.grid), sensor_of(fitted)
+    if sensor:
+        model = model.with_(data=model.data | {"joint_sensor": sensor}, reasons=(*model.reasons, *words(sensor)))
     model = model.with_(joint=_joint(model, written, matrix[:known, :known]))
     model = model.with_(bands=bands(model), valid_for=valid_for(model, setup.grid, setup.fitted))
     return model.with_(quality=quality(model, setup.grid, setup.fitted, fitted.converged))
@@ -134,6 +137,7 @@ def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
     setup = fitted.problem.setup
     own = fitted.unforeseen.get(chosen.effect)
     joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
+    joint |= {"angle_late_s": setup.angle_late_s or None}
     return {
         "id": chosen.effect,
         "form": chosen.form.name,

@@ -15,6 +15,7 @@ from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, run_
 from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadModel
+from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.simulation.joint_surface import Acting, angle_range
@@ -52,17 +53,29 @@ class Muscle(Protocol):
     def extra(self) -> dict[str, Any]: ...
 
 
-def predict(model: Muscle, record: Record) -> np.ndarray:
+def predict(model: Muscle, record: Record, causal: bool = False) -> np.ndarray:
     """Torque that the model predicts for the record's pulse widths, N·m, shape (N,).
 
-    No measured torque is used: a controller would predict the same. What cannot be foreseen (`unforeseen`) is included
-    only on the rows that it was fitted on.
+    No measured torque is used: a controller would predict the same. The angle is smoothed both ways, as a whole record
+    is there; `causal`: from what was read until then, as a controller has it while the joint moves. What cannot be
+    foreseen (`unforeseen`) is included only on the rows that it was fitted on.
 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, or the record lacks a
     column it needs.
     """
     refuse_rate(model, record)
-    return predict_on(model, make_grid(record))
+    grid = make_grid(record)
+    if not causal or record.angle_rad is None or isinstance(model.linear, Discrete):
+        return predict_on(model, grid)
+    problem, theta = problem_of(model, grid)
+    first = [part.first for part in record.parts]
+    motion = JointMotion.of(record.time_s, record.angle_rad, first, causal=True)
+    return _moved(problem, motion).at_samples(theta)
+
+
+def _moved(problem: Problem, motion: JointMotion) -> Problem:
+    """The problem with the joint moving in another way."""
+    return Problem(problem.setup.with_(motion=motion), [(one.effect, one.form) for one in problem.chosen])
 
 
 def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
@@ -125,6 +138,7 @@ def problem_of(
         zero_nm=float(settings.get("zero_nm", 0.0)),
         sign=float(settings.get("sign", 1.0)),
         reference_s=float(settings.get("reference_s", 0.0)),
+        angle_late_s=float(settings.get("angle_late_s", 0.0)),
         **_own_angles(model, own_record, settings),
         states={} if own_record else states_of(model),
     )
@@ -135,7 +149,7 @@ def problem_of(
             baseline_nm += entry.get("unforeseen", {}).get("mean_nm", 0.0)
             continue
         for need in own.effect.needs:
-            if getattr(grid.record, need) is None:
+            if not grid.record.knows(need):
                 fix = "Record this column, or fit without the effect."
                 raise BadModel(f"{own.effect.id} needs the column {need}", place=need, fix=fix)
         acting.append((own.effect.id, own.form, [*own.values.values()]))
@@ -151,6 +165,16 @@ def problem_of(
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
     values[problem.coefficients.stop :] = [value for *_, given in acting for value in given]
     return problem, problem.from_physical(values)
+
+
+def sensor_cost_nm(problem: Problem, theta: np.ndarray) -> float:
+    """Standard deviation of the torque owing to the angle's error, N·m: of the same movement, read another time."""
+    grid = problem.setup.grid
+    record, again = grid.record, 0.0
+    if record.motion is not None:
+        motion = record.motion.read_again(record.time_s, [part.first for part in record.parts])
+        again = (_moved(problem, motion).run(theta)[0] - problem.run(theta)[0])[grid.comparable]
+    return float(np.sqrt(np.mean(np.square(again))))
 
 
 def _own_angles(model: Muscle, own_record: bool, settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,178 @@
+"""A joint whose sensor errs: noise, steps, delay, gaps; what the angle alone says of velocity and acceleration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from stimrig import identify
+from stimrig.hardware_sim.arm_patient import arm_patient
+from stimrig.hardware_sim.arm_records import ENCODER, AngleSensor, record
+from stimrig.identify.estimation.candidates import SLOW, trusted_joint
+from stimrig.identify.estimation.effect_fit import fitted_with
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.fitting import MOVING_JOINT
+from stimrig.identify.model import Model
+from stimrig.identify.records.join import join
+from stimrig.identify.records.joint_motion import JointMotion, smooth
+from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.predict import predict
+from stimrig.identify.simulation.pulses import Motion
+from tests.harness.carried_sessions import as_record
+from tests.harness.made_once import made_once
+
+ARM = 5
+NOISY, STEPPED, LATE = AngleSensor(noise_deg=0.3), AngleSensor(step_deg=0.35), AngleSensor(delay_s=0.02)
+RATE_HZ, MOVES_S = 200.0, 20.0
+
+
+def moved(rate_hz: float = RATE_HZ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, true angles and true velocities of a movement that is never still."""
+    time_s = np.arange(0.0, MOVES_S, 1.0 / rate_hz)
+    angle = 1.2 + 0.4 * np.sin(1.7 * time_s) + 0.15 * np.sin(4.1 * time_s + 1.0)
+    return time_s, angle, 0.68 * np.cos(1.7 * time_s) + 0.615 * np.cos(4.1 * time_s + 1.0)
+
+
+def rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error[20:-20] ** 2)))
+
+
+def test_the_velocity_of_a_noisy_angle_is_found_much_better_than_by_its_slope():
+    time_s, angle, velocity = moved()
+    read = angle + np.radians(0.3) * np.random.default_rng(0).normal(size=angle.size)
+    found = JointMotion.of(time_s, read)
+    assert rms(found.velocity_rad_s - velocity) < 0.03 * rms(np.gradient(read, time_s) - velocity)
+    assert rms(found.angle_rad - angle) < 0.25 * rms(read - angle)
+    assert found.noise_rad[0] == pytest.approx(np.radians(0.3), rel=0.1)
+    assert found.step_rad == 0.0
+
+
+def test_both_ways_are_neither_late_nor_early_and_the_causal_filter_looks_at_nothing_later():
+    time_s, angle, velocity = moved()
+    read = angle + np.radians(0.3) * np.random.default_rng(1).normal(size=angle.size)
+    found = JointMotion.of(time_s, read)
+    shifts = np.arange(-4, 5)
+    errors = [rms(found.velocity_rad_s - np.interp(time_s - shift / RATE_HZ, time_s, velocity)) for shift in shifts]
+    assert abs(shifts[int(np.argmin(errors))]) <= 1
+    own = float(found.noise_rad[0]), float(found.jerk[0])
+    whole, cut = smooth(time_s, read, *own, True), smooth(time_s[:2000], read[:2000], *own, True)
+    assert np.array_equal(whole[:2000], cut)
+
+
+def test_steps_are_seen_and_an_angle_that_rests_on_them_does_not_move():
+    step = np.radians(0.35)
+    time_s, angle, velocity = moved()
+    found = JointMotion.of(time_s, np.round(angle / step) * step)
+    assert found.step_rad == pytest.approx(step, rel=1e-6)
+    assert rms(found.angle_rad - angle) < 0.4 * step / np.sqrt(12.0)
+    assert rms(found.velocity_rad_s - velocity) < 0.03
+    creeps = 1.2 + 0.3 * step * np.sin(time_s)  # over the edge between two steps, again and again
+    both = np.r_[np.round(angle / step) * step, np.round(creeps / step) * step]
+    parts = JointMotion.of(np.r_[time_s, time_s + MOVES_S], both, [0, time_s.size])
+    assert np.max(np.abs(parts.velocity_rad_s[time_s.size :])) < 0.002
+
+
+def test_readings_that_are_missing_late_or_uneven_are_bridged():
+    rng = np.random.default_rng(2)
+    time_s, angle, velocity = moved()
+    time_s = time_s + rng.uniform(-0.001, 0.001, time_s.size)
+    angle = np.interp(time_s, *moved()[:2])
+    velocity = np.interp(time_s, moved()[0], velocity)
+    read = angle + 0.002 * rng.normal(size=angle.size)
+    read[1000:1016] = np.nan
+    kept = np.ones(read.size, bool)
+    kept[2000:2016] = False
+    found = JointMotion.of(time_s[kept], read[kept])
+    assert np.isfinite(found.velocity_rad_s).all()
+    assert rms(found.velocity_rad_s - velocity[kept]) < 0.05
+    assert np.max(np.abs(found.angle_rad - angle[kept])[900:2100]) < 0.01
+
+
+def test_each_part_of_a_joined_record_is_smoothed_by_itself():
+    time_s, angle, _ = moved()
+    noise = 0.004 * np.random.default_rng(3).normal(size=(2, time_s.size))
+    alone = [JointMotion.of(time_s, read) for read in (angle + noise[0], 0.3 + 0.1 * noise[1])]
+    both = JointMotion.of(np.r_[time_s, time_s + 30.0], np.r_[angle + noise[0], 0.3 + 0.1 * noise[1]], [0, time_s.size])
+    assert both.angle_rad == pytest.approx(np.r_[alone[0].angle_rad, alone[1].angle_rad], abs=1e-6)
+    assert both.jerk[0] > 1e3 * both.jerk[1] and both.noise_rad[0] > 5 * both.noise_rad[1]
+
+
+def test_the_recorded_velocity_is_not_believed_beside_an_angle():
+    made = as_record(record(arm_patient(ARM), "moving", 1, duration_s=10.0))
+    assert made.velocity_rad_s is not None and made.motion is not None
+    wild = replace(made, velocity_rad_s=made.velocity_rad_s + 3.0)
+    assert wild.motion is not None and np.array_equal(wild.motion.velocity_rad_s, made.motion.velocity_rad_s)
+
+
+def test_angles_of_a_trial_are_smoothed_and_a_plan_stays_as_it_is():
+    _, angle, velocity = moved(40.0)
+    planned = Motion.of(angle, 40.0)
+    assert rms(planned.angle_rad - angle) < 1e-5 and rms(planned.velocity_rad_s - velocity) < 0.005
+    read = angle + np.radians(0.3) * np.random.default_rng(4).normal(size=angle.size)
+    assert rms(Motion.of(read, 40.0).velocity_rad_s - velocity) < 0.2 * rms(np.gradient(read, 1 / 40) - velocity)
+
+
+@cache
+def recorded_by(sensor: AngleSensor) -> Record:
+    """An isometric test, a passive and a moving one, joined."""
+    arm = arm_patient(ARM)
+    made = [record(arm, "isometric", 1, sensor=sensor), record(arm, "passive", 1, duration_s=30.0, sensor=sensor)]
+    made.append(record(arm, "moving", 1, duration_s=25.0, sensor=sensor))
+    return join([as_record(one) for one in made], [0.0, 120.0, 240.0])
+
+
+@made_once
+def clean() -> Model:
+    return identify.fit(recorded_by(ENCODER), effects=MOVING_JOINT)
+
+
+@made_once
+def late() -> Model:
+    return identify.fit(recorded_by(LATE), effects=MOVING_JOINT)
+
+
+@made_once
+def noisy() -> Model:
+    return identify.fit(recorded_by(NOISY), effects=MOVING_JOINT)
+
+
+def unseen_over_noise(model: Model, sensor: AngleSensor) -> float:
+    unseen = record(arm_patient(ARM), "unseen", 7, duration_s=20.0, sensor=sensor)
+    error_nm = unseen["torque_nm"] - predict(model, as_record(unseen))
+    return float(np.std(error_nm)) / unseen["truth"]["noise_sd_nm"]
+
+
+def test_a_record_tells_by_how_much_its_angle_is_late():
+    assert late().data["joint_sensor"]["delay_s"] == pytest.approx(0.02, abs=0.003)
+    assert abs(clean().data["joint_sensor"]["delay_s"]) < 0.003
+    assert any("20 ms late" in reason or "ms late" in reason for reason in late().reasons)
+    assert unseen_over_noise(late(), LATE) < 1.3
+
+
+def test_a_noisy_angle_costs_little_and_the_model_says_how_much():
+    told = noisy().data["joint_sensor"]
+    assert told["noise_rad"] == pytest.approx(np.radians(0.25), rel=0.15)
+    assert 0.0 < clean().data["joint_sensor"]["cost_nm"] < told["cost_nm"] < 0.1
+    assert unseen_over_noise(noisy(), NOISY) < 1.3
+    assert unseen_over_noise(clean(), NOISY) < 1.5 * unseen_over_noise(clean(), ENCODER)
+    assert any("strays by 0.2" in reason for reason in noisy().reasons)
+    assert Model.from_json(noisy().to_json()).data["joint_sensor"] == told
+
+
+def test_slow_noise_that_holds_what_the_structure_leaves_is_left_for_the_likelier_optimum():
+    fitted = fitted_with(recorded_by(ENCODER), MOVING_JOINT)
+    assert trusted_joint(fitted) is fitted
+    wrong = replace(fitted, noise=replace(fitted.noise, ar1=0.99, share=0.9), log_evidence=fitted.log_evidence - 50.0)
+    again = trusted_joint(wrong)
+    assert isinstance(again, Fitted) and not (again.noise.ar1 > SLOW and again.noise.share > 0.05)
+    assert again.log_evidence > wrong.log_evidence
+
+
+def test_the_velocity_follows_from_the_angle_and_needs_no_column():
+    made = recorded_by(ENCODER)
+    alone = replace(made, velocity_rad_s=None)
+    assert np.array_equal(predict(clean(), alone), predict(clean(), made))
+    assert alone.knows("velocity_rad_s") and not replace(alone, angle_rad=None).knows("velocity_rad_s")
