@@ -1,6 +1,10 @@
 """f, G, g and h of simulated arms from joined records, beside the truth; see docs/moving-joint.md.
 
     python -m bench.moving_joint --arms 1000:1050 [--json FILE]
+    python -m bench.moving_joint --arms 1000:1016 --sensors clean,noise,steps,late,all
+
+With `--sensors` the angle is read by each of them instead, in the unseen trial too: what its error costs, all tests
+joined.
 
 The arms come from `hardware_sim.arm_patient`, whose laws and distributions were written apart from the library. Arms
 0 to 99 were developed on; report on arms from 1000. Of each arm: the paper's isometric test, and the three guided tests
@@ -11,6 +15,7 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,14 +23,22 @@ import numpy as np
 from bench.common import in_processes, keep, parser, written_by
 from stimrig.api.sessions import joint_plan
 from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
-from stimrig.hardware_sim.arm_records import record
+from stimrig.hardware_sim.arm_records import ENCODER, AngleSensor, record
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.fitting import MOVING_JOINT, fit
 from stimrig.identify.model import Model
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.predict import predict
+from stimrig.identify.simulation.predict import predict, problem_of, sensor_cost_nm
 from tests.harness.carried_sessions import as_record
 
+SENSORS = {
+    "clean": ENCODER,
+    "noise": AngleSensor(noise_deg=0.3),
+    "steps": AngleSensor(step_deg=0.35),
+    "late": AngleSensor(delay_s=0.02),
+    "all": AngleSensor(noise_deg=0.3, step_deg=0.35, delay_s=0.02),
+}
 PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0
 
 
@@ -53,17 +66,50 @@ def one(seed: int) -> dict[str, Any]:
     return told
 
 
-def guided_tests(arm: ArmPatient, model: Model, isometric: dict[str, Any], seed: int) -> list[dict[str, Any]]:
+def one_by_sensors(seed: int, names: tuple[str, ...]) -> dict[str, Any]:
+    """One arm whose angle is read by each of some sensors, in its tests and in the unseen trial."""
+    arm, told = arm_patient(seed), {}
+    alone = fit(as_record(record(arm, "isometric", seed)))
+    clean = record(arm, "unseen", seed, duration_s=UNSEEN_S)
+    for name in names:
+        sensor = SENSORS[name]
+        isometric = record(arm, "isometric", seed, sensor=sensor)
+        tests = joined([isometric, *guided_tests(arm, alone, isometric, seed, sensor)])
+        began = time.process_time()
+        model = fit(tests, effects=MOVING_JOINT)
+        unseen = record(arm, "unseen", seed, duration_s=UNSEEN_S, sensor=sensor)
+        told[name] = {"cpu_s": time.process_time() - began, **model.data["joint_sensor"]}
+        told[name] |= {"error": over_noise(model, unseen), "causal": over_noise(model, unseen, causal=True)}
+        cost_nm = sensor_cost_nm(*problem_of(model, make_grid(as_record(unseen))))
+        told[name]["cost"] = cost_nm / unseen["truth"]["noise_sd_nm"]
+        if name == "clean":
+            noisy = record(arm, "unseen", seed, duration_s=UNSEEN_S, sensor=SENSORS["noise"])
+            beside = over_noise(model, clean)
+            told["predict"] = {"both ways": over_noise(model, noisy) / beside}
+            told["predict"] |= {"causal": over_noise(model, noisy, causal=True) / beside}
+    return {"seed": seed, "sensors": told}
+
+
+def over_noise(model: Model, unseen: dict[str, Any], causal: bool = False) -> float:
+    """Error of the prediction over the noise, root mean square; the load cell's zero is not the model's."""
+    error_nm = unseen["torque_nm"] - predict(model, as_record(unseen), causal)
+    return float(np.std(error_nm - np.median(error_nm))) / unseen["truth"]["noise_sd_nm"]
+
+
+def guided_tests(
+    arm: ArmPatient, model: Model, isometric: dict[str, Any], seed: int, sensor: AngleSensor = ENCODER
+) -> list[dict[str, Any]]:
     """The three tests as the service plans them with the model of the isometric test: passive, held, moving."""
     width_us, torque_nm = model.recruitment.table()
     top_us = float(arm.largest_width_us)
     curve = joint_plan.curve_of({"pulse_width_us": list(width_us), "torque_nm": list(torque_nm)}, top_us, None)
     every = round(isometric["time_s"].size / (isometric["time_s"][-1] * RATE_HZ))
     layout = joint_plan.layout(arm.range_rad, curve, top_us, isometric["pulse_width_us"][::every], RATE_HZ)
-    made = [record(arm, "passive", seed, duration_s=PASSIVE_S)]
+    made = [record(arm, "passive", seed, duration_s=PASSIVE_S, sensor=sensor)]
     for place, x in enumerate(layout.targets_rad):
-        made.append(record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held)))
-    return [*made, record(arm, "moving", seed, parts=parts_of(layout.moving))]
+        held = record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held), sensor=sensor)
+        made.append(held)
+    return [*made, record(arm, "moving", seed, parts=parts_of(layout.moving), sensor=sensor)]
 
 
 def parts_of(segments: list[dict[str, Any]]) -> list[tuple[str, np.ndarray]]:
@@ -159,11 +205,45 @@ def tell(rows: list[dict[str, Any]]) -> None:
     print(f"torque-time of the three over the paper's test: median {np.median(share):.2f}, largest {share.max():.2f}")
 
 
+def tell_sensors(rows: list[dict[str, Any]], names: tuple[str, ...]) -> None:
+    """What each sensor costs."""
+    for name in names:
+        own = [row["sensors"][name] for row in rows]
+        error, cost, cpu_s, causal = (
+            np.array([each[key] for each in own]) for key in ("error", "cost", "cpu_s", "causal")
+        )
+        apart = np.sqrt(np.maximum(error**2 - cost**2, 0.0))
+        late_ms = 1e3 * np.array([each["delay_s"] for each in own])
+        print(
+            f"{name}: error {np.median(error):.2f} x noise (median), worst {error.max():.2f}, within 1.3: "
+            f"{np.sum(error <= 1.3)} of {error.size}; without the sensor's own cost ({np.median(cost):.2f}) "
+            f"{np.median(apart):.2f}, within 1.3: {np.sum(apart <= 1.3)}; causal {np.median(causal):.2f}; delay found "
+            f"{np.median(late_ms):.1f} ms ({late_ms.min():.1f} to {late_ms.max():.1f}); "
+            f"fit {np.median(cpu_s):.1f} s of a processor, longest {cpu_s.max():.1f}"
+        )
+    if "clean" in names:
+        for way in ("both ways", "causal"):
+            ratio = np.array([row["sensors"]["predict"][way] for row in rows])
+            print(
+                f"the clean model on an angle with 0.3 degrees of noise, {way}: {np.median(ratio):.2f} x its error on "
+                f"a clean one (median), worst {ratio.max():.2f}, within 1.5: {np.sum(ratio <= 1.5)} of {ratio.size}"
+            )
+
+
 def main() -> None:
     """Run."""
     made = parser(__doc__, "1000:1050", "--arms")
     made.add_argument("--workers", type=int, default=2)
+    made.add_argument("--sensors", default="", help=f"some of {','.join(SENSORS)}")
     options = made.parse_args()
+    if options.sensors:
+        names = tuple(options.sensors.split(","))
+        rows = list(in_processes(partial(one_by_sensors, names=names), options.arms, options.workers))
+        asked = f"--arms {options.arms.start}:{options.arms.stop} --sensors {options.sensors}"
+        print(written_by(f"python -m bench.moving_joint {asked}"))
+        tell_sensors(rows, names)
+        keep(options.json, rows)
+        return
     rows = []
     for row in in_processes(one, options.arms, options.workers):
         rows.append(row)
