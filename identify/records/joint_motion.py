@@ -17,8 +17,9 @@ MOTION = ("angle_rad", "velocity_rad_s", "acceleration_rad_s2")
 BLOCK_S = 0.01
 """Readings so close together are averaged where noise is asked for: a column that was interpolated between them says
 little of noise from row to row."""
-UNKNOWN = 1e14
-"""Variance of a state before anything is measured, over that of the noise."""
+UNKNOWN, AT_REST = 1e14, 1e3
+"""Variance of a state before anything is measured, over that of the noise: it may be whatever it is; or, where there
+is nothing later to tell, the joint begins about at rest."""
 LEAST_BLOCKS = 8
 LEAST_NOISE_RAD = 2e-6
 """Even an angle without noise is written with so many digits."""
@@ -40,7 +41,7 @@ LARGEST_STEP_RAD = 0.035
 
 
 @njit(cache=True, nogil=True)
-def _forward(time_s, angle_rad, noise, jerk, states, spreads, told):  # pragma: no cover
+def _forward(time_s, angle_rad, noise, jerk, unknown, states, spreads, told):  # pragma: no cover
     """Kalman filter of (angle, velocity, acceleration); a reading that is NaN is left out.
 
     Writes the filtered `states` (N, 3), `spreads` (N, 6): their covariance; `told` (N, 5): innovation, its variance,
@@ -52,8 +53,7 @@ def _forward(time_s, angle_rad, noise, jerk, states, spreads, told):  # pragma: 
         if angle_rad[k] == angle_rad[k]:
             x = angle_rad[k]
             break
-    # Before anything is measured velocity and acceleration may be whatever they are.
-    wide = UNKNOWN * noise[0]
+    wide = unknown * noise[0]
     pxx, pxv, pxa, pvv, pva, paa = wide, 0.0, 0.0, wide, 0.0, 100.0 * wide
     logs, squares, count = 0.0, 0.0, 0
     for k in range(time_s.size):
@@ -168,7 +168,9 @@ def smooth(
     """Angle, velocity and acceleration at each reading, from all readings, or from those until then; shape (N, 3)."""
     size = time_s.size
     states, spreads, told = np.empty((size, 3)), np.empty((size, 6)), np.empty((size, 5))
-    _forward(time_s, angle_rad, np.full(size, noise_rad**2), jerk, states, spreads, told)
+    _forward(
+        time_s, angle_rad, np.full(size, noise_rad**2), jerk, AT_REST if causal else UNKNOWN, states, spreads, told
+    )
     if not causal:
         _backward(time_s, states, spreads, told)
     return states
@@ -191,7 +193,7 @@ def sensor_of(time_s: np.ndarray, angle_rad: np.ndarray, step_rad: float = 0.0) 
     nothing = np.empty((0, 3)), np.empty((0, 6)), np.empty((0, 5))
 
     def unlikely(log_ratio: float) -> tuple[float, float, float]:
-        logs, squares, told = _forward(at_s, mean_rad, 1.0 / count, float(np.exp(log_ratio)), *nothing)
+        logs, squares, told = _forward(at_s, mean_rad, 1.0 / count, float(np.exp(log_ratio)), UNKNOWN, *nothing)
         variance = max(squares / told, least)
         return logs + told * np.log(variance) + squares / variance, log_ratio, variance
 
