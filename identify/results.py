@@ -101,6 +101,10 @@ class Diagnosis(Result):
     """Effects, most probable first: `effect`, `name`, `probability`, errors before and after, `confused_with`,
     `next_experiment` (words) and `next_experiment_plan`, `form`, `equation`, `parameters`, `rival_probabilities`,
     `plain`."""
+    free: tuple[Row, ...]
+    """Free effects, which describe what no effect of the library explains: `effect`, `name`, `form`, `equation`,
+    `parameters`, `enters`, `driven_by`, `words`, `left_out`, and the picture: `driver`, `at`, `axis`, `lines`, each
+    with `value`, `lower` and `upper`."""
     where: tuple[Row, ...]  # where the error is, as in `Comparison`
     with_all: Row  # the model with all of `missing`: the keys of `base`, and `noise_sd_nm`
     explained: float  # share, 0 to 1, of the explainable log-likelihood that the effects explain
@@ -121,7 +125,8 @@ class Diagnosis(Result):
             ("the model", both_words(self.base)),
             *[(str(row["effect"]), _read_row(row)) for row in self.missing],
         ]
-        if self.missing:
+        rows += [(str(row["effect"]), str(row["words"])) for row in self.free]
+        if self.missing or self.free:
             rows.append(("with all", both_words(self.with_all)))
         told = [row for row in self.missing if row["confused_with"]]
         rows += [("next test", row["next_experiment"]) for row in told[:1]]

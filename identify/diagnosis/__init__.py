@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from stimrig.identify.diagnosis.free import searched
 from stimrig.identify.diagnosis.result import diagnosis_of
-from stimrig.identify.diagnosis.search import Progress, search_effects
-from stimrig.identify.diagnosis.verdict import judge
+from stimrig.identify.diagnosis.search import Progress
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.effect_fit import fitted_with
-from stimrig.identify.estimation.samples import fitted_rows, prepare
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.experiments import NOTHING, Experiment, plan
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
@@ -49,8 +49,7 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
     """
     structure = structure_of(model)
     grid, raw = prepare(record)
-    search = search_effects(grid, raw, fitted_rows(grid, None), progress, structure=structure)
-    result = diagnosis_of(search, judge(search))
+    result = diagnosis_of(*searched(grid, raw, progress, structure=structure))
     if progress is not None:
         progress(1.0, "done")
     return result

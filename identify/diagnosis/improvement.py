@@ -6,23 +6,23 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stimrig.identify.diagnosis import structure_of
+from stimrig.identify.diagnosis.free import searched
 from stimrig.identify.diagnosis.search import (
     MOST,
     EffectSearch,
     Progress,
     Step,
     helpful,
-    search_effects,
 )
 from stimrig.identify.diagnosis.thresholds import RISE
-from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.left_out import difference
-from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
+from stimrig.identify.estimation.samples import Raw, prepare
+from stimrig.identify.estimation.shapes import told
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Improvement
@@ -71,8 +71,7 @@ def improve(
     most = MOST if max_effects is None else min(max_effects, MOST)
     structure = structure_of(model)
     grid, raw = prepare(record)
-    search = search_effects(grid, raw, fitted_rows(grid, None), progress, most=most, structure=structure)
-    verdict = judge(search)
+    search, verdict = searched(grid, raw, progress, most=most, structure=structure)
     row, against = helpful(search)
     if max_effects is not None:
         row = row[: max_effects + 1]
@@ -97,6 +96,7 @@ def improve(
     )
 
 
+FREE = "It is free: it describes what no effect of the library explains, and names no cause."
 _PLAIN = "The plain structure: recruitment curve and linear dynamics."
 
 
@@ -108,6 +108,9 @@ def _reason(search: EffectSearch, step: Step, before: Step) -> str:
     if step.added in search.detected:
         return "The samples show it directly, before any fit."
     number = search.added.index(step.added)
+    if step.added in search.free:
+        seen = difference(search.left_out[number], search.left_out[number + 1])
+        return " ".join([told(step.fitted, step.added)["words"], seen.words, FREE])
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
     seen = difference(search.left_out[number], search.left_out[number + 1])
     reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."

@@ -15,6 +15,8 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters
 from stimrig.identify.estimation.joint import predict_fitted
+from stimrig.identify.estimation.left_out import difference
+from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.uncertainty import covariance_of
 from stimrig.identify.experiments import Experiment, plan
 from stimrig.identify.results import Diagnosis
@@ -37,6 +39,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     ranked = _ranked(search, verdict)
     covariance = covariance_of(search.last.written) if ranked else np.zeros((0, 0))
     missing = [_missing(search, verdict, effect, row, covariance) for effect in ranked]
+    free = [_free(search, effect) for effect in search.free]
     final = row[-1].statistics
     residual = record.torque_nm - (
         predict_fitted(search.last)[0] if verdict.kind == "unexplained_structure" else base_prediction
@@ -54,6 +57,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
         verdict=verdict.kind,
         probability=verdict.probability,
         missing=tuple(missing),
+        free=tuple(free),
         where=tuple(where),
         with_all={key: final[key] for key in STATISTICS} | {"noise_sd_nm": final["noise_sd_nm"]},
         explained=verdict.explained,
@@ -63,7 +67,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
         else {"rms_nm": verdict.held_out_error.rms_nm, "allowed_nm": verdict.held_out_error.allowed_nm},
         candidates=tuple([_candidate(one) for one in tried] for tried in search.rounds),
         notes=tuple(verdict.notes),
-        plain=tuple(_plain(search, verdict, base, final, missing, where)),
+        plain=tuple(_plain(search, verdict, base, final, missing, free, where)),
     )
 
 
@@ -109,6 +113,25 @@ def _missing(
     }
 
 
+def _free(search: EffectSearch, effect: str) -> dict[str, Any]:
+    """What a free effect does, and what left-out blocks say of it."""
+    number = search.added.index(effect)
+    fitted = search.last.written
+    index = [name for name, _ in fitted.effects].index(effect)
+    covariance = covariance_of(fitted)
+    shape = shape_of(fitted, index, covariance)
+    assert shape is not None
+    return {
+        "effect": effect,
+        "name": find_effect(effect).name,
+        "form": fitted.effects[index][1].name,
+        "equation": fitted.effects[index][1].equation,
+        "parameters": describe_parameters(fitted, index, covariance),
+        "left_out": difference(search.left_out[number], search.left_out[number + 1]).words,
+        **{"axis" if key == "effect" else key: value for key, value in shape.items()},
+    }
+
+
 def _close(search: EffectSearch, effect: str) -> set[str]:
     """Effects that resemble this one and gain nearly as much: in another form they might be better."""
     if effect not in search.added:
@@ -148,7 +171,13 @@ def _candidate(one: Candidate) -> dict[str, Any]:
 
 
 def _plain(
-    search: EffectSearch, verdict: Verdict, base: dict[str, Any], final: dict[str, Any], missing: list, where: list
+    search: EffectSearch,
+    verdict: Verdict,
+    base: dict[str, Any],
+    final: dict[str, Any],
+    missing: list,
+    free: list,
+    where: list,
 ) -> list[str]:
     noise = search.raw.noise_sd_nm
     held = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
@@ -164,6 +193,7 @@ def _plain(
             "An error is left that no effect in the library explains. It appears when the muscle works, so it is not "
             "measurement noise."
         )
+        lines += [f"{row['words']} {row['left_out']}" for row in free]
         if where:
             lines.append(f"Most of it is here: {where[0]['text']}.")
     for entry in missing:

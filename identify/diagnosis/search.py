@@ -79,6 +79,7 @@ class EffectSearch:
     losses: dict[str, float] = field(default_factory=dict)  # log evidence lost without each effect, if of several
     quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # intervals in which the muscle rests
     residuals: list[ResidualStructure] = field(default_factory=list)  # what that of each model of the chain shows
+    free: list[str] = field(default_factory=list)  # of `added` the last ones, which describe what no other explains
 
     @property
     def held(self) -> list[str]:
@@ -165,7 +166,7 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     """The likeliest candidate of a round that predicts left-out blocks better; None if none does."""
     before = search.rounds[0] if search.rounds else []
     listed, least = _worth_a_fit(search)
-    tried = _scan(search.last, listed, least, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
+    tried = scan(search.last, listed, least, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
     candidates = sorted((_discounted(search, c) for c in tried), key=_by_gain)
     search.rounds.append(candidates)
     if not number and (lawless := try_effect(FREE_GAIN, search.last)) is not None:
@@ -257,7 +258,7 @@ def _fitted_to_its_end(candidate: Candidate) -> Candidate:
     return replace(candidate, fitted=fitted, gain=candidate.gain + fitted.log_evidence - begun.log_evidence)
 
 
-def _scan(
+def scan(
     base: Fitted, listed: list[Effect], least: float, before: list[Candidate], progress: Progress
 ) -> list[Candidate]:
     """Add each of some effects to a model; best first. `before` holds the candidates of an earlier round."""
@@ -294,7 +295,7 @@ def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     """
     grid = base.problem.setup.grid
     record, jumps = grid.record, base.heavy_tails and grid.readings is not None
-    asked = not effect.raw and effect.id not in present
+    asked = not effect.raw and not effect.shape and effect.id not in present
     asked = asked and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
     return asked and all(record.knows(need) for need in effect.needs)
 

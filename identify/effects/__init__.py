@@ -22,7 +22,7 @@ from stimrig.identify.errors import BadRequest
 
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"
-_NOT_EFFECTS = {"base", "own_file"}
+_NOT_EFFECTS = {"base", "own_file", "use"}
 
 
 def _own() -> list[Effect]:

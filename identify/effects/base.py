@@ -11,9 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.polynomial.chebyshev import chebvander
 
+from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 
-STAGES = ("pulse_width", "gain", "speed", "branch", "delay", "filter", "output", "additive", "sensor")
+STAGES = ("pulse_width", "gain", "speed", "lags", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
 LEAST_RANGE_RAD = 0.1
@@ -208,6 +209,7 @@ class Form:
     - "pulse_width": x is the pulse width, µs; returns the pulse width that acts.
     - "gain": x is the drive f(u), N·m; returns the drive.
     - "speed": x is (drive, torque); returns a factor on the time constant.
+    - "lags": `apply` is not called: `law` says what of `stimrig.identify.dynamics.free_lags` each parameter sets.
     - "branch": x is the drive; returns a list of (drive, factor on the time constant), whose responses are added.
     - "delay": x is None; returns a delay, s.
     - "filter": x is (torque, rate) at the ends of the pulse intervals, shape (K + 1,); returns the same.
@@ -232,6 +234,8 @@ class Form:
     law : dict
         For "speed" only: the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on
         that scale. `apply` is then not called.
+    held : dict
+        For "lags" only: what of the same has a given value.
     propose : callable or None
         `propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
         there are none. `previous` holds the parameters of the form before it in a chain.
@@ -261,7 +265,8 @@ class Form:
     parameters: tuple[Parameter, ...]
     apply: Apply | None = None
     batched: bool = False
-    law: dict[str, tuple[Lag, SpeedLaw]] = field(default_factory=dict)
+    law: Mapping[str, tuple[Lag, SpeedLaw] | FreeLaw] = field(default_factory=dict)
+    held: Mapping[FreeLaw, float] = field(default_factory=dict)
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     grows: bool = False
     accept: Callable[[dict[str, float], Scene], bool] | None = None
@@ -302,6 +307,37 @@ class Form:
         if isinstance(results[0], tuple):
             return tuple(np.stack([result[i] for result in results]) for i in range(len(results[0])))
         return np.stack([np.broadcast_to(np.asarray(result, float), scene.time_s.shape) for result in results])
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a free effect is found to do.
+
+    Parameters
+    ----------
+    enters : str
+        "drive", "rate of rise", "rate of fall", "output" or "zero".
+    driven_by : str
+        "width", "activation", "torque", "time since" or "sum of the past".
+    words : str
+        The same in one sentence with its size.
+    driver : str
+        Name and unit of the horizontal axis.
+    at : ndarray, shape (n,)
+        Places there.
+    effect : str
+        Name and unit of the vertical axis.
+    lines : dict of str to ndarray, shape (n,)
+        The curves, by name.
+    """
+
+    enters: str
+    driven_by: str
+    words: str
+    driver: str
+    at: np.ndarray
+    effect: str
+    lines: Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -349,6 +385,9 @@ class Effect:
     main : dict of str
         The parameters that stand for it in the trend, first choice first, and their names for people, without units;
         the form's first one where none of them is its own.
+    shape : callable or None
+        Of a free effect only: `shape(form, values)` is what a fit found, as a picture with its sentence. A free effect
+        describes what no other explains. It is tried last, and its name claims no physics.
     """
 
     id: str
@@ -368,6 +407,7 @@ class Effect:
     prior: float = 0.0
     muscle: bool = True
     main: dict[str, str] = field(default_factory=dict)
+    shape: Callable[[Form, Mapping[str, float]], Shape] | None = None
 
     @property
     def stage(self) -> str:

@@ -18,6 +18,7 @@ from stimrig.identify.estimation.joint_sensor import sensor_of, words
 from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
+from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.uncertainty import bands, covariance_of, unexplained
 from stimrig.identify.model import Covariance, Model, Noise
 from stimrig.identify.recruitment import Curve
@@ -136,23 +137,28 @@ def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
     chosen = fitted.problem.chosen[index]
     setup = fitted.problem.setup
     own = fitted.unforeseen.get(chosen.effect)
+    shape = shape_of(fitted, index, matrix)
     joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
     joint |= {"angle_late_s": setup.angle_late_s or None}
-    return {
-        "id": chosen.effect,
-        "form": chosen.form.name,
-        "stage": chosen.form.stage,
-        "equation": chosen.form.equation,
-        "parameters": describe_parameters(fitted, index, matrix),
-        "settings": {
-            "scale_nm": setup.scale_nm,
-            "noise_sd_nm": setup.noise_sd_nm,
-            "zero_nm": setup.zero_nm,
-            "sign": setup.sign,
-            "reference_s": setup.reference_s,
+    return (
+        {
+            "id": chosen.effect,
+            "form": chosen.form.name,
+            "stage": chosen.form.stage,
+            "equation": chosen.form.equation,
+            "parameters": describe_parameters(fitted, index, matrix),
+            "settings": {
+                "scale_nm": setup.scale_nm,
+                "noise_sd_nm": setup.noise_sd_nm,
+                "zero_nm": setup.zero_nm,
+                "sign": setup.sign,
+                "reference_s": setup.reference_s,
+            }
+            | {name: value for name, value in joint.items() if value is not None},
         }
-        | {name: value for name, value in joint.items() if value is not None},
-    } | ({} if own is None else {"unforeseen": {"mean_nm": own[0], "rms_nm": own[1]}})
+        | ({} if own is None else {"unforeseen": {"mean_nm": own[0], "rms_nm": own[1]}})
+        | ({} if shape is None else {"shape": shape})
+    )
 
 
 def describe_parameters(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, dict[str, Any]]:

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from stimrig.identify.dynamics.second_order import Core
 from stimrig.identify.dynamics.states import read_means
@@ -276,7 +277,7 @@ class _StagePass:
 
     def dynamics(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         core, initial = self.join(range(2)), self.join(self.problem.initials)
-        speeds = [(chosen, self.join(chosen.places)) for chosen in self.forms("speed")]
+        speeds, lags = ([(one, self.join(one.places)) for one in self.forms(stage)] for stage in ("speed", "lags"))
         branches = [(drive, np.ones((len(drive), 1)))]
         for chosen, p in self.joined("branch"):
             branches = [
@@ -286,15 +287,18 @@ class _StagePass:
             ]
         branches = [(self.grown(part), self.grown(slower)) for part, slower in branches]
         self.cores, initial = self.grown(core), self.grown(initial)
+        if lags:
+            return self.respond_freely(branches, self.free_laws(lags, len(initial)), initial)
         law, given = np.zeros((len(initial), len(Lag), len(SpeedLaw))), []
         for chosen, values in speeds:
             p = self.named(chosen, self.grown(values))
             if not chosen.form.law:
                 given.append((chosen.form, p))
             for one in chosen.parameters:
-                if one.name in chosen.form.law:
+                column = chosen.form.law.get(one.name)
+                if isinstance(column, tuple):
                     value = p[one.name][:, 0]
-                    law[:, *chosen.form.law[one.name]] += np.log(value) if one.scale == "log" else value
+                    law[:, *column] += np.log(value) if one.scale == "log" else value
         torque, rate = self.respond(branches, law, initial, np.zeros((0, 1)))
         # A speed law given as a Python function needs the torque: it is iterated, starting from the torque without it.
         for _ in range(4 if given else 0):
@@ -306,6 +310,29 @@ class _StagePass:
                 break
             torque, rate = self.respond(branches, law, initial, np.ascontiguousarray(np.clip(factor, 0.02, 50.0)))
         return torque, rate
+
+    def respond_freely(self, branches: list, laws: np.ndarray, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `respond`, where the rates of both lags are free."""
+        setup = self.setup
+        begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
+        shared = setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
+        torque, rate = np.zeros((2, len(initial), setup.grid.size + 1))
+        for part, slower in branches:
+            core = self.cores * np.c_[slower, np.ones_like(slower)]
+            drive = np.ascontiguousarray(part)
+            found = run_free(drive, setup.scene.on, setup.scene.rest_s, core, laws, *shared)
+            torque, rate = torque + found[0], rate + found[1]
+        return torque, rate
+
+    def free_laws(self, lags: list[tuple[Chosen, np.ndarray]], rows: int) -> np.ndarray:
+        """What all forms of the stage "lags" say together, shape (M, len(FreeLaw))."""
+        laws = np.zeros((rows, len(FreeLaw)))
+        for chosen, values in lags:
+            for column, value in chosen.form.held.items():
+                laws[:, column] = value
+            for one, value in zip(chosen.parameters, self.grown(values).T, strict=True):
+                laws[:, chosen.form.law[one.name]] += value  # pyright: ignore[reportCallIssue, reportArgumentType]
+        return laws
 
     def respond(
         self, branches: list, law: np.ndarray, initial: np.ndarray, multiplier: np.ndarray

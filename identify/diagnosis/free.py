@@ -1,0 +1,169 @@
+"""Free effects: what is added where no effect of the library explains a record.
+
+The library's effects ask "is it this?"; free ones describe. They are tried only where structure is left, on the model
+without the library's effects of the muscle and on the one with them; left-out blocks choose, as everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.diagnosis.residual import held_out_error, residual_structure, vetoed
+from stimrig.identify.diagnosis.search import (
+    MOST,
+    EffectSearch,
+    Progress,
+    scan,
+    search_effects,
+    silent,
+    without_effect,
+)
+from stimrig.identify.diagnosis.verdict import Verdict, judge
+from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.effects import Effect, find_effect, registry
+from stimrig.identify.estimation.effect_fit import WORTHLESS, Candidate
+from stimrig.identify.estimation.joint import Fitted, solve
+from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
+from stimrig.identify.estimation.samples import Raw, fitted_rows
+from stimrig.identify.noise import WHITE
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Models from a base on, each with one free effect more."""
+
+    models: tuple[Fitted, ...]
+    left_out: tuple[LeftOut, ...]
+    added: tuple[str, ...] = ()
+
+    def with_(self, fitted: Fitted, unseen: LeftOut, effect: str) -> Chain:
+        """With one model more."""
+        return Chain((*self.models, fitted), (*self.left_out, unseen), (*self.added, effect))
+
+
+def searched(
+    grid: Grid, raw: Raw, progress: Progress | None = None, *, most: int = MOST, structure: Sequence[str] = ()
+) -> tuple[EffectSearch, Verdict]:
+    """The search for effects of the library, and then, where structure is left, for free ones; and its verdict.
+
+    As `search_effects`. A free effect is no name: where one is needed, the verdict stays that structure is left.
+    """
+    say = progress or silent
+    search = search_effects(grid, raw, fitted_rows(grid, None), progress, most=most, structure=structure)
+    verdict = judge(search)
+    if verdict.kind != "unexplained_structure" or most == 0 or search.last.noise.band > 0.0:
+        return search, verdict
+    freely = explain_freely(search, lambda done, text: say(0.75 + 0.2 * done, text))
+    if not freely.free:
+        return search, verdict
+    found = {effect: p for effect, p in verdict.found.items() if effect in [*freely.detected, *freely.added]}
+    first, left = freely.chain[0], freely.residuals[-1]
+    explained = (freely.last.log_likelihood - first.log_likelihood) / max(left.ideal - first.log_likelihood, 1.0)
+    error = held_out_error(freely.last, thresholds.FORM_ERROR_WITH_EFFECTS)
+    return freely, replace(verdict, found=found, explained=explained, structure=left.ratio, held_out_error=error)
+
+
+def explain_freely(search: EffectSearch, progress: Progress | None = None) -> EffectSearch:
+    """The search with free effects, where they predict left-out blocks better than what it found; else as it was.
+
+    Parameters
+    ----------
+    search : EffectSearch
+        In whose last model structure is left.
+    progress : callable or None
+        As `search_effects` takes it.
+    """
+    kept = [effect for effect in search.added if not find_effect(effect).predictable]
+    say = progress or silent
+    best = _extended(_chain(_with_only(search, kept)), lambda done, text: say(0.5 * done, text))
+    names = kept
+    if (
+        len(kept) < len(search.added)
+        and difference(best.left_out[-1], search.left_out[-1]).errors > thresholds.NO_WORSE
+    ):
+        other = _extended(_chain(search.chain), lambda done, text: say(0.5 + 0.5 * done, text))
+        if difference(best.left_out[-1], other.left_out[-1]).errors >= thresholds.BETTER:
+            best, names = other, search.added
+    gained = difference(search.left_out[-1], best.left_out[-1])
+    if not best.added or not gained.errors >= thresholds.BETTER:
+        return search
+    return _with_chain(search, best, [*names, *best.added])
+
+
+def _chain(models: Sequence[Fitted]) -> Chain:
+    return Chain(tuple(models), tuple(leave_out(one) for one in models))
+
+
+def _with_only(search: EffectSearch, kept: Sequence[str]) -> list[Fitted]:
+    """The chain of models with only some of the effects that were added."""
+    last = search.last
+    for effect in search.added:
+        if effect not in kept:
+            last = without_effect(last, effect)
+    models = [last]
+    for effect in reversed(kept):
+        models.append(without_effect(models[-1], effect))
+    return models[::-1]
+
+
+def _extended(chain: Chain, progress: Progress) -> Chain:
+    """With the free effects that left-out blocks ask for, and against which held-out rows do not speak."""
+    for number in range(thresholds.MOST_FREE):
+        base, unseen = chain.models[-1], chain.left_out[-1]
+        listed = [effect for effect in registry().values() if _applicable(effect, base)]
+        share = number / thresholds.MOST_FREE
+        tried = scan(base, listed, WORTHLESS, [], lambda done, text, at=share: progress(at + 0.5 * done, text))
+        best = _best(unseen, tried, *(thresholds.FURTHER_FREE if chain.added else thresholds.FIRST_FREE))
+        if best is None or vetoed(base, best[0]):
+            break
+        chain = chain.with_(*best)
+    return chain
+
+
+def _applicable(effect: Effect, base: Fitted) -> bool:
+    """Whether a free effect can stand beside those of a model: free lags take the place of every other speed law."""
+    stages = {form.stage for _, form in base.effects}
+    own = {form.stage for form in effect.forms}
+    return bool(effect.shape) and effect.id not in dict(base.effects) and not ("speed" in stages and "lags" in own)
+
+
+def _best(
+    unseen: LeftOut, tried: Sequence[Candidate], errors: float, least: float
+) -> tuple[Fitted, LeftOut, str] | None:
+    """The candidate that predicts left-out blocks best, its error there and its effect."""
+    able = []
+    for one in tried:
+        if one.gain < thresholds.NEXT_MARGIN:
+            break
+        for fitted in _twins(one.fitted):
+            own = leave_out(fitted)
+            seen = difference(unseen, own)
+            if seen.errors >= errors and seen.gain >= least:
+                able.append((seen.gain, fitted, own, one.effect.id))
+    return max(able, key=lambda found: found[0])[1:] if able else None
+
+
+def _twins(fitted: Fitted) -> list[Fitted]:
+    """A fit; and, where its slow noise may have taken up structure, the same with noise that is held white."""
+    if fitted.noise.held or fitted.noise.ar1 < thresholds.TAKES_UP:
+        return [fitted]
+    return [fitted, solve(fitted.problem, fitted.theta, WHITE)]
+
+
+def _with_chain(search: EffectSearch, chain: Chain, names: list[str]) -> EffectSearch:
+    """The search that ends with this chain. Rounds of effects that are no longer there say what was refused."""
+    kept = [search.added.index(name) for name in names if name not in chain.added]
+    rounds = [search.rounds[place] for place in kept] + search.rounds[:1]
+    return replace(
+        search,
+        added=names,
+        chain=list(chain.models),
+        left_out=list(chain.left_out),
+        residuals=[residual_structure(fitted, search.quiet) for fitted in chain.models],
+        rounds=rounds,
+        margins=[search.margins[place] for place in kept] + search.margins[:1],
+        losses={},
+        free=list(chain.added),
+    )

@@ -1,0 +1,38 @@
+"""What free effects of use share: a slow state that fills with work, its picture, and words for sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from stimrig.identify.dynamics.free_lags import FreeLaw, filled
+from stimrig.identify.effects.base import Parameter
+
+FILL = Parameter("fill_s", "s", 0.5, 200.0, 0.0, (20.0, 4.0, 50.0), "log", about="time constant under full work")
+EMPTY = Parameter("empty_s", "s", 0.5, 400.0, 0.0, (40.0, 10.0, 40.0), "log", about="time constant at rest")
+STATE = {"fill_s": FreeLaw.FILL_S, "empty_s": FreeLaw.EMPTY_S}
+BY = {"by_torque": {}, "by_pulses": {FreeLaw.BY_PULSES: 1.0}, "by_drive": {FreeLaw.BY_DRIVE: 1.0}}
+WORK_S, STEP_S = 20.0, 0.5
+"""Full work in the picture, then rest."""
+TIME_S = np.arange(0.0, 4.0 * WORK_S + STEP_S, STEP_S)
+DRIVER = "time, full work for 20 s, then rest (s)"
+
+
+def course(values: Mapping[str, float]) -> np.ndarray:
+    """The slow state at `TIME_S`, 0 to 1."""
+    state, found = 0.0, []
+    for at in TIME_S:
+        found.append(state)
+        state = filled(state, float(at < WORK_S), values["fill_s"], values["empty_s"], STEP_S)
+    return np.array(found)
+
+
+def changed(share: float, more: str, less: str) -> str:
+    """A change as words: "weaker by 12 %"."""
+    return f"{more if share > 0.0 else less} by {100.0 * abs(share):.0f} %"
+
+
+def seconds(value_s: float) -> str:
+    """A time constant as people say it."""
+    return f"{value_s:.2g} s" if value_s < 100.0 else f"{value_s / 60.0:.2g} min"

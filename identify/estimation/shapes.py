@@ -1,0 +1,66 @@
+"""What free effects of a fit do, as pictures: curves with bands, and one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from stimrig.identify.effects import find_effect
+from stimrig.identify.effects.base import Form, Shape
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.uncertainty import covariance_of
+
+DRAWS = 200
+PERCENTILES = 2.5, 97.5
+
+
+def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] | None:
+    """What one effect of a fit does; None of an effect that is not free.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        With effects.
+    index : int
+        Of the effect in `fitted.problem.chosen`.
+    matrix : ndarray, shape (P, P)
+        Covariance of all parameters in their units.
+
+    Returns
+    -------
+    dict or None
+        `enters`, `driven_by`, `words`, `driver`, `at`, `effect`, and `lines`: by name `value`, `lower` and `upper`
+        (95 % of draws of the effect's parameters), each of shape (n,).
+    """
+    chosen = fitted.problem.chosen[index]
+    shape = find_effect(chosen.effect).shape
+    if shape is None:
+        return None
+    places = list(chosen.places)
+    values = fitted.physical[places]
+    names = [p.name for p in chosen.parameters]
+    found = shape(chosen.form, dict(zip(names, values.tolist(), strict=True)))
+    drawn = np.random.default_rng(0).multivariate_normal(values, matrix[np.ix_(places, places)], DRAWS, method="svd")
+    bounds = np.array([(p.lower, p.upper) for p in chosen.parameters]).T
+    every = [_lines(shape, chosen.form, names, row) for row in np.clip(drawn, *bounds)]
+    lines = {}
+    for name, line in found.lines.items():
+        lower, upper = np.percentile([one[name] for one in every], PERCENTILES, axis=0)
+        lines[name] = {"value": line.tolist(), "lower": lower.tolist(), "upper": upper.tolist()}
+    told = {key: getattr(found, key) for key in ("enters", "driven_by", "words", "driver", "effect")}
+    return told | {"at": found.at.tolist(), "lines": lines}
+
+
+def told(fitted: Fitted, effect: str) -> dict[str, Any]:
+    """As `shape_of`, of a free effect by its id."""
+    written = fitted.written
+    found = shape_of(written, [name for name, _ in written.effects].index(effect), covariance_of(written))
+    assert found is not None
+    return found
+
+
+def _lines(shape: Any, form: Form, names: list[str], row: np.ndarray) -> Mapping[str, np.ndarray]:
+    drawn: Shape = shape(form, dict(zip(names, row.tolist(), strict=True)))
+    return drawn.lines
