@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.residual import held_out_error, residual_structure, vetoed
+from stimrig.identify.diagnosis.residual import residual_structure, vetoed
 from stimrig.identify.diagnosis.search import (
     MOST,
     EffectSearch,
@@ -20,7 +20,7 @@ from stimrig.identify.diagnosis.search import (
     silent,
     without_effect,
 )
-from stimrig.identify.diagnosis.verdict import Verdict, judge
+from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, find_effect, registry
 from stimrig.identify.estimation.effect_fit import WORTHLESS, Candidate
@@ -58,11 +58,7 @@ def searched(
     freely = explain_freely(search, lambda done, text: say(0.75 + 0.2 * done, text))
     if not freely.free:
         return search, verdict
-    found = {effect: p for effect, p in verdict.found.items() if effect in [*freely.detected, *freely.added]}
-    first, left = freely.chain[0], freely.residuals[-1]
-    explained = (freely.last.log_likelihood - first.log_likelihood) / max(left.ideal - first.log_likelihood, 1.0)
-    error = held_out_error(freely.last, thresholds.FORM_ERROR_WITH_EFFECTS)
-    return freely, replace(verdict, found=found, explained=explained, structure=left.ratio, held_out_error=error)
+    return freely, judge_free(freely, verdict)
 
 
 def explain_freely(search: EffectSearch, progress: Progress | None = None) -> EffectSearch:

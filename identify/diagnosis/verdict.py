@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from stimrig.identify.diagnosis.search import EffectSearch, resembles_earlier, s
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import doubts
 from stimrig.identify.estimation.effect_fit import Candidate
+from stimrig.identify.estimation.joint import Fitted
 
 
 @dataclass(frozen=True)
@@ -96,13 +97,43 @@ def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
     return before is None or after.excess_nm > thresholds.HELD_OUT_SHARE * before.excess_nm
 
 
+def _beyond(error: HeldOutError) -> str:
+    return (
+        f"On held-out rows the error of the last model is {error.ratio:.1f} times what noise and its uncertainty allow: "
+        "something is still missing."
+    )
+
+
+def _explained(search: EffectSearch, first: Fitted) -> float:
+    """Share of the explainable log-likelihood that the effects explain."""
+    possible = search.residuals[-1].ideal - first.log_likelihood
+    return float((search.last.log_likelihood - first.log_likelihood) / max(possible, 1.0))
+
+
+def judge_free(search: EffectSearch, before: Verdict) -> Verdict:
+    """The verdict with free effects. They name nothing: what is told of the library's effects stays."""
+    first, last = search.plain if search.held else search.chain[0], search.last
+    errors = [held_out_error(fitted, thresholds.FORM_ERROR_WITH_EFFECTS, last) for fitted in (first, last)]
+    readings = search.raw.readings
+    notes = [*([] if readings is None else [readings.words]), *doubts(last)]
+    if errors[1] is not None and _contradicted(errors[0], errors[1]):
+        notes.append(_beyond(errors[1]))
+    return replace(
+        before,
+        found={effect: p for effect, p in before.found.items() if effect in (*search.detected, *search.added)},
+        explained=_explained(search, first),
+        structure=search.residuals[-1].ratio,
+        held_out_error=errors[1],
+        notes=notes,
+    )
+
+
 def judge(search: EffectSearch) -> Verdict:
     """The verdict on a search for effects."""
     first, last = search.plain if search.held else search.chain[0], search.last
     effects = [*search.held, *search.added]
     left = search.residuals[-1]
-    possible = max(left.ideal - first.log_likelihood, 1.0)
-    explained = (last.log_likelihood - first.log_likelihood) / possible if effects else 0.0
+    explained = _explained(search, first) if effects else 0.0
     readings = search.raw.readings
     notes = [*([] if readings is None else [readings.words]), *doubts(last)]
     found: dict[str, float] = dict.fromkeys(search.detected, 0.99)
@@ -147,10 +178,7 @@ def judge(search: EffectSearch) -> Verdict:
     before, after = (held_out_error(fitted, form, last) for fitted in (first, last))
     if after is not None and _contradicted(before, after):
         strange = True
-        notes.append(
-            f"On held-out rows the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
-            "allow: something is still missing."
-        )
+        notes.append(_beyond(after))
     if strange:
         found = {effect: min(p, thresholds.DOUBTED) for effect, p in found.items()}
         kind = "unexplained_structure"
