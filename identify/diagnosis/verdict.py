@@ -99,8 +99,8 @@ def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
 
 def _beyond(error: HeldOutError) -> str:
     return (
-        f"On held-out rows the error of the last model is {error.ratio:.1f} times what noise and its uncertainty allow: "
-        "something is still missing."
+        f"On held-out rows the error of the last model is {error.ratio:.1f} times what noise and its uncertainty "
+        "allow: something is still missing."
     )
 
 
