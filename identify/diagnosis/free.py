@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import residual_structure, vetoed
 from stimrig.identify.diagnosis.search import (
@@ -28,6 +30,9 @@ from stimrig.identify.estimation.joint import Fitted, solve
 from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
 from stimrig.identify.estimation.samples import Raw, fitted_rows
 from stimrig.identify.noise import WHITE
+
+ZERO = {"free_zero": "baseline_drift"}
+"""A free effect, and the one of the library that nothing foretells and that may look like it."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +58,16 @@ def searched(
     say = progress or silent
     search = search_effects(grid, raw, fitted_rows(grid, None), progress, most=most, structure=structure)
     verdict = judge(search)
-    if verdict.kind != "unexplained_structure" or most == 0 or search.last.noise.band > 0.0:
+    named = verdict.kind == "effect_missing"
+    if most == 0 or verdict.kind == "nothing_missing" or (named and not search.residuals[-1].left):
         return search, verdict
-    freely = explain_freely(search, lambda done, text: say(0.75 + 0.2 * done, text))
+    freely = explain_freely(search, lambda done, text: say(0.75 + 0.2 * done, text), named)
     if not freely.free:
         return search, verdict
     return freely, judge_free(freely, verdict)
 
 
-def explain_freely(search: EffectSearch, progress: Progress | None = None) -> EffectSearch:
+def explain_freely(search: EffectSearch, progress: Progress | None = None, named: bool = False) -> EffectSearch:
     """The search with free effects, where they predict left-out blocks better than what it found; else as it was.
 
     Parameters
@@ -70,9 +76,14 @@ def explain_freely(search: EffectSearch, progress: Progress | None = None) -> Ef
         In whose last model structure is left.
     progress : callable or None
         As `search_effects` takes it.
+    named : bool
+        Whether what the search found is named, and so stays whatever else is added.
     """
-    kept = [effect for effect in search.added if not find_effect(effect).predictable]
     say = progress or silent
+    if named:
+        whole = _extended(_chain(search.chain), say, thresholds.FURTHER_FREE)
+        return _with_chain(search, whole, [*search.added, *whole.added]) if whole.added else search
+    kept = [effect for effect in search.added if not find_effect(effect).predictable and not find_effect(effect).band]
     best = _extended(_chain(_with_only(search, kept)), lambda done, text: say(0.5 * done, text))
     names = kept
     if (
@@ -104,14 +115,14 @@ def _with_only(search: EffectSearch, kept: Sequence[str]) -> list[Fitted]:
     return models[::-1]
 
 
-def _extended(chain: Chain, progress: Progress) -> Chain:
+def _extended(chain: Chain, progress: Progress, first: tuple[float, float] = thresholds.FIRST_FREE) -> Chain:
     """With the free effects that left-out blocks ask for, and against which held-out rows do not speak."""
     for number in range(thresholds.MOST_FREE):
         base, unseen = chain.models[-1], chain.left_out[-1]
         listed = [effect for effect in registry().values() if _applicable(effect, base)]
         share = number / thresholds.MOST_FREE
         tried = scan(base, listed, WORTHLESS, [], lambda done, text, at=share: progress(at + 0.5 * done, text))
-        best = _best(unseen, tried, *(thresholds.FURTHER_FREE if chain.added else thresholds.FIRST_FREE))
+        best = _best(unseen, tried, *(thresholds.FURTHER_FREE if chain.added else first))
         if best is None or vetoed(base, best[0]):
             break
         chain = chain.with_(*best)
@@ -119,7 +130,12 @@ def _extended(chain: Chain, progress: Progress) -> Chain:
 
 
 def _applicable(effect: Effect, base: Fitted) -> bool:
-    """Whether a free effect can stand beside those of a model: free lags take the place of every other speed law."""
+    """Whether a free effect can stand beside those of a model: free lags take the place of every other speed law.
+
+    A zero that drifts is tried, too: a zero that follows from the work must gain more.
+    """
+    if effect.id in ZERO.values():
+        return effect.id not in dict(base.effects)
     stages = {form.stage for _, form in base.effects}
     own = {form.stage for form in effect.forms}
     return bool(effect.shape) and effect.id not in dict(base.effects) and not ("speed" in stages and "lags" in own)
@@ -129,8 +145,10 @@ def _best(
     unseen: LeftOut, tried: Sequence[Candidate], errors: float, least: float
 ) -> tuple[Fitted, LeftOut, str] | None:
     """The candidate that predicts left-out blocks best, its error there and its effect."""
-    able = []
+    able, gains = [], {one.effect.id: one.gain for one in tried}
     for one in tried:
+        if one.effect.shape is None or gains.get(ZERO.get(one.effect.id, ""), -np.inf) > one.gain:
+            continue
         if one.gain < thresholds.NEXT_MARGIN:
             break
         for fitted in _twins(one.fitted):
