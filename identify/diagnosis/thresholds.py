@@ -97,7 +97,7 @@ LEAST_HELD_OUT_ROWS = 40
 """With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""
 MOST_FREE = 2
 """Free effects at most."""
-FIRST_FREE, FURTHER_FREE = (2.0, 0.3), (3.0, 0.2)
+FIRST_FREE, FURTHER_FREE = (2.0, 0.2), (3.0, 0.2)
 """Standard errors, and share as a logarithm, by which the error on left-out blocks must fall with a free effect."""
 TAKES_UP = 0.9
 """Correlation of neighbours from which slow noise may have taken up structure: white noise is tried, too."""
