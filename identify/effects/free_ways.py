@@ -41,9 +41,12 @@ def parallel(drive: np.ndarray, p: Values, scene: Scene) -> list:
         ((1.0 - share) * drive, p["loss_quick"], np.ones_like(p["ratio"])),
         (share * drive, p["loss_slow"], p["ratio"]),
     ):
-        use = np.minimum(np.abs(own) / scene.scale_nm, 1.0)
-        tired, _ = adapt(use, p["fill_s"][:, 0], p["empty_s"][:, 0], False, scene.step_s, scene.rest_s)
-        found.append((own * (1.0 - loss * tired), slower))
+        if np.any(loss):
+            use = np.minimum(np.abs(own) / scene.scale_nm, 1.0)
+            own = own * (
+                1.0 - loss * adapt(use, p["fill_s"][:, 0], p["empty_s"][:, 0], False, scene.step_s, scene.rest_s)[0]
+            )
+        found.append((own, slower))
     return found
 
 

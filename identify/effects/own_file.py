@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 from stimrig.identify.effects.base import STAGES, Effect, Form, Parameter, Scene
 from stimrig.identify.errors import IdentifyError
@@ -120,16 +121,32 @@ def _check_form(form: Form, place: str, path: Path | None) -> None:
         raise BadEffect(f"two parameters are called {twice[0]!r}", place=where, fix="Name each parameter once.")
     for parameter in form.parameters:
         _check_parameter(parameter, where)
-    if not isinstance(form.law, dict):
-        raise BadEffect(f"law is a {type(form.law).__name__}", place=where, fix="Give a dictionary, or leave it out.")
-    for name, pair in form.law.items():
-        if name not in names or not (isinstance(pair, tuple) and [*map(type, pair)] == [Lag, SpeedLaw]):
-            fix = "Give law={parameter: (Lag, SpeedLaw)}, both from stimrig.identify.dynamics.variable_speed."
-            raise BadEffect(f"law {name!r}: {pair!r}", place=where, fix=fix)
+    _check_laws(form, names, where)
     if form.apply is None and not form.law:
         raise BadEffect("no apply", place=where, fix="Give apply=, a function of (x, p, scene).")
-    if form.apply is not None and form.stage not in ("speed", "branch", "filter"):
+    if form.apply is not None and form.stage not in ("speed", "lags", "branch", "filter"):
         _try_out(form, where, path)
+
+
+def _check_laws(form: Form, names: list[str], where: str) -> None:
+    """Of "lags" each parameter sets what is free there; of "speed" what it likes."""
+    for what in ("law", "held"):
+        told = getattr(form, what)
+        if not isinstance(told, dict):
+            raise BadEffect(
+                f"{what} is a {type(told).__name__}", place=where, fix="Give a dictionary, or leave it out."
+            )
+    free = form.stage == "lags"
+    for name, own in form.law.items():
+        kinds = [*map(type, own)] if isinstance(own, tuple) else [type(own)]
+        if name not in names or kinds != ([FreeLaw] if free else [Lag, SpeedLaw]):
+            given = "FreeLaw} of free_lags" if free else "(Lag, SpeedLaw)}, both of variable_speed"
+            fix = f"Give law={{parameter: {given} in stimrig.identify.dynamics."
+            raise BadEffect(f"law {name!r}: {own!r}", place=where, fix=fix)
+    if free and set(form.law) != set(names):
+        raise BadEffect("a parameter without a law", place=where, fix="Give law={parameter: FreeLaw} for each.")
+    if form.held and not (free and all(isinstance(one, FreeLaw) for one in form.held)):
+        raise BadEffect(f"held {dict(form.held)!r}", place=where, fix='Give held={FreeLaw: number}, for "lags" only.')
 
 
 def _check_parameter(parameter: Parameter, where: str) -> None:

@@ -287,7 +287,7 @@ class _StagePass:
             ]
         branches = [(self.grown(part), self.grown(slower)) for part, slower in branches]
         self.cores, initial = self.grown(core), self.grown(initial)
-        if lags:
+        if lags and np.any(np.concatenate([values for _, values in lags], axis=None)):
             return self.respond_freely(branches, self.free_laws(lags, len(initial)), initial)
         law, given = np.zeros((len(initial), len(Lag), len(SpeedLaw))), []
         for chosen, values in speeds:
