@@ -56,5 +56,6 @@ EFFECT = Effect(
     plain="That pulses come, and how wide they are, act in different ways: the picture shows how the first ones open "
     "the muscle. No effect of the library describes it.",
     source="cf. calcium and its binding in Ding et al. 2003",
+    main={"gate_s": "time to open"},
     shape=_shape,
 )

@@ -59,5 +59,6 @@ EFFECT = Effect(
     plain="How much torque there is changes what the same pulse adds: the picture shows how. No effect of the library "
     "describes it.",
     source="cf. electrodes that move with the muscle, springs that stiffen",
+    main={"bend": "bend", "feedback": "change of the drive"},
     shape=_shape,
 )

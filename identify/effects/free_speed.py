@@ -77,5 +77,6 @@ EFFECT = Effect(
     plain="How quickly the torque follows depends on the level and on the direction: the picture shows how. No effect "
     "of the library describes it.",
     source="two lags with free rates; cf. Winters 1995, Zajac 1989",
+    main={"first_direction": "speed of rise over that of fall"},
     shape=_shape,
 )

@@ -53,6 +53,6 @@ EFFECT = Effect(
     plain="The muscle answers otherwise after it has worked: the picture shows by how much, and how soon it recovers. "
     "No effect of the library describes it.",
     source="a slow state with gain and rate, free in sign; cf. Ding et al. 2003",
-    main={"gain": "change of strength"},
+    main={"gain": "gain"},
     shape=_shape,
 )

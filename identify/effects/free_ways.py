@@ -73,5 +73,6 @@ EFFECT = Effect(
     plain="Two parts of the muscle act side by side, one slower than the other: the picture shows which part carries "
     "how much. No effect of the library describes it.",
     source="cf. Burke 1973; two branches with curves of their own",
+    main={"ratio": "ratio"},
     shape=_shape,
 )

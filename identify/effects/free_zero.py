@@ -40,5 +40,6 @@ EFFECT = Effect(
     plain="Work leaves a torque behind, which goes away slowly: the picture shows how much and how long. No effect of "
     "the library describes it.",
     source="cf. plateau potentials, creep of a fixture",
+    main={"zero": "torque left by work"},
     shape=_shape,
 )
