@@ -58,13 +58,13 @@ def searched(
     say = progress or silent
     search = search_effects(grid, raw, fitted_rows(grid, None), progress, most=most, structure=structure)
     verdict = judge(search)
-    named = verdict.kind == "effect_missing"
+    named = verdict.kind == "effect_missing" and not verdict.objections
     if most == 0 or verdict.kind == "nothing_missing" or (named and not search.residuals[-1].left):
         return search, verdict
     freely = explain_freely(search, lambda done, text: say(0.75 + 0.2 * done, text), named)
     if not freely.free:
         return search, verdict
-    return freely, judge_free(freely, verdict)
+    return freely, judge_free(freely, verdict, named)
 
 
 def explain_freely(search: EffectSearch, progress: Progress | None = None, named: bool = False) -> EffectSearch:

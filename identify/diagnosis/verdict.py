@@ -110,8 +110,8 @@ def _explained(search: EffectSearch, first: Fitted) -> float:
     return float((search.last.log_likelihood - first.log_likelihood) / max(possible, 1.0))
 
 
-def judge_free(search: EffectSearch, before: Verdict) -> Verdict:
-    """The verdict with free effects. They name nothing: what is told of the library's effects stays."""
+def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
+    """The verdict with free effects. They name nothing: what was `named` of the library's effects stays."""
     first, last = search.plain if search.held else search.chain[0], search.last
     errors = [held_out_error(fitted, thresholds.FORM_ERROR_WITH_EFFECTS, last) for fitted in (first, last)]
     readings = search.raw.readings
@@ -120,6 +120,7 @@ def judge_free(search: EffectSearch, before: Verdict) -> Verdict:
         notes.append(_beyond(errors[1]))
     return replace(
         before,
+        kind=before.kind if named else "unexplained_structure",
         found={effect: p for effect, p in before.found.items() if effect in (*search.detected, *search.added)},
         explained=_explained(search, first),
         structure=search.residuals[-1].ratio,

@@ -1,0 +1,156 @@
+"""Free effects: exact where nothing is free, found on physics that no library holds, absent where nothing is missing."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stimrig import identify
+from stimrig.hardware_sim.physics_records import record_of_physics
+from stimrig.identify.diagnosis import free
+from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
+from stimrig.identify.dynamics.states import boundary_states
+from stimrig.identify.effects import registry
+from stimrig.identify.effects.base import Form
+from stimrig.identify.estimation.shapes import shape_of
+from stimrig.identify.inversion import Reference, invert
+from stimrig.identify.model import Model
+from stimrig.identify.results import Diagnosis, Improvement
+from stimrig.identify.simulation.problem import Chosen
+from tests.harness import few_effects
+from tests.harness.carried_sessions import as_record
+from tests.harness.made_once import made_once
+from tests.identify import hidden_muscles
+
+STEP_S, SIZE = 0.025, 400
+FREE = [effect for effect in registry().values() if effect.shape]
+FORMS = [(effect, form) for effect in FREE for form in effect.forms]
+named = partial(pytest.mark.parametrize, ids=lambda one: getattr(one, "id", getattr(one, "name", None)))
+
+
+def drive(seed: int = 0) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).choice([0.0, 1.0, 3.0, 5.0], SIZE // 20), 20)
+
+
+def run(drives: np.ndarray, core: tuple[float, float], **laws: float) -> tuple[np.ndarray, np.ndarray]:
+    table = np.zeros((len(drives), len(FreeLaw)))
+    for name, value in laws.items():
+        table[:, FreeLaw[name]] = value
+    start, begin = np.zeros(1, np.int64), np.zeros((len(drives), 1, 2))
+    on, rest_s = (drives[0] > 0).astype(float), np.zeros(SIZE)
+    return run_free(drives, on, rest_s, np.tile(core, (len(drives), 1)), table, start, begin, 5.0, STEP_S)
+
+
+@pytest.mark.parametrize("damping", [0.6, 1.0, 2.5])
+@pytest.mark.parametrize("swapped", [0.0, 1.0])
+def test_without_anything_free_two_lags_are_the_second_order(damping: float, swapped: float):
+    own = run(drive()[None, :], (0.15, damping), SWAPPED=swapped)
+    for found, asked in zip(own, boundary_states(0.15, damping, STEP_S, drive()), strict=True):
+        np.testing.assert_allclose(found[0], asked, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "laws",
+    [
+        {"GATE_S": 0.02, "BEND": 3.0, "GATE_RATE": -0.5},
+        {"FILL_S": 5.0, "EMPTY_S": 20.0, "GAIN": -0.4, "ZERO": 0.1, "BY_PULSES": 1.0},
+    ],
+)
+def test_a_row_with_another_drive_is_as_if_run_alone(laws: dict[str, float]):
+    """Where the rates do not depend on the drive itself, the shared transitions are exact."""
+    other = 1.3 * drive()
+    both = run(np.stack([drive(), other]), (0.15, 1.3), **laws)
+    alone = run(other[None, :], (0.15, 1.3), **laws)
+    np.testing.assert_allclose(both[0][1], alone[0][0], atol=1e-9)
+
+
+def test_use_weakens_and_rest_brings_back():
+    """By hand: held full work fills the state with its time constant."""
+    held = np.full((1, SIZE), 5.0)
+    torque = run(held, (0.02, 1.0), FILL_S=4.0, EMPTY_S=20.0, GAIN=-0.5, BY_PULSES=1.0)[0][0]
+    seconds = STEP_S * np.arange(1, SIZE + 1)
+    np.testing.assert_allclose(torque[41:], 5.0 * (1.0 - 0.5 * (1.0 - np.exp(-seconds / 4.0)))[40:], rtol=5e-3)
+
+
+@named(("effect", "form"), FORMS)
+def test_a_picture_is_finite_and_says_where_it_enters(effect, form: Form):
+    start = {p.name: p.start[0] for p in form.parameters}
+    shape = effect.shape(form, start)
+    assert shape.enters in ("drive", "rate of rise", "rate of fall", "output", "zero")
+    assert shape.driven_by in ("width", "activation", "torque", "time since", "sum of the past")
+    assert shape.words.endswith(".") and shape.driver and shape.effect
+    assert all(line.shape == shape.at.shape and np.isfinite(line).all() for line in shape.lines.values())
+
+
+@made_once
+def found() -> tuple[Diagnosis, Improvement]:
+    """Of a muscle of Ding's calcium and bridges."""
+    with few_effects.only(*(effect.id for effect in FREE), "asymmetric_relaxation", "catch_like", "baseline_drift"):
+        record = as_record(record_of_physics("physics", 0))
+        return identify.diagnose(record), identify.improve(record)
+
+
+def unseen_error(model: Model, made: dict) -> float:
+    """Over the noise, on the second record, without the zero that differs."""
+    off = model.predict(as_record(made["unseen"])) - made["unseen"]["torque_nm"]
+    return float(np.std(off - off[made["unseen"]["time_s"] < 1.9].mean()) / made["truth"]["noise_sd_nm"])
+
+
+@pytest.mark.slow
+def test_on_other_physics_a_free_effect_lowers_the_unseen_error_and_names_no_cause():
+    made, (diagnosis, improvement) = record_of_physics("physics", 0), found()
+    assert diagnosis.verdict == improvement.verdict == "unexplained_structure"
+    assert [row for row in diagnosis.missing if row["probability"] >= 0.9 and row["effect"] != "catch_like"] == []
+    assert diagnosis.free and diagnosis.free[0]["effect"] == improvement.steps[-1]["added"] == "free_gate"
+    before, after = (unseen_error(model, made) for model in (improvement.models[0], improvement.models[-1]))
+    assert after < 0.5 * before
+    assert diagnosis.free[0]["words"] in improvement.steps[-1]["reason"]
+    assert any(diagnosis.free[0]["words"] in line for line in diagnosis.plain)
+    json.dumps(diagnosis.to_dict())
+
+
+@pytest.mark.slow
+def test_a_picture_has_bands_about_its_curves_and_stands_in_the_model():
+    diagnosis, improvement = found()
+    (row,) = diagnosis.free
+    for line in row["lines"].values():
+        lower, value, upper = (np.array(line[key]) for key in ("lower", "value", "upper"))
+        assert len(value) == len(row["at"]) and np.all(lower <= upper + 1e-12)
+        assert np.mean((lower - 1e-9 <= value) & (value <= upper + 1e-9)) > 0.9
+    shape = improvement.models[-1].effects[-1]["shape"]
+    assert shape["words"] == row["words"] and shape["lines"].keys() == row["lines"].keys()
+
+
+@pytest.mark.slow
+def test_a_model_with_a_free_effect_is_read_back_predicts_the_same_and_is_inverted():
+    made, (_, improvement) = record_of_physics("physics", 0), found()
+    model, unseen = improvement.models[-1], as_record(made["unseen"])
+    again = Model.from_json(model.to_json())
+    np.testing.assert_array_equal(again.predict(unseen), model.predict(unseen))
+    wanted = 0.4 * np.max(model.recruitment.table()[1]) * np.sin(np.linspace(0.0, np.pi, 200)) ** 2
+    inverted = invert(model, Reference.of(wanted))
+    assert inverted.fit_percent is not None and inverted.fit_percent > 90.0
+
+
+def test_where_nothing_is_missing_nothing_free_is_added():
+    record = hidden_muscles.record(seed=3, rate_hz=100)
+    with few_effects.only(*(effect.id for effect in FREE), "fatigue"):
+        assert identify.improve(record).steps[1:] == () and identify.diagnose(record).free == ()
+
+
+def test_free_lags_do_not_stand_beside_another_speed_law():
+    gate, ways = registry()["free_gate"], registry()["free_ways"]
+    relaxed = registry()["asymmetric_relaxation"].forms[0]
+
+    base = SimpleNamespace(effects=[("asymmetric_relaxation", relaxed)])
+    assert not free._applicable(gate, base) and free._applicable(ways, base)
+
+
+def test_no_picture_of_an_effect_that_is_not_free():
+    form = registry()["fatigue"].forms[0]
+    fitted = SimpleNamespace(problem=SimpleNamespace(chosen=[Chosen("fatigue", form, form.parameters, 0)]))
+    assert shape_of(fitted, 0, np.zeros((0, 0))) is None
