@@ -1,4 +1,4 @@
-"""Free effects: exact where nothing is free, found on physics that no library holds, absent where nothing is missing."""
+"""Free effects: exact where nothing is free, found on other physics, absent where nothing is missing."""
 
 from __future__ import annotations
 
