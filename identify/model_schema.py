@@ -194,6 +194,15 @@ JOINT_SETTINGS = {
 }
 """Of a record with an angle."""
 EFFECT_STATE = number(0.0, 1.0, "Give a number from 0 (rested) to 1, or leave it out: rested.")
+_LINE = several(ANY, 0, 1000)
+SHAPE = fields(
+    {
+        **dict.fromkeys(("enters", "driven_by", "words", "driver", "effect"), text),
+        "at": _LINE,
+        "lines": each(fields(dict.fromkeys(("value", "lower", "upper"), _LINE))),
+    }
+)
+"""The picture of a free effect."""
 EFFECT = fields(
     {"id": text, "parameters": each(lambda value, place: ANY(parameter_value(value), place))},
     {
@@ -201,6 +210,7 @@ EFFECT = fields(
         "settings": fields({}, SETTINGS | JOINT_SETTINGS),
         "state": EFFECT_STATE,
         "unforeseen": fields({"mean_nm": number(-PLAUSIBLE, PLAUSIBLE), "rms_nm": number(0.0, PLAUSIBLE)}),
+        "shape": SHAPE,
     },
 )
 WHOLE = number(0, LONGEST)

@@ -105,6 +105,9 @@ class Diagnosis(Result):
     """Free effects, which describe what no effect of the library explains: `effect`, `name`, `form`, `equation`,
     `parameters`, `enters`, `driven_by`, `words`, `left_out`, and the picture: `driver`, `at`, `axis`, `lines`, each
     with `value`, `lower` and `upper`."""
+    deciding_experiment: Row | None
+    """Where structure is left, the test that teaches most about it: as `next_experiment_plan`, with `expected_fall`,
+    the share by which the model's own standard error should fall; else None."""
     where: tuple[Row, ...]  # where the error is, as in `Comparison`
     with_all: Row  # the model with all of `missing`: the keys of `base`, and `noise_sd_nm`
     explained: float  # share, 0 to 1, of the explainable log-likelihood that the effects explain
@@ -130,6 +133,7 @@ class Diagnosis(Result):
             rows.append(("with all", both_words(self.with_all)))
         told = [row for row in self.missing if row["confused_with"]]
         rows += [("next test", row["next_experiment"]) for row in told[:1]]
+        rows += [("next test", str(self.deciding_experiment["text"]))] if self.deciding_experiment else []
         # If nothing is missing, the places of the largest noise do not matter.
         places = () if self.verdict == "nothing_missing" else self.where[:FEW]
         rows += _listed("error in", [row["text"] for row in places])

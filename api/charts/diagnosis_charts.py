@@ -7,10 +7,11 @@ from typing import Any
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import INK, MEASURED, MODEL, TOOLBAR_PX, axis, box, line, role
 from stimrig.api.charts.model_charts import segment_marks
-from stimrig.api.language import _, localised
+from stimrig.api.language import _, localised, plain
 from stimrig.api.models import explanation
 
 MARK, MARK_LINE, FLOOR = role("worst-band"), role("worst"), role("limit")
+EDGES = ("lower", "upper")
 NAMED_LETTERS = 60
 """Letters of the versions' names up to which they stand below their chart on a tablet."""
 
@@ -29,7 +30,7 @@ def diagnosis_figures(
     for entry in view["missing"] if view else []:
         if entry["id"] in signatures:
             figures[f"signature-{entry['id']}"] = signature(signatures["time_s"], signatures[entry["id"]])
-    return figures
+    return figures | {f"free-{entry['id']}": picture(entry) for entry in (view["free"] if view else [])}
 
 
 def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
@@ -73,6 +74,21 @@ def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, A
     x = axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **fig.AT_TIME)
     margin = {"l": 56, "r": TOOLBAR_PX, "t": 30, "b": 42}
     return fig.figure(data, height=250, xaxis=x, yaxis=axis(_("Torque (N·m)")), margin=margin)
+
+
+def picture(found: dict[str, Any]) -> dict[str, Any]:
+    """What a free effect does: its curves, each with its band."""
+    data = []
+    for number, (name, own) in enumerate(found["lines"].items()):
+        colour, words = (MODEL, MEASURED)[number % 2], plain(name)
+        data += fig.filled(found["at"], own["lower"], own["upper"], _("95 %% band")) if number == 0 else []
+        if number:
+            edges = (line(found["at"], own[edge], "", colour, 0.8, showlegend=False, **fig.QUIET) for edge in EDGES)
+            data += edges
+        data.append(line(found["at"], own["value"], words, colour, 2.2, **fig.hover(words, fig.SHARE)))
+    margin = {"l": 64, "r": TOOLBAR_PX, "t": 30, "b": 48}
+    x, y = axis(plain(found["driver"])), axis(plain(found["axis"]))
+    return fig.figure(data, height=270, xaxis=x, yaxis=y, margin=margin)
 
 
 def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -139,7 +139,7 @@ def _diagnose(record: Any, _task: Task) -> Row:
 
     found = identify.diagnose(record).to_dict()
     missing = found["missing"]
-    plan = planned(missing)
+    plan = planned(missing, found["deciding_experiment"])
     words = [row["next_experiment"] for row in missing if row["confused_with"]]
     return {
         **{name: found["base"].get(name) for name in FIGURES},

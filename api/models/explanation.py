@@ -59,6 +59,7 @@ def view(
     return {
         **headline(diagnosis, missing, comparison, effects, leaves_structure),
         "missing": [card(entry, library) for entry in missing],
+        "free": [free_card(entry, library) for entry in diagnosis.get("free") or [] if entry["effect"] not in effects],
         "likely": [name_of(entry["effect"], library) for entry in missing if likely(entry)],
         "structure": effects_words(diagnosis.get("structure") or []) or _("plain"),
         "present": [{"id": effect, "name": name_of(effect, library)} for effect in effects],
@@ -178,6 +179,13 @@ def card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
         "most_nm": max([value for _, *pair in errors for value in pair if value is not None], default=1.0),
         "parameters": _labelled(entry.get("parameters") or {}, known),
     }  # fmt: skip
+
+
+def free_card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
+    """One free effect: what it does, and its picture."""
+    known = library.get(entry["effect"]) or {}
+    more = {"id": entry["effect"], "parameters": _labelled(entry["parameters"], known), "source": known.get("source")}
+    return {**entry, **more}
 
 
 def likely(entry: dict[str, Any]) -> bool:

@@ -89,13 +89,14 @@ def diagnosed(record: Any, progress: Progress, model_json: str | None = None) ->
     found["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(found)}
     progress(0.82, "what each effect would explain")
     found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]], structure)
-    found["experiment"] = experiment(found["missing"])
+    found["experiment"] = experiment(found["missing"], found["deciding_experiment"])
     return clean(found)
 
 
 def mentioned(found: dict[str, Any]) -> set[str]:
     named = {entry["effect"] for entry in found["missing"]}
     named |= {rival for entry in found["missing"] for rival in entry.get("confused_with") or []}
+    named |= {entry["effect"] for entry in found["free"]}
     return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
 
 
@@ -129,12 +130,12 @@ def smooth(record: Any, values: Any) -> Any:
     return np.convolve(padded, np.ones(width) / width, "valid")
 
 
-def experiment(missing: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """The test that separates the first effect with rivals from them; None where no effect has any."""
+def experiment(missing: Sequence[dict[str, Any]], further: dict[str, Any] | None = None) -> dict[str, Any] | None:
+    """The test that separates the first effect with rivals from them, or the `further` one for what is left."""
     from stimrig.identify.diagnosis import planned
 
-    found = planned(missing)
-    return found and {**found.to_dict(), "effect": found.rivals[0]}
+    found = planned(missing, further)
+    return found and {**found.to_dict(), "effect": next(iter(found.rivals), "")}
 
 
 def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json: str | None = None) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def next_experiment(about: Record | Diagnosis, rivals: Sequence[str] = ()) -> Ex
     """
     if not rivals:
         diagnosis = about if isinstance(about, Diagnosis) else diagnose(about)
-        return planned(diagnosis.missing)
+        return planned(diagnosis.missing, diagnosis.deciding_experiment)
     if isinstance(about, Diagnosis):
         raise TypeError("rivals are told apart on a record: next_experiment(record, rivals)")
     names = list(dict.fromkeys(rivals))
@@ -103,9 +103,10 @@ def next_experiment(about: Record | Diagnosis, rivals: Sequence[str] = ()) -> Ex
     return plan(about, fits)
 
 
-def planned(missing: Sequence[Mapping[str, Any]]) -> Experiment | None:
-    """The experiment of the first effect with rivals among those that a diagnosis found missing; None without any."""
+def planned(missing: Sequence[Mapping[str, Any]], further: Mapping[str, Any] | None = None) -> Experiment | None:
+    """The experiment of the first effect with rivals among those that a diagnosis found missing; else the `further` one
+    for what is left; None without any."""
     for row in missing:
-        if row["confused_with"] and row["next_experiment_plan"]:
+        if further is None and row["confused_with"] and row["next_experiment_plan"]:
             return Experiment(rivals=(row["effect"], row["confused_with"][0]), **row["next_experiment_plan"])
-    return None
+    return Experiment(rivals=(), **further) if further else None

@@ -96,7 +96,7 @@ def improve(
     )
 
 
-FREE = "It is free: it describes what no effect of the library explains, and names no cause."
+FREE = "A free effect: it describes what no effect of the library explains, and names no cause."
 _PLAIN = "The plain structure: recruitment curve and linear dynamics."
 
 

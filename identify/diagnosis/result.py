@@ -16,9 +16,10 @@ from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters
 from stimrig.identify.estimation.joint import predict_fitted
 from stimrig.identify.estimation.left_out import difference
+from stimrig.identify.estimation.plain import moves
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.uncertainty import covariance_of
-from stimrig.identify.experiments import Experiment, plan
+from stimrig.identify.experiments import Experiment, plan, plan_further
 from stimrig.identify.results import Diagnosis
 from stimrig.identify.summary import probability, sure
 
@@ -58,6 +59,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
         probability=verdict.probability,
         missing=tuple(missing),
         free=tuple(free),
+        deciding_experiment=_plan(plan_further(record, search.last)) if _undecided(search, verdict) else None,
         where=tuple(where),
         with_all={key: final[key] for key in STATISTICS} | {"noise_sd_nm": final["noise_sd_nm"]},
         explained=verdict.explained,
@@ -103,7 +105,7 @@ def _missing(
         "held_out_rms_after_nm": after["held_out_rms_nm"],
         "confused_with": confused,
         "next_experiment": experiment.text if experiment else described.separated_by,
-        "next_experiment_plan": experiment and {k: v for k, v in experiment.to_dict().items() if k != "rivals"},
+        "next_experiment_plan": experiment and _plan(experiment),
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
         "parameters": dict(list(own.items())[:MOST_PARAMETERS]),
@@ -111,6 +113,16 @@ def _missing(
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }
+
+
+def _plan(experiment: Experiment) -> dict[str, Any]:
+    return {key: value for key, value in experiment.to_dict().items() if key != "rivals"}
+
+
+def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
+    """Whether a further test is planned for what is left; not of a joint that moves, which has tests of its own."""
+    still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)
+    return verdict.kind == "unexplained_structure" and still and search.last.noise.band == 0.0
 
 
 def _free(search: EffectSearch, effect: str) -> dict[str, Any]:

@@ -22,12 +22,10 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
     rate = np.exp(values["gate_rate"] * gate)
     half_s = float(np.interp(0.5, gate[TIME_S <= STOPS_S], TIME_S[TIME_S <= STOPS_S]))
     stays_s = float(np.max(TIME_S[gate > 0.5], initial=STOPS_S)) - STOPS_S
-    open_rate = float(np.exp(values["gate_rate"]))
-    which = "faster" if open_rate > 1.0 else "slower"
     words = (
         f"Pulses open a gate, half of it within {1000.0 * half_s:.0f} ms, and it stays half open for "
-        f"{1000.0 * stays_s:.0f} ms after the last one; the open muscle is "
-        f"{max(open_rate, 1.0 / open_rate):.2g} times {which} than the closed one."
+        f"{1000.0 * stays_s:.0f} ms after the last one; open, the muscle has {np.exp(values['gate_rate']):.2g} times the "
+        "speed that it has closed."
     )
     axes = "time, pulses for 0.25 s, then none (s)", TIME_S, "opening and speed"
     return Shape("rate of fall", "time since", words, *axes, {"opening": gate, "speed": rate})

@@ -8,6 +8,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Shape, Values, form
+from stimrig.identify.effects.use import percent
 
 LEVEL = np.linspace(0.0, 1.0, 41)
 
@@ -40,12 +41,10 @@ def _shape(own: Form, values: Mapping[str, float]) -> Shape:
     driver = "torque (share of the largest)"
     if own.name == "before":
         share = values["feedback"]
-        which = "more" if share > 0.0 else "less"
-        words = f"At full torque the same pulse recruits {100.0 * abs(share):.0f} % {which} than at none."
+        words = f"At full torque the drive by the same pulse has changed by {percent(share)}."
         return Shape("drive", "torque", words, driver, LEVEL, "drive, at rest: 1", {"drive": 1.0 + share * LEVEL})
     found = LEVEL + _bent(LEVEL, dict(values))
-    which = "more" if found[20] > 0.5 else "less"
-    words = f"Half of the torque arrives as {100.0 * abs(found[20] / 0.5 - 1.0):.0f} % {which}, behind the dynamics."
+    words = f"Half of the torque arrives changed by {percent(found[20] / 0.5 - 1.0)}, behind the dynamics."
     return Shape("output", "torque", words, driver, LEVEL, "torque that arrives (share)", {"torque": found})
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.effects.base import Effect, Form, Parameter, Shape
-from stimrig.identify.effects.use import BY, DRIVER, EMPTY, FILL, STATE, TIME_S, changed, course, seconds
+from stimrig.identify.effects.use import BY, DRIVER, EMPTY, FILL, STATE, TIME_S, course, percent, seconds
 
 _PARAMETERS = (
     FILL,
@@ -24,8 +24,8 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
     top = int(np.argmax(state))
     slowed = abs(values["rate"]) > abs(np.log(max(1.0 + values["gain"], 0.05)))
     words = (
-        f"After 20 s of full work the muscle is {changed(strength[top] - 1.0, 'stronger', 'weaker')} and "
-        f"{changed(speed[top] - 1.0, 'faster', 'slower')}; it recovers at rest with {seconds(values['empty_s'])}."
+        f"After 20 s of full work the strength has changed by {percent(strength[top] - 1.0)} and the speed by "
+        f"{percent(speed[top] - 1.0)}; at rest this goes away with a time constant of {seconds(values['empty_s'])}."
     )
     lines = {"strength": strength, "speed": speed}
     enters = "rate of fall" if slowed else "drive"

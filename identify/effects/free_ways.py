@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Shape, Values, adapt, form
-from stimrig.identify.effects.use import changed, seconds
+from stimrig.identify.effects.use import percent, seconds
 
 LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)
 AT = np.linspace(0.0, 1.0, 41)
@@ -54,9 +54,9 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
     share = _share(AT[None, :], dict(values))[0]
     tires = max(abs(values["loss_quick"]), abs(values["loss_slow"])) > 0.2
     words = (
-        f"A slow way, {values['ratio']:.2g} times slower, carries {100.0 * share[20]:.0f} % at half of the torque; "
-        f"with use the quick one gets {changed(-values['loss_quick'], 'stronger', 'weaker')}, the slow one "
-        f"{changed(-values['loss_slow'], 'stronger', 'weaker')}, within {seconds(values['fill_s'])}."
+        f"A way that is {values['ratio']:.2g} times slower carries {100.0 * share[20]:.0f} % at half of the torque; "
+        f"full use changes the quick way by {percent(-values['loss_quick'])} and the slow one by "
+        f"{percent(-values['loss_slow'])}, with a time constant of {seconds(values['fill_s'])}."
     )
     lines = {"slow way": share, "quick way": 1.0 - share}
     where = ("drive", "sum of the past") if tires else ("rate of fall", "width")

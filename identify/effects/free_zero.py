@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.effects.base import Effect, Form, Parameter, Shape
-from stimrig.identify.effects.use import BY, DRIVER, EMPTY, FILL, STATE, TIME_S, course, seconds
+from stimrig.identify.effects.use import BY, DRIVER, EMPTY, FILL, STATE, TIME_S, course, percent, seconds
 
 
 def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
     added = values["zero"] * course(values)
+    most = float(added[np.argmax(np.abs(added))])
     words = (
-        f"After 20 s of full work {100.0 * added.max(initial=0.0) + 100.0 * added.min(initial=0.0):+.1f} % of the "
-        f"largest torque are added; they go away at rest with {seconds(values['empty_s'])}."
+        f"20 s of full work add {percent(most)} of the largest torque, which goes away at rest with a time constant of "
+        f"{seconds(values['empty_s'])}."
     )
     axes = DRIVER, TIME_S, "torque added (share of the largest)"
     return Shape("zero", "sum of the past", words, *axes, {"torque added": added})

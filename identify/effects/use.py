@@ -28,9 +28,9 @@ def course(values: Mapping[str, float]) -> np.ndarray:
     return np.array(found)
 
 
-def changed(share: float, more: str, less: str) -> str:
-    """A change as words: "weaker by 12 %"."""
-    return f"{more if share > 0.0 else less} by {100.0 * abs(share):.0f} %"
+def percent(share: float) -> str:
+    """A change, with its sign."""
+    return f"{100.0 * share:+.0f} %"
 
 
 def seconds(value_s: float) -> str:

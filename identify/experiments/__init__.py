@@ -12,7 +12,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import ends_of, make_grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.experiments.designs import Design, designs
+from stimrig.identify.experiments.designs import Design, designs, held_levels
 from stimrig.identify.noise import whitened
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Result
@@ -38,13 +38,15 @@ class Experiment(Result):
     expected_log_evidence: float  # how clearly the test is expected to decide: of the pair with the smallest
     decides: bool  # whether that is enough
     text: str  # the test in one sentence
+    expected_fall: float | None = None  # share by which the model's own standard error is expected to fall, if asked
 
     def _sheet(self) -> Sheet:
         rows = [("test", self.text), ("pulses", f"{self.dose['pulses']:.0f}")]
         for segment in self.segments:
             settings = ", ".join(f"{key} {_short(value)}" for key, value in segment["settings"].items())
             rows.append((str(segment["name"]), f"{segment['sequence']}: {settings}"))
-        return Sheet(f"Next experiment: {' or '.join(self.rivals)}, {self.duration_s:.0f} s", tuple(rows))
+        about = " or ".join(self.rivals) or "what is left"
+        return Sheet(f"Next experiment: {about}, {self.duration_s:.0f} s", tuple(rows))
 
 
 def _short(value: Any) -> str:
@@ -70,22 +72,72 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     else:
         best = max(range(len(rows)), key=lambda place: expected[place] / rows[place][1].size)
     (design, width), gain = rows[best], expected[best]
-    first, duration_s = next(iter(fits.values())), width.size / record.pulse_rate_hz
-    torque_nm = first.physical[first.problem.coefficients] @ first.problem.setup.basis.design(width).T
     names = tuple(name for name in fits if name != NOTHING)
-    return Experiment(
-        rivals=names,
-        segments=tuple(segment.to_dict() for segment in design.segments),
-        duration_s=duration_s,
-        dose={
-            "pulses": int(np.sum(width > 0)),
-            "pulse_width_sum_us": float(width.sum()),
-            "torque_time_nm_s": float(np.abs(torque_nm).sum() / record.pulse_rate_hz),
-        },
-        expected_log_evidence=gain,
-        decides=gain >= ENOUGH,
-        text=_text(design, duration_s, gain, names),
+    text = _text(design, width.size / record.pulse_rate_hz, gain, names)
+    decides = gain >= ENOUGH
+    return Experiment(names, *_played(design, width, record, next(iter(fits.values()))), gain, decides, text)
+
+
+def _played(
+    design: Design, width_us: np.ndarray, record: Record, fitted: Fitted
+) -> tuple[Any, float, dict[str, float]]:
+    """Segments, duration, s, and dose of a test."""
+    torque_nm = fitted.physical[fitted.problem.coefficients] @ fitted.problem.setup.basis.design(width_us).T
+    dose = {
+        "pulses": int(np.sum(width_us > 0)),
+        "pulse_width_sum_us": float(width_us.sum()),
+        "torque_time_nm_s": float(np.abs(torque_nm).sum() / record.pulse_rate_hz),
+    }
+    return tuple(segment.to_dict() for segment in design.segments), width_us.size / record.pulse_rate_hz, dose
+
+
+def plan_further(record: Record, fitted: Fitted) -> Experiment:
+    """The test that teaches a model most, where structure is left and no two effects stand against one another.
+
+    Of all designs the one after which the model's own standard error on held random levels is smallest: levels are what
+    a person trains on, and what the paper's test has least of.
+
+    Parameters
+    ----------
+    record : Record
+        In which structure is left.
+    fitted : Fitted
+        The last model of it.
+    """
+    largest_us, rate_hz = float(record.pulse_width_us.max()), record.pulse_rate_hz
+    levels = held_levels(largest_us, _threshold_us(fitted))
+    reference = _simulate(fitted, _blank(record, levels[0].pulse_widths(rate_hz)[::-1]), True)[1]
+    rows = [(one, one.pulse_widths(rate_hz)) for one in (*levels, *designs(largest_us))]
+    before = _expected_nm(fitted, reference, np.zeros((fitted.theta.size, 1)))
+    after = [_expected_nm(fitted, reference, _whitened_slopes(fitted, _blank(record, width))) for _, width in rows]
+    best = int(np.argmin(after))
+    design, width = rows[best]
+    fall, played = 1.0 - after[best] / before, _played(design, width, record, fitted)
+    text = (
+        f"{design.words} ({played[1]:.0f} s) would teach most about what is left: the model's own standard error on "
+        f"levels is expected to fall by {100.0 * fall:.0f} %."
     )
+    return Experiment((), *played, 0.0, False, text, fall)
+
+
+def _threshold_us(fitted: Fitted) -> float:
+    """Smallest width with a tenth of the largest torque, µs."""
+    widths_us = np.linspace(0.0, fitted.problem.setup.basis.largest_us, 201)
+    torque_nm = fitted.problem.setup.basis.design(widths_us) @ fitted.physical[fitted.problem.coefficients]
+    return float(widths_us[np.argmax(np.abs(torque_nm) >= 0.1 * np.abs(torque_nm).max())])
+
+
+def _whitened_slopes(fitted: Fitted, record: Record) -> np.ndarray:
+    slopes = _simulate(fitted, record, True)[1]
+    assert slopes is not None
+    return whitened(slopes, ends_of([slice(0, slopes.shape[1])]), fitted.noise)
+
+
+def _expected_nm(fitted: Fitted, reference: np.ndarray | None, white: np.ndarray) -> float:
+    """Standard error of the model on a reference, N·m, once it has also seen a test of such whitened slopes."""
+    assert reference is not None
+    found = np.linalg.lstsq(fitted.hessian + white @ white.T, reference, rcond=None)[0]
+    return float(np.sqrt(max(np.mean(np.sum(reference * found, axis=0)), 0.0)))
 
 
 def _text(design: Design, duration_s: float, gain: float, names: tuple[str, ...]) -> str:

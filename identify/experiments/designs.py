@@ -75,7 +75,11 @@ def _prbs(s: dict[str, Any], rate: float) -> np.ndarray:
     return np.repeat(np.array(bits, float) * s["max_pulse_width_us"], s["clock_pulses"])
 
 
-SHAPES = {"rest": _rest, "ramp": _ramp, "steps": _steps, "staircase": _staircase, "prbs": _prbs}
+def _widths(s: dict[str, Any], _rate: float) -> np.ndarray:
+    return np.array(s["pulse_width_us"], float)
+
+
+SHAPES = {"rest": _rest, "ramp": _ramp, "steps": _steps, "staircase": _staircase, "prbs": _prbs, "widths": _widths}
 
 
 def designs(largest_us: float) -> list[Design]:
@@ -120,6 +124,49 @@ def designs(largest_us: float) -> list[Design]:
         ),
         Design("A test without stimulation", (rest(10, "sham"),)),
     ]
+
+
+LEVELS_S, SHORTEST_S, LONGEST_S = 26.0, 0.25, 1.25
+"""Seconds of held random levels, and of each level."""
+OFTEN_S = 5.0
+"""Seconds of levels after which there is a rest of one second: it shows what the muscle keeps of its work."""
+
+
+def held_levels(largest_us: float, threshold_us: float) -> list[Design]:
+    """Random levels, each held for a while, as no ramp and no PRBS has them: jumps of level while stimulated.
+
+    In one design they are even between the threshold and the largest width, in the other half of them lie near the
+    threshold, where a slow ramp spends little time and a PRBS none.
+    """
+    found = []
+    for words, near in (
+        ("Random levels, each held for a moment", 0.0),
+        ("Random levels, many near the threshold", 0.5),
+    ):
+        rng = np.random.default_rng(7)
+        levels: list[tuple[float, float]] = []
+        rested_s = 0.0
+        while sum(seconds for _, seconds in levels) < LEVELS_S:
+            top_us = min(1.5 * threshold_us, largest_us) if rng.random() < near else largest_us
+            levels.append((rng.uniform(0.9 * threshold_us, top_us), rng.uniform(SHORTEST_S, LONGEST_S)))
+            rested_s += levels[-1][1]
+            if rested_s > OFTEN_S:
+                levels.append((0.0, 1.0))
+                rested_s = 0.0
+        found.append((words, levels))
+    return [
+        Design(words, (_pause(), Segment("levels", "widths", {"pulse_width_us": _held(own), "jumps": True}), _pause()))
+        for words, own in found
+    ]
+
+
+def _pause() -> Segment:
+    return Segment("rest", "rest", {"duration_s": 2.0})
+
+
+def _held(levels: list[tuple[float, float]], rate_hz: float = 40.0) -> list[float]:
+    """Widths of pulses, rounded down as the rig takes them."""
+    return [float(np.floor(10.0 * us) / 10.0) for us, seconds in levels for _ in range(round(seconds * rate_hz))]
 
 
 PIECE_S = 1.0

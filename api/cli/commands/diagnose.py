@@ -70,6 +70,9 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
         lines += ["", "Nearest in the library, but not near enough: adding it leaves the structure."]
     for effect in found.get("missing") or []:
         lines += ["", *effect_lines(effect)]
+    for row in found.get("free") or []:
+        lines += ["", f"{row['effect']}: a free effect; it describes, and names no cause", f"  {row['words']}"]
+        lines += [f"  {row['left_out']}"]
     # Where nothing is missing the worst of the noise is no place to look at.
     places = [] if verdict == "nothing_missing" else found.get("where") or []
     if places:
@@ -82,6 +85,10 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
 def next_step(found: dict[str, Any], doubt: str) -> str:
     """What to do with a diagnosis."""
     if found["verdict"] == "unexplained_structure":
+        if plan := found.get("deciding_experiment"):
+            return (
+                f"{worded(plan['text'])} The page plays it; then `stimrig diagnose DATA FURTHER` judges both together"
+            )
         return (
             "look at the worst places and at electrodes, cell and fixture, and record again; an effect of your own: "
             "docs/add-an-effect.md"
