@@ -24,8 +24,8 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
     stays_s = float(np.max(TIME_S[gate > 0.5], initial=STOPS_S)) - STOPS_S
     words = (
         f"Pulses open a gate, half of it within {1000.0 * half_s:.0f} ms, and it stays half open for "
-        f"{1000.0 * stays_s:.0f} ms after the last one; open, the muscle has {np.exp(values['gate_rate']):.2g} times the "
-        "speed that it has closed."
+        f"{1000.0 * stays_s:.0f} ms after the last one; open, the muscle has {np.exp(values['gate_rate']):.2g} times "
+        "the speed that it has closed."
     )
     axes = "time, pulses for 0.25 s, then none (s)", TIME_S, "opening and speed"
     return Shape("rate of fall", "time since", words, *axes, {"opening": gate, "speed": rate})

@@ -38,11 +38,12 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
     swing = {way: float(np.ptp(np.log(line)) + abs(np.mean(np.log(line)))) for way, line in lines.items()}
     own = {lag: sum(abs(values[f"{lag}_{what}"]) for what in ("direction", "rising", "falling")) for lag in _LAGS}
     middle, low = LEVEL.size // 2, LEVEL.size // 4
+    ratio = lines["rising"][middle] / lines["falling"][middle]
     rise, fall = (line[-1] / line[low] for line in lines.values())
     words = (
-        f"At half of the torque the speed while it rises is {lines['rising'][middle] / lines['falling'][middle]:.2g} times "
-        f"that while it falls; from a quarter of the torque to the full one, that of the rise grows {rise:.2g}-fold and "
-        f"that of the fall {fall:.2g}-fold."
+        f"At half of the torque the speed while it rises is {ratio:.2g} times that while it falls; "
+        f"from a quarter of the torque to the full one, that of the rise grows {rise:.2g}-fold and that of the fall "
+        f"{fall:.2g}-fold."
     )
     enters = "rate of rise" if swing["rising"] >= swing["falling"] else "rate of fall"
     driven = "activation" if own["first"] >= own["second"] else "torque"
