@@ -6,7 +6,7 @@ import importlib.util
 import re
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,15 @@ import numpy as np
 from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 from stimrig.identify.effects.base import STAGES, Effect, Form, Parameter, Scene
-from stimrig.identify.errors import IdentifyError
+from stimrig.identify.errors import BadRequest, IdentifyError
 
 FIX = "See docs/add-an-effect.md."
 SCALES = ("linear", "log")
 RELATIVE = ("", "torque", "width", "span", "level")
+REACH = 4.0
+"""Standard deviations by which a parameter of a written file may move from what was found."""
+ID = r"[a-z][a-z0-9_]{0,63}"
+HEAD = "from stimrig.effects import Effect, Form, Parameter"
 ROWS = 80
 """Pulse intervals on which a form is tried."""
 OLD_NAMES = ("identify", "identify.effects", "identify.effects.base")
@@ -93,7 +97,7 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
     if not isinstance(effect, Effect):
         message = f"EFFECT is a {type(effect).__name__}, not an Effect"
         raise BadEffect(message, place=place, fix="Give EFFECT = Effect(...).")
-    if not isinstance(effect.id, str) or not re.fullmatch(r"[a-z][a-z0-9_]{0,63}", effect.id):
+    if not isinstance(effect.id, str) or not re.fullmatch(ID, effect.id):
         raise BadEffect(
             f"id {effect.id!r}", place=place, fix="Use small letters, digits and _, beginning with a letter."
         )
@@ -107,6 +111,58 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
     for form in forms:
         _check_form(form, place, path)
     return effect
+
+
+def text_of(effect: Effect, form: Form, found: Mapping[str, tuple[float, float]], name: str) -> str:
+    """A file of one's own that holds what a free effect was found to be, to be edited and named.
+
+    Parameters
+    ----------
+    effect, form : Effect, Form
+        The free effect, and its form.
+    found : mapping of str to (float, float)
+        By parameter, its value and its standard deviation: where a fit starts, and how far it may go (`REACH`).
+    name : str
+        The id of the effect in the file.
+
+    Raises
+    ------
+    BadRequest
+        The name is none, or the library's.
+    """
+    if not re.fullmatch(ID, name) or name == effect.id:
+        fix = "Use small letters, digits and _, beginning with a letter, and another name than the free effect's."
+        raise BadRequest(f"no name for an effect: {name!r}", place="name", fix=fix)
+    rows = "".join(f"                {_row(one, *found[one.name])},\n" for one in form.parameters)
+    law = ", ".join(f'"{key}": FreeLaw.{FreeLaw(value).name}' for key, value in form.law.items())  # type: ignore[arg-type]
+    held = ", ".join(f"FreeLaw.{key.name}: {value}" for key, value in form.held.items())
+    more = [f"law={{{law}}}"] * bool(law) + [f"held={{{held}}}"] * bool(held)
+    lines = ["from stimrig.effects import Effect, Form, FreeLaw, Parameter" if law else HEAD]
+    if form.apply is not None:
+        lines.append(f"from stimrig.identify.effects.{effect.id} import {form.name}")
+        more = [f"apply={form.name}.apply", "batched=True"]
+    ends = "".join(f"            {one},\n" for one in more)
+    return (
+        f'"""What {effect.id} was found to be: edit it, name it, and let it be fitted (docs/add-an-effect.md)."""\n\n'
+        + "\n".join(lines)
+        + f'\n\nEFFECT = Effect(\n    id="{name}",\n    name={name.replace("_", " ").capitalize()!r},\n    forms=(\n'
+        f"        Form(\n            {form.name!r},\n            {form.stage!r},\n            {form.equation!r},\n"
+        f"            (\n{rows}            ),\n{ends}        ),\n    ),\n    signature={effect.signature!r},\n"
+        f"    resembles=({effect.id!r},),\n    separated_by={effect.separated_by!r},\n"
+        f'    plain="Say here what it is.",\n    source="Say here where it is described.",\n)\n'
+    )
+
+
+def _row(parameter: Parameter, value: float, sd: float) -> str:
+    """A parameter that starts at what was found, as Python writes it."""
+    reach = max(REACH * sd, 0.1 * abs(value), 0.02 * (parameter.upper - parameter.lower))
+    lower, upper = max(parameter.lower, value - reach), min(parameter.upper, value + reach)
+    told = [f"{one:.6g}" for one in (lower, upper, parameter.neutral, value)]
+    told[3] = f"({min(max(float(told[3]), float(told[0])), float(told[1])):.6g},)"
+    return (
+        f"Parameter({parameter.name!r}, {parameter.unit!r}, {', '.join(told)}, {parameter.scale!r}, "
+        f"about={parameter.about!r})"
+    )
 
 
 def _check_form(form: Form, place: str, path: Path | None) -> None:

@@ -14,8 +14,9 @@ from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import free
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.states import boundary_states
-from stimrig.identify.effects import registry
+from stimrig.identify.effects import own_file, registry
 from stimrig.identify.effects.base import Form
+from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
@@ -154,3 +155,35 @@ def test_no_picture_of_an_effect_that_is_not_free():
     form = registry()["fatigue"].forms[0]
     fitted = SimpleNamespace(problem=SimpleNamespace(chosen=[Chosen("fatigue", form, form.parameters, 0)]))
     assert shape_of(fitted, 0, np.zeros((0, 0))) is None
+
+
+@pytest.mark.slow
+@named(("effect", "form"), FORMS)
+def test_a_written_file_holds_the_same_form_about_what_was_found(effect, form: Form, tmp_path):
+    found = {p.name: (p.start[0], 0.01) for p in form.parameters}
+    path = tmp_path / "mine.py"
+    path.write_text(own_file.text_of(effect, form, found, "mine"), "utf-8")
+    own = own_file.effect_of(path)
+    (written,) = own.forms
+    assert (own.id, written.stage, written.law, written.held) == ("mine", form.stage, form.law, form.held)
+    for mine, theirs in zip(written.parameters, form.parameters, strict=True):
+        assert theirs.lower <= mine.lower < mine.upper <= theirs.upper
+        assert mine.lower <= mine.start[0] <= mine.upper and mine.scale == theirs.scale
+
+
+@pytest.mark.parametrize("name", ["free_gate", "Gate", "", "1st", "a-b", "x" * 65])
+def test_a_written_file_needs_a_name_of_its_own(name: str):
+    effect = registry()["free_gate"]
+    with pytest.raises(BadRequest, match="name"):
+        own_file.text_of(effect, effect.forms[0], {p.name: (p.start[0], 0.1) for p in effect.forms[0].parameters}, name)
+
+
+@pytest.mark.slow
+def test_what_is_left_gets_a_further_test_within_the_limits():
+    record, (diagnosis, _) = as_record(record_of_physics("physics", 0)), found()
+    plan = diagnosis.deciding_experiment
+    assert plan is not None and plan["duration_s"] <= 40.0 and 0.1 < plan["expected_fall"] < 1.0
+    widths_us = [segment["settings"].get("pulse_width_us", [0.0]) for segment in plan["segments"]]
+    assert max(map(max, widths_us)) <= record.pulse_width_us.max()
+    told = identify.next_experiment(diagnosis)
+    assert told is not None and told.rivals == () and told.text == plan["text"]

@@ -2,13 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
-from stimrig.api.cli.terminal import Json, say, say_json
+import typer
+
+from stimrig import identify
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.terminal import Json, load_model, say, say_json
 
 
-def effects(as_json: Json = False) -> None:
-    """The library of effects: equation, parameters, source, signature, what each is confused with."""
+def effects(
+    export: Annotated[
+        Path | None, typer.Option(help="write a free effect of this model as a file of one's own", metavar="MODEL.json")
+    ] = None,
+    effect: Annotated[str | None, typer.Option(help="the free effect; default: the model's last", metavar="ID")] = None,
+    name: Annotated[str, typer.Option(help="how your effect is called", metavar="NAME")] = "my_effect",
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="the file; default: NAME.py")] = None,
+    as_json: Json = False,
+) -> None:
+    """The library of effects: equation, parameters, source, signature, what each is confused with.
+
+    With --export, what a free effect of a model was found to be is written as an effect that you edit and name.
+    """
+    if export is not None:
+        path = output or Path(f"{name}.py")
+        _write(path, _own_text(export, effect, name))
+        say_json({"written": str(path)}) if as_json else say(
+            f"{path}: edit it, then set STIMRIG_EFFECTS_DIR to its folder"
+        )
+        return
     from stimrig.identify import effects as library
 
     found = library.library()
@@ -17,6 +40,38 @@ def effects(as_json: Json = False) -> None:
         return
     for entry in found:
         say(*effect_lines(entry), "")
+
+
+def _own_text(path: Path, wanted: str | None, name: str) -> str:
+    """The text of an effect's file.
+
+    Raises
+    ------
+    InputError
+        The model has no such free effect, or the name is none.
+    """
+    from stimrig.identify.effects import known_form, own_file
+
+    free = [entry for entry in load_model(path).effects if "shape" in entry]
+    found = [entry for entry in free if wanted in (None, entry["id"])]
+    known = known_form(found[-1]) if found else None
+    if known is None:
+        names = ", ".join(str(entry["id"]) for entry in free) or "none"
+        raise InputError(f"{path}: no free effect{f' {wanted!r}' if wanted else ''} in it. It has {names}.")
+    values = {one: (float(told["value"]), float(told["sd"])) for one, told in found[-1]["parameters"].items()}
+    try:
+        return own_file.text_of(*known, values, name)
+    except identify.IdentifyError as error:
+        raise InputError(str(error)) from error
+
+
+def _write(path: Path, text: str) -> None:
+    """A new file. Raises InputError: it is there, or cannot be written."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give another file with -o.") from error
 
 
 def effect_lines(entry: dict[str, Any]) -> list[str]:
