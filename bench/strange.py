@@ -8,7 +8,8 @@ given, tared on its first rest; those of arms over the error of plain repetition
 
 `--nudge` fits and improves again with every torque × (1 + 1e-9), `--processor` in a process of its own with the
 arithmetic of another processor, and both compare. `--no-names` leaves out `diagnose`, half of the time; then no name
-counts as untrue. `--only-plain` leaves out `improve`, too, and takes a second a record.
+counts as untrue. `--second` makes the record that the program chooses after the first, too, and learns from both:
+rows then have `second`, the error with both. `--only-plain` leaves out `improve`, too, and takes a second a record.
 """
 
 from __future__ import annotations
@@ -27,9 +28,16 @@ import numpy as np
 from bench.common import ROOT, in_processes, keep, line, parser, table
 from stimrig import identify
 from stimrig.hardware_sim.bout_records import Peculiar, record_of_bouts
-from stimrig.hardware_sim.physics_records import DISTURBED, SETS, record_of_physics
+from stimrig.hardware_sim.physics_records import DISTURBED, SETS, further_record, record_of_physics
 from stimrig.identify.diagnosis import side_by_side as workers
+from stimrig.identify.diagnosis.free import searched
+from stimrig.identify.diagnosis.result import diagnosis_of
+from stimrig.identify.diagnosis.search import helpful
+from stimrig.identify.estimation.finish import finish
+from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
+from stimrig.identify.records.join import join
+from stimrig.rig.sequences import build
 from tests.harness.carried_sessions import as_record
 
 NUDGE = 1.0 + 1e-9
@@ -45,6 +53,8 @@ ARMS = ("arms", "idle")
 """Records of bouts; the stimulator of `idle` goes on below threshold between them."""
 TRUE_OF_ARMS = {"mixed_fibres", "baseline_drift"}
 REST_S = 1.9
+PAUSE_S = 1200.0
+"""From the begin of the first record to that of the second, which the muscle begins rested."""
 HEADS = ("record", "plain", "improved", "added", "names and probabilities", "verdict", "seconds")
 
 
@@ -118,6 +128,32 @@ def look(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
     }
 
 
+def last_model(record: identify.Record) -> tuple[identify.Model, list[str], np.ndarray | None, str]:
+    """The last model of `improve`, its effects, and the pulse widths of the experiment that the program chooses."""
+    search, verdict = searched(*prepare(record))
+    last = helpful(search)[0][-1].fitted
+    chosen = diagnosis_of(search, verdict).deciding_experiment
+    if chosen is None:
+        return finish("maximum-likelihood", last), search.added, None, ""
+    played = [build(one["sequence"], dict(one["settings"]), record.pulse_rate_hz) for one in chosen["segments"]]
+    return finish("maximum-likelihood", last), search.added, np.concatenate(played), chosen["text"].partition(" (")[0]
+
+
+def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
+    """One record, and both together: the first and the one that the program chose."""
+    workers.WORKERS = 1
+    record, began = as_record(made), time.perf_counter()
+    first, added, width_us, words = last_model(record)
+    row = {name: made["truth"][name] for name in ("seed", "disturbed")} | {"kind": made["kind"]}
+    row |= {"plain": score(made, identify.fit(record)), "improved": score(made, first), "second": score(made, first)}
+    row |= {"added": added, "named": {}, "untrue": [], "verdict": words or "nothing chosen", "stated": 0.0}
+    if width_us is not None:
+        further = as_record(further_record(kinds, made["truth"]["seed"], tuple(row["disturbed"]), width_us))
+        both, row["added"], *_ = last_model(join([record, further], [0.0, PAUSE_S]))
+        row["second"] = score(made, both)
+    return row | {"seconds": time.perf_counter() - began, "own_nm": []}
+
+
 def elsewhere(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
     """The same record, to the last bit, in a process of its own with another processor's arithmetic."""
     command = [sys.executable, "-c", "from bench.strange import answer; answer()"]
@@ -141,7 +177,7 @@ def compared(job: tuple[str, int, Collection[str], Collection[str]]) -> dict[str
     """One record, and `again` with a nudge or by another processor."""
     kind, seed, steps, again = job
     made = make(kind, seed)
-    row = look(made, steps)
+    row = look_twice(made, kind) if "second" in again else look(made, steps)
     once_more = [step for step in steps if step != "diagnose"]
     if "nudge" in again:
         row["nudge"] = moved(row, look(made | {"torque_nm": made["torque_nm"] * NUDGE}, once_more))
@@ -156,9 +192,14 @@ def compared(job: tuple[str, int, Collection[str], Collection[str]]) -> dict[str
 def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     """The summary."""
     plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
+    second = [row["second"] for row in rows if "second" in row]
     unit = "plain repetition" if kind in ARMS else "noise"
     yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
+    if second:
+        close = f"within {CLOSE} × {np.sum(np.array(second) <= CLOSE)} of {len(rows)}"
+        worse = np.sum(np.array(second) > WORSE * improved)
+        yield f"with the record that the program chose: {np.median(second):.2f}, {close}, worse by over 2 %: {worse}"
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
     beyond = np.sum(improved > plain + [max(row["stated"], 0.02 * row["plain"]) for row in rows])
     yield f"… and by more than the standard error that it states of itself: {beyond} of {len(rows)}"
@@ -191,7 +232,7 @@ def cells(row: dict[str, Any]) -> list[str]:
     return [
         f"{row['seed']} {row['kind']}{over}",
         f"{row['plain']:.2f}",
-        f"{row['improved']:.2f}",
+        f"{row['improved']:.2f}" + (f", {row['second']:.2f}" if "second" in row else ""),
         ", ".join(row["added"]) or "–",
         names or "–",
         row["verdict"],
@@ -206,11 +247,12 @@ def main() -> None:
     made.add_argument("--nudge", action="store_true", help="again with every torque × (1 + 1e-9)")
     made.add_argument("--processor", action="store_true", help="again with another processor's arithmetic")
     made.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")
+    made.add_argument("--second", action="store_true", help="one more record, which the program chooses")
     made.add_argument("--only-plain", action="store_true", help="without `improve`, too")
     made.add_argument("--jobs", type=int, default=1, help="processes")
     asked = made.parse_args()
     steps = () if asked.only_plain else ("improve",) if asked.no_names else ("improve", "diagnose")
-    again = [name for name in ("nudge", "processor") if getattr(asked, name)]
+    again = [name for name in ("nudge", "processor", "second") if getattr(asked, name)]
     jobs = [(asked.set, seed, steps, again) for seed in asked.seeds]
     found = in_processes(compared, jobs, asked.jobs) if asked.jobs > 1 else map(compared, jobs)
     rows = []

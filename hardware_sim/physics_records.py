@@ -23,6 +23,8 @@ DISTURBED = {"hum": "mains_hum", "slow zero": "baseline_drift", "breath": ""}
 NOISE_SD_NM = 0.05
 RATE_HZ = 400
 UNSEEN_S = 22.0
+AGAIN = 1_000_000
+"""Added to the seed of what lies over a further record."""
 
 
 def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -64,6 +66,32 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     told = _truth(kinds, muscle) | {"seed": seed, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
     told["true"] = sorted({*told["true"], *(DISTURBED[one] for one in over)} - {""})
     return made | {"unseen": _columns(unseen_design(seed, top_us), muscle), "truth": told}
+
+
+def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Floats) -> dict[str, Any]:
+    """One more record of a set's muscle, rested, of pulse widths that somebody chose.
+
+    Parameters
+    ----------
+    kinds, seed
+        As in `record_of_physics`.
+    over
+        What of `DISTURBED` lies over it, as over the first record: the same hum; what has no law begins anew.
+    width_us
+        One for each pulse, at 40 pulses/s, shape (n,).
+
+    Returns
+    -------
+    dict
+        The columns of `record_of_physics`, with noise; its one segment is `further`.
+    """
+    design = Design(np.round(width_us), np.full(width_us.size, "further", "U12"))
+    made = _columns(design, draw_muscle(kinds, seed))
+    rng = rng_of(seed, "physics", "further")
+    made["torque_nm"] = made["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, made["torque_nm"].size)
+    for one in over:
+        made["torque_nm"] += disturbance_nm(one, seed if one == "hum" else seed + AGAIN, made["time_s"])
+    return made
 
 
 def _truth(kinds: str, muscle: PhysicsMuscle) -> dict[str, Any]:
