@@ -21,6 +21,8 @@ from stimrig.identify.summary import Sheet
 
 ENOUGH = 7.0
 """Expected log evidence that is enough to decide: odds of about 1000 to 1."""
+LONGEST_S = 40.0
+"""No further test for what is left takes longer."""
 PER_PULSE = 4
 """Samples per pulse of the simulated test."""
 NOTHING = "nothing"
@@ -108,6 +110,7 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
     levels = held_levels(largest_us, _threshold_us(fitted))
     reference = _simulate(fitted, _blank(record, levels[0].pulse_widths(rate_hz)[::-1]), True)[1]
     rows = [(one, one.pulse_widths(rate_hz)) for one in (*levels, *designs(largest_us))]
+    rows = [(one, width) for one, width in rows if width.size <= LONGEST_S * rate_hz]
     before = _expected_nm(fitted, reference, np.zeros((fitted.theta.size, 1)))
     after = [_expected_nm(fitted, reference, _whitened_slopes(fitted, _blank(record, width))) for _, width in rows]
     best = int(np.argmin(after))

@@ -1,0 +1,75 @@
+"""The experiment that decides: there where structure is left, within the limits, the same each time, and it teaches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stimrig import identify
+from stimrig.hardware_sim.physics_records import further_record, record_of_physics
+from stimrig.identify.experiments.designs import SHAPES, held_levels
+from stimrig.identify.records.join import join
+from stimrig.rig.sequences import build
+from tests.harness import few_effects
+from tests.harness.carried_sessions import as_record
+from tests.identify import hidden_muscles
+
+SEED = 0
+
+
+@pytest.fixture(scope="module")
+def made():
+    return record_of_physics("physics", SEED, ())
+
+
+@pytest.fixture(scope="module")
+def diagnosis(made):
+    with few_effects.only("fatigue", "free_gate"):
+        return identify.diagnose(as_record(made))
+
+
+def played_us(experiment):
+    return np.concatenate([build(one["sequence"], dict(one["settings"]), 40.0) for one in experiment.segments])
+
+
+@pytest.mark.parametrize("design", held_levels(300.0, 80.0), ids=lambda design: design.words)
+def test_the_rig_plays_the_held_levels_that_were_simulated(design):
+    for segment in design.segments:
+        played = build(segment.sequence, segment.settings, 40.0)
+        np.testing.assert_allclose(played, SHAPES[segment.sequence](segment.settings, 40.0))
+    assert design.pulse_widths(40.0).max() <= 300.0 and design.pulse_widths(40.0).size <= 40.0 * 40.0
+
+
+def test_it_is_there_where_structure_is_left_and_keeps_the_limits(made, diagnosis):
+    found = identify.next_experiment(diagnosis)
+    assert diagnosis.verdict == "unexplained_structure" and found is not None and found.text in str(diagnosis)
+    assert found.duration_s <= 40.0
+    assert 0.0 < played_us(found).max() <= made["pulse_width_us"].max()
+    assert found.dose["pulses"] == np.sum(played_us(found) > 0)
+
+
+def test_the_same_record_gives_the_same_experiment(made, diagnosis):
+    with few_effects.only("fatigue", "free_gate"):
+        again = identify.diagnose(as_record(made))
+    assert again.deciding_experiment == diagnosis.deciding_experiment
+
+
+def test_there_is_none_where_nothing_is_missing():
+    with few_effects.only("fatigue", "free_gate"):
+        found = identify.diagnose(hidden_muscles.record(seed=13, rate_hz=100, validate=False))
+    assert found.verdict == "nothing_missing"
+    assert found.deciding_experiment is None and identify.next_experiment(found) is None
+
+
+def test_both_records_together_foretell_a_further_one_better_than_the_first_alone(made, diagnosis):
+    experiment = identify.next_experiment(diagnosis)
+    assert experiment is not None
+    first = as_record(made)
+    further = as_record(further_record("physics", SEED, (), played_us(experiment)))
+    both = join([first, further], [0.0, 1200.0])
+    error_nm = []
+    for record in (first, both):
+        model = identify.fit(record, effects=["free_gate"])
+        off = identify.predict(model, as_record(made["unseen"])) - made["unseen"]["torque_nm"]
+        error_nm.append(np.std(off))
+    assert error_nm[1] < error_nm[0]
