@@ -86,9 +86,7 @@ def next_step(found: dict[str, Any], doubt: str) -> str:
     """What to do with a diagnosis."""
     if found["verdict"] == "unexplained_structure":
         if plan := found.get("deciding_experiment"):
-            return (
-                f"{worded(plan['text'])} The page plays it; then `stimrig diagnose DATA FURTHER` judges both together"
-            )
+            return f"{worded(plan['text'])} `stimrig test --decide DATA` plays it and judges both together"
         return (
             "look at the worst places and at electrodes, cell and fixture, and record again; an effect of your own: "
             "docs/add-an-effect.md"

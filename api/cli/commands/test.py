@@ -14,6 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
+from stimrig.api.cli import deciding
+from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.launcher import Services
 from stimrig.api.cli.session_report import report_lines, run_test
@@ -49,6 +51,14 @@ def test(
         ),
     ] = None,
     anyway: Annotated[bool, typer.Option("--anyway", help="play it although the target is out of reach")] = False,
+    decide: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="play the next experiment of this recording, and diagnose both together; once for each recording",
+            metavar="DATA",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Json = False,
     **labels: str | None,
 ) -> None:
@@ -57,6 +67,10 @@ def test(
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
     asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway) | given(**labels)
+    if decide:
+        if adaptive or protocol is not None:
+            raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
+        asked |= deciding.asked(decide)
     if url:
         token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
         if not token:
@@ -68,6 +82,8 @@ def test(
     else:
         found = on_own_services(rig, data, emulate, participant, asked)
     recording = found.pop("recording")
+    if decide:
+        found["diagnosis"] = deciding.diagnosed(decide, recording)
     if output is not None:
         with writing(output):
             output.parent.mkdir(parents=True, exist_ok=True)
@@ -76,6 +92,8 @@ def test(
         say_json(found)
         return
     say(*report_lines(found["test"], found["model"]))
+    if decide:
+        say("", "both together", "", *diagnosis_lines(found["diagnosis"]), "")
     say(f"recording      {output or found['test']['recording_url']}")
 
 
