@@ -30,8 +30,8 @@ def test_every_block_runs_in_order(tmp_path: Path) -> None:
     (path,) = tmp_path.glob("*.csv")
     scope: dict[str, object] = {"path": path}
     pieces = blocks("python")
-    assert len(pieces) == 8
-    with few_effects.only("asymmetric_relaxation", "fatigue", "output_saturation"):
+    assert len(pieces) == 12
+    with few_effects.only("asymmetric_relaxation", "fatigue", "output_saturation", "free_gate", "free_speed"):
         for piece in pieces:
             exec(compile(piece, "tutorial.md", "exec"), scope)
     figure = stimrig.plot(scope["better"])  # pyright: ignore[reportArgumentType]
