@@ -21,8 +21,6 @@ from stimrig.identify.summary import Sheet
 
 ENOUGH = 7.0
 """Expected log evidence that is enough to decide: odds of about 1000 to 1."""
-LONGEST_S = 40.0
-"""No further test for what is left takes longer."""
 PER_PULSE = 4
 """Samples per pulse of the simulated test."""
 NOTHING = "nothing"
@@ -96,8 +94,8 @@ def _played(
 def plan_further(record: Record, fitted: Fitted) -> Experiment:
     """The test that teaches a model most, where structure is left and no two effects stand against one another.
 
-    Of all designs the one after which the model's own standard error on held random levels is smallest: levels are what
-    a person trains on, and what the paper's test has least of.
+    Held random levels, in the design after which the model's own standard error on other such levels is smallest: jumps
+    of level while stimulated are what the paper's test lacks. A further ramp taught muscles of other physics nothing.
 
     Parameters
     ----------
@@ -107,10 +105,9 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
         The last model of it.
     """
     largest_us, rate_hz = float(record.pulse_width_us.max()), record.pulse_rate_hz
-    levels = held_levels(largest_us, _threshold_us(fitted))
-    reference = _simulate(fitted, _blank(record, levels[0].pulse_widths(rate_hz)[::-1]), True)[1]
-    rows = [(one, one.pulse_widths(rate_hz)) for one in (*levels, *designs(largest_us))]
-    rows = [(one, width) for one, width in rows if width.size <= LONGEST_S * rate_hz]
+    levels = held_levels(largest_us, _threshold_us(fitted), rate_hz)
+    rows = [(one, one.pulse_widths(rate_hz)) for one in levels]
+    reference = _simulate(fitted, _blank(record, rows[0][1][::-1]), True)[1]
     before = _expected_nm(fitted, reference, np.zeros((fitted.theta.size, 1)))
     after = [_expected_nm(fitted, reference, _whitened_slopes(fitted, _blank(record, width))) for _, width in rows]
     best = int(np.argmin(after))

@@ -132,7 +132,7 @@ OFTEN_S = 5.0
 """Seconds of levels after which there is a rest of one second: it shows what the muscle keeps of its work."""
 
 
-def held_levels(largest_us: float, threshold_us: float) -> list[Design]:
+def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float) -> list[Design]:
     """Random levels, each held for a while, as no ramp and no PRBS has them: jumps of level while stimulated.
 
     In one design they are even between the threshold and the largest width, in the other half of them lie near the
@@ -155,7 +155,14 @@ def held_levels(largest_us: float, threshold_us: float) -> list[Design]:
                 rested_s = 0.0
         found.append((words, levels))
     return [
-        Design(words, (_pause(), Segment("levels", "widths", {"pulse_width_us": _held(own), "jumps": True}), _pause()))
+        Design(
+            words,
+            (
+                _pause(),
+                Segment("levels", "widths", {"pulse_width_us": _held(own, pulse_rate_hz), "jumps": True}),
+                _pause(),
+            ),
+        )
         for words, own in found
     ]
 
@@ -164,7 +171,7 @@ def _pause() -> Segment:
     return Segment("rest", "rest", {"duration_s": 2.0})
 
 
-def _held(levels: list[tuple[float, float]], rate_hz: float = 40.0) -> list[float]:
+def _held(levels: list[tuple[float, float]], rate_hz: float) -> list[float]:
     """Widths of pulses, rounded down as the rig takes them."""
     return [float(np.floor(10.0 * us) / 10.0) for us, seconds in levels for _ in range(round(seconds * rate_hz))]
 

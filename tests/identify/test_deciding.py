@@ -32,7 +32,7 @@ def played_us(experiment):
     return np.concatenate([build(one["sequence"], dict(one["settings"]), 40.0) for one in experiment.segments])
 
 
-@pytest.mark.parametrize("design", held_levels(300.0, 80.0), ids=lambda design: design.words)
+@pytest.mark.parametrize("design", held_levels(300.0, 80.0, 40.0), ids=lambda design: design.words)
 def test_the_rig_plays_the_held_levels_that_were_simulated(design):
     for segment in design.segments:
         played = build(segment.sequence, segment.settings, 40.0)
