@@ -120,6 +120,7 @@ def look(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
         "named": named,
         "untrue": [name for name, sure in named.items() if sure >= SURE and name not in made["true"]],
         "verdict": improved.verdict if improved else "",
+        "picture": pictured(made, improved.models[-1] if improved else plain),
         "phi": plain.noise.ar1,
         "white_nm": plain.noise.white_sd_nm,
         "seconds": seconds,
@@ -152,6 +153,15 @@ def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
         both, row["added"], *_ = last_model(join([record, further], [0.0, PAUSE_S]))
         row["second"] = score(made, both)
     return row | {"seconds": time.perf_counter() - began, "own_nm": []}
+
+
+def pictured(made: dict[str, Any], model: identify.Model) -> list[bool] | None:
+    """Whether the first free effect of a model is right in where it enters and in what drives it; None without one."""
+    found = next((effect["shape"] for effect in model.effects if "shape" in effect), None)
+    truth = made["truth"]
+    if found is None or "enters" not in truth:
+        return None
+    return [found[key] in truth[key] for key in ("enters", "driven_by")]
 
 
 def elsewhere(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
@@ -204,6 +214,10 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     beyond = np.sum(improved > plain + [max(row["stated"], 0.02 * row["plain"]) for row in rows])
     yield f"… and by more than the standard error that it states of itself: {beyond} of {len(rows)}"
     yield f"improved better by 10 % and more: {np.sum(improved <= 0.9 * plain)} of {len(rows)}"
+    told = [row["picture"] for row in rows if row["picture"]]
+    if told:
+        right = np.sum(told, axis=0)
+        yield f"free effects {len(told)}: where they enter right in {right[0]}, what drives them in {right[1]}"
     yield f"records with a name that is untrue with {SURE} and more: {sum(bool(row['untrue']) for row in rows)}"
     if kind in ARMS:
         held = sum(row["phi"] > 0.985 for row in rows), sum(row["phi"] > 0.9939 for row in rows)
