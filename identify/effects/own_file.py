@@ -133,6 +133,8 @@ def text_of(effect: Effect, form: Form, found: Mapping[str, tuple[float, float]]
     if not re.fullmatch(ID, name) or name == effect.id:
         fix = "Use small letters, digits and _, beginning with a letter, and another name than the free effect's."
         raise BadRequest(f"no name for an effect: {name!r}", place="name", fix=fix)
+    if not np.isfinite([*found.values()]).all():
+        raise BadRequest("a value that is no number", place=effect.id, fix="Fit the record again.")
     rows = "".join(f"                {_row(one, *found[one.name])},\n" for one in form.parameters)
     law = ", ".join(f'"{key}": FreeLaw.{FreeLaw(value).name}' for key, value in form.law.items())  # type: ignore[arg-type]
     held = ", ".join(f"FreeLaw.{key.name}: {value}" for key, value in form.held.items())

@@ -58,9 +58,12 @@ def _own_text(path: Path, wanted: str | None, name: str) -> str:
     if known is None:
         names = ", ".join(str(entry["id"]) for entry in free) or "none"
         raise InputError(f"{path}: no free effect{f' {wanted!r}' if wanted else ''} in it. It has {names}.")
-    values = {one: (float(told["value"]), float(told["sd"])) for one, told in found[-1]["parameters"].items()}
+    given = found[-1]["parameters"]
     try:
+        values = {p.name: (float(given[p.name]["value"]), float(given[p.name]["sd"])) for p in known[1].parameters}
         return own_file.text_of(*known, values, name)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: {known[0].id} lacks a value or an sd: {error}. Fit the record again.") from error
     except identify.IdentifyError as error:
         raise InputError(str(error)) from error
 
