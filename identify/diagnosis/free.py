@@ -56,12 +56,13 @@ def searched(
     As `search_effects`. A free effect is no name: where one is needed, the verdict stays that structure is left.
     """
     say = progress or silent
-    search = search_effects(grid, raw, fitted_rows(grid, None), progress, most=most, structure=structure)
+    rows = fitted_rows(grid, None)
+    search = search_effects(grid, raw, rows, lambda done, text: say(0.7 * done, text), most=most, structure=structure)
     verdict = judge(search)
     named = verdict.kind == "effect_missing" and not verdict.objections
     if most == 0 or verdict.kind == "nothing_missing" or (named and not search.residuals[-1].left):
         return search, verdict
-    freely = explain_freely(search, lambda done, text: say(0.75 + 0.2 * done, text), named)
+    freely = explain_freely(search, lambda done, text: say(0.7 + 0.25 * done, text), named)
     if not freely.free:
         return search, verdict
     return freely, judge_free(freely, verdict, named)
