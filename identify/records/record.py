@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.summary import Sheet, Summarised, quantity
+
+if TYPE_CHECKING:
+    from stimrig.identify.records.joint_motion import JointMotion
 
 HELD_OUT = "validate"
 """Rows of this segment are never used to fit or to choose an effect; they may only speak against one."""
@@ -262,6 +265,8 @@ class Record(Summarised):
         """How the joint moved, by the angles alone, each part smoothed by itself; None without an angle."""
         if self.angle_rad is None:
             return None
+        from stimrig.identify.records.joint_motion import JointMotion  # here, so that reading a file imports no numba
+
         return JointMotion.of(self.time_s, self.angle_rad, [part.first for part in self.parts])
 
     def knows(self, name: str) -> bool:
