@@ -451,6 +451,7 @@ class Effect:
             "plain": self.plain,
             "needs": list(self.needs),
             "predictable": self.predictable,
+            "free": self.shape is not None,
         }
 
 

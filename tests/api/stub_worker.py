@@ -294,7 +294,8 @@ class Stub:
                 ("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up"
             )
             lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
-            return {"result": {"effects": [{"id": name, **words, **lists, "predictable": True} for name in names]}}
+            flags = {"predictable": True, "free": False}
+            return {"result": {"effects": [{"id": name, **words, **lists, **flags} for name in names]}}
         if verb == "export_csv":
             Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
             return {"result": {"rows": 1}}
