@@ -128,7 +128,7 @@ def text_of(effect: Effect, form: Form, found: Mapping[str, tuple[float, float]]
     Raises
     ------
     BadRequest
-        The name is none, or the library's.
+        The name is none, or the free effect's.
     """
     if not re.fullmatch(ID, name) or name == effect.id:
         fix = "Use small letters, digits and _, beginning with a letter, and another name than the free effect's."

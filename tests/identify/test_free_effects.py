@@ -14,7 +14,7 @@ from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import free
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.states import boundary_states
-from stimrig.identify.effects import own_file, registry
+from stimrig.identify.effects import known_form, own_file, registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.shapes import shape_of
@@ -169,6 +169,18 @@ def test_a_written_file_holds_the_same_form_about_what_was_found(effect, form: F
     for mine, theirs in zip(written.parameters, form.parameters, strict=True):
         assert theirs.lower <= mine.lower < mine.upper <= theirs.upper
         assert mine.lower <= mine.start[0] <= mine.upper and mine.scale == theirs.scale
+
+
+@pytest.mark.slow
+def test_a_written_file_fits_the_record_as_well_as_what_was_found(tmp_path, monkeypatch):
+    record, (_, improvement) = as_record(record_of_physics("physics", 0)), found()
+    row = improvement.models[-1].effects[-1]
+    values = {name: (one["value"], one["sd"]) for name, one in row["parameters"].items()}
+    (tmp_path / "mine.py").write_text(own_file.text_of(*known_form(row), values, "mine"), "utf-8")
+    monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
+    own, free_one = (identify.fit(record, effects=[name]).fit for name in ("mine", "free_gate"))
+    assert own["rms_nm"] == pytest.approx(free_one["rms_nm"], rel=0.01)
+    assert own["held_out_rms_nm"] == pytest.approx(free_one["held_out_rms_nm"], rel=0.01)
 
 
 @pytest.mark.parametrize("name", ["free_gate", "Gate", "", "1st", "a-b", "x" * 65])
