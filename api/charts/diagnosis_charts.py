@@ -30,7 +30,12 @@ def diagnosis_figures(
     for entry in view["missing"] if view else []:
         if entry["id"] in signatures:
             figures[f"signature-{entry['id']}"] = signature(signatures["time_s"], signatures[entry["id"]])
-    return figures | {f"free-{entry['id']}": picture(entry) for entry in (view["free"] if view else [])}
+    return figures | pictures(view["free"] if view else [])
+
+
+def pictures(entries: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of free effects, by name."""
+    return {f"free-{entry['id']}": picture(entry) for entry in entries}
 
 
 def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
@@ -80,14 +85,14 @@ def picture(found: dict[str, Any]) -> dict[str, Any]:
     """What a free effect does: its curves, each with its band."""
     data = []
     for number, (name, own) in enumerate(found["lines"].items()):
-        colour, words = (MODEL, MEASURED)[number % 2], plain(name)
+        colour, words = (MODEL, MEASURED)[number % 2], fig.unlinked(plain(name))
         data += fig.filled(found["at"], own["lower"], own["upper"], _("95 %% band")) if number == 0 else []
         if number:
             edges = (line(found["at"], own[edge], "", colour, 0.8, showlegend=False, **fig.QUIET) for edge in EDGES)
             data += edges
         data.append(line(found["at"], own["value"], words, colour, 2.2, **fig.hover(words, fig.SHARE)))
     margin = {"l": 64, "r": TOOLBAR_PX, "t": 30, "b": 48}
-    x, y = axis(plain(found["driver"])), axis(plain(found["axis"]))
+    x, y = (axis(fig.unlinked(plain(found[key]))) for key in ("driver", "axis"))
     return fig.figure(data, height=270, xaxis=x, yaxis=y, margin=margin)
 
 

@@ -10,7 +10,7 @@ from stimrig.api.charts import diagnosis_charts, model_charts
 from stimrig.api.charts.figure import CHART_CONFIG, in_light
 from stimrig.api.models import explanation
 from stimrig.api.workers.curves import curves, runs, thinned
-from stimrig.identify import BadRequest, Comparison, Improvement, Model, Record, compare
+from stimrig.identify import BadRequest, Comparison, Diagnosis, Improvement, Model, Record, compare
 
 BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]
 """Widths of the measurement and of the recruitment curve beside it."""
@@ -52,12 +52,12 @@ class LocalFigure(go.Figure):
 
 
 def plot(what: Any, record: Record | None = None) -> LocalFigure:
-    """Draw a model beside its measurement, what a comparison left over, or how the error fell.
+    """Draw a model beside its measurement, what a comparison left over, how the error fell, or what a free effect does.
 
     Parameters
     ----------
-    what : Model, Comparison or Improvement
-        A model needs a record.
+    what : Model, Comparison, Improvement or Diagnosis
+        A model needs a record; of a diagnosis the first free effect is drawn.
     record : Record, optional
         The measurement.
 
@@ -69,7 +69,7 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
     Raises
     ------
     BadRequest
-        It is none of these, or a model without a record.
+        It is none of these, a model without a record, or a diagnosis without a free effect.
     """
     if isinstance(what, Model) and record is not None:
         return LocalFigure(in_light(_model(what, record)))
@@ -81,7 +81,12 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
     if isinstance(what, Improvement):
         rows = explanation.step_versions({**what.to_dict(), "models": []})
         return LocalFigure(in_light(diagnosis_charts.falling(rows)))
-    message = "plot takes a model and its record, a comparison, or what improve found: plot(model, record)"
+    if isinstance(what, Diagnosis) and what.free:
+        return LocalFigure(in_light(diagnosis_charts.picture(what.free[0])))
+    message = (
+        "plot takes a model and its record, a comparison, what improve found, or a diagnosis with a free effect: "
+        "plot(model, record)"
+    )
     raise BadRequest(message, place="plot")
 
 

@@ -188,6 +188,15 @@ def free_card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
     return {**entry, **more}
 
 
+def held_free(document: dict[str, Any]) -> list[dict[str, Any]]:
+    """The free effects that a model holds, as `free_card` gives what a diagnosis found."""
+    return [
+        {"id": one["id"], "name": effect_words(one["id"]), "equation": one.get("equation") or "", **one["shape"],
+         "axis": one["shape"]["effect"], "left_out": "", "parameters": _labelled(one["parameters"], {})}
+        for one in document.get("effects") or [] if one.get("shape")
+    ]  # fmt: skip
+
+
 def likely(entry: dict[str, Any]) -> bool:
     """Whether an effect is more than possibly missing: only such a one is advised to be added."""
     probability = entry.get("probability")
@@ -349,6 +358,8 @@ def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> s
 
     It speaks against one that it asks for where rows of `validate` object.
     """
+    if effect in [entry["effect"] for entry in diagnosis.get("free") or []]:
+        return None
     for entry in diagnosis.get("missing") or []:
         if entry["effect"] == effect:
             return entry.get("objection")

@@ -62,6 +62,7 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
     """What a model's page and its report show alike."""
     return {
         "document": document,
+        "held": explanation.held_free(document),
         "recruitment": stored_model.recruitment(document),
         "dynamics": stored_model.dynamics(document),
         "repetition": stored_model.repetition(document),
@@ -75,7 +76,8 @@ def draw_figures(document: dict[str, Any], measured: dict[str, Any]) -> dict[str
     """The model's own figures; the first one low enough for the first screen."""
     figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
     first = {"overview": model_charts.overview(figures[model_charts.LARGE])} if model_charts.LARGE in figures else {}
-    return figures | first | joint_charts.joint_figures(document)
+    held = diagnosis_charts.pictures(explanation.held_free(document))
+    return figures | first | held | joint_charts.joint_figures(document)
 
 
 async def next_step_of(context: Context, row: Model, version: dict[str, Any], may_test: bool) -> next_view.Step | None:

@@ -37,9 +37,10 @@ def comparison_html(
     comparison : dict or None
         As `identify.compare` gives it, cleaned and thinned.
     """
-    judged = stored_model.quality(document)
+    judged, held = stored_model.quality(document), explanation.held_free(document)
     return _page(
         "report.html",
+        held=held,
         title=f"{name}: measurement against model",
         model={**stored_model.figures(document), **judged, "id": document["model_id"], "method": document["method"]},
         effects=[effect["id"] for effect in document.get("effects") or []],
@@ -50,6 +51,7 @@ def comparison_html(
         figures={
             **model_charts.model_figures(document, curves, comparison),
             **joint_charts.joint_figures(document),
+            **diagnosis_charts.pictures(held),
             **diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, []),
         },
         plain=(comparison or {}).get("plain") or [],
