@@ -176,7 +176,9 @@ def test_a_written_file_fits_the_record_as_well_as_what_was_found(tmp_path, monk
     record, (_, improvement) = as_record(record_of_physics("physics", 0)), found()
     row = improvement.models[-1].effects[-1]
     values = {name: (one["value"], one["sd"]) for name, one in row["parameters"].items()}
-    (tmp_path / "mine.py").write_text(own_file.text_of(*known_form(row), values, "mine"), "utf-8")
+    known = known_form(row)
+    assert known is not None
+    (tmp_path / "mine.py").write_text(own_file.text_of(*known, values, "mine"), "utf-8")
     monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
     own, free_one = (identify.fit(record, effects=[name]).fit for name in ("mine", "free_gate"))
     assert own["rms_nm"] == pytest.approx(free_one["rms_nm"], rel=0.01)
