@@ -82,7 +82,7 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
         rows = explanation.step_versions({**what.to_dict(), "models": []})
         return LocalFigure(in_light(diagnosis_charts.falling(rows)))
     if isinstance(what, Diagnosis) and what.free:
-        return LocalFigure(in_light(diagnosis_charts.picture(what.free[0])))
+        return LocalFigure(in_light(diagnosis_charts.picture(dict(what.free[0]))))
     message = (
         "plot takes a model and its record, a comparison, what improve found, or a diagnosis with a free effect: "
         "plot(model, record)"
