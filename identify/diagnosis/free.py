@@ -25,7 +25,7 @@ from stimrig.identify.diagnosis.search import (
 from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, find_effect, registry
-from stimrig.identify.estimation.effect_fit import WORTHLESS, Candidate
+from stimrig.identify.estimation.effect_fit import WORTHLESS, Candidate, replaced_by
 from stimrig.identify.estimation.joint import Fitted, solve
 from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
 from stimrig.identify.estimation.samples import Raw, fitted_rows
@@ -137,9 +137,7 @@ def _applicable(effect: Effect, base: Fitted) -> bool:
     """
     if effect.id in ZERO.values():
         return effect.id not in dict(base.effects)
-    stages = {form.stage for _, form in base.effects}
-    own = {form.stage for form in effect.forms}
-    return bool(effect.shape) and effect.id not in dict(base.effects) and not ("speed" in stages and "lags" in own)
+    return bool(effect.shape) and effect.id not in dict(base.effects) and not replaced_by(base.effects, effect.forms)
 
 
 def _best(

@@ -33,6 +33,7 @@ from stimrig.identify.estimation.effect_fit import (
     effect_names,
     fit_form,
     fit_from,
+    replaced_by,
     try_effect,
 )
 from stimrig.identify.estimation.fit_statistics import evaluate
@@ -297,6 +298,7 @@ def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     record, jumps = grid.record, base.heavy_tails and grid.readings is not None
     asked = not effect.raw and not effect.shape and effect.id not in present
     asked = asked and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
+    asked = asked and not replaced_by(base.effects, effect.forms)
     return asked and all(record.knows(need) for need in effect.needs)
 
 

@@ -143,13 +143,16 @@ def effect_names(fitted: Fitted) -> list[str]:
 def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     """The model with one more effect, in the named form or in its most likely one.
 
-    Raises BadRequest: the effect has no such form. NotIdentifiable: it needs a column that the record does not have, or
-    its fit finds nothing to start from.
+    Raises BadRequest: the effect has no such form, or stands against one that is there. NotIdentifiable: it needs a
+    column that the record does not have, or its fit finds nothing to start from.
     """
     for need in effect.needs:
         if not base.problem.setup.grid.record.knows(need):
             raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, fix="Record this column.")
     forms = [_form(effect, form)] if form else list(effect.forms)
+    if (other := replaced_by(base.effects, forms)) is not None:
+        message = f"{effect.id} and {other} both set the speed of the two lags: one would be ignored"
+        raise BadRequest(message, place="effects", fix="Leave one of them out.")
     for identifier, seen, values in detected_effects(raw):
         if identifier == effect.id:
             return fit_from(base, identifier, seen, values)
@@ -159,6 +162,13 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     if found is None:
         raise NotIdentifiable(f"the record shows nothing that looks like {effect.id}", fix="Leave this effect out.")
     return found.fitted
+
+
+def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> str | None:
+    """The effect of a model that cannot stand beside these forms: free lags take the place of every speed law."""
+    against = {"lags": "speed", "speed": "lags"}
+    stages = {against.get(form.stage, "") for form in forms}
+    return next((name for name, own in present if own.stage in stages), None)
 
 
 def fit_from(base: Fitted, identifier: str, form: Form, values: dict[str, float]) -> Fitted:

@@ -201,3 +201,10 @@ def test_what_is_left_gets_a_further_test_within_the_limits():
     assert max(map(max, widths_us)) <= record.pulse_width_us.max()
     told = identify.next_experiment(diagnosis)
     assert told is not None and told.rivals == () and told.text == plan["text"]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_two_effects_of_which_one_would_be_ignored_are_refused(order: int):
+    asked = ["free_gate", "asymmetric_relaxation:by_drive"][::order]
+    with pytest.raises(BadRequest, match="one would be ignored"):
+        identify.fit(hidden_muscles.record(seed=3, rate_hz=100), effects=asked)
