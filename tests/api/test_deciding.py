@@ -13,6 +13,7 @@ from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.commands.diagnose import next_step
 from stimrig.api.cli.errors import InputError
 from stimrig.api.models import explanation
+from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.responses.models import ExperimentOut
 from stimrig.api.workers.verbs import experiment
 
@@ -39,6 +40,15 @@ def test_it_goes_before_the_test_between_rivals_and_the_page_shows_it() -> None:
     assert "stimrig test --decide" in next_step(
         {"verdict": "unexplained_structure", "deciding_experiment": DECIDING}, ""
     )
+
+
+def test_the_page_says_of_a_test_without_rivals_that_it_teaches_and_of_others_that_they_tell_apart() -> None:
+    found = experiment(MISSING, DECIDING)
+    assert found is not None
+    card = environment.get_template("why.html").module.experiment  # pyright: ignore[reportAttributeAccessIssue]
+    for rivals, said, unsaid in (([], "teaches", "tells them apart"), (["fatigue"], "tells them apart", "teaches")):
+        html = card(explanation.tidy_experiment({**found, "rivals": rivals}, {}))
+        assert said in html and unsaid not in html and ("Decides" in html) == bool(rivals)
 
 
 @pytest.fixture
