@@ -23,6 +23,8 @@ ENOUGH = 7.0
 """Expected log evidence that is enough to decide: odds of about 1000 to 1."""
 PER_PULSE = 4
 """Samples per pulse of the simulated test."""
+REFERENCE = 8
+"""Seed of the levels on which designs are compared: none of a design's own, which would speak for it."""
 NOTHING = "nothing"
 """The name of a model without effects, as a rival."""
 
@@ -105,9 +107,10 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
         The last model of it.
     """
     largest_us, rate_hz = float(record.pulse_width_us.max()), record.pulse_rate_hz
-    levels = held_levels(largest_us, _threshold_us(fitted), rate_hz)
-    rows = [(one, one.pulse_widths(rate_hz)) for one in levels]
-    reference = _simulate(fitted, _blank(record, rows[0][1][::-1]), True)[1]
+    threshold_us = _threshold_us(fitted)
+    rows = [(one, one.pulse_widths(rate_hz)) for one in held_levels(largest_us, threshold_us, rate_hz)]
+    others = [one.pulse_widths(rate_hz) for one in held_levels(largest_us, threshold_us, rate_hz, REFERENCE)]
+    reference = _simulate(fitted, _blank(record, np.concatenate(others)), True)[1]
     before = _expected_nm(fitted, reference, np.zeros((fitted.theta.size, 1)))
     after = [_expected_nm(fitted, reference, _whitened_slopes(fitted, _blank(record, width))) for _, width in rows]
     best = int(np.argmin(after))

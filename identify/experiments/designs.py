@@ -132,7 +132,7 @@ OFTEN_S = 5.0
 """Seconds of levels after which there is a rest of one second: it shows what the muscle keeps of its work."""
 
 
-def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float) -> list[Design]:
+def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, seed: int = 7) -> list[Design]:
     """Random levels, each held for a while, as no ramp and no PRBS has them: jumps of level while stimulated.
 
     In one design they are even between the threshold and the largest width, in the other half of them lie near the
@@ -143,7 +143,7 @@ def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float) ->
         ("Random levels, each held for a moment", 0.0),
         ("Random levels, many near the threshold", 0.5),
     ):
-        rng = np.random.default_rng(7)
+        rng = np.random.default_rng(seed)
         levels: list[tuple[float, float]] = []
         rested_s = 0.0
         while sum(seconds for _, seconds in levels) < LEVELS_S:
