@@ -122,7 +122,7 @@ def _plan(experiment: Experiment) -> dict[str, Any]:
 def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
     """Whether a further test is planned for what is left; not of a joint that moves, which has tests of its own."""
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)
-    return verdict.kind == "unexplained_structure" and still and search.last.noise.band == 0.0
+    return verdict.kind == "unexplained_structure" and still
 
 
 def _free(search: EffectSearch, effect: str) -> dict[str, Any]:

@@ -7,6 +7,8 @@ import pytest
 
 from stimrig import identify
 from stimrig.hardware_sim.physics_records import further_record, record_of_physics
+from stimrig.identify.estimation.effect_fit import fitted_with
+from stimrig.identify.experiments import plan_further
 from stimrig.identify.experiments.designs import SHAPES, held_levels
 from stimrig.identify.records.join import join
 from stimrig.rig.sequences import build
@@ -38,6 +40,19 @@ def test_the_rig_plays_the_held_levels_that_were_simulated(design):
         played = build(segment.sequence, segment.settings, 40.0)
         np.testing.assert_allclose(played, SHAPES[segment.sequence](segment.settings, 40.0))
     assert design.pulse_widths(40.0).max() <= 300.0 and design.pulse_widths(40.0).size <= 40.0 * 40.0
+
+
+def test_the_muscle_decides_which_design_is_chosen():
+    records = [as_record(record_of_physics("physics", seed, ())) for seed in (0, 3)]
+    chosen = {plan_further(record, fitted_with(record, [])).text.partition(" (")[0] for record in records}
+    assert len(chosen) == 2
+
+
+def test_a_tremor_is_no_reason_to_choose_none():
+    record = hidden_muscles.record("tremor", seed=3)
+    fitted = fitted_with(record, ["tremor"])
+    found = plan_further(record, fitted).expected_fall
+    assert fitted.noise.band > 0.0 and found is not None and 0.0 < found < 1.0
 
 
 def test_it_is_there_where_structure_is_left_and_keeps_the_limits(made, diagnosis):
