@@ -148,6 +148,7 @@ def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
     row = {name: made["truth"][name] for name in ("seed", "disturbed")} | {"kind": made["kind"]}
     row |= {"plain": score(made, identify.fit(record)), "improved": score(made, first), "second": score(made, first)}
     row |= {"added": added, "named": {}, "untrue": [], "verdict": words or "nothing chosen", "stated": 0.0}
+    row |= {"picture": pictured(made, first)}
     if width_us is not None:
         further = as_record(further_record(kinds, made["truth"]["seed"], tuple(row["disturbed"]), width_us))
         both, row["added"], *_ = last_model(join([record, further], [0.0, PAUSE_S]))
