@@ -89,7 +89,9 @@ def diagnosed(record: Any, progress: Progress, model_json: str | None = None) ->
     found["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(found)}
     progress(0.82, "what each effect would explain")
     found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]], structure)
-    found["experiment"] = experiment(found["missing"], found["deciding_experiment"])
+    planned = experiment(found["missing"], found["deciding_experiment"])
+    # A list of widths is one of pulses: at another rate it would be another test, and could not be joined.
+    found["experiment"] = planned and {**planned, "pulse_rate_hz": record.pulse_rate_hz}
     return clean(found)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.commands.diagnose import next_step
 from stimrig.api.cli.errors import InputError
 from stimrig.api.models import explanation
+from stimrig.api.web.pages import model_view
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.responses.models import ExperimentOut
 from stimrig.api.workers.verbs import experiment
@@ -34,7 +36,7 @@ MISSING = [{"effect": "fatigue", "confused_with": ["potentiation"], "next_experi
 def test_it_goes_before_the_test_between_rivals_and_the_page_shows_it() -> None:
     found = experiment(MISSING, DECIDING)
     assert found is not None and found["effect"] == "" and found["text"] == DECIDING["text"]
-    ExperimentOut.model_validate({key: found[key] for key in ExperimentOut.model_fields})
+    ExperimentOut.model_validate(found)
     shown = explanation.tidy_experiment(found, {})
     assert shown["shown"] == ["widths", "Rest 2 s"] and shown["text"] == DECIDING["text"]
     assert "stimrig test --decide" in next_step(
@@ -49,6 +51,24 @@ def test_the_page_says_of_a_test_without_rivals_that_it_teaches_and_of_others_th
     for rivals, said, unsaid in (([], "teaches", "tells them apart"), (["fatigue"], "tells them apart", "teaches")):
         html = card(explanation.tidy_experiment({**found, "rivals": rivals}, {}))
         assert said in html and unsaid not in html and ("Decides" in html) == bool(rivals)
+
+
+def test_the_page_asks_for_it_at_the_rate_of_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    bodies: list[Any] = []
+
+    async def ask(_context: object, _who: object, body: Any, back: str) -> str:
+        bodies.append(body)
+        return back
+
+    known = {"segments": DECIDING["segments"], "pulse_rate_hz": 25.0}
+    context: Any = SimpleNamespace(analyses=SimpleNamespace(known_diagnosis=lambda _: {"experiment": known}))
+    row: Any = SimpleNamespace(id="M1", participant="P1")
+    monkeypatch.setattr(model_view.starting, "ask", ask)
+    for rate_hz in (25.0, 40.0):  # a diagnosis that was kept by an earlier version tells none
+        asyncio.run(model_view.run_experiment(context, SimpleNamespace(name="B"), row))  # pyright: ignore[reportArgumentType]
+        assert bodies[-1].pulse_rate_hz == rate_hz and bodies[-1].joins == "M1"
+        assert [dict(one) for one in bodies[-1].segments] == DECIDING["segments"]
+        known.pop("pulse_rate_hz", None)
 
 
 @pytest.fixture

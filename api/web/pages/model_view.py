@@ -195,9 +195,8 @@ async def run_experiment(context: Ctx, who: Tester, row: Version) -> Response:
     if not experiment:
         detail = "The diagnosis of this recording names none: no effects need to be told apart."
         raise ApiError(409, "no-experiment", "There is no next experiment", detail)
-    body = TestIn.model_validate(
-        {"participant": row.participant, "kind": "next-experiment", "segments": experiment["segments"], "joins": row.id}
-    )
+    asked = {key: experiment[key] for key in ("segments", "pulse_rate_hz") if key in experiment}
+    body = TestIn.model_validate({"participant": row.participant, "kind": "next-experiment", "joins": row.id, **asked})
     return RedirectResponse(await starting.ask(context, who, body, back=f"/models/{row.id}#experiment"), 303)
 
 

@@ -138,6 +138,7 @@ class ExperimentOut(Document):
     duration_s: float
     dose: dict[str, float]
     text: str
+    pulse_rate_hz: float = Field(40.0, description="of the recording, which its own is joined to")
 
 
 class FiguresOut(Document):
