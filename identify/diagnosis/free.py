@@ -82,16 +82,16 @@ def explain_freely(search: EffectSearch, progress: Progress | None = None, named
     """
     say = progress or silent
     if named:
-        whole = _extended(_chain(search.chain), say, thresholds.FURTHER_FREE)
+        whole = _extended(_found(search), say, thresholds.FURTHER_FREE)
         return _with_chain(search, whole, [*search.added, *whole.added]) if whole.added else search
     kept = [effect for effect in search.added if not find_effect(effect).predictable and not find_effect(effect).band]
-    best = _extended(_chain(_with_only(search, kept)), lambda done, text: say(0.5 * done, text))
+    best = _extended(_with_only(search, kept), lambda done, text: say(0.5 * done, text))
     names = kept
     if (
         len(kept) < len(search.added)
         and difference(best.left_out[-1], search.left_out[-1]).errors > thresholds.NO_WORSE
     ):
-        other = _extended(_chain(search.chain), lambda done, text: say(0.5 + 0.5 * done, text))
+        other = _extended(_found(search), lambda done, text: say(0.5 + 0.5 * done, text))
         if difference(best.left_out[-1], other.left_out[-1]).errors >= thresholds.BETTER:
             best, names = other, search.added
     gained = difference(search.left_out[-1], best.left_out[-1])
@@ -100,12 +100,15 @@ def explain_freely(search: EffectSearch, progress: Progress | None = None, named
     return _with_chain(search, best, [*names, *best.added])
 
 
-def _chain(models: Sequence[Fitted]) -> Chain:
-    return Chain(tuple(models), tuple(leave_out(one) for one in models))
+def _found(search: EffectSearch) -> Chain:
+    """The chain of the library's effects, as the search left it."""
+    return Chain(tuple(search.chain), tuple(search.left_out))
 
 
-def _with_only(search: EffectSearch, kept: Sequence[str]) -> list[Fitted]:
+def _with_only(search: EffectSearch, kept: Sequence[str]) -> Chain:
     """The chain of models with only some of the effects that were added."""
+    if kept == search.added:
+        return _found(search)
     last = search.last
     for effect in search.added:
         if effect not in kept:
@@ -113,7 +116,7 @@ def _with_only(search: EffectSearch, kept: Sequence[str]) -> list[Fitted]:
     models = [last]
     for effect in reversed(kept):
         models.append(without_effect(models[-1], effect))
-    return models[::-1]
+    return Chain(tuple(models[::-1]), tuple(leave_out(one) for one in reversed(models)))
 
 
 def _extended(chain: Chain, progress: Progress, first: tuple[float, float] = thresholds.FIRST_FREE) -> Chain:
@@ -166,17 +169,17 @@ def _twins(fitted: Fitted) -> list[Fitted]:
 
 
 def _with_chain(search: EffectSearch, chain: Chain, names: list[str]) -> EffectSearch:
-    """The search that ends with this chain. Rounds of effects that are no longer there say what was refused."""
+    """The search that ends with this chain. Where an effect is no longer there, round 1 says what was refused."""
     kept = [search.added.index(name) for name in names if name not in chain.added]
-    rounds = [search.rounds[place] for place in kept] + search.rounds[:1]
+    refused = slice(len(kept), None) if len(kept) == len(search.added) else slice(1)
     return replace(
         search,
         added=names,
         chain=list(chain.models),
         left_out=list(chain.left_out),
         residuals=[residual_structure(fitted, search.quiet) for fitted in chain.models],
-        rounds=rounds,
-        margins=[search.margins[place] for place in kept] + search.margins[:1],
+        rounds=[*(search.rounds[place] for place in kept), *search.rounds[refused]],
+        margins=[*(search.margins[place] for place in kept), *search.margins[refused]],
         losses={},
         free=list(chain.added),
     )
