@@ -22,7 +22,6 @@ from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.samples import Raw, prepare
-from stimrig.identify.estimation.shapes import told
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Improvement
@@ -75,13 +74,14 @@ def improve(
     row, against = helpful(search)
     if max_effects is not None:
         row = row[: max_effects + 1]
-    reasons = [_reason(search, step, before) for before, step in zip([row[0], *row], row, strict=False)]
+    asked = len(row)
     for effect in force:
         step = _forced(row[-1], effect, search.raw)
         if step is not None:
             row.append(step)
-            reasons.append("Added on request. The evidence does not ask for it.")
     models = _models(row)
+    reasons = [_reason(search, *three) for three in zip(row[:asked], [row[0], *row], models, strict=False)]
+    reasons += ["Added on request. The evidence does not ask for it."] * (len(row) - asked)
     return Improvement(
         noise_sd_nm=search.raw.noise_sd_nm,
         verdict=verdict.kind,
@@ -100,7 +100,7 @@ FREE = "A free effect: it describes what no effect of the library explains, and 
 _PLAIN = "The plain structure: recruitment curve and linear dynamics."
 
 
-def _reason(search: EffectSearch, step: Step, before: Step) -> str:
+def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str:
     if step.added is None:
         held = ", ".join(find_effect(name).name.lower() for name in effect_names(search.base))
         base = f"The given structure, with {held}." if held else _PLAIN
@@ -110,7 +110,8 @@ def _reason(search: EffectSearch, step: Step, before: Step) -> str:
     number = search.added.index(step.added)
     if step.added in search.free:
         seen = difference(search.left_out[number], search.left_out[number + 1])
-        return " ".join([told(step.fitted, step.added)["words"], seen.words, FREE])
+        told = next(effect["shape"]["words"] for effect in model.effects if effect["id"] == step.added)
+        return " ".join([told, seen.words, FREE])
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
     seen = difference(search.left_out[number], search.left_out[number + 1])
     reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."

@@ -38,9 +38,9 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     row = steps(search)
     base = row[0].statistics
     ranked = _ranked(search, verdict)
-    covariance = covariance_of(search.last.written) if ranked else np.zeros((0, 0))
+    covariance = covariance_of(search.last.written) if ranked or search.free else np.zeros((0, 0))
     missing = [_missing(search, verdict, effect, row, covariance) for effect in ranked]
-    free = [_free(search, effect) for effect in search.free]
+    free = [_free(search, effect, covariance) for effect in search.free]
     final = row[-1].statistics
     residual = record.torque_nm - (
         predict_fitted(search.last)[0] if verdict.kind == "unexplained_structure" else base_prediction
@@ -125,12 +125,11 @@ def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
     return verdict.kind == "unexplained_structure" and still
 
 
-def _free(search: EffectSearch, effect: str) -> dict[str, Any]:
+def _free(search: EffectSearch, effect: str, covariance: np.ndarray) -> dict[str, Any]:
     """What a free effect does, and what left-out blocks say of it."""
     number = search.added.index(effect)
     fitted = search.last.written
     index = [name for name, _ in fitted.effects].index(effect)
-    covariance = covariance_of(fitted)
     shape = shape_of(fitted, index, covariance)
     assert shape is not None
     return {

@@ -10,7 +10,6 @@ import numpy as np
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Form, Shape
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.uncertainty import covariance_of
 
 DRAWS = 200
 PERCENTILES = 2.5, 97.5
@@ -51,14 +50,6 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
         lines[name] = {"value": line.tolist(), "lower": lower.tolist(), "upper": upper.tolist()}
     told = {key: getattr(found, key) for key in ("enters", "driven_by", "words", "driver", "effect")}
     return told | {"at": found.at.tolist(), "lines": lines}
-
-
-def told(fitted: Fitted, effect: str) -> dict[str, Any]:
-    """As `shape_of`, of a free effect by its id."""
-    written = fitted.written
-    found = shape_of(written, [name for name, _ in written.effects].index(effect), covariance_of(written))
-    assert found is not None
-    return found
 
 
 def _lines(shape: Any, form: Form, names: list[str], row: np.ndarray) -> Mapping[str, np.ndarray]:
