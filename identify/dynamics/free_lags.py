@@ -62,11 +62,13 @@ def lag_s(base_s, log_rate):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def filled(state, work, fill_s, empty_s, step_s):  # pragma: no cover
-    """The slow state after a step: s' = work (1 - s)/fill - (1 - work) s/empty, exact for held work from 0 to 1."""
-    up, down = work / fill_s, (1.0 - work) / empty_s
-    goal = up / (up + down)
-    return goal + (state - goal) * np.exp(-(up + down) * step_s)
+def filled(state, up, down, step_s):  # pragma: no cover
+    """A slow state after a step: s' = up (1 - s) - down s, exact for held rates, 1/s; as it was where both are 0."""
+    rate = up + down
+    if not rate > 0.0:
+        return state
+    goal = up / rate
+    return goal + (state - goal) * np.exp(-rate * step_s)
 
 
 @njit(cache=True, nogil=True)
@@ -118,7 +120,7 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
                     s *= np.exp(-rest_s[k] / p[FreeLaw.EMPTY_S])
                 work = w if p[FreeLaw.BY_DRIVE] > 0.5 else y
                 work = on[k] if p[FreeLaw.BY_PULSES] > 0.5 else min(max(work / scale_nm, 0.0), 1.0)
-                s = filled(s, work, p[FreeLaw.FILL_S], p[FreeLaw.EMPTY_S], step_s)
+                s = filled(s, work / p[FreeLaw.FILL_S], (1.0 - work) / p[FreeLaw.EMPTY_S], step_s)
                 strength, quick = max(1.0 + p[FreeLaw.GAIN] * s, 0.0), p[FreeLaw.RATE] * s
             if p[FreeLaw.FEEDBACK] != 0.0:
                 strength *= max(1.0 + p[FreeLaw.FEEDBACK] * min(max(y / scale_nm, 0.0), 2.0), 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.polynomial.chebyshev import chebvander
 
-from stimrig.identify.dynamics.free_lags import FreeLaw
+from stimrig.identify.dynamics.free_lags import FreeLaw, filled
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 
 STAGES = ("pulse_width", "gain", "speed", "lags", "branch", "delay", "filter", "output", "additive", "sensor")
@@ -527,11 +527,7 @@ def adapt(
             a = min(max(drive[m, k], 0.0), 1.0)
             up = a / onset_s[m]
             down = 1.0 / recovery_s[m] if constant else (1.0 - a) / recovery_s[m]
-            rate = up + down
-            end = x
-            if rate > 0.0:
-                goal = up / rate
-                end = goal + (x - goal) * np.exp(-rate * step_s)
+            end = filled(x, up, down, step_s)
             out[m, k] = 0.5 * (x + end)
             x = end
         last[m] = x

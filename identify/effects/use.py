@@ -24,7 +24,8 @@ def course(values: Mapping[str, float]) -> np.ndarray:
     state, found = 0.0, []
     for at in TIME_S:
         found.append(state)
-        state = filled(state, float(at < WORK_S), values["fill_s"], values["empty_s"], STEP_S)
+        up, down = (1.0 / values["fill_s"], 0.0) if at < WORK_S else (0.0, 1.0 / values["empty_s"])
+        state = filled(state, up, down, STEP_S)
     return np.array(found)
 
 
