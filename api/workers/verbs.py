@@ -133,7 +133,7 @@ def smooth(record: Any, values: Any) -> Any:
 
 
 def experiment(missing: Sequence[dict[str, Any]], further: dict[str, Any] | None = None) -> dict[str, Any] | None:
-    """The test that separates the first effect with rivals from them, or the `further` one for what is left."""
+    """The `further` test for what is left, or the one that separates the first effect with rivals from them."""
     from stimrig.identify.diagnosis import planned
 
     found = planned(missing, further)

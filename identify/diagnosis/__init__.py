@@ -104,9 +104,10 @@ def next_experiment(about: Record | Diagnosis, rivals: Sequence[str] = ()) -> Ex
 
 
 def planned(missing: Sequence[Mapping[str, Any]], further: Mapping[str, Any] | None = None) -> Experiment | None:
-    """The experiment of the first effect with rivals among those that a diagnosis found missing; else the `further` one
-    for what is left; None without any."""
+    """The `further` experiment, for what is left; else that of the first missing effect with rivals; or None."""
+    if further:
+        return Experiment(rivals=(), **further)
     for row in missing:
-        if further is None and row["confused_with"] and row["next_experiment_plan"]:
+        if row["confused_with"] and row["next_experiment_plan"]:
             return Experiment(rivals=(row["effect"], row["confused_with"][0]), **row["next_experiment_plan"])
-    return Experiment(rivals=(), **further) if further else None
+    return None
