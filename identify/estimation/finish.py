@@ -140,25 +140,26 @@ def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
     shape = shape_of(fitted, index, matrix)
     joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
     joint |= {"angle_late_s": setup.angle_late_s or None}
-    return (
-        {
-            "id": chosen.effect,
-            "form": chosen.form.name,
-            "stage": chosen.form.stage,
-            "equation": chosen.form.equation,
-            "parameters": describe_parameters(fitted, index, matrix),
-            "settings": {
-                "scale_nm": setup.scale_nm,
-                "noise_sd_nm": setup.noise_sd_nm,
-                "zero_nm": setup.zero_nm,
-                "sign": setup.sign,
-                "reference_s": setup.reference_s,
-            }
-            | {name: value for name, value in joint.items() if value is not None},
+    told = {
+        "id": chosen.effect,
+        "form": chosen.form.name,
+        "stage": chosen.form.stage,
+        "equation": chosen.form.equation,
+        "parameters": describe_parameters(fitted, index, matrix),
+        "settings": {
+            "scale_nm": setup.scale_nm,
+            "noise_sd_nm": setup.noise_sd_nm,
+            "zero_nm": setup.zero_nm,
+            "sign": setup.sign,
+            "reference_s": setup.reference_s,
         }
-        | ({} if own is None else {"unforeseen": {"mean_nm": own[0], "rms_nm": own[1]}})
-        | ({} if shape is None else {"shape": shape})
-    )
+        | {name: value for name, value in joint.items() if value is not None},
+    }
+    if own is not None:
+        told["unforeseen"] = {"mean_nm": own[0], "rms_nm": own[1]}
+    if shape is not None:
+        told["shape"] = shape
+    return told
 
 
 def describe_parameters(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, dict[str, Any]]:
