@@ -2,7 +2,7 @@
 
 `PHYSICS` are those of the yardstick, `FURTHER` come from elsewhere in the literature; `physics_places` has those of
 other places than the muscle. Nothing here is fitted to a measured muscle: numbers lie about those of the papers, slowed
-where a whole arm is slower than a fibre.
+where a whole arm is slower than a fibre. `sarcomere_chain` and `closed_space` were once sealed, under other names.
 """
 
 from __future__ import annotations
@@ -319,5 +319,78 @@ def cooperative(x, p, s, c):
     return p[0] * c[LARGEST_NM] * s[2]
 
 
+@mechanism(
+    "a chain of sarcomeres of unequal strength on their length-tension curve: Morgan 1990, Campbell 2009",
+    "asymmetric_relaxation series_compliance potentiation",
+    "rate of rise, rate of fall",
+    "activation, torque, sum of the past",
+    activation_s=(0.03, 0.09),
+    unequal=(0.05, 0.25),
+    fastest_per_s=(0.5, 3.0),
+    compliance=(0.05, 0.25),
+    curved=(1.0, 6.0),
+    passive=(0.5, 3.0),
+)
+def sarcomere_chain(x, p, s, c):
+    """p: scale, activation s, spread of strength, lengths/s, spring's stretch, curve of length-tension, passive.
+
+    s: two lags, 9 lengths beyond the optimum from s[10]. Total length and the spring's stretch add to a constant.
+    """
+    count = 9
+    before = s[0]
+    s[0] = lag_after(x / c[LARGEST_NM], x / c[LARGEST_NM], before, p[1], c[STEP_S])
+    s[1] = lag_after(before, s[0], s[1], p[1], c[STEP_S])
+    force = 0.0
+    for _ in range(6):
+        shortened = 0.0
+        for k in range(count):
+            shortened -= s[10 + k] / count
+        force = max(shortened / p[4], 0.0)
+        for k in range(count):
+            own = 1.0 + p[2] * (2.0 * k / (count - 1.0) - 1.0)
+            length = s[10 + k]
+            active = own * s[1] * max(1.0 - p[5] * length * length, 0.05)
+            stretched = p[6] * length * abs(length)
+            speed = (force - active - stretched) / (active + 0.15)
+            s[10 + k] += c[STEP_S] / 6.0 * p[3] * min(max(speed, -1.0), 1.0)
+    return p[0] * c[LARGEST_NM] * force
+
+
+@mechanism(
+    "phosphate and potassium of a closed space, washed out by flow that force itself stops; Dutka and Lamb 2004",
+    "fatigue asymmetric_relaxation activation_dependent_speed",
+    "drive, rate of rise, rate of fall",
+    "activation, torque, sum of the past",
+    rise_s=(0.03, 0.1),
+    force_s=(0.06, 0.3),
+    heaps_s=(3.0, 15.0),
+    washed_s=(5.0, 25.0),
+    lost=(0.3, 0.9),
+    block=(0.1, 1.2),
+    stops=(0.3, 0.9),
+    block_s=(0.5, 3.0),
+)
+def closed_space(x, p, s, c):
+    """p: scale, activation s, force s, heaps up s, washed out s, force lost, block of weak pulses, flow, block s.
+
+    s: activation, force, phosphate, potassium.
+    """
+    drive = x / c[LARGEST_NM]
+    if c[PULSE] > 0.0:
+        s[3] += (1.0 - s[3]) * min(0.025 / p[8], 1.0)
+    s[3] *= math.exp(-c[STEP_S] / (4.0 * p[8]))
+    drive = drive ** (1.0 + p[6] * s[3])
+    s[0] = lag_after(drive, drive, s[0], p[1], c[STEP_S])
+    flow = 1.0 / (1.0 + (s[1] / p[7]) ** 4)
+    s[2] += c[STEP_S] * (s[1] * (1.0 - s[2]) / p[3] - flow * s[2] / p[4])
+    target = s[0] * (1.0 - p[5] * s[2] * s[2])
+    tau = p[2] * (1.0 + 1.5 * s[2]) * (1.0 - 0.5 * s[0])
+    s[1] += (target - s[1]) * (1.0 - math.exp(-c[STEP_S] / tau))
+    return p[0] * c[LARGEST_NM] * max(s[1], 0.0)
+
+
 PHYSICS = {one.kernel.function.__name__: one for one in (ding, ding_fatigue, hill_series, two_populations)}
-FURTHER = {one.kernel.function.__name__: one for one in (huxley, unit_pool, slack_tendon, two_buffers, cooperative)}
+FURTHER = {
+    one.kernel.function.__name__: one
+    for one in (huxley, unit_pool, slack_tendon, two_buffers, cooperative, sarcomere_chain, closed_space)
+}

@@ -1,14 +1,14 @@
-"""Muscles whose departure from the plain structure lies elsewhere than in the muscle: spinal cord, electrode, fixture.
+"""Muscles whose departure from the plain structure lies elsewhere: in spinal cord, axons, electrode or fixture.
 
-As `physics`; the muscle itself is two lags.
+As `physics`; the muscle itself is two lags. From `worn_reflex` on they were once sealed, under other names.
 """
 
 from __future__ import annotations
 
 import math
 
-from stimrig.hardware_sim.hidden.base import lag_after
-from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, STEP_S, WIDTH_US, helper
+from stimrig.hardware_sim.hidden.base import delayed, lag_after
+from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US, helper
 from stimrig.hardware_sim.hidden.mechanism import mechanism
 
 _muscle = {"first_s": (0.03, 0.08), "second_s": (0.08, 0.25)}
@@ -16,7 +16,7 @@ _muscle = {"first_s": (0.03, 0.08), "second_s": (0.08, 0.25)}
 
 @helper
 def two_lags(drive, p, s, c):
-    """The muscle of all here: p[1], p[2] its time constants, s[0], s[1] its state."""
+    """The muscle of the first three: p[1], p[2] its time constants, s[0], s[1] its state."""
     before = s[0]
     s[0] = lag_after(drive, drive, before, p[1], c[STEP_S])
     s[1] = lag_after(before, s[0], s[1], p[2], c[STEP_S])
@@ -113,4 +113,103 @@ def dry_cushion(x, p, s, c):
     return p[0] * c[LARGEST_NM] * felt
 
 
-PLACES = {one.kernel.function.__name__: one for one in (central_plateau, moving_electrode, dry_cushion)}
+@mechanism(
+    "a reflex beside the direct way, worn by each pulse and held down by tension, late: Crone and Nielsen 1989 and Ib",
+    "catch_like asymmetric_relaxation",
+    "drive",
+    "torque, time since",
+    first_s=(0.03, 0.08),
+    second_s=(0.06, 0.2),
+    reflex=(0.6, 2.0),
+    worn=(0.03, 0.15),
+    rests_s=(0.5, 3.0),
+    held_down=(0.5, 2.0),
+    late_s=(0.04, 0.15),
+)
+def worn_reflex(x, p, s, c):
+    """p: scale, τ s twice, reflex's size, worn by a pulse, rests s, held down by tension, late s.
+
+    s: place in a ring, two lags, wear; s[100:612]: the ring. The reflex is largest where half of the axons answer.
+    """
+    own = min(max(x / c[LARGEST_NM], 0.0), 1.0)
+    if c[PULSE] > 0.0:
+        s[3] += p[4] * (1.0 - s[3])
+    s[3] *= math.exp(-c[STEP_S] / p[5])
+    felt = delayed(s[2], p[7] / c[STEP_S], s, 100, 512)
+    drive = own + p[3] * own * (1.0 - own) * (1.0 - s[3]) * max(1.0 - p[6] * felt, 0.0)
+    before = s[1]
+    s[1] = lag_after(drive, drive, before, p[1], c[STEP_S])
+    s[2] = lag_after(before, s[1], s[2], p[2], c[STEP_S])
+    return p[0] * c[LARGEST_NM] * s[2]
+
+
+@mechanism(
+    "axons whose own pump hyperpolarises them the more they fire: Vagg and others 1998, Kiernan and others 2004",
+    "fatigue threshold_drift",
+    "drive",
+    "width, sum of the past",
+    first_s=(0.03, 0.08),
+    second_s=(0.08, 0.25),
+    half_at_us_share=(0.3, 0.8),
+    spread_us=(12.0, 35.0),
+    rises=(0.3, 0.8),
+    tires_s=(1.5, 6.0),
+    rests_s=(5.0, 40.0),
+)
+def axon_pump(x, p, s, c):
+    """p: scale, τ s twice, width at half µs, spread µs, rise of a threshold, tires s, rests s.
+
+    s: two lags; s[10:34]: the pump of each of 24 groups of axons.
+    """
+    count, drive, width = 24, 0.0, c[WIDTH_US]
+    for k in range(count):
+        rank = (k + 0.5) / count
+        needs = max(p[3] + p[4] * math.log(rank / (1.0 - rank)), 15.0) * (1.0 + p[5] * s[10 + k])
+        fires = 1.0 / (1.0 + math.exp(-min(max((width - needs) / 2.0, -60.0), 60.0))) if width > 0.0 else 0.0
+        s[10 + k] += c[STEP_S] * (fires * (1.0 - s[10 + k]) / p[6] - (1.0 - fires) * s[10 + k] / p[7])
+        drive += fires / count
+    before = s[0]
+    s[0] = lag_after(drive, drive, before, p[1], c[STEP_S])
+    s[1] = lag_after(before, s[0], s[1], p[2], c[STEP_S])
+    return p[0] * c[LARGEST_NM] * s[1]
+
+
+@mechanism(
+    "forearm and splint swing on pads that are soft until they are pressed, between joints that slip: Iwan 1966",
+    "series_compliance",
+    "rate of rise, rate of fall, output",
+    "torque",
+    first_s=(0.02, 0.06),
+    second_s=(0.04, 0.12),
+    swings_hz=(2.5, 6.0),
+    soft=(0.15, 0.5),
+    pressed_at=(0.2, 0.8),
+    slips=(0.05, 0.3),
+    slips_at=(0.02, 0.2),
+    zeta=(0.08, 0.3),
+)
+def swinging_splint(x, p, s, c):
+    """p: scale, τ s twice, Hz where pressed, stiffness before, travel that presses, joints' share, slip at, damping.
+
+    s: two lags, travel, its speed; s[10:18]: where each of 8 joints has slipped to.
+    """
+    before = s[0]
+    s[0] = lag_after(x / c[LARGEST_NM], x / c[LARGEST_NM], before, p[1], c[STEP_S])
+    s[1] = lag_after(before, s[0], s[1], p[2], c[STEP_S])
+    omega, step, held = 2.0 * math.pi * p[3], 0.125 * c[STEP_S], 0.0
+    for _ in range(8):
+        held = p[4] * s[2] + (1.0 - p[4]) * max(s[2] - p[5], 0.0)
+        for k in range(8):
+            reach = p[7] * (k + 1.0) / 8.0
+            s[10 + k] = min(max(s[10 + k], s[2] - reach), s[2] + reach)
+            held += p[6] / 8.0 * (s[2] - s[10 + k]) / p[7]
+        held += 2.0 * p[8] / omega * s[3]
+        s[3] += step * omega * omega * (s[1] - held)
+        s[2] += step * s[3]
+    return p[0] * c[LARGEST_NM] * held
+
+
+PLACES = {
+    one.kernel.function.__name__: one
+    for one in (central_plateau, moving_electrode, dry_cushion, worn_reflex, axon_pump, swinging_splint)
+}

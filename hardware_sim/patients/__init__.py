@@ -30,8 +30,8 @@ PATIENTS: dict[str, tuple[type[Any], Callable[[Any], Muscle]]] = {
 """Parameters and muscle, in alphabetical order."""
 OTHER_PHYSICS = (
     *("ding", "ding_fatigue", "hill_series", "two_populations"),
-    *("huxley", "unit_pool", "slack_tendon", "two_buffers", "cooperative"),
-    *("central_plateau", "moving_electrode", "dry_cushion"),
+    *("huxley", "unit_pool", "slack_tendon", "two_buffers", "cooperative", "sarcomere_chain", "closed_space"),
+    *("central_plateau", "moving_electrode", "dry_cushion", "worn_reflex", "axon_pump", "swinging_splint"),
 )
 """The names in `hidden.other_physics.OPEN`; importing that compiles, which takes a while."""
 NAMES = (*PATIENTS, *OTHER_PHYSICS)
