@@ -191,28 +191,42 @@ SETTINGS = {
 JOINT_SETTINGS = {
     "reference_rad": number(-1e3, 1e3),
     "angle_range_rad": several(number(-1e3, 1e3), 2, 2, rising=True),
+    "angle_late_s": number(-1.0, 1.0),
 }
 """Of a record with an angle."""
 EFFECT_STATE = number(0.0, 1.0, "Give a number from 0 (rested) to 1, or leave it out: rested.")
 _LINE = several(ANY, 0, 1000)
-SHAPE = fields(
+_SHAPE = fields(
     {
         **dict.fromkeys(("enters", "driven_by", "words", "driver", "effect"), text),
         "at": _LINE,
         "lines": each(fields(dict.fromkeys(("value", "lower", "upper"), _LINE))),
     }
 )
-"""The picture of a free effect."""
-EFFECT = fields(
+_EFFECT = fields(
     {"id": text, "parameters": each(lambda value, place: ANY(parameter_value(value), place))},
     {
         "form": text,
         "settings": fields({}, SETTINGS | JOINT_SETTINGS),
         "state": EFFECT_STATE,
         "unforeseen": fields({"mean_nm": number(-PLAUSIBLE, PLAUSIBLE), "rms_nm": number(0.0, PLAUSIBLE)}),
-        "shape": SHAPE,
+        "shape": _SHAPE,
     },
 )
+
+
+def effect(value: Any, place: str) -> None:
+    """An effect; of a free one every parameter has its sd, and every line of the picture a value at each place."""
+    _EFFECT(value, place)
+    if "shape" not in value:
+        return
+    each(fields({"value": ANY, "sd": maybe(ANY)}))(value["parameters"], f"{place}.parameters")
+    count = len(value["shape"]["at"])
+    for name, line in value["shape"]["lines"].items():
+        for key, numbers in line.items():
+            several(ANY, count, count)(numbers, f"{place}.shape.lines.{name}.{key}"[:100])
+
+
 WHOLE = number(0, LONGEST)
 _NARX = fields(
     {
@@ -289,7 +303,7 @@ MODEL = fields(
         "baseline_nm": ANY,
         "initial": several(ANY, 2, 2),
         "noise": fields({}, NOISE),
-        "effects": several(EFFECT, most=50),
+        "effects": several(effect, most=50),
         "joint": joint,
         "uncertainty": maybe(fields({}, {"covariance": maybe(COVARIANCE), "bands": each(anything)})),
         "fit": fields({}, FIT),

@@ -205,6 +205,35 @@ def _check_laws(form: Form, names: list[str], where: str) -> None:
         raise BadEffect("a parameter without a law", place=where, fix="Give law={parameter: FreeLaw} for each.")
     if form.held and not (free and all(isinstance(one, FreeLaw) for one in form.held)):
         raise BadEffect(f"held {dict(form.held)!r}", place=where, fix='Give held={FreeLaw: number}, for "lags" only.')
+    if free:
+        _check_free(form, where)
+
+
+def _check_free(form: Form, where: str) -> None:
+    """What the kernel can take: each law set once, and numbers in its range over the whole of the bounds."""
+    ranges: dict[Any, tuple[float, float]] = {
+        one: (float(value), float(value)) for one, value in form.held.items() if _is_number(value)
+    }
+    if len(ranges) < len(form.held):
+        raise BadEffect(f"held {dict(form.held)!r}", place=where, fix="Give finite numbers.")
+    for parameter in form.parameters:
+        own = form.law[parameter.name]
+        if own in ranges:
+            raise BadEffect(f"{own!r} is set twice", place=where, fix="Give each FreeLaw once, in law or in held.")
+        ranges[own] = parameter.lower, parameter.upper
+    if (FreeLaw.FILL_S in ranges) != (FreeLaw.EMPTY_S in ranges):
+        raise BadEffect("FILL_S without EMPTY_S, or EMPTY_S without FILL_S", place=where, fix="Give both or none.")
+    for own, least in POSITIVE.items():
+        if own in ranges and not ranges[own][0] > least:
+            raise BadEffect(f"{own!r} from {ranges[own][0]:g}", place=where, fix=f"Give values above {least:g}.")
+
+
+POSITIVE = {FreeLaw.FILL_S: 0.0, FreeLaw.EMPTY_S: 0.0, FreeLaw.GATE_S: 0.0, FreeLaw.BEND: -1.0}
+"""Where the kernel divides by it, or by one more than it."""
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def _check_parameter(parameter: Parameter, where: str) -> None:
