@@ -9,10 +9,11 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
-from stimrig.identify.effects import depend_on_joint
+from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.predict import refuse_rate
+from stimrig.identify.simulation.pulses import above_rest
 
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
@@ -31,6 +32,8 @@ SEEN = (0.01, 0.99)
 """Shares of the samples: between these angles the joint moved."""
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which the kind of an error does not matter."""
+PROBES, PULSES_PER_S, TAME = 60, 40.0, 4.0
+"""A free effect is tried on so many held widths; its torque must stay below so many times the curve's range."""
 
 
 def valid_for(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
@@ -149,6 +152,14 @@ def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:
 def _stable(model: Model) -> dict[str, Any]:
     linear = model.linear
     stable = linear.stable if isinstance(linear, Discrete) else linear.time_constant_s > 0 and linear.damping > 0
+    names = [str(entry["id"]) for entry in model.effects]
+    if (
+        stable and any(find_effect(name).shape for name in names) and not depend_on_joint(names)
+    ):  # rates that switch can pump energy, though each alone damps
+        rng = np.random.default_rng(0)
+        held = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
+        curve_nm = float(np.ptp(model.recruitment(np.linspace(0.0, model.recruitment.basis.largest_us, 101))))
+        stable = bool(np.max(np.abs(above_rest(model, held, PULSES_PER_S))) < TAME * curve_nm)
     return _gate(stable, "refuse", "the dynamics are unstable")
 
 
