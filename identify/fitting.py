@@ -114,10 +114,10 @@ def _fit_auto(
         given = ", ".join(sorted(options))
         fix = "Leave out the options."
         raise BadRequest(f"{AUTO} takes no options, but {given} is given", place="effects", fix=fix)
-    from stimrig.identify.diagnosis.search import helpful, search_effects  # here: a fit without a search needs it not
+    from stimrig.identify.diagnosis.free import searched  # here: a fit without a search needs them not
+    from stimrig.identify.diagnosis.search import helpful
 
-    search = search_effects(grid, raw, rows, progress)
-    last = helpful(search)[0][-1]
+    last = helpful(searched(grid, raw, progress, rows=rows)[0])[0][-1]
     progress(1.0, "done")
     added = f"effects added: {', '.join(effect_names(last.fitted)) or 'none'}"
     return finish(MAXIMUM_LIKELIHOOD.id, last.fitted, [added], last.statistics)

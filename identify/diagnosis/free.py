@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from stimrig.identify.diagnosis.search import (
     MOST,
     EffectSearch,
     Progress,
+    helpful,
     scan,
     search_effects,
     silent,
@@ -25,14 +27,17 @@ from stimrig.identify.diagnosis.search import (
 from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, find_effect, registry
-from stimrig.identify.estimation.effect_fit import WORTHLESS, Candidate, replaced_by
-from stimrig.identify.estimation.joint import Fitted, solve
-from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
+from stimrig.identify.effects.base import replaced_by
+from stimrig.identify.estimation.candidates import trusted
+from stimrig.identify.estimation.effect_fit import WORTHLESS
+from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.left_out import Difference, LeftOut, difference, leave_out
 from stimrig.identify.estimation.samples import Raw, fitted_rows
-from stimrig.identify.noise import WHITE
 
 ZERO = {"free_zero": "baseline_drift"}
 """A free effect, and the one of the library that nothing foretells and that may look like it."""
+ANY = (thresholds.BETTER, 0.0)
+"""As `FIRST_FREE`, against a model that names nothing."""
 
 
 @dataclass(frozen=True)
@@ -41,31 +46,54 @@ class Chain:
 
     models: tuple[Fitted, ...]
     left_out: tuple[LeftOut, ...]
+    names: tuple[str, ...]  # of the effects of the library that were found and stay
     added: tuple[str, ...] = ()
 
     def with_(self, fitted: Fitted, unseen: LeftOut, effect: str) -> Chain:
         """With one model more."""
-        return Chain((*self.models, fitted), (*self.left_out, unseen), (*self.added, effect))
+        return replace(
+            self,
+            models=(*self.models, fitted),
+            left_out=(*self.left_out, unseen),
+            added=(*self.added, effect),
+        )
+
+    def better(self, than: LeftOut) -> Difference:
+        """How much better its last model predicts left-out blocks."""
+        return difference(than, self.left_out[-1])
 
 
 def searched(
-    grid: Grid, raw: Raw, progress: Progress | None = None, *, most: int = MOST, structure: Sequence[str] = ()
+    grid: Grid,
+    raw: Raw,
+    progress: Progress | None = None,
+    *,
+    rows: np.ndarray | None = None,
+    most: int = MOST,
+    structure: Sequence[str] = (),
 ) -> tuple[EffectSearch, Verdict]:
     """The search for effects of the library, and then, where structure is left, for free ones; and its verdict.
 
-    As `search_effects`. A free effect is no name: where one is needed, the verdict stays that structure is left.
+    As `search_effects`; by default on all rows that may be fitted. A free effect is no name: where one is needed, the
+    verdict stays that structure is left.
     """
     say = progress or silent
-    rows = fitted_rows(grid, None)
+    rows = fitted_rows(grid, None) if rows is None else rows
     search = search_effects(grid, raw, rows, lambda done, text: say(0.7 * done, text), most=most, structure=structure)
     verdict = judge(search)
     named = verdict.kind == "effect_missing" and not verdict.objections
-    if most == 0 or verdict.kind == "nothing_missing" or (named and not search.residuals[-1].left):
+    if most == 0 or verdict.kind == "nothing_missing" or (named and not _doubted(verdict, search.residuals[-1].left)):
         return search, verdict
     freely = explain_freely(search, lambda done, text: say(0.7 + 0.25 * done, text), named)
     if not freely.free:
         return search, verdict
-    return freely, judge_free(freely, verdict, named)
+    return freely, judge_free(freely, verdict, named and set(search.added) < set(freely.added))
+
+
+def _doubted(verdict: Verdict, left: bool) -> bool:
+    """Whether free effects are tried beside named ones or in their place."""
+    error = verdict.held_out_error
+    return left or (error is not None and error.ratio > thresholds.NAMED_BUT)
 
 
 def explain_freely(search: EffectSearch, progress: Progress | None = None, named: bool = False) -> EffectSearch:
@@ -78,37 +106,27 @@ def explain_freely(search: EffectSearch, progress: Progress | None = None, named
     progress : callable or None
         As `search_effects` takes it.
     named : bool
-        Whether what the search found is named, and so stays whatever else is added.
+        Whether what the search found is named: then it stays beside free effects, unless these do much better alone.
     """
     say = progress or silent
-    if named:
-        whole = _extended(_found(search), say, thresholds.FURTHER_FREE)
-        return _with_chain(search, whole, [*search.added, *whole.added]) if whole.added else search
-    kept = [effect for effect in search.added if not find_effect(effect).predictable and not find_effect(effect).band]
-    best = _extended(_with_only(search, kept), lambda done, text: say(0.5 * done, text))
-    names = kept
-    if (
-        len(kept) < len(search.added)
-        and difference(best.left_out[-1], search.left_out[-1]).errors > thresholds.NO_WORSE
-    ):
-        other = _extended(_found(search), lambda done, text: say(0.5 + 0.5 * done, text))
-        if difference(best.left_out[-1], other.left_out[-1]).errors >= thresholds.BETTER:
-            best, names = other, search.added
-    gained = difference(search.left_out[-1], best.left_out[-1])
-    if not best.added or not gained.errors >= thresholds.BETTER:
-        return search
-    return _with_chain(search, best, [*names, *best.added])
-
-
-def _found(search: EffectSearch) -> Chain:
-    """The chain of the library's effects, as the search left it."""
-    return Chain(tuple(search.chain), tuple(search.left_out))
+    count = len(helpful(search)[0]) - 1 - len(search.detected)  # of effects against which held-out rows do not speak
+    names = search.added[:count]
+    whole = Chain(tuple(search.chain[: count + 1]), tuple(search.left_out[: count + 1]), tuple(names))
+    kept = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
+    alone = [] if kept == names else [_with_only(search, kept)]
+    stays = whole.left_out[-1]
+    first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
+    tries = [(alone, first, first), ([whole], further, further)] if named else [([*alone, whole], first, ANY)]
+    for number, (bases, least, required) in enumerate(tries):
+        own = partial(_within, say, number / len(tries), 1.0 / len(tries))
+        found = [chain for chain in _extended(bases, own, least) if _asked_for(stays, chain, required)]
+        if found:
+            return _with_chain(search, found[-1])
+    return search
 
 
 def _with_only(search: EffectSearch, kept: Sequence[str]) -> Chain:
     """The chain of models with only some of the effects that were added."""
-    if kept == search.added:
-        return _found(search)
     last = search.last
     for effect in search.added:
         if effect not in kept:
@@ -116,21 +134,81 @@ def _with_only(search: EffectSearch, kept: Sequence[str]) -> Chain:
     models = [last]
     for effect in reversed(kept):
         models.append(without_effect(models[-1], effect))
-    return Chain(tuple(models[::-1]), tuple(leave_out(one) for one in reversed(models)))
+    models.reverse()
+    return Chain(tuple(models), tuple(leave_out(one) for one in models), tuple(kept))
 
 
-def _extended(chain: Chain, progress: Progress, first: tuple[float, float] = thresholds.FIRST_FREE) -> Chain:
-    """With the free effects that left-out blocks ask for, and against which held-out rows do not speak."""
+def _extended(
+    bases: Sequence[Chain], progress: Progress, first: tuple[float, float] = thresholds.FIRST_FREE
+) -> list[Chain]:
+    """The best chain with one free effect, with two, …, as far as left-out blocks ask for more.
+
+    The likeliest few of each length are extended: which effect is best alone does not say which is best beside others.
+    """
+    found: list[Chain] = []
+    beam = list(bases)
     for number in range(thresholds.MOST_FREE):
-        base, unseen = chain.models[-1], chain.left_out[-1]
-        listed = [effect for effect in registry().values() if _applicable(effect, base)]
-        share = number / thresholds.MOST_FREE
-        tried = scan(base, listed, WORTHLESS, [], lambda done, text, at=share: progress(at + 0.5 * done, text))
-        best = _best(unseen, tried, *(thresholds.FURTHER_FREE if chain.added else first))
-        if best is None or vetoed(base, best[0]):
+        longer: list[Chain] = []
+        for at, chain in enumerate(beam):
+            share, part = (number + at / len(beam)) / thresholds.MOST_FREE, 1.0 / len(beam) / thresholds.MOST_FREE
+            longer += _longer(chain, partial(_within, progress, share, part), first)
+        if not longer:
             break
-        chain = chain.with_(*best)
-    return chain
+        reference = bases[0].left_out[-1]
+        longer.sort(key=lambda chain: -chain.better(reference).gain)
+        best = _likeliest(longer)
+        if found and not _asked_for(found[-1].left_out[-1], best, thresholds.FURTHER_FREE):
+            break
+        found.append(best)
+        unlike: dict[str, Chain] = {}  # of each effect its best form
+        for chain in longer:
+            unlike.setdefault(chain.added[-1], chain)
+        beam, first = [*unlike.values()][: thresholds.BEAM], thresholds.FURTHER_FREE
+    return found
+
+
+def _likeliest(chains: Sequence[Chain]) -> Chain:
+    """Of the chains that left-out blocks cannot tell from the first the one with fewest names, then the likeliest.
+
+    Likelihoods are compared where the noise is of one kind.
+    """
+    held = chains[0].models[-1].noise.held
+    near = [
+        chain
+        for chain in chains
+        if chain.models[-1].noise.held == held and chains[0].better(chain.left_out[-1]).errors < thresholds.BETTER
+    ]
+    return min(near, key=lambda chain: (len(chain.names), -chain.models[-1].log_evidence))
+
+
+def _within(progress: Progress, begin: float, part: float, done: float, text: str) -> None:
+    progress(begin + part * done, text)
+
+
+def _asked_for(before: LeftOut, chain: Chain, required: tuple[float, float]) -> bool:
+    seen = chain.better(before)
+    return seen.errors >= required[0] and seen.gain >= required[1]
+
+
+def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> list[Chain]:
+    """A chain with each free effect more that left-out blocks ask for, and against which held-out rows do not speak."""
+    base, unseen = chain.models[-1], chain.left_out[-1]
+    listed: list[Effect] = []
+    for effect in registry().values():
+        if _applicable(effect, base):
+            listed += [replace(effect, forms=(form,)) for form in effect.forms] if effect.shape else [effect]
+    tried = scan(base, listed, WORTHLESS, [], progress)
+    able, gains = [], {one.effect.id: one.gain for one in tried}
+    for one in tried:
+        if one.effect.shape is None or gains.get(ZERO.get(one.effect.id, ""), -np.inf) > one.gain:
+            continue
+        if one.gain < thresholds.NEXT_MARGIN:
+            break
+        fitted = trusted(one.fitted)
+        longer = chain.with_(fitted, leave_out(fitted), one.effect.id)
+        if _asked_for(unseen, longer, required) and not vetoed(base, fitted):
+            able.append(longer)
+    return able
 
 
 def _applicable(effect: Effect, base: Fitted) -> bool:
@@ -143,38 +221,13 @@ def _applicable(effect: Effect, base: Fitted) -> bool:
     return bool(effect.shape) and effect.id not in dict(base.effects) and not replaced_by(base.effects, effect.forms)
 
 
-def _best(
-    unseen: LeftOut, tried: Sequence[Candidate], errors: float, least: float
-) -> tuple[Fitted, LeftOut, str] | None:
-    """The candidate that predicts left-out blocks best, its error there and its effect."""
-    able, gains = [], {one.effect.id: one.gain for one in tried}
-    for one in tried:
-        if one.effect.shape is None or gains.get(ZERO.get(one.effect.id, ""), -np.inf) > one.gain:
-            continue
-        if one.gain < thresholds.NEXT_MARGIN:
-            break
-        for fitted in _twins(one.fitted):
-            own = leave_out(fitted)
-            seen = difference(unseen, own)
-            if seen.errors >= errors and seen.gain >= least:
-                able.append((seen.gain, fitted, own, one.effect.id))
-    return max(able, key=lambda found: found[0])[1:] if able else None
-
-
-def _twins(fitted: Fitted) -> list[Fitted]:
-    """A fit; and, where its slow noise may have taken up structure, the same with noise that is held white."""
-    if fitted.noise.held or fitted.noise.ar1 < thresholds.TAKES_UP:
-        return [fitted]
-    return [fitted, solve(fitted.problem, fitted.theta, WHITE)]
-
-
-def _with_chain(search: EffectSearch, chain: Chain, names: list[str]) -> EffectSearch:
+def _with_chain(search: EffectSearch, chain: Chain) -> EffectSearch:
     """The search that ends with this chain. Where an effect is no longer there, round 1 says what was refused."""
-    kept = [search.added.index(name) for name in names if name not in chain.added]
+    kept = [search.added.index(name) for name in chain.names]
     refused = slice(len(kept), None) if len(kept) == len(search.added) else slice(1)
     return replace(
         search,
-        added=names,
+        added=[*chain.names, *chain.added],
         chain=list(chain.models),
         left_out=list(chain.left_out),
         residuals=[residual_structure(fitted, search.quiet) for fitted in chain.models],

@@ -22,6 +22,7 @@ from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, Form, Parameter, Scene, find_effect, form, registry
+from stimrig.identify.effects.base import replaced_by
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import (
     BAND_COST,
@@ -33,7 +34,6 @@ from stimrig.identify.estimation.effect_fit import (
     effect_names,
     fit_form,
     fit_from,
-    replaced_by,
     try_effect,
 )
 from stimrig.identify.estimation.fit_statistics import evaluate

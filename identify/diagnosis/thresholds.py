@@ -38,7 +38,7 @@ REPAIR_PROBABILITY = 0.85
 """Largest probability of an effect that may only repair the inexact form of an earlier one."""
 SEEN_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
-DYNAMIC = {"speed", "branch", "delay", "filter"}
+DYNAMIC = {"speed", "lags", "branch", "delay", "filter"}
 """Stages that change how quickly the torque follows."""
 SLOWEST_AR1 = 0.97
 """Correlation of neighbours above which slow noise may also be a drift."""
@@ -97,7 +97,9 @@ LEAST_HELD_OUT_ROWS = 40
 """With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""
 MOST_FREE = 2
 """Free effects at most."""
+BEAM = 2
+"""So many chains of each length, the best on left-out blocks, are extended by a further free effect."""
 FIRST_FREE, FURTHER_FREE = (2.0, 0.2), (3.0, 0.2)
 """Standard errors, and share as a logarithm, by which the error on left-out blocks must fall with a free effect."""
-TAKES_UP = 0.9
-"""Correlation of neighbours from which slow noise may have taken up structure: white noise is tried, too."""
+NAMED_BUT = 1.3
+"""Error on held-out rows, divided by what is allowed there, from which free effects may take names' place."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -14,6 +14,8 @@ from numpy.polynomial.chebyshev import chebvander
 from stimrig.identify.dynamics.free_lags import FreeLaw, filled
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 
+IDLE_SHARE = 0.1
+"""Pulses of this share of the largest width are as good as none: some stimulators never send 0."""
 STAGES = ("pulse_width", "gain", "speed", "lags", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
@@ -152,6 +154,11 @@ class Scene:
     def on(self) -> np.ndarray:
         """1.0 where a pulse has a width, else 0.0, shape (K,)."""
         return (self.pulse_width_us > 0).astype(float)
+
+    @property
+    def acting(self) -> np.ndarray:
+        """The same where its width is more than an idling stimulator's."""
+        return (self.pulse_width_us > IDLE_SHARE * self.largest_us).astype(float)
 
     @property
     def span_s(self) -> float:
@@ -532,3 +539,19 @@ def adapt(
             x = end
         last[m] = x
     return out, last
+
+
+def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> str | None:
+    """The effect of a model that cannot stand beside these forms.
+
+    Free lags take the place of every speed law, and there is one slow state, one gate: two cannot share them.
+    """
+    against = {"lags": "speed", "speed": "lags"}
+    stages, alone = {against.get(form.stage, "") for form in forms}, set().union(*map(_alone, forms))
+    return next((name for name, own in present if own.stage in stages or alone & _alone(own)), None)
+
+
+def _alone(form: Form) -> set[int]:
+    """What one form of free lags alone can set: all but the rates, whose logarithms add up."""
+    columns = [*form.law.values(), *form.held] if form.stage == "lags" else []
+    return {one for one in columns if isinstance(one, FreeLaw) and one > FreeLaw.COUPLING}

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted, knows_joint, solve
 from stimrig.identify.estimation.left_out import bouts, difference, leave_out, near_widths
 from stimrig.identify.estimation.rests import relaxed
@@ -24,7 +25,8 @@ Fit = Callable[[np.ndarray, bool], Fitted]
 BETTER = 1.0
 """Standard errors by which a candidate must predict left-out blocks better: where they cannot tell, the usual stays."""
 SLOW, SLOW_SHARE = 0.9, 0.05
-"""Correlation of neighbours, and share of the variance, from which slow noise of a moving joint is distrusted."""
+"""Correlation of neighbours, and share of the variance, from which slow noise of free effects or a moving joint is
+distrusted."""
 SMOOTH = 0.1
 """Share of the largest width by which pulses follow one another where the width moves smoothly."""
 LONG_S = 1.0
@@ -59,18 +61,22 @@ def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
     return best
 
 
-def trusted_joint(base: Fitted) -> Fitted:
-    """A model of a moving joint, searched again from white noise where slow noise may hold what the structure leaves.
+def trusted(base: Fitted) -> Fitted:
+    """A model of a moving joint or with a free effect, searched again from white noise where slow noise may hold what
+    the structure leaves.
 
     The other optimum is taken where it is the likelier one; else white noise where it predicts left-out blocks better.
     """
     noise = base.noise
-    if not knows_joint(base) or noise.held or noise.band or min(noise.share, 1.0) < SLOW_SHARE or noise.ar1 < SLOW:
+    free = any(find_effect(name).shape for name, _ in base.effects)
+    if noise.held or noise.band or min(noise.share, 1.0) < SLOW_SHARE or noise.ar1 < SLOW:
+        return base
+    if not (free or knows_joint(base)):
         return base
     white = solve(base.problem, base.theta, WHITE)
-    free = solve(white.problem, white.theta, NoiseLevel(0.0, 0.5, white.noise.sd_nm))
-    if free.log_evidence > base.log_evidence:
-        return free
+    again = solve(white.problem, white.theta, NoiseLevel(0.0, 0.5, white.noise.sd_nm))
+    if again.log_evidence > base.log_evidence:
+        return again
     unseen = leave_out(base)
     return white if difference(unseen, leave_out(white, unseen.block)).errors >= BETTER else base
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.effects import find_effect, registry
-from stimrig.identify.effects.base import STAGES, Effect, Form, Scene
+from stimrig.identify.effects.base import STAGES, Effect, Form, Scene, replaced_by
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.candidates import trusted_joint
+from stimrig.identify.estimation.candidates import trusted
 from stimrig.identify.estimation.joint import Fitted, solve, start_from
 from stimrig.identify.estimation.joint_sensor import with_angle_delay
 from stimrig.identify.estimation.left_out import Difference
@@ -151,7 +151,7 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
             raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, fix="Record this column.")
     forms = [_form(effect, form)] if form else list(effect.forms)
     if (other := replaced_by(base.effects, forms)) is not None:
-        message = f"{effect.id} and {other} both set the speed of the two lags: one would be ignored"
+        message = f"{effect.id} and {other} both set the speed of the lags, or their slow state: one would be ignored"
         raise BadRequest(message, place="effects", fix="Leave one of them out.")
     for identifier, seen, values in detected_effects(raw):
         if identifier == effect.id:
@@ -162,13 +162,6 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     if found is None:
         raise NotIdentifiable(f"the record shows nothing that looks like {effect.id}", fix="Leave this effect out.")
     return found.fitted
-
-
-def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> str | None:
-    """The effect of a model that cannot stand beside these forms: free lags take the place of every speed law."""
-    against = {"lags": "speed", "speed": "lags"}
-    stages = {against.get(form.stage, "") for form in forms}
-    return next((name for name, own in present if own.stage in stages), None)
 
 
 def fit_from(base: Fitted, identifier: str, form: Form, values: dict[str, float]) -> Fitted:
@@ -199,14 +192,16 @@ def add_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[s
         if tell is not None:
             tell(identifier)
         base = add_effect(base, find_effect(identifier), forms[0], raw)
-    base = with_angle_delay(trusted_joint(base))
+        if find_effect(identifier).shape:
+            base = trusted(base)  # as the search for free effects does after each
+    base = with_angle_delay(trusted(base))
     for identifier, forms in chosen:
         for form in forms[1:]:
             if tell is not None:
                 tell(identifier)
             other = in_form(base, identifier, form)
             base = max(base, other, key=lambda fitted: fitted.log_evidence)
-    return with_angle_delay(trusted_joint(base))
+    return with_angle_delay(trusted(base))
 
 
 def in_form(base: Fitted, effect: str, form: str) -> Fitted:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.effects.base import IDLE_SHARE
 
 RELAXED_S = 1.0
 """So long after its last pulse a muscle has relaxed; where no rest is twice as long, half of the longest is taken."""
@@ -14,8 +15,6 @@ LEAST_SHARE = 0.05
 """The zero is not taken as better known than this share of the torque's range: a residual state may hold it up."""
 SHORT = 8
 """Rests of no more intervals say nothing of the noise."""
-IDLE_SHARE = 0.1
-"""Pulses of this share of the largest width are as good as none, where no rest without any lasts for two seconds."""
 
 
 def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from stimrig.identify import model_schema
 from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, run_narx
 from stimrig.identify.effects import depend_on_joint, find_effect
-from stimrig.identify.effects.base import Form
+from stimrig.identify.effects.base import Form, replaced_by
 from stimrig.identify.errors import BadModel
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
@@ -154,6 +154,7 @@ def problem_of(
                 raise BadModel(f"{own.effect.id} needs the column {need}", place=need, fix=fix)
         acting.append((own.effect.id, own.form, [*own.values.values()]))
     acting += [(form.name, form, values) for form, values in further if form.stage != "gain"]
+    _refuse_ignored([(name, form) for name, form, _ in acting])
     problem = Problem(setup, [(name, form) for name, form, _ in acting])
     values = np.zeros(problem.size)
     values[:3] = model.linear.time_constant_s, model.linear.damping, model.linear.delay_s
@@ -165,6 +166,17 @@ def problem_of(
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
     values[problem.coefficients.stop :] = [value for *_, given in acting for value in given]
     return problem, problem.from_physical(values)
+
+
+def _refuse_ignored(acting: Sequence[tuple[str, Form]]) -> None:
+    """Refuse an effect that stands twice, or of which another would take the place."""
+    for number, (name, form) in enumerate(acting):
+        other = name if name in dict(acting[:number]) else replaced_by(acting[:number], [form])
+        if other is not None:
+            message = (
+                "it stands twice" if other == name else f"{other} already sets the speed of the lags, or their state"
+            )
+            raise BadModel(message, place=f"effects, {name}", fix="Leave one of them out, and fit again.")
 
 
 def sensor_cost_nm(problem: Problem, theta: np.ndarray) -> float:

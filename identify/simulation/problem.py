@@ -320,7 +320,7 @@ class _StagePass:
         for part, slower in branches:
             core = self.cores * np.c_[slower, np.ones_like(slower)]
             drive = np.ascontiguousarray(part)
-            found = run_free(drive, setup.scene.on, setup.scene.rest_s, core, laws, *shared)
+            found = run_free(drive, setup.scene.acting, setup.scene.rest_s, core, laws, *shared)
             torque, rate = torque + found[0], rate + found[1]
         return torque, rate
 

@@ -11,7 +11,7 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import ENCODER, AngleSensor, record
-from stimrig.identify.estimation.candidates import SLOW, trusted_joint
+from stimrig.identify.estimation.candidates import SLOW, trusted
 from stimrig.identify.estimation.effect_fit import fitted_with
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.fitting import MOVING_JOINT
@@ -164,9 +164,9 @@ def test_a_noisy_angle_costs_little_and_the_model_says_how_much():
 
 def test_slow_noise_that_holds_what_the_structure_leaves_is_left_for_the_likelier_optimum():
     fitted = fitted_with(recorded_by(ENCODER), MOVING_JOINT)
-    assert trusted_joint(fitted) is fitted
+    assert trusted(fitted) is fitted
     wrong = replace(fitted, noise=replace(fitted.noise, ar1=0.99, share=0.9), log_evidence=fitted.log_evidence - 50.0)
-    again = trusted_joint(wrong)
+    again = trusted(wrong)
     assert isinstance(again, Fitted) and not (again.noise.ar1 > SLOW and again.noise.share > 0.05)
     assert again.log_evidence > wrong.log_evidence
 
