@@ -12,22 +12,51 @@ from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import load_record
 from stimrig.api.progress_bar import progress_bar
 
+RATES = 2
+"""Samples between two pulses that a recording must have to be joined to one of another rate."""
 
-def asked(data: Sequence[Path]) -> dict[str, Any]:
-    """The next experiment of recordings as a test.
+
+def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
+    """The next experiment of recordings as a test, with the participant whose recordings they are.
 
     Raises
     ------
     InputError
-        Nothing is left to decide.
+        Nothing is left to decide; it is not known whose they are, or they are another's; or no further recording could
+        be joined to them. All of it is said before anything is played.
     """
     record = load_record(data)
+    owner = _owner(record, data[0], participant)
+    if record.sample_rate_hz < RATES * record.pulse_rate_hz:
+        least = f"{RATES * record.pulse_rate_hz:g} Hz"
+        raise InputError(
+            f"{data[0]}: sampled at {record.sample_rate_hz:.4g} Hz; a further one is joined from {least} on."
+        )
     with progress_bar() as progress:
         experiment = identify.next_experiment(identify.diagnose(record, None, progress))
     if experiment is None:
         raise InputError(f"{data[0]}: no experiment is asked for: nothing is left to decide. Leave out --decide.")
     segments = [dict(segment) for segment in experiment.segments]
-    return {"kind": "next-experiment", "segments": segments, "pulse_rate_hz": record.pulse_rate_hz}
+    return {
+        "participant": owner,
+        "kind": "next-experiment",
+        "segments": segments,
+        "pulse_rate_hz": record.pulse_rate_hz,
+    }
+
+
+def _owner(record: identify.Record, file: Path, participant: str | None) -> str:
+    """Who is stimulated: whose recordings these are."""
+    sources = record.source.parts or (record.source,)
+    owners = {source.participant for source in sources} - {""}
+    if len(owners) > 1:
+        raise InputError(f"these recordings are of several people: {', '.join(sorted(owners))}.")
+    owner = next(iter(owners), participant)
+    if owner is None:
+        raise InputError(f"{file} does not say whose it is. Give --participant.")
+    if participant not in (None, owner):
+        raise InputError(f"{file} is a recording of {owner}; --participant is {participant}.")
+    return owner
 
 
 def diagnosed(data: Sequence[Path], recording: bytes) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session, defer
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.models import stored_model
-from stimrig.api.models.places import Site, in_words, kept, site_of, site_of_recording
+from stimrig.api.models.places import Site, in_words, kept, place_of, site_of, site_of_recording
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
@@ -245,6 +245,14 @@ class Versions:
         detail |= {"tracking": decision.tracking} if decision.tracking else {}
         audit.write(session, now, by, "approve" if approved else "reject", row.id, **detail)
         return decision
+
+    def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
+        """Where a version's recording was made, and with what current, mA; None: not known."""
+        with self.store.read() as session:
+            recording = session.get(Recording, row.recording_id)
+            assert recording is not None
+            test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
+            return site_of_recording(recording, test), None if test is None else place_of(test)[3]
 
     def _site(self, session: Session, row: Model, approved: bool) -> Site:
         """The participant's site; 409 where a model is to be approved that was measured at another one."""

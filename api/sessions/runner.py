@@ -17,7 +17,7 @@ from stimrig.api.clock import Clock, asked_s
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.logs import current_test
 from stimrig.api.models.analyses import Analyses
-from stimrig.api.models.places import site_of
+from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.joint import JointTests
@@ -130,8 +130,6 @@ class Runner(Playing):
         await asyncio.to_thread(self.store.refuse_changed, *rests_on)  # then the preview may differ for no other reason
         planned = await self._planned(body, participant)
         plan = planned.plan
-        if body.joins is not None:
-            await asyncio.to_thread(self._check_joins, body)
         until_utc = await asyncio.to_thread(self.until_utc, tokens)
         current = self.current = Current(
             plan.test_id, plan.participant, by, plan.kind, tokens=tokens, until_utc=until_utc
@@ -204,6 +202,8 @@ class Runner(Playing):
             pulse_rate_hz=body.pulse_rate_hz,
             **limits_of(body, participant.profile),
         )
+        if body.joins is not None:
+            await asyncio.to_thread(self._check_joins, body.joins, participant, plan)
         return await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:
@@ -213,12 +213,24 @@ class Runner(Playing):
         plan = messages.TestPlan(test_id=self._new_id(), participant=participant.code, **limits)
         return await self.joint.overview(plan, PREVIEW_S)
 
-    def _check_joins(self, body: TestIn) -> None:
-        """The model whose recording the new one is to be joined to is the participant's own."""
-        model = self.versions.get(str(body.joins))
-        if model.participant != body.participant:
-            detail = f"{model.id} is a model of {model.participant}, the test is for {body.participant}."
+    def _check_joins(self, joins: str, participant: Participant, plan: messages.TestPlan) -> None:
+        """The model whose recording the new one is to be joined to is the participant's own, and of the same place."""
+        model = self.versions.get(joins)
+        if model.participant != participant.code:
+            detail = f"{model.id} is a model of {model.participant}, the test is for {participant.code}."
             raise ApiError(422, "other-participant", "The model is another participant's", detail)
+        (there, before_ma), here, now_ma = (
+            self.versions.measured_at(model),
+            site_of(participant),
+            plan.profile.current_ma,
+        )
+        title, end = "The recordings could not be joined", "Nothing was played."
+        if there not in (None, here):
+            detail = f"The model was measured at {in_words(there)}, this test is at {in_words(here)}. {end}"
+            raise ApiError(409, "other-site", title, detail)
+        if before_ma not in (None, now_ma):
+            detail = f"The model was measured with {before_ma:g} mA, this test is with {now_ma:g} mA. {end}"
+            raise ApiError(409, "other-current", title, detail)
 
     def _new_id(self) -> str:
         stamp = self.clock.utc()[:19].replace("-", "").replace(":", "")

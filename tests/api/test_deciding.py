@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +14,14 @@ from stimrig.api.cli import deciding
 from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.commands.diagnose import next_step
 from stimrig.api.cli.errors import InputError
+from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
+from stimrig.api.sessions.runner import Runner
 from stimrig.api.web.pages import model_view
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.responses.models import ExperimentOut
 from stimrig.api.workers.verbs import experiment
+from stimrig.identify.records.record import Source
 
 DECIDING: dict[str, Any] = {
     "segments": [
@@ -30,6 +34,7 @@ DECIDING: dict[str, Any] = {
     "decides": False,
     "text": "Held random levels should teach most: 40 % of what the model is unsure of at held levels should go.",
 }
+OWNER, FOUND = "P1", {"verdict": "unexplained_structure"}
 MISSING = [{"effect": "fatigue", "confused_with": ["potentiation"], "next_experiment_plan": {}}]
 
 
@@ -81,7 +86,7 @@ def recordings(monkeypatch: pytest.MonkeyPatch) -> list[list[Path]]:
     def load(data: list[Path]) -> Any:
         assert all(path.exists() for path in data)
         loaded.append(list(data))
-        return SimpleNamespace(pulse_rate_hz=25.0)
+        return SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=Source(participant=OWNER))
 
     monkeypatch.setattr(deciding, "load_record", load)
     monkeypatch.setattr(deciding.identify, "diagnose", lambda *_: found, raising=False)
@@ -101,12 +106,69 @@ def test_the_verb_asks_for_it_and_diagnoses_all_together(
 
     monkeypatch.setattr(verb, "on_own_services", play)
     monkeypatch.setattr(verb, "say_json", told.append)
-    verb.test(participant="P1", decide=[first], as_json=True)
+    output = tmp_path / "second.h5"
+    monkeypatch.setattr(deciding, "diagnosed", lambda *_: pytest.fail("not written") if not output.exists() else FOUND)
+    verb.test(decide=[first], output=output, as_json=True)
+    assert output.read_bytes() == b"second", "written before the long work that may fail"
     assert sent == {
-        "participant": "P1", "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0,
+        "participant": OWNER, "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0,
     }  # fmt: skip
-    assert recordings[0] == [first] and recordings[1][0] == first and len(recordings[1]) == 2
-    assert told[0]["diagnosis"]["verdict"] == "nothing_missing" and "recording" not in told[0]
+    assert recordings == [[first]] and told[0]["diagnosis"] == FOUND and "recording" not in told[0]
+
+
+def test_both_are_diagnosed_together(recordings: list[list[Path]], tmp_path: Path) -> None:
+    first = tmp_path / "first.h5"
+    first.touch()
+    assert deciding.diagnosed([first], b"second")["verdict"] == "nothing_missing"
+    assert recordings[0][0] == first and len(recordings[0]) == 2
+
+
+@pytest.mark.parametrize(
+    ("sources", "rate_hz", "participant", "said"),
+    [
+        ([OWNER], 400.0, "P2", "a recording of P1; --participant is P2"),
+        ([""], 400.0, None, "does not say whose it is. Give --participant"),
+        ([OWNER, "P2"], 400.0, None, "of several people: P1, P2"),
+        ([OWNER], 30.0, None, "joined from 50 Hz on"),
+    ],
+)
+def test_nobody_is_stimulated_for_a_recording_that_is_anothers_or_cannot_be_joined(
+    sources: list[str], rate_hz: float, participant: str | None, said: str, monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, recordings: list[list[Path]],
+) -> None:  # fmt: skip
+    (tmp_path / "first.h5").touch()
+    source = Source(parts=tuple(Source(participant=one) for one in sources))
+    record = SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=rate_hz, source=source)
+    monkeypatch.setattr(deciding, "load_record", lambda _: record)
+    monkeypatch.setattr(verb, "on_own_services", lambda *_: pytest.fail("it played"))
+    with pytest.raises(InputError, match=said):
+        verb.test(participant=participant, decide=[tmp_path / "first.h5"])
+
+
+SITE = ("right", "biceps brachii", None)
+
+
+@pytest.mark.parametrize(
+    ("measured_at", "kind"),
+    [
+        ((SITE, 20.0), None), ((None, None), None), ((SITE, None), None),
+        ((("left", *SITE[1:]), 20.0), "other-site"), (((None, None, None), 20.0), "other-site"),
+        ((SITE, 16.0), "other-current"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_joined_is_refused_before_it_is_played(measured_at: Any, kind: str | None) -> None:
+    versions = SimpleNamespace(
+        get=lambda _: SimpleNamespace(id="M1", participant="P1"), measured_at=lambda _: measured_at
+    )
+    participant: Any = SimpleNamespace(code="P1", side=SITE[0], muscle=SITE[1], placement=SITE[2])
+    plan: Any = SimpleNamespace(profile=SimpleNamespace(current_ma=20.0))
+    check = partial(Runner._check_joins, SimpleNamespace(versions=versions), "M1", participant, plan)  # pyright: ignore
+    if kind is None:
+        check()
+        return
+    with pytest.raises(ApiError) as refused:
+        check()
+    assert refused.value.status == 409 and refused.value.code == kind
 
 
 def test_the_verb_plays_nothing_where_nothing_is_left(

@@ -27,7 +27,12 @@ from stimrig.rig.messages import LABEL_TITLES, Labels
 
 
 def test(
-    participant: Annotated[str, typer.Option(help="participant's code")] = "TEST",
+    participant: Annotated[
+        str | None,
+        typer.Option(
+            help="participant's code; default TEST, or with --decide whose the recording is", show_default=False
+        ),
+    ] = None,
     rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
     url: Annotated[str, typer.Option(help="a running service; default: one is started", envvar="STIMRIG_URL")] = "",
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
@@ -67,27 +72,28 @@ def test(
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
     asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway) | given(**labels)
+    if decide and (adaptive or protocol is not None):
+        raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
+    token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
+    if url and not token:
+        raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
     if decide:
-        if adaptive or protocol is not None:
-            raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
-        asked |= deciding.asked(decide)
-    if url:
-        token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
-        if not token:
-            raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
+        asked |= deciding.asked(decide, participant)
+    code = asked.pop("participant", participant or "TEST")
+    if url and token:
         over = Event()
         with StopKey(at_service(url, token, over.is_set), say_aside) as key:
             announce(key)
-            found = through(url, token, participant, over=over.set, asked=asked)
+            found = through(url, token, code, over=over.set, asked=asked)
     else:
-        found = on_own_services(rig, data, emulate, participant, asked)
+        found = on_own_services(rig, data, emulate, code, asked)
     recording = found.pop("recording")
-    if decide:
-        found["diagnosis"] = deciding.diagnosed(decide, recording)
-    if output is not None:
+    if output is not None:  # first: what was measured is not lost, whatever comes after
         with writing(output):
             output.parent.mkdir(parents=True, exist_ok=True)
             output.write_bytes(recording)
+    if decide:
+        found["diagnosis"] = deciding.diagnosed(decide, recording)
     if as_json:
         say_json(found)
         return
