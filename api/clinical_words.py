@@ -20,6 +20,8 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "step": lazy("Step"),
         "passive": lazy("No stimulation"),
         "moving": lazy("Level while moving"),
+        "widths": lazy("Levels held at random"),
+        "levels": lazy("Levels held at random"),
     },
     "verdict": {
         "usable": lazy("usable"),

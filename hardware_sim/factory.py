@@ -46,6 +46,10 @@ def make_devices(
     return Devices(muscle, settings, None if arm is None else _arm(arm, arm_laws, seed), epoch_us)
 
 
+LONGEST_NAME = 256
+"""Of a file; the system refuses to look for far longer ones."""
+
+
 def _hidden_seed(patient: str) -> int | None:
     try:
         return int(patient.removeprefix(HIDDEN)) if patient.startswith(HIDDEN) else None
@@ -55,7 +59,8 @@ def _hidden_seed(patient: str) -> int | None:
 
 def _muscle(patient: str) -> Muscle:
     file = Path(patient)
-    if patient not in patients.NAMES and (file.suffix.lower() in {".toml", ".json"} or file.exists()):
+    read = file.suffix.lower() in {".toml", ".json"} or (len(patient) < LONGEST_NAME and file.exists())
+    if patient not in patients.NAMES and read:
         return patients.from_file(file)
     return patients.make(patient)
 

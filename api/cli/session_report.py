@@ -101,8 +101,8 @@ def adaptive_lines(told: Mapping[str, Any] | None) -> list[str]:
     return [*lines, *([f"in doubt       {told['problem']}"] if told["problem"] else [])]
 
 
-def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
-    """The report of a test and its model."""
+def report_lines(test: Mapping[str, Any], model: dict[str, Any] | None) -> list[str]:
+    """The report of a test, and of its model where that is asked for."""
     summary, planned = test["summary"], test.get("planned") or {}
     late, aligned = summary.get("lateness_ms") or {}, summary.get("alignment") or {}
     segments = ", ".join(
@@ -125,7 +125,7 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any]) -> list[str]:
         f"clocks         aligned by {aligned.get('method')}, error {number(aligned.get('error_ms'), 4)} ms",
         *(f"in doubt       {words}" for words in summary.get("warnings") or []),
         *adaptive_lines(test.get("adaptive")),
-        *model_report(model),
+        *(model_report(model) if model else []),
         *carried_lines((test.get("fit") or {}).get("carried")),
         f"served         {number(summary.get('last_sample_to_model_s'), 2)} s from the last sample to the stored model",
     ]

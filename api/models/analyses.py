@@ -198,11 +198,14 @@ class Analyses:
         if force and not reason.strip():
             detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
             raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
+        free: dict[str, str] = {}
         if not force:
-            require_evidence(await self.diagnosis(model, on_call), model.effects, added)
+            diagnosis = await self.diagnosis(model, on_call)
+            require_evidence(diagnosis, model.effects, added)
+            free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in diagnosis.get("free") or []}
         path = await asyncio.to_thread(self.path, model.recording_id)
         held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
-        asked = [held.get(effect, effect) for effect in effects]
+        asked = [held.get(effect, free.get(effect, effect)) for effect in effects]
         found = await self.asked("fit", on_call, data=path, method=model.method, effects=asked)
         return await asyncio.to_thread(self._store_added, found["json"], model, added, by, force, reason)
 
@@ -242,6 +245,7 @@ class Analyses:
         """Each step that adds something as a version; what they begin with is there already."""
         rows = [first]
         for step, document in zip(found["steps"], found["models"], strict=True):
+            step["model_id"] = rows[-1].id
             if step["added"] is None:
                 continue
             parent = rows[-1]
@@ -252,4 +256,5 @@ class Analyses:
                     json.dumps(document), parent.participant, parent.recording_id, by, parent.id, step["added"]
                 )
             rows.append(row)
+            step["model_id"] = row.id
         return rows

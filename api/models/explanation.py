@@ -57,7 +57,7 @@ def view(
     if experiment and experiment["effect"] in effects:
         experiment = None
     return {
-        **headline(diagnosis, missing, comparison, effects, leaves_structure),
+        **headline(diagnosis, missing, comparison, effects, places, leaves_structure),
         "missing": [card(entry, library) for entry in missing],
         "free": [free_card(entry, library) for entry in diagnosis.get("free") or [] if entry["effect"] not in effects],
         "likely": [name_of(entry["effect"], library) for entry in missing if likely(entry)],
@@ -78,14 +78,15 @@ def headline(
     missing: list[dict[str, Any]],
     comparison: dict[str, Any] | None,
     effects: Sequence[str],
+    places: Sequence[dict[str, Any]],
     leaves_structure: bool = False,
 ) -> dict[str, str]:
     """The verdict on this model: kind, title, sentence."""
     if diagnosis["verdict"] == "unexplained_structure":
         kind, title = "unexplained", _("The error has structure that no effect of the library explains")
         words = _("The error depends on what the muscle does, so it is not measurement noise.")
-        if where := diagnosis.get("where"):
-            words += " " + _("It sits mostly here: %(place)s.", place=place(where[0], 1)["words"])
+        if places:
+            words += " " + _("It sits mostly here: %(place)s.", place=place(places[0], 1)["words"])
     elif missing:
         names = _(" and ").join(plain(entry.get("name") or entry["effect"]) for entry in missing)
         kind, title = "missing", _missing(missing)
@@ -267,14 +268,16 @@ def tidy_experiment(found: dict[str, Any], library: dict[str, Any]) -> dict[str,
         "text": worded(found["text"]),
         "names": [_in_a_sentence(rival, library) for rival in found["rivals"]],
         "shown": [
-            f"{segment_words(segment['sequence'])} {_seconds(segment['settings'])}".strip()
+            f"{segment_words(segment['sequence'])} {_seconds(segment['settings'], found.get('pulse_rate_hz'))}".strip()
             for segment in found["segments"]
         ],
     }
 
 
-def _seconds(settings: dict[str, Any]) -> str:
+def _seconds(settings: dict[str, Any], pulse_rate_hz: float | None) -> str:
     parts = [f"{value:g} s" for key, value in settings.items() if key.endswith("_s")]
+    if pulse_rate_hz and (widths := settings.get("pulse_width_us")):
+        parts.append(f"{len(widths) / pulse_rate_hz:g} s")
     width = settings.get("max_pulse_width_us")
     times = f" × {settings['repeats']}" if settings.get("repeats", 1) != 1 else ""
     return localised(" + ".join(parts)) + times + (" " + _("to %(width)s µs", width=f"{width:g}") if width else "")
@@ -373,7 +376,8 @@ def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> s
         return rows[-1]["refusal"]
     if gain <= 0:
         return f"the recording speaks against it (log evidence {gain:+.1f})."
-    better = [entry for entry in diagnosis.get("missing") or [] if entry["effect"] != effect]
+    told = [*(diagnosis.get("missing") or []), *(diagnosis.get("free") or [])]
+    better = [entry for entry in told if entry["effect"] != effect]
     if better and rows[0]["log_evidence_gain"] > 6:
         names = " and ".join((entry.get("name") or entry["effect"]).lower() for entry in better)
         name = ((diagnosis.get("library") or {}).get(effect) or {}).get("name", effect).lower()

@@ -35,6 +35,7 @@ OTHER_PHYSICS = (
 )
 """The names in `hidden.other_physics.OPEN`; importing that compiles, which takes a while."""
 NAMES = (*PATIENTS, *OTHER_PHYSICS)
+LONGEST_SEED = 18
 
 
 def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
@@ -89,13 +90,14 @@ def _of_other_physics(name: str, given: Mapping[str, float]) -> Muscle:
 def _drawn(name: str, given: Mapping[str, float]) -> Muscle:
     """The muscle that `SET:SEED` names."""
     kinds, _, seed = name.partition(":")
-    if seed.isascii() and seed.isdigit():
+    if seed.isascii() and seed.isdigit() and len(seed) < LONGEST_SEED:
         from stimrig.hardware_sim.hidden import live, other_physics
 
         if kinds in other_physics.SETS:
             if given:
                 raise PatientError(f"patient '{name}' has no parameters; its seed decides them")
             return live.HiddenMuscle(other_physics.draw_muscle(kinds, int(seed)))
+        raise PatientError(f"no set '{kinds}' of muscles; one of {', '.join(other_physics.SETS)}")
     raise PatientError(f"patient '{name}' is neither a file nor SET:SEED nor one of {', '.join(NAMES)}")
 
 

@@ -43,7 +43,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     free = [_free(search, effect, covariance) for effect in search.free]
     final = row[-1].statistics
     residual = record.torque_nm - (
-        predict_fitted(search.last)[0] if verdict.kind == "unexplained_structure" else base_prediction
+        predict_fitted(search.last)[0] if verdict.kind == "unexplained_structure" and not free else base_prediction
     )
     where = worst_places(
         record, residual, raw.noise_sd_nm, rows=~record.held_out & search.base.problem.setup.grid.counted
@@ -69,7 +69,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
         else {"rms_nm": verdict.held_out_error.rms_nm, "allowed_nm": verdict.held_out_error.allowed_nm},
         candidates=tuple([_candidate(one) for one in tried] for tried in search.rounds),
         notes=tuple(verdict.notes),
-        plain=tuple(_plain(search, verdict, base, final, missing, free, where)),
+        plain=tuple(_plain(search, verdict, base, row[-1 - len(free)].statistics, missing, free, where)),
     )
 
 
@@ -185,7 +185,7 @@ def _plain(
     search: EffectSearch,
     verdict: Verdict,
     base: dict[str, Any],
-    final: dict[str, Any],
+    named: dict[str, Any],
     missing: list,
     free: list,
     where: list,
@@ -204,9 +204,9 @@ def _plain(
             "An error is left that no effect in the library explains. It appears when the muscle works, so it is not "
             "measurement noise."
         )
-        lines += [f"{row['words']} {row['left_out']}" for row in free]
         if where:
             lines.append(f"Most of it is here: {where[0]['text']}.")
+    lines += [f"{row['words']} {row['left_out']}" for row in free]
     for entry in missing:
         chance = entry["probability"]
         text = f"{entry['name']} is {sure(chance)} missing ({probability(chance)}). {entry['plain']}"
@@ -219,6 +219,6 @@ def _plain(
     if missing and verdict.kind == "effect_missing":
         lines.append(
             f"With {'it' if len(missing) == 1 else 'them'} the error on rows that were not fitted falls from "
-            f"{base['held_out_rms_nm']:.3g} to {final['held_out_rms_nm']:.3g} N·m."
+            f"{base['held_out_rms_nm']:.3g} to {named['held_out_rms_nm']:.3g} N·m."
         )
     return lines + verdict.notes

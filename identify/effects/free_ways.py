@@ -27,7 +27,12 @@ def _share(level: np.ndarray, p: Values) -> np.ndarray:
     "branch",
     "y = G(T) (1 - s) f (1 - loss_quick·x1) + G(ratio·T) s f (1 - loss_slow·x2); s linear between five levels of f; "
     "x' = a (1 - x)/fill - (1 - a) x/empty, a: the way's own drive",
-    *(Parameter(one, "1", 0.0, 1.0, 0.0, (0.3, 0.6), about="share of the slow way at this level") for one in _SHARES),
+    *(
+        Parameter(
+            one, "1", 0.0, 1.0, 0.0, (0.3, 0.6), about=f"share of the slow way at {100 * level:.0f} % of the level"
+        )
+        for one, level in zip(_SHARES, LEVELS, strict=True)
+    ),
     Parameter("ratio", "1", 1.2, 12.0, 1.0, (2.0, 4.0), "log", about="slow time constant over the quick one"),
     Parameter("loss_quick", "1", -0.9, 0.95, 0.0, (0.1,), about="share that the quick way loses with use"),
     Parameter("loss_slow", "1", -0.9, 0.95, 0.0, (0.0,), about="share that the slow way loses with use"),

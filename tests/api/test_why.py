@@ -258,8 +258,8 @@ def test_verdict_on_this_model_in_words() -> None:
 def test_a_page_that_says_that_structure_is_left_does_not_say_that_it_is_noise() -> None:
     quiet = {"noise_sd_nm": 0.04, "rms_nm": 0.04}
     diagnosis = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": []}
-    assert explanation.headline(diagnosis, [], quiet, [])["kind"] == "nothing"
-    checked = explanation.headline(diagnosis, [], quiet, [], leaves_structure=True)
+    assert explanation.headline(diagnosis, [], quiet, [], [])["kind"] == "nothing"
+    checked = explanation.headline(diagnosis, [], quiet, [], [], leaves_structure=True)
     assert checked["kind"] == "unsure" and checked["title"].startswith("No effect of the library has enough evidence")
 
 

@@ -153,5 +153,5 @@ def test_a_third_effect_is_named_beside_the_structure_and_one_that_is_not_named_
     assert [entry["effect"] for entry in told.missing] == ["output_saturation"]
     untold = replace(told, verdict="nothing_missing", missing=(), probability=0.2)
     assert "output_saturation: log evidence would rise by" in str(untold) and "cannot tell" in str(untold)
-    title = headline(untold.to_dict(), [], None, found.still_needed)
+    title = headline(untold.to_dict(), [], None, found.still_needed, [])
     assert title["kind"] == "unsure" and "explains too little to be named" in title["words"]

@@ -73,6 +73,7 @@ def _own_text(path: Path, wanted: str | None, name: str) -> str:
 def _write(path: Path, text: str) -> None:
     """A new file. Raises InputError: it is there, or cannot be written."""
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except OSError as error:

@@ -97,7 +97,7 @@ def test(
     if as_json:
         say_json(found)
         return
-    say(*report_lines(found["test"], found["model"]))
+    say(*report_lines(found["test"], None if decide else found["model"]))
     if decide:
         say("", "both together", "", *diagnosis_lines(found["diagnosis"]), "")
     say(f"recording      {output or found['test']['recording_url']}")
