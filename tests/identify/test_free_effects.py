@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -13,10 +14,12 @@ from stimrig import identify
 from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import free
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
+from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
-from stimrig.identify.effects import known_form, own_file, registry
+from stimrig.identify.effects import BadEffect, known_form, own_file, registry
 from stimrig.identify.effects.base import Form
-from stimrig.identify.errors import BadRequest
+from stimrig.identify.errors import BadModel, BadRequest
+from stimrig.identify.estimation.quality import _stable
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
@@ -201,6 +204,104 @@ def test_what_is_left_gets_a_further_test_within_the_limits():
     assert max(map(max, widths_us)) <= record.pulse_width_us.max()
     told = identify.next_experiment(diagnosis)
     assert told is not None and told.rivals == () and told.text == plan["text"]
+
+
+@pytest.mark.slow
+def test_one_structure_is_one_model_whether_it_was_found_or_asked_for():
+    record, (_, improvement) = as_record(record_of_physics("physics", 0)), found()
+    wanted = [f"{effect['id']}:{effect['form']}" for effect in improvement.models[-1].effects]
+    with few_effects.only(*(effect.id for effect in FREE), "asymmetric_relaxation", "catch_like", "baseline_drift"):
+        asked = identify.fit(record, effects=wanted)
+        auto = identify.fit(record, effects="auto")
+    for model in (asked, auto):
+        np.testing.assert_allclose(model.predict(record), improvement.models[-1].predict(record), atol=2e-3)
+
+
+@pytest.mark.slow
+def test_zero_sign_scale_start_and_idle_pulses_change_no_free_effect():
+    made, (_, improvement) = record_of_physics("physics", 0), found()
+    width_us = np.maximum(made["pulse_width_us"], 1.0)
+    other = as_record(made | {"torque_nm": 2.0 - 0.3 * made["torque_nm"], "time_s": made["time_s"] + 1000.0})
+    with few_effects.only("free_gate", "free_speed", "free_strength", "baseline_drift"):
+        same = identify.improve(other)
+        idle = identify.improve(as_record(made | {"pulse_width_us": width_us}))
+    error_nm = improvement.steps[-1]["held_out_rms_nm"]
+    for again, scale, tolerance in ((same, 0.3, 0.01), (idle, 1.0, 0.05)):
+        assert [step["added"] for step in again.steps[1:]] == ["free_gate"]
+        assert again.steps[-1]["held_out_rms_nm"] / scale == pytest.approx(error_nm, rel=tolerance)
+
+
+def test_two_slow_states_are_refused_where_one_would_be_ignored():
+    with pytest.raises(BadRequest, match="or their slow state"):
+        identify.fit(hidden_muscles.record(seed=3, rate_hz=100), effects=["free_zero", "free_strength"])
+
+
+@made_once
+def speedy() -> Model:
+    return identify.fit(hidden_muscles.record(seed=3, rate_hz=100), effects=["free_speed:quick_first"])
+
+
+def changed(model: Model, **values: float) -> Model:
+    """With other parameters of its free effect."""
+    (effect,) = model.effects
+    parameters = {name: one | {"value": values.get(name, one["value"])} for name, one in effect["parameters"].items()}
+    return model.with_(effects=({**effect, "parameters": parameters},))
+
+
+def test_a_free_effect_whose_torque_would_run_away_is_not_usable():
+    tame = speedy()
+    assert _stable(tame)["passed"]
+    assert isinstance(tame.linear, SecondOrder)
+    wild = changed(
+        tame.with_(linear=replace(tame.linear, time_constant_s=0.06, damping=0.5)),
+        first_direction=-0.35, first_rising=-0.74, first_falling=0.0,
+        second_direction=0.6, second_rising=0.66, second_falling=-0.15, coupling=0.86,
+    )  # fmt: skip
+    assert np.max(np.abs(wild.predict(as_record(record_of_physics("physics", 0))))) > 1e3, "it does run away"
+    assert not _stable(wild)["passed"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (lambda one: [one, one], "stands twice"),
+        (lambda one: [{**one, "settings": one["settings"] | {"angle_late_s": "x"}}], "angle_late_s"),
+        (lambda one: [{**one, "shape": one["shape"] | {"at": [0.0]}}], "shape.lines"),
+        (lambda one: [{**one, "parameters": dict.fromkeys(one["parameters"], 0.1)}], "parameters"),
+    ],
+)
+def test_a_model_whose_free_effect_cannot_be_run_is_refused(wrong, says: str):
+    document = json.loads(speedy().to_json())
+    document["effects"] = wrong(document["effects"][0])
+    with pytest.raises(BadModel, match=says):
+        Model.from_json(json.dumps(document)).predict(hidden_muscles.record(seed=3, rate_hz=100))
+
+
+STATE = "Parameter('a', 's', 1.0, 9.0, 0.0, (2.0,)), Parameter('b', 's', 1.0, 9.0, 0.0, (2.0,))"
+BOTH = "'a': FreeLaw.FILL_S, 'b': FreeLaw.EMPTY_S"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "law", "held", "says"),
+    [
+        (STATE, BOTH, "FreeLaw.GAIN: 'x'", "finite numbers"),
+        (STATE, BOTH, "FreeLaw.GAIN: float('nan')", "finite numbers"),
+        (STATE, BOTH, "FreeLaw.FILL_S: 3.0", "set twice"),
+        (STATE.partition("), ")[0] + "),", "'a': FreeLaw.FILL_S", "", "FILL_S without EMPTY_S"),
+        ("Parameter('a', '1', -2.0, 9.0, 0.0, (2.0,)),", "'a': FreeLaw.BEND", "", "values above -1"),
+    ],
+)
+def test_an_edited_file_that_the_kernel_cannot_run_is_refused(tmp_path, parameters, law, held, says: str):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from stimrig.identify.dynamics.free_lags import FreeLaw\n"
+        "from stimrig.identify.effects.base import Effect, Form, Parameter\n"
+        f"form = Form('one', 'lags', 'y', ({parameters}), law={{{law}}}, held={{{held}}})\n"
+        "EFFECT = Effect('mine', 'Mine', (form,), 'a', (), 'b', 'c')\n",
+        "utf-8",
+    )
+    with pytest.raises(BadEffect, match=says):
+        own_file.effect_of(path)
 
 
 @pytest.mark.parametrize("order", [1, -1])
