@@ -219,17 +219,14 @@ class Runner(Playing):
         if model.participant != participant.code:
             detail = f"{model.id} is a model of {model.participant}, the test is for {participant.code}."
             raise ApiError(422, "other-participant", "The model is another participant's", detail)
-        (there, before_ma), here, now_ma = (
-            self.versions.measured_at(model),
-            site_of(participant),
-            plan.profile.current_ma,
-        )
-        title, end = "The recordings could not be joined", "Nothing was played."
+        there, before_ma = self.versions.measured_at(model)
+        here, now_ma = site_of(participant), plan.profile.current_ma
+        title = "The recordings could not be joined"
         if there not in (None, here):
-            detail = f"The model was measured at {in_words(there)}, this test is at {in_words(here)}. {end}"
+            detail = f"The model was measured at {in_words(there)}, this test is at {in_words(here)}."
             raise ApiError(409, "other-site", title, detail)
         if before_ma not in (None, now_ma):
-            detail = f"The model was measured with {before_ma:g} mA, this test is with {now_ma:g} mA. {end}"
+            detail = f"The model was measured with {before_ma:g} mA, this test is with {now_ma:g} mA."
             raise ApiError(409, "other-current", title, detail)
 
     def _new_id(self) -> str:
