@@ -43,7 +43,7 @@ def test_it_goes_before_the_test_between_rivals_and_the_page_shows_it() -> None:
     assert found is not None and found["effect"] == "" and found["text"] == DECIDING["text"]
     ExperimentOut.model_validate(found)
     shown = explanation.tidy_experiment(found, {})
-    assert shown["shown"] == ["widths", "Rest 2 s"] and shown["text"] == DECIDING["text"]
+    assert shown["shown"] == ["Levels held at random", "Rest 2 s"] and shown["text"] == DECIDING["text"]
     assert "stimrig test --decide" in next_step(
         {"verdict": "unexplained_structure", "deciding_experiment": DECIDING}, ""
     )

@@ -59,7 +59,7 @@ def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
         ({}, {"effect": "free_ways"}, "no free effect 'free_ways' in it. It has free_gate"),
         ({}, {"name": "Not a name"}, "no name for an effect"),
         ({}, {"name": "fatigue"}, "an effect is called so already"),
-        ({"parameters": {"gate_s": 0.02, "bend": 3.0, "gate_rate": -0.5}}, {}, "lacks a value or an sd"),
+        ({"parameters": {"gate_s": 0.02, "bend": 3.0, "gate_rate": -0.5}}, {}, "gate_s"),
         ({"id": "nobody_knows"}, {}, "no free effect"),
     ],
 )

@@ -50,14 +50,14 @@ def _own_text(path: Path, wanted: str | None, name: str) -> str:
     InputError
         The model has no such free effect, or the name is none or taken.
     """
-    from stimrig.identify.effects import find_effect, known_form, own_file, registry
+    from stimrig.identify.effects import known_form, own_file, registry
 
     if name in registry():
         raise InputError(f"--name {name}: an effect is called so already. Give another name.")
-    free = [entry for entry in load_model(path).effects if "shape" in entry and find_effect(entry["id"]).shape]
+    free = [entry for entry in load_model(path).effects if "shape" in entry]
     found = [entry for entry in free if wanted in (None, entry["id"])]
     known = known_form(found[-1]) if found else None
-    if known is None:
+    if known is None or known[0].shape is None:
         names = ", ".join(str(entry["id"]) for entry in free) or "none"
         raise InputError(f"{path}: no free effect{f' {wanted!r}' if wanted else ''} in it. It has {names}.")
     given = found[-1]["parameters"]
