@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
+from scipy.optimize import minimize
 
 MOTION = ("angle_rad", "velocity_rad_s", "acceleration_rad_s2")
 BLOCK_S = 0.01
@@ -35,17 +36,25 @@ LEAST_STEPS, WHOLE = 5, 0.05
 FEW_STEPS, RESTS = 6.5, 0.8
 """A joint that moves over no more steps, and whose angle is the one before in such a share of readings, is held:
 when it went from one step to the next says nothing of its velocity."""
+STEADY = (0.0, 0.0)
+"""Of a movement of which nothing but its jerk is known."""
+PACES = ((0.3, 3.0, 30.0), (0.3,))
+"""Starts of the pace, 1/s² and 1/s: what a movement that comes and goes tells of its next moments."""
+PIECE, LONG_GAP_S = 0.2, 1.0
+"""The series of a step is taken in pieces of so little of a pace; over a longer gap nothing is foretold."""
+LOGS, SETTLED = (-9.0, 12.0), {"maxiter": 120, "xatol": 0.03, "fatol": 0.3}
 UNIFORM = 1.0 / np.sqrt(12.0)
 """Standard deviation of what lies evenly within a step."""
 LARGEST_STEP_RAD = 0.035
 
 
 @njit(cache=True, nogil=True)
-def _forward(time_s, angle_rad, noise, jerk, unknown, states, spreads, told):  # pragma: no cover
+def _forward(time_s, angle_rad, noise, jerk, pace, unknown, states, spreads, told):  # pragma: no cover
     """Kalman filter of (angle, velocity, acceleration); a reading that is NaN is left out.
 
-    Writes the filtered `states` (N, 3), `spreads` (N, 6): their covariance; `told` (N, 5): innovation, its variance,
-    gains. Returns the sum of log variances and of squared innovations over their variance, and the count.
+    The jerk is white, less `pace[0]` times the velocity and `pace[1]` times the acceleration. Writes the filtered
+    `states` (N, 3), `spreads` (N, 6): their covariance; `told` (N, 5): innovation, its variance, gains. Returns the
+    sum of log variances and of squared innovations over their variance, and the count.
     """
     keep = states.shape[0] > 0
     x, v, a = 0.0, 0.0, 0.0
@@ -57,19 +66,26 @@ def _forward(time_s, angle_rad, noise, jerk, unknown, states, spreads, told):  #
     pxx, pxv, pxa, pvv, pva, paa = wide, 0.0, 0.0, wide, 0.0, 100.0 * wide
     logs, squares, count = 0.0, 0.0, 0
     for k in range(time_s.size):
-        if k:
-            t = time_s[k] - time_s[k - 1]
-            h = 0.5 * t * t
-            x, v = x + t * v + h * a, v + t * a
-            # F P F' with F = [[1, t, h], [0, 1, t], [0, 0, 1]], and what white jerk adds over t
-            bx, bv, ba = pxx + t * pxv + h * pxa, pxv + t * pvv + h * pva, pxa + t * pva + h * paa
-            cv, ca = pvv + t * pva, pva + t * paa
-            pxx = bx + t * bv + h * ba + jerk * t**5 / 20.0
-            pxv = bv + t * ba + jerk * t**4 / 8.0
-            pxa = ba + jerk * t**3 / 6.0
-            pvv = cv + t * ca + jerk * t**3 / 3.0
-            pva = ca + jerk * t * t / 2.0
-            paa = paa + jerk * t
+        apart = time_s[k] - time_s[k - 1] if k else 0.0
+        pieces = int(np.ceil(apart * max(np.sqrt(pace[0]), pace[1]) / PIECE)) if apart < LONG_GAP_S else 1
+        t = apart / max(pieces, 1)
+        for _ in range(max(pieces, 1) if k else 0):
+            # F = [[1, xv, xa], [0, vv, va], [0, av, aa]], its series in t, which ends where the pace is 0
+            xv = t - pace[0] * t**3 / 6.0 + pace[0] * pace[1] * t**4 / 24.0
+            xa = 0.5 * t * t - pace[1] * t**3 / 6.0 + (pace[1] ** 2 - pace[0]) * t**4 / 24.0
+            va = t - pace[1] * t * t / 2.0 + (pace[1] ** 2 - pace[0]) * t**3 / 6.0
+            vv = 1.0 - pace[0] * xa
+            av, aa = -pace[0] * va, vv - pace[1] * va
+            x, v, a = x + xv * v + xa * a, vv * v + va * a, av * v + aa * a
+            # F P F', and what white jerk adds over t
+            bx, bv, ba = pxx + xv * pxv + xa * pxa, pxv + xv * pvv + xa * pva, pxa + xv * pva + xa * paa
+            cv, ca, dv, da = vv * pvv + va * pva, vv * pva + va * paa, av * pvv + aa * pva, av * pva + aa * paa
+            pxx = bx + xv * bv + xa * ba + jerk * t**5 / 20.0
+            pxv = vv * bv + va * ba + jerk * t**4 / 8.0
+            pxa = av * bv + aa * ba + jerk * t**3 / 6.0
+            pvv = vv * cv + va * ca + jerk * t**3 / 3.0
+            pva = av * cv + aa * ca + jerk * t * t / 2.0
+            paa = av * dv + aa * da + jerk * t
         e, s, gx, gv, ga = 0.0, 0.0, 0.0, 0.0, 0.0
         if angle_rad[k] == angle_rad[k]:
             e, s = angle_rad[k] - x, pxx + noise[k]
@@ -108,6 +124,10 @@ def _backward(time_s, states, spreads, told):  # pragma: no cover
             lv, la = lv + t * lx, la + t * lv + 0.5 * t * t * lx
 
 
+Pace = tuple[float, float]
+"""How the jerk follows velocity and acceleration, 1/s² and 1/s."""
+
+
 @dataclass(frozen=True)
 class JointMotion:
     """How the joint moved, and what its sensor is like.
@@ -137,7 +157,8 @@ class JointMotion:
     ) -> JointMotion:
         """From angles, of which any may be NaN; each part, from its `first` reading on, by itself.
 
-        `causal`: from the readings until then alone, as a controller has them.
+        `causal`: from the readings until then alone, as a controller has them. Only how noisy the sensor is, and how
+        the joint moves in general, is taken from the whole part: an earlier trial tells it.
         """
         parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
         step_rad = step_of([angle_rad[own] for own in parts])
@@ -145,35 +166,73 @@ class JointMotion:
         sensors = [sensor_of(time_s[own], read_rad[own], step_rad) for own in parts]
         noise_rad, jerk = np.array(sensors).T
         begun = cls(read_rad, read_rad, read_rad, noise_rad, jerk, step_rad)
-        return begun._smoothed(time_s, read_rad, first, causal)
+        if not causal:
+            return begun._smoothed(time_s, read_rad, first)
+        moved = [pace_of(time_s[own], read_rad[own], *one) for own, one in zip(parts, sensors, strict=True)]
+        begun = replace(begun, jerk=np.array([jerk for jerk, _ in moved]))
+        return begun._smoothed(time_s, read_rad, first, [pace for _, pace in moved])
 
     def read_again(self, time_s: np.ndarray, first: Sequence[int], seed: int = 0) -> JointMotion:
         """The same movement as the same sensor would tell it another time: what its error does to a model."""
         read_rad = self.angle_rad + np.random.default_rng(seed).normal(size=time_s.size) * np.repeat(
             self.noise_rad, np.diff([*first, time_s.size])
         )
-        return self._smoothed(time_s, read_rad, first, False)
+        return self._smoothed(time_s, read_rad, first)
 
-    def _smoothed(self, time_s: np.ndarray, read_rad: np.ndarray, first: Sequence[int], causal: bool) -> JointMotion:
+    def ahead(self, late_s: float) -> JointMotion:
+        """Where the joint is by now, where what is told of it is late."""
+        angle, velocity, acceleration = (getattr(self, name) for name in MOTION)
+        on = angle + late_s * velocity + 0.5 * late_s**2 * acceleration
+        return replace(self, angle_rad=on, velocity_rad_s=velocity + late_s * acceleration)
+
+    def _smoothed(
+        self, time_s: np.ndarray, read_rad: np.ndarray, first: Sequence[int], paces: Sequence[Pace] | None = None
+    ) -> JointMotion:
         parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
-        sensors = zip(parts, self.noise_rad, self.jerk, strict=True)
-        found = [smooth(time_s[own], read_rad[own], noise, jerk, causal) for own, noise, jerk in sensors]
+        sensors = zip(parts, self.noise_rad, self.jerk, paces or [None] * len(parts), strict=True)
+        found = [smooth(time_s[own], read_rad[own], noise, jerk, pace) for own, noise, jerk, pace in sensors]
         angle, velocity, acceleration = np.concatenate(found).T.copy()
         return replace(self, angle_rad=angle, velocity_rad_s=velocity, acceleration_rad_s2=acceleration)
 
 
 def smooth(
-    time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: float, causal: bool = False
+    time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: float, pace: Pace | None = None
 ) -> np.ndarray:
-    """Angle, velocity and acceleration at each reading, from all readings, or from those until then; shape (N, 3)."""
+    """Angle, velocity and acceleration at each reading, shape (N, 3): from all readings; with a pace from those until
+    then."""
     size = time_s.size
     states, spreads, told = np.empty((size, 3)), np.empty((size, 6)), np.empty((size, 5))
-    _forward(
-        time_s, angle_rad, np.full(size, noise_rad**2), jerk, AT_REST if causal else UNKNOWN, states, spreads, told
-    )
-    if not causal:
+    noise, unknown = np.full(size, noise_rad**2), UNKNOWN if pace is None else AT_REST
+    _forward(time_s, angle_rad, noise, jerk, pace or STEADY, unknown, states, spreads, told)
+    if pace is None:
         _backward(time_s, states, spreads, told)
     return states
+
+
+def pace_of(time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: float) -> tuple[float, Pace]:
+    """Intensity of the jerk and pace that make one part's angles most likely beside a sensor's noise."""
+    known = np.isfinite(angle_rad)
+    at_s, read_rad, nothing = time_s[known], angle_rad[known], [np.empty((0, size)) for size in (3, 6, 5)]
+    every = max(int(BLOCK_S / max(np.median(np.diff(at_s)), 1e-9)), 1) if at_s.size > LEAST_BLOCKS else 1
+    at_s, read_rad = at_s[::every], read_rad[::every]
+    noise = np.full(at_s.size, noise_rad**2)
+
+    def unlikely(logs: np.ndarray) -> float:
+        own, spring, drag = np.exp(np.clip(logs, *LOGS))
+        spread, squares, _ = _forward(at_s, read_rad, noise, own, (spring, drag), UNKNOWN, *nothing)
+        return spread + squares
+
+    if not jerk > 0.0 or at_s.size <= LEAST_BLOCKS:
+        return jerk, STEADY
+    begins = [np.log([jerk, spring, drag]) for spring in PACES[0] for drag in PACES[1]]
+    found = min(
+        (minimize(unlikely, begin, method="Nelder-Mead", options=SETTLED) for begin in begins), key=lambda one: one.fun
+    )
+    steady = _forward(at_s, read_rad, noise, jerk, STEADY, UNKNOWN, *nothing)
+    if not found.fun < steady[0] + steady[1]:
+        return jerk, STEADY
+    own, spring, drag = np.exp(np.clip(found.x, *LOGS)).tolist()
+    return own, (spring, drag)
 
 
 def sensor_of(time_s: np.ndarray, angle_rad: np.ndarray, step_rad: float = 0.0) -> tuple[float, float]:
@@ -193,7 +252,7 @@ def sensor_of(time_s: np.ndarray, angle_rad: np.ndarray, step_rad: float = 0.0) 
     nothing = np.empty((0, 3)), np.empty((0, 6)), np.empty((0, 5))
 
     def unlikely(log_ratio: float) -> tuple[float, float, float]:
-        logs, squares, told = _forward(at_s, mean_rad, 1.0 / count, float(np.exp(log_ratio)), UNKNOWN, *nothing)
+        logs, squares, told = _forward(at_s, mean_rad, 1.0 / count, float(np.exp(log_ratio)), STEADY, UNKNOWN, *nothing)
         variance = max(squares / told, least)
         return logs + told * np.log(variance) + squares / variance, log_ratio, variance
 

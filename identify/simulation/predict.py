@@ -70,12 +70,12 @@ def predict(model: Muscle, record: Record, causal: bool = False) -> np.ndarray:
     problem, theta = problem_of(model, grid)
     first = [part.first for part in record.parts]
     motion = JointMotion.of(record.time_s, record.angle_rad, first, causal=True)
-    return _moved(problem, motion).at_samples(theta)
+    return _moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0).at_samples(theta)
 
 
-def _moved(problem: Problem, motion: JointMotion) -> Problem:
+def _moved(problem: Problem, motion: JointMotion, **changes: float) -> Problem:
     """The problem with the joint moving in another way."""
-    return Problem(problem.setup.with_(motion=motion), [(one.effect, one.form) for one in problem.chosen])
+    return Problem(problem.setup.with_(motion=motion, **changes), [(one.effect, one.form) for one in problem.chosen])
 
 
 def predict_on(model: Muscle, grid: Grid) -> np.ndarray:

@@ -17,7 +17,7 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.model import Model
 from stimrig.identify.records.join import join
-from stimrig.identify.records.joint_motion import JointMotion, smooth
+from stimrig.identify.records.joint_motion import STEADY, JointMotion, smooth
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.predict import predict
 from stimrig.identify.simulation.pulses import Motion
@@ -58,8 +58,33 @@ def test_both_ways_are_neither_late_nor_early_and_the_causal_filter_looks_at_not
     errors = [rms(found.velocity_rad_s - np.interp(time_s - shift / RATE_HZ, time_s, velocity)) for shift in shifts]
     assert abs(shifts[int(np.argmin(errors))]) <= 1
     own = float(found.noise_rad[0]), float(found.jerk[0])
-    whole, cut = smooth(time_s, read, *own, True), smooth(time_s[:2000], read[:2000], *own, True)
+    whole, cut = smooth(time_s, read, *own, STEADY), smooth(time_s[:2000], read[:2000], *own, STEADY)
     assert np.array_equal(whole[:2000], cut)
+
+
+@pytest.mark.parametrize("comes_and_goes", [True, False])
+def test_what_a_movement_does_in_general_helps_the_causal_filter_where_it_comes_and_goes(comes_and_goes: bool):
+    time_s, angle, velocity = moved()
+    if not comes_and_goes:
+        share = np.clip((time_s - 8.0) / 2.0, 0.0, 1.0)
+        angle = 0.5 + share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        velocity = np.gradient(angle, time_s)
+    read = angle + np.radians(0.3) * np.random.default_rng(2).normal(size=angle.size)
+    both = JointMotion.of(time_s, read)
+    usual = smooth(time_s, read, both.noise_rad[0], both.jerk[0], STEADY)
+    errors = [
+        rms(found - velocity) for found in (JointMotion.of(time_s, read, causal=True).velocity_rad_s, usual[:, 1])
+    ]
+    assert errors[0] < (0.85 if comes_and_goes else 1.05) * errors[1]
+
+
+def test_a_late_angle_is_told_ahead():
+    time_s, angle, velocity = moved()
+    late_s = 0.02
+    read = np.interp(time_s - late_s, time_s, angle)
+    now = JointMotion.of(time_s, read, causal=True).ahead(late_s)
+    assert rms(now.angle_rad - angle) < 0.1 * rms(read - angle)
+    assert rms(now.velocity_rad_s - velocity) < 0.3 * rms(np.gradient(read, time_s) - velocity)
 
 
 def test_steps_are_seen_and_an_angle_that_rests_on_them_does_not_move():
