@@ -77,8 +77,7 @@ def trusted(base: Fitted) -> Fitted:
     again = solve(white.problem, white.theta, NoiseLevel(0.0, 0.5, white.noise.sd_nm))
     if again.log_evidence > base.log_evidence:
         return again
-    unseen = leave_out(base)
-    return white if difference(unseen, leave_out(white, unseen.block)).errors >= BETTER else base
+    return white if difference(leave_out(base), leave_out(white)).errors >= BETTER else base
 
 
 def words(fitted: Fitted, rows: np.ndarray) -> list[str]:

@@ -40,9 +40,9 @@ OPTIMISM = 3.0
 """A run is stopped only if it stays below the floor even with this many times the gain that a parabola predicts."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fitted:
-    """A problem solved: its most probable parameters, and what follows from them."""
+    """A problem solved: its most probable parameters, and what follows from them. Each is a thing of its own."""
 
     problem: Problem  # the model's stages and parameters
     theta: np.ndarray  # parameters, on the scale on which they are varied, shape (P,)

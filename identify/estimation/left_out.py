@@ -8,7 +8,7 @@ difference and its standard error; Roberts and others 2017 on blocks in place of
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -140,9 +140,19 @@ def leave_out(fitted: Fitted, block: np.ndarray | None = None) -> LeftOut:
     block : ndarray of int, shape (K,), optional
         The block of each interval, -1 for none; as `blocks` gives it by default.
     """
+    return _left_out(fitted) if block is None else _without(fitted, block)
+
+
+@lru_cache(maxsize=8)
+def _left_out(fitted: Fitted) -> LeftOut:
+    """Each of the last models once: whoever trusts a model and whoever adds it ask the same."""
+    setup = fitted.problem.setup
+    return _without(fitted, blocks(setup.grid, setup.fitted))
+
+
+def _without(fitted: Fitted, block: np.ndarray) -> LeftOut:
     setup = fitted.problem.setup
     grid = setup.grid
-    block = blocks(grid, setup.fitted) if block is None else block
     opening = np.zeros(grid.size, bool)
     for start in grid.starts:
         opening[start : start + round(START_S / grid.step_s)] = True
