@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
 import os
@@ -21,7 +22,9 @@ from stimrig.api.cli.launcher import Services
 from stimrig.api.cli.session_report import report_lines, run_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
 from stimrig.api.cli.terminal import Json, given, say, say_json, writing
+from stimrig.api.client.errors import ServiceError
 from stimrig.api.client.rest import Client
+from stimrig.api.progress_bar import progress_bar
 from stimrig.api.settings import Settings
 from stimrig.rig.messages import LABEL_TITLES, Labels
 
@@ -206,5 +209,10 @@ def through(
     """
     with Client(url, token) as client:
         document = run_test(client, participant, events, over, **(asked or {}))
-        model = client.model_file(document["model_id"])
+        best = document["model_id"]
+        if (document.get("adaptive") or {}).get("problem"):
+            say_aside("  the structure leaves an error: adding what explains it")
+            with contextlib.suppress(ServiceError), progress_bar() as progress:  # the plain model is there all the same
+                best = client.improve(best, progress)["id"]
+        model = client.model_file(best)
         return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}
