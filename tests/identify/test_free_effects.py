@@ -33,6 +33,8 @@ from tests.identify import hidden_muscles
 STEP_S, SIZE = 0.025, 400
 FREE = [effect for effect in registry().values() if effect.shape]
 FORMS = [(effect, form) for effect in FREE for form in effect.forms]
+TRIED = "free_gate", "free_level", "free_ways", "asymmetric_relaxation", "baseline_drift"
+"""Each costs seconds; what all of them find is in bench.strange."""
 named = partial(pytest.mark.parametrize, ids=lambda one: getattr(one, "id", getattr(one, "name", None)))
 
 
@@ -93,7 +95,7 @@ def test_a_picture_is_finite_and_says_where_it_enters(effect, form: Form):
 @made_once
 def found() -> tuple[Diagnosis, Improvement]:
     """Of a muscle of Ding's calcium and bridges."""
-    with few_effects.only(*(effect.id for effect in FREE), "asymmetric_relaxation", "catch_like", "baseline_drift"):
+    with few_effects.only(*TRIED):
         record = as_record(record_of_physics("physics", 0))
         return identify.diagnose(record), identify.improve(record)
 
@@ -210,7 +212,7 @@ def test_what_is_left_gets_a_further_test_within_the_limits():
 def test_one_structure_is_one_model_whether_it_was_found_or_asked_for():
     record, (_, improvement) = as_record(record_of_physics("physics", 0)), found()
     wanted = [f"{effect['id']}:{effect['form']}" for effect in improvement.models[-1].effects]
-    with few_effects.only(*(effect.id for effect in FREE), "asymmetric_relaxation", "catch_like", "baseline_drift"):
+    with few_effects.only(*TRIED):
         asked = identify.fit(record, effects=wanted)
         auto = identify.fit(record, effects="auto")
     for model in (asked, auto):
@@ -222,7 +224,7 @@ def test_zero_sign_scale_start_and_idle_pulses_change_no_free_effect():
     made, (_, improvement) = record_of_physics("physics", 0), found()
     width_us = np.maximum(made["pulse_width_us"], 1.0)
     other = as_record(made | {"torque_nm": 2.0 - 0.3 * made["torque_nm"], "time_s": made["time_s"] + 1000.0})
-    with few_effects.only("free_gate", "free_speed", "free_strength", "baseline_drift"):
+    with few_effects.only("free_gate", "free_level", "baseline_drift"):
         same = identify.improve(other)
         idle = identify.improve(as_record(made | {"pulse_width_us": width_us}))
     error_nm = improvement.steps[-1]["held_out_rms_nm"]
