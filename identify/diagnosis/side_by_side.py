@@ -18,6 +18,8 @@ from numba.core.compiler_lock import global_compiler_lock
 WORKERS = min(2, os.cpu_count() or 1)
 """Processes that share tasks, this one included."""
 ROOM_BYTES = 2**20
+LOOKS_S = 1.0
+"""So often a copy looks whether its parent still lives."""
 Copy = tuple[Any, Any]
 """A process, and the end of a pipe from which its results come."""
 
@@ -103,5 +105,14 @@ def _work(work: Callable[[int], Any], numbers: int, put: Any) -> None:
     for stream in (0, 1, 2):
         os.dup2(silent, stream)
     parent = os.getppid()
-    while (number := os.read(numbers, 1)) and os.getppid() == parent:
+
+    def end_with_parent(*_: object) -> None:
+        if os.getppid() != parent:
+            os._exit(1)
+
+    # Whoever kills the parent knows nothing of its copies, and one may wait for what will never come.
+    signal.signal(signal.SIGALRM, end_with_parent)
+    signal.setitimer(signal.ITIMER_REAL, LOOKS_S, LOOKS_S)
+    while number := os.read(numbers, 1):
+        end_with_parent()
         put.send((number[0], work(number[0])))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import struct
+import subprocess
+import sys
 import threading
 import time
 from multiprocessing.connection import Connection
@@ -120,3 +122,27 @@ def test_a_diagnosis_does_not_depend_on_who_did_what(monkeypatch):
         by_default = diagnose(record).to_dict()
         monkeypatch.setattr(module, "WORKERS", 2 if module.WORKERS == 1 else 1)
         assert diagnose(record).to_dict() == by_default
+
+
+def test_a_copy_ends_with_its_parent_in_the_middle_of_a_task(tmp_path: Path) -> None:
+    code = (
+        "import os, sys, time\n"
+        "from pathlib import Path\n"
+        "from stimrig.identify.diagnosis.side_by_side import side_by_side\n"
+        "def work(number):\n"
+        "    (Path(sys.argv[1]) / str(os.getpid())).touch()\n"
+        "    time.sleep(3600)\n"
+        "list(side_by_side(work, 2, 2))\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) as parent:
+        while len(begun := [int(file.name) for file in tmp_path.iterdir()]) < 2:
+            assert parent.poll() is None
+            time.sleep(0.02)
+        parent.kill()
+    (copy,) = set(begun) - {parent.pid}
+    for _ in range(3000):
+        if not Path(f"/proc/{copy}/stat").exists() or " Z " in Path(f"/proc/{copy}/stat").read_text():
+            return
+        time.sleep(0.02)
+    os.kill(copy, signal.SIGKILL)
+    pytest.fail("it outlived its parent by a minute")
