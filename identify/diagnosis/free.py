@@ -81,13 +81,19 @@ def searched(
     rows = fitted_rows(grid, None) if rows is None else rows
     search = search_effects(grid, raw, rows, lambda done, text: say(0.7 * done, text), most=most, structure=structure)
     verdict = judge(search)
-    named = verdict.kind == "effect_missing" and not verdict.objections
+    believed = _believed(search)
+    named = verdict.kind == "effect_missing" and bool(believed or not search.added)
     if most == 0 or verdict.kind == "nothing_missing" or (named and not _doubted(verdict, search.residuals[-1].left)):
         return search, verdict
-    freely = explain_freely(search, lambda done, text: say(0.7 + 0.25 * done, text), named)
+    freely = explain_freely(search, believed, named, lambda done, text: say(0.7 + 0.25 * done, text))
     if not freely.free:
         return search, verdict
-    return freely, judge_free(freely, verdict, named and set(search.added) < set(freely.added))
+    return freely, judge_free(freely, verdict, named and set(believed) < set(freely.added))
+
+
+def _believed(search: EffectSearch) -> list[str]:
+    """The effects that were added before the first against which held-out rows speak."""
+    return search.added[: len(helpful(search)[0]) - 1 - len(search.detected)]
 
 
 def _doubted(verdict: Verdict, left: bool) -> bool:
@@ -96,21 +102,21 @@ def _doubted(verdict: Verdict, left: bool) -> bool:
     return left or (error is not None and error.ratio > thresholds.NAMED_BUT)
 
 
-def explain_freely(search: EffectSearch, progress: Progress | None = None, named: bool = False) -> EffectSearch:
+def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, progress: Progress) -> EffectSearch:
     """The search with free effects, where they predict left-out blocks better than what it found; else as it was.
 
     Parameters
     ----------
     search : EffectSearch
         In whose last model structure is left.
-    progress : callable or None
-        As `search_effects` takes it.
+    names : sequence of str
+        Of its effects the first ones, against which held-out rows do not speak.
     named : bool
-        Whether what the search found is named: then it stays beside free effects, unless these do much better alone.
+        Whether they are named: then they stay beside free effects, unless these do much better alone.
+    progress : callable
+        As `search_effects` takes it.
     """
-    say = progress or silent
-    count = len(helpful(search)[0]) - 1 - len(search.detected)  # of effects against which held-out rows do not speak
-    names = search.added[:count]
+    count = len(names)
     whole = Chain(tuple(search.chain[: count + 1]), tuple(search.left_out[: count + 1]), tuple(names))
     kept = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
     alone = [] if kept == names else [_with_only(search, kept)]
@@ -118,7 +124,7 @@ def explain_freely(search: EffectSearch, progress: Progress | None = None, named
     first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
     tries = [(alone, first, first), ([whole], further, further)] if named else [([*alone, whole], first, ANY)]
     for number, (bases, least, required) in enumerate(tries):
-        own = partial(_within, say, number / len(tries), 1.0 / len(tries))
+        own = partial(_within, progress, number / len(tries), 1.0 / len(tries))
         found = [chain for chain in _extended(bases, own, least) if _asked_for(stays, chain, required)]
         if found:
             return _with_chain(search, found[-1])
