@@ -239,8 +239,8 @@ class Form:
     batched : bool
         Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row.
     law : dict
-        For "speed" only: the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on
-        that scale. `apply` is then not called.
+        For "speed": the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on that
+        scale; for "lags" the `FreeLaw`. `apply` is then not called.
     held : dict
         For "lags" only: what of the same has a given value.
     propose : callable or None

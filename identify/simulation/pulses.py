@@ -26,7 +26,7 @@ class Motion:
 
     @classmethod
     def of(cls, angle_rad: np.ndarray, pulse_rate_hz: float) -> Motion:
-        """From the angles alone, planned or measured in an earlier trial: smoothed both ways."""
+        """From the angles alone, as the sensor told or would tell them, late if it is late: smoothed both ways."""
         angle = np.asarray(angle_rad, float)
         found = JointMotion.of(np.arange(angle.size) / pulse_rate_hz, angle)
         return cls(found.angle_rad, found.velocity_rad_s)
