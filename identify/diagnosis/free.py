@@ -97,7 +97,7 @@ def _believed(search: EffectSearch) -> list[str]:
 
 
 def _doubted(verdict: Verdict, left: bool) -> bool:
-    """Whether free effects are tried beside named ones or in their place."""
+    """Whether free effects are tried beside named ones."""
     error = verdict.held_out_error
     return left or (error is not None and error.ratio > thresholds.NAMED_BUT)
 
@@ -112,23 +112,20 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     names : sequence of str
         Of its effects the first ones, against which held-out rows do not speak.
     named : bool
-        Whether they are named: then they stay beside free effects, unless these do much better alone.
+        Whether they are named: then they stay beside free effects. A free effect describes more than a name's own form,
+        so it would often do better alone where the name is right.
     progress : callable
         As `search_effects` takes it.
     """
     count = len(names)
     whole = Chain(tuple(search.chain[: count + 1]), tuple(search.left_out[: count + 1]), tuple(names))
     kept = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
-    alone = [] if kept == names else [_with_only(search, kept)]
+    alone = [] if named or kept == names else [_with_only(search, kept)]
     stays = whole.left_out[-1]
     first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
-    tries = [(alone, first, first), ([whole], further, further)] if named else [([*alone, whole], first, ANY)]
-    for number, (bases, least, required) in enumerate(tries):
-        own = partial(_within, progress, number / len(tries), 1.0 / len(tries))
-        found = [chain for chain in _extended(bases, own, least) if _asked_for(stays, chain, required)]
-        if found:
-            return _with_chain(search, found[-1])
-    return search
+    found = _extended([whole], progress, further) if named else _extended([*alone, whole], progress, first)
+    found = [chain for chain in found if _asked_for(stays, chain, further if named else ANY)]
+    return _with_chain(search, found[-1]) if found else search
 
 
 def _with_only(search: EffectSearch, kept: Sequence[str]) -> Chain:

@@ -102,4 +102,4 @@ BEAM = 2
 FIRST_FREE, FURTHER_FREE = (2.0, 0.2), (3.0, 0.2)
 """Standard errors, and share as a logarithm, by which the error on left-out blocks must fall with a free effect."""
 NAMED_BUT = 1.3
-"""Error on held-out rows, divided by what is allowed there, from which free effects may take names' place."""
+"""Error on held-out rows, divided by what is allowed there, from which free effects are tried beside named ones."""
