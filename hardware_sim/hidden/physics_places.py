@@ -16,7 +16,7 @@ _muscle = {"first_s": (0.03, 0.08), "second_s": (0.08, 0.25)}
 
 @helper
 def two_lags(drive, p, s, c):
-    """The muscle of the first three: p[1], p[2] its time constants, s[0], s[1] its state."""
+    """The muscle of most here: p[1], p[2] its time constants, s[0], s[1] its state."""
     before = s[0]
     s[0] = lag_after(drive, drive, before, p[1], c[STEP_S])
     s[1] = lag_after(before, s[0], s[1], p[2], c[STEP_S])
@@ -148,8 +148,7 @@ def worn_reflex(x, p, s, c):
     "fatigue threshold_drift",
     "drive",
     "width, sum of the past",
-    first_s=(0.03, 0.08),
-    second_s=(0.08, 0.25),
+    **_muscle,
     half_at_us_share=(0.3, 0.8),
     spread_us=(12.0, 35.0),
     rises=(0.3, 0.8),
@@ -168,10 +167,7 @@ def axon_pump(x, p, s, c):
         fires = 1.0 / (1.0 + math.exp(-min(max((width - needs) / 2.0, -60.0), 60.0))) if width > 0.0 else 0.0
         s[10 + k] += c[STEP_S] * (fires * (1.0 - s[10 + k]) / p[6] - (1.0 - fires) * s[10 + k] / p[7])
         drive += fires / count
-    before = s[0]
-    s[0] = lag_after(drive, drive, before, p[1], c[STEP_S])
-    s[1] = lag_after(before, s[0], s[1], p[2], c[STEP_S])
-    return p[0] * c[LARGEST_NM] * s[1]
+    return p[0] * c[LARGEST_NM] * two_lags(drive, p, s, c)
 
 
 @mechanism(
@@ -193,9 +189,7 @@ def swinging_splint(x, p, s, c):
 
     s: two lags, travel, its speed; s[10:18]: where each of 8 joints has slipped to.
     """
-    before = s[0]
-    s[0] = lag_after(x / c[LARGEST_NM], x / c[LARGEST_NM], before, p[1], c[STEP_S])
-    s[1] = lag_after(before, s[0], s[1], p[2], c[STEP_S])
+    torque = two_lags(x / c[LARGEST_NM], p, s, c)
     omega, step, held = 2.0 * math.pi * p[3], 0.125 * c[STEP_S], 0.0
     for _ in range(8):
         held = p[4] * s[2] + (1.0 - p[4]) * max(s[2] - p[5], 0.0)
@@ -204,7 +198,7 @@ def swinging_splint(x, p, s, c):
             s[10 + k] = min(max(s[10 + k], s[2] - reach), s[2] + reach)
             held += p[6] / 8.0 * (s[2] - s[10 + k]) / p[7]
         held += 2.0 * p[8] / omega * s[3]
-        s[3] += step * omega * omega * (s[1] - held)
+        s[3] += step * omega * omega * (torque - held)
         s[2] += step * s[3]
     return p[0] * c[LARGEST_NM] * held
 
