@@ -13,6 +13,7 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import free
+from stimrig.identify.diagnosis.search import search_effects, silent
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
@@ -20,6 +21,7 @@ from stimrig.identify.effects import BadEffect, known_form, own_file, registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.estimation.quality import _stable
+from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
@@ -146,6 +148,9 @@ def test_where_nothing_is_missing_nothing_free_is_added():
     record = hidden_muscles.record(seed=3, rate_hz=100)
     with few_effects.only(*(effect.id for effect in FREE), "fatigue"):
         assert identify.improve(record).steps[1:] == () and identify.diagnose(record).free == ()
+        grid, raw = prepare(record)
+        search = search_effects(grid, raw, fitted_rows(grid, None))
+        assert free.explain_freely(search, (), False, silent).free == [], "nor where one is looked for"
 
 
 def test_free_lags_do_not_stand_beside_another_speed_law():
