@@ -245,16 +245,15 @@ class Analyses:
         """Each step that adds something as a version; what they begin with is there already."""
         rows = [first]
         for step, document in zip(found["steps"], found["models"], strict=True):
+            if step["added"] is not None:
+                rows.append(self._child(rows[-1], step["added"], document, by))
             step["model_id"] = rows[-1].id
-            if step["added"] is None:
-                continue
-            parent = rows[-1]
-            row = self.versions.child_with(parent, [*parent.effects, step["added"]])
-            if row is None:
-                document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
-                row = self.versions.add(
-                    json.dumps(document), parent.participant, parent.recording_id, by, parent.id, step["added"]
-                )
-            rows.append(row)
-            step["model_id"] = row.id
         return rows
+
+    def _child(self, parent: Model, added: str, document: dict[str, Any], by: str) -> Model:
+        """The version with one effect more than its parent; made of the document where there is none."""
+        same = self.versions.child_with(parent, [*parent.effects, added])
+        if same is not None:
+            return same
+        document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
+        return self.versions.add(json.dumps(document), parent.participant, parent.recording_id, by, parent.id, added)
