@@ -11,9 +11,7 @@ from stimrig import identify
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import load_record
 from stimrig.api.progress_bar import progress_bar
-
-RATES = 2
-"""Samples between two pulses that a recording must have to be joined to one of another rate."""
+from stimrig.identify.records.join import LEAST_SAMPLES, samples_between
 
 
 def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
@@ -27,8 +25,8 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
     """
     record = load_record(data)
     owner = _owner(record, data[0], participant)
-    if record.sample_rate_hz < RATES * record.pulse_rate_hz:
-        least = f"{RATES * record.pulse_rate_hz:g} Hz"
+    if samples_between(record.sample_rate_hz, record.pulse_rate_hz) < LEAST_SAMPLES:
+        least = f"{LEAST_SAMPLES * record.pulse_rate_hz:g} Hz"
         raise InputError(
             f"{data[0]}: sampled at {record.sample_rate_hz:.4g} Hz; a further one is joined from {least} on."
         )

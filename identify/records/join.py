@@ -149,6 +149,8 @@ def _part(found: FileContent, number: int, row: int, texts: Mapping[str, str]) -
 
 PAUSE_S = 30.0
 """What of a pause is kept in the time at most: every pulse interval of it is a row of the grid."""
+LEAST_SAMPLES = 2
+"""Samples between two pulses from which recordings of different rates are joined."""
 SAME_RATE = 0.01
 """Sampling rates that differ by less, as a share, are one nominal rate and two clocks."""
 TOLD_WHERE_SO = ("late_s", "doubted")
@@ -265,15 +267,20 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
     return found
 
 
+def samples_between(sample_rate_hz: float, pulse_rate_hz: float) -> int:
+    """Whole samples between two pulses, as far as rates are known."""
+    return math.floor((1 + SAME_RATE) * sample_rate_hz / pulse_rate_hz)
+
+
 def _at_one_rate(pieces: list[_Piece], rate_hz: float) -> list[_Piece]:
     """All pieces at the lowest of their rates, or just below it, where a whole number of samples is to make a pulse."""
     own = [piece.record.sample_rate_hz for piece in pieces]
     lowest = min(own)
     if max(own) <= (1 + SAME_RATE) * lowest:
         return pieces
-    each = math.floor((1 + SAME_RATE) * lowest / rate_hz)
-    if each < 2:
-        fix = f"Recordings of different rates are joined from {2 * rate_hz:g} Hz on."
+    each = samples_between(lowest, rate_hz)
+    if each < LEAST_SAMPLES:
+        fix = f"Recordings of different rates are joined from {LEAST_SAMPLES * rate_hz:g} Hz on."
         raise BadRecord(f"sampled at {lowest:.4g} and {max(own):.4g} Hz", fix=fix)
     return [
         replace(piece, record=_block_means(piece, each, rate_hz)) if own_hz > (1 + SAME_RATE) * lowest else piece
