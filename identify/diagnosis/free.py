@@ -141,9 +141,7 @@ def _with_only(search: EffectSearch, kept: Sequence[str]) -> Chain:
     return Chain(tuple(models), tuple(leave_out(one) for one in models), tuple(kept))
 
 
-def _extended(
-    bases: Sequence[Chain], progress: Progress, first: tuple[float, float] = thresholds.FIRST_FREE
-) -> list[Chain]:
+def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, float]) -> list[Chain]:
     """The best chain with one free effect, with two, …, as far as left-out blocks ask for more.
 
     The likeliest few of each length are extended: which effect is best alone does not say which is best beside others.

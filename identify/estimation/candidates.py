@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
-from stimrig.identify.effects import find_effect
+from stimrig.identify.effects import any_free
 from stimrig.identify.estimation.joint import Fitted, knows_joint, solve
 from stimrig.identify.estimation.left_out import bouts, difference, leave_out, near_widths
 from stimrig.identify.estimation.rests import relaxed
@@ -68,10 +68,9 @@ def trusted(base: Fitted) -> Fitted:
     The other optimum is taken where it is the likelier one; else white noise where it predicts left-out blocks better.
     """
     noise = base.noise
-    free = any(find_effect(name).shape for name, _ in base.effects)
     if noise.held or noise.band or min(noise.share, 1.0) < SLOW_SHARE or noise.ar1 < SLOW:
         return base
-    if not (free or knows_joint(base)):
+    if not (any_free(name for name, _ in base.effects) or knows_joint(base)):
         return base
     white = solve(base.problem, base.theta, WHITE)
     again = solve(white.problem, white.theta, NoiseLevel(0.0, 0.5, white.noise.sd_nm))

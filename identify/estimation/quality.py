@@ -9,7 +9,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
-from stimrig.identify.effects import depend_on_joint, find_effect
+from stimrig.identify.effects import any_free, depend_on_joint
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.predict import refuse_rate
@@ -154,7 +154,7 @@ def _stable(model: Model) -> dict[str, Any]:
     stable = linear.stable if isinstance(linear, Discrete) else linear.time_constant_s > 0 and linear.damping > 0
     names = [str(entry["id"]) for entry in model.effects]
     if (
-        stable and any(find_effect(name).shape for name in names) and not depend_on_joint(names)
+        stable and any_free(names) and not depend_on_joint(names)
     ):  # rates that switch can pump energy, though each alone damps
         rng = np.random.default_rng(0)
         held = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
