@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,6 +33,15 @@ def test_the_tables_add_up_series_fit_a_screen_and_words_name_a_place(compared):
     assert result.fit_percent < result.ceiling_percent
     assert any("N·m" in place["text"] and "%" in place["text"] for place in result.where)
     json.dumps(result.to_dict(), allow_nan=False)
+
+
+def test_a_record_that_is_all_held_out_is_compared_as_a_whole():
+    record = hidden_muscles.record(seed=3)
+    model = identify.fit(record)
+    names = ("validate",) * len(record.segment_names)
+    held, own = compare(model, replace(record, segment_names=names)), compare(model, record)
+    assert held.rms_nm == pytest.approx(own.rms_nm, rel=0.05) and held.held_out is None
+    assert held.fitted["samples"] == record.time_s.size and "validate" not in held.where[0]["text"]
 
 
 def test_a_wrong_model_alarms_and_a_right_one_does_not(compared):
