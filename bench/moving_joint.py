@@ -16,6 +16,7 @@ from __future__ import annotations
 import sys
 import time
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,8 @@ SENSORS = {
     "all": AngleSensor(noise_deg=0.3, step_deg=0.35, delay_s=0.02),
 }
 PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0
+EARLIER = 1_000_000
+"""Added to the seed of a trial that comes before the unseen one."""
 
 
 def torque_time_nms(arm: ArmPatient, made: dict[str, Any]) -> float:
@@ -70,7 +73,6 @@ def one_by_sensors(seed: int, names: tuple[str, ...]) -> dict[str, Any]:
     """One arm whose angle is read by each of some sensors, in its tests and in the unseen trial."""
     arm, told = arm_patient(seed), {}
     alone = fit(as_record(record(arm, "isometric", seed)))
-    clean = record(arm, "unseen", seed, duration_s=UNSEEN_S)
     for name in names:
         sensor = SENSORS[name]
         isometric = record(arm, "isometric", seed, sensor=sensor)
@@ -79,20 +81,31 @@ def one_by_sensors(seed: int, names: tuple[str, ...]) -> dict[str, Any]:
         model = fit(tests, effects=MOVING_JOINT)
         unseen = record(arm, "unseen", seed, duration_s=UNSEEN_S, sensor=sensor)
         told[name] = {"cpu_s": time.process_time() - began, **model.data["joint_sensor"]}
-        told[name] |= {"error": over_noise(model, unseen), "causal": over_noise(model, unseen, causal=True)}
+        told[name] |= {"error": over_noise(model, unseen)}
         cost_nm = sensor_cost_nm(*problem_of(model, make_grid(as_record(unseen))))
         told[name]["cost"] = cost_nm / unseen["truth"]["noise_sd_nm"]
         if name == "clean":
-            noisy = record(arm, "unseen", seed, duration_s=UNSEEN_S, sensor=SENSORS["noise"])
-            beside = over_noise(model, clean)
-            told["predict"] = {"both ways": over_noise(model, noisy) / beside}
-            told["predict"] |= {"causal": over_noise(model, noisy, causal=True) / beside}
+            told["predict"] = {kind: noise_costs(arm, model, kind, seed) for kind in ("unseen", "reaching")}
     return {"seed": seed, "sensors": told}
 
 
-def over_noise(model: Model, unseen: dict[str, Any], causal: bool = False) -> float:
+def noise_costs(arm: ArmPatient, model: Model, kind: str, seed: int) -> dict[str, float]:
+    """Error along an angle with noise over that along a clean one; causal: with an earlier trial of the same kind."""
+    make = partial(record, arm, kind, duration_s=UNSEEN_S)
+    clean, noisy, earlier = (
+        make(seed=number, sensor=SENSORS[name])
+        for number, name in ((seed, "clean"), (seed, "noise"), (seed + EARLIER, "noise"))
+    )
+    beside = over_noise(model, clean)
+    return {
+        "both ways": over_noise(model, noisy) / beside,
+        "causal": over_noise(model, noisy, as_record(earlier)) / beside,
+    }
+
+
+def over_noise(model: Model, unseen: dict[str, Any], earlier: Record | None = None) -> float:
     """Error of the prediction over the noise, root mean square; the load cell's zero is not the model's."""
-    error_nm = unseen["torque_nm"] - predict(model, as_record(unseen), causal)
+    error_nm = unseen["torque_nm"] - predict(model, as_record(unseen), earlier)
     return float(np.std(error_nm - np.median(error_nm))) / unseen["truth"]["noise_sd_nm"]
 
 
@@ -209,23 +222,21 @@ def tell_sensors(rows: list[dict[str, Any]], names: tuple[str, ...]) -> None:
     """What each sensor costs."""
     for name in names:
         own = [row["sensors"][name] for row in rows]
-        error, cost, cpu_s, causal = (
-            np.array([each[key] for each in own]) for key in ("error", "cost", "cpu_s", "causal")
-        )
+        error, cost, cpu_s = (np.array([each[key] for each in own]) for key in ("error", "cost", "cpu_s"))
         apart = np.sqrt(np.maximum(error**2 - cost**2, 0.0))
         late_ms = 1e3 * np.array([each["delay_s"] for each in own])
         print(
             f"{name}: error {np.median(error):.2f} x noise (median), worst {error.max():.2f}, within 1.3: "
             f"{np.sum(error <= 1.3)} of {error.size}; without the sensor's own cost ({np.median(cost):.2f}) "
-            f"{np.median(apart):.2f}, within 1.3: {np.sum(apart <= 1.3)}; causal {np.median(causal):.2f}; delay found "
+            f"{np.median(apart):.2f}, within 1.3: {np.sum(apart <= 1.3)}; delay found "
             f"{np.median(late_ms):.1f} ms ({late_ms.min():.1f} to {late_ms.max():.1f}); "
             f"fit {np.median(cpu_s):.1f} s of a processor, longest {cpu_s.max():.1f}"
         )
     if "clean" in names:
-        for way in ("both ways", "causal"):
-            ratio = np.array([row["sensors"]["predict"][way] for row in rows])
+        for kind, way in product(("unseen", "reaching"), ("both ways", "causal")):
+            ratio = np.array([row["sensors"]["predict"][kind][way] for row in rows])
             print(
-                f"the clean model on an angle with 0.3 degrees of noise, {way}: {np.median(ratio):.2f} x its error on "
+                f"{kind}: the clean model on an angle with 0.3° of noise, {way}: {np.median(ratio):.2f} x its error on "
                 f"a clean one (median), worst {ratio.max():.2f}, within 1.5: {np.sum(ratio <= 1.5)} of {ratio.size}"
             )
 

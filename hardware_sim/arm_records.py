@@ -18,7 +18,7 @@ from numpy.random import Generator
 from scipy.signal import savgol_filter
 
 from stimrig.hardware_sim.arm.laws import Floats
-from stimrig.hardware_sim.arm.motion import Begin, Motion
+from stimrig.hardware_sim.arm.motion import Begin, Motion, Quintic, lasting_s
 from stimrig.hardware_sim.arm.movers import Mover, make_mover
 from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, levels, make_design, staircase
@@ -166,6 +166,21 @@ def _unseen(asked: Asked) -> ArmDesign:
     return ArmDesign(parts, low + (high - low) * (waves - waves.min()) / np.ptp(waves))
 
 
+def _reaching(asked: Asked) -> ArmDesign:
+    """As `_unseen`, by movements of minimum jerk from one angle to another, with pauses."""
+    parts, (low, high), rng = _unseen(asked).parts, asked.patient.range_rad, asked.rng
+    time_s = np.arange(_fine(parts).size) / SIMULATION_HZ
+    begin_s, at, angle = 0.0, Motion(float(rng.uniform(low, high))), np.empty(time_s.size)
+    while begin_s < time_s[-1]:
+        to = Motion(float(rng.uniform(low, high)))
+        lasts_s = lasting_s(at.angle_rad, to.angle_rad, math.radians(rng.uniform(20.0, 90.0)))
+        way = Quintic(begin_s, lasts_s, at, to)
+        for row in np.flatnonzero(time_s >= begin_s):
+            angle[row] = way.at(float(time_s[row])).angle_rad
+        begin_s, at = begin_s + lasts_s + float(rng.uniform(0.0, 1.0)), to
+    return ArmDesign(parts, angle)
+
+
 def _sweeps(asked: Asked, deg_s: float) -> tuple[str, dict[str, Any]]:
     """Through the range of the day, a little inside its ends."""
     low_deg, high_deg = np.degrees(asked.patient.range_rad)
@@ -197,6 +212,7 @@ KINDS: dict[str, Callable[[Asked], ArmDesign]] = {
     "passive": _passive,
     "moving": _moving,
     "unseen": _unseen,
+    "reaching": _reaching,
 }
 
 
@@ -220,13 +236,13 @@ def record(
         `isometric`: at `angle_rad` (90 degrees if None) by `protocol`, `prbs` (the paper's PRBS, then a ramp) or
         `staircase`. `held`: a short staircase at `angle_rad`, or anywhere in the range. `passive`: no current; sweeps
         at about 8, 20, 45 and 80 degrees/s. `moving`: steady levels, 3 to 7 s each, while the joint is swept. `unseen`:
-        random levels and another movement, for validation.
+        random levels and another movement, for validation. `reaching`: as `unseen`, by movements of minimum jerk.
     seed
         Decides, together with patient and kind, every random number.
     mover
         `hand` or `robot`; drawn if None. `unseen` moves by waves of 0.05 to 0.6 Hz.
     duration_s
-        Length of `passive`, `moving` or `unseen`; 66, 60 and 30 if None. Others have their protocol's.
+        Length of `passive`, `moving`, `unseen` or `reaching`; 66, 60, 30 and 30 if None. Others have their protocol's.
     parts
         Of `held` or `moving`: segments in order, each a name and its pulse widths at 40 pulses/s, µs, instead of the
         kind's own.

@@ -152,25 +152,33 @@ class JointMotion:
     step_rad: float = 0.0
 
     @classmethod
-    def of(
-        cls, time_s: np.ndarray, angle_rad: np.ndarray, first: Sequence[int] = (0,), causal: bool = False
-    ) -> JointMotion:
-        """From angles, of which any may be NaN; each part, from its `first` reading on, by itself.
-
-        `causal`: from the readings until then alone, as a controller has them. Only how noisy the sensor is, and how
-        the joint moves in general, is taken from the whole part: an earlier trial tells it.
-        """
+    def of(cls, time_s: np.ndarray, angle_rad: np.ndarray, first: Sequence[int] = (0,)) -> JointMotion:
+        """From angles, of which any may be NaN; each part, from its `first` reading on, by itself."""
         parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
         step_rad = step_of([angle_rad[own] for own in parts])
         read_rad = np.concatenate([_without_held(time_s[own], angle_rad[own]) for own in parts])
-        sensors = [sensor_of(time_s[own], read_rad[own], step_rad) for own in parts]
-        noise_rad, jerk = np.array(sensors).T
-        begun = cls(read_rad, read_rad, read_rad, noise_rad, jerk, step_rad)
-        if not causal:
-            return begun._smoothed(time_s, read_rad, first)
-        moved = [pace_of(time_s[own], read_rad[own], *one) for own, one in zip(parts, sensors, strict=True)]
-        begun = replace(begun, jerk=np.array([jerk for jerk, _ in moved]))
-        return begun._smoothed(time_s, read_rad, first, [pace for _, pace in moved])
+        noise_rad, jerk = np.array([sensor_of(time_s[own], read_rad[own], step_rad) for own in parts]).T
+        return cls(read_rad, read_rad, read_rad, noise_rad, jerk, step_rad)._smoothed(time_s, read_rad, first)
+
+    @classmethod
+    def until_then(
+        cls,
+        time_s: np.ndarray,
+        angle_rad: np.ndarray,
+        first: Sequence[int],
+        earlier: tuple[np.ndarray, np.ndarray],
+    ) -> JointMotion:
+        """At each reading from those until then alone, as a controller has them.
+
+        How noisy the sensor is, and how the joint moves in general, is told by times and angles of an `earlier` trial.
+        """
+        at_s, read_rad = earlier[0], _without_held(*earlier)
+        step_rad = step_of([read_rad])
+        noise_rad, jerk = sensor_of(at_s, read_rad, step_rad)
+        jerk, pace = pace_of(at_s, read_rad, noise_rad, jerk)
+        one = np.ones(len(first))
+        begun = cls(angle_rad, angle_rad, angle_rad, noise_rad * one, jerk * one, step_rad)
+        return begun._smoothed(time_s, angle_rad, first, pace)
 
     def read_again(self, time_s: np.ndarray, first: Sequence[int], seed: int = 0) -> JointMotion:
         """The same movement as the same sensor would tell it another time: what its error does to a model."""
@@ -186,11 +194,11 @@ class JointMotion:
         return replace(self, angle_rad=on, velocity_rad_s=velocity + late_s * acceleration)
 
     def _smoothed(
-        self, time_s: np.ndarray, read_rad: np.ndarray, first: Sequence[int], paces: Sequence[Pace] | None = None
+        self, time_s: np.ndarray, read_rad: np.ndarray, first: Sequence[int], pace: Pace | None = None
     ) -> JointMotion:
         parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
-        sensors = zip(parts, self.noise_rad, self.jerk, paces or [None] * len(parts), strict=True)
-        found = [smooth(time_s[own], read_rad[own], noise, jerk, pace) for own, noise, jerk, pace in sensors]
+        sensors = zip(parts, self.noise_rad, self.jerk, strict=True)
+        found = [smooth(time_s[own], read_rad[own], noise, jerk, pace) for own, noise, jerk in sensors]
         angle, velocity, acceleration = np.concatenate(found).T.copy()
         return replace(self, angle_rad=angle, velocity_rad_s=velocity, acceleration_rad_s2=acceleration)
 

@@ -14,7 +14,7 @@ from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, run_narx
 from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.effects.base import Form, replaced_by
-from stimrig.identify.errors import BadModel
+from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
@@ -53,23 +53,27 @@ class Muscle(Protocol):
     def extra(self) -> dict[str, Any]: ...
 
 
-def predict(model: Muscle, record: Record, causal: bool = False) -> np.ndarray:
+def predict(model: Muscle, record: Record, earlier: Record | None = None) -> np.ndarray:
     """Torque that the model predicts for the record's pulse widths, N·m, shape (N,).
 
     No measured torque is used: a controller would predict the same. The angle is smoothed both ways, as a whole record
-    is there; `causal`: from what was read until then, as a controller has it while the joint moves. What cannot be
-    foreseen (`unforeseen`) is included only on the rows that it was fitted on.
+    is there; with an `earlier` trial of the same movement from what was read until then alone, as a controller has it
+    while the joint moves: the earlier trial tells how noisy the sensor is and how the joint moves in general. What
+    cannot be foreseen (`unforeseen`) is included only on the rows that it was fitted on.
 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, or the record lacks a
-    column it needs.
+    column it needs. Raises BadRequest: in the earlier trial no joint moves.
     """
     refuse_rate(model, record)
     grid = make_grid(record)
-    if not causal or record.angle_rad is None or isinstance(model.linear, Discrete):
+    if earlier is None or record.angle_rad is None or isinstance(model.linear, Discrete):
         return predict_on(model, grid)
+    if earlier.angle_rad is None or earlier.motion is None or not np.any(earlier.motion.jerk > 0.0):
+        raise BadRequest("in the earlier trial no joint moves", fix="Give a trial of the same movement and sensor.")
     problem, theta = problem_of(model, grid)
     first = [part.first for part in record.parts]
-    motion = JointMotion.of(record.time_s, record.angle_rad, first, causal=True)
+    told = earlier.time_s, earlier.angle_rad
+    motion = JointMotion.until_then(record.time_s, record.angle_rad, first, told)
     return _moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0).at_samples(theta)
 
 

@@ -12,6 +12,7 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import ENCODER, AngleSensor, record
+from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.candidates import SLOW, trusted
 from stimrig.identify.estimation.effect_fit import fitted_with
 from stimrig.identify.estimation.joint import Fitted
@@ -51,16 +52,26 @@ def test_the_velocity_of_a_noisy_angle_is_found_much_better_than_by_its_slope():
     assert found.step_rad == 0.0
 
 
-def test_both_ways_are_neither_late_nor_early_and_the_causal_filter_looks_at_nothing_later():
+def test_both_ways_are_neither_late_nor_early():
     time_s, angle, velocity = moved()
     read = angle + np.radians(0.3) * np.random.default_rng(1).normal(size=angle.size)
     found = JointMotion.of(time_s, read)
     shifts = np.arange(-4, 5)
     errors = [rms(found.velocity_rad_s - np.interp(time_s - shift / RATE_HZ, time_s, velocity)) for shift in shifts]
     assert abs(shifts[int(np.argmin(errors))]) <= 1
-    own = float(found.noise_rad[0]), float(found.jerk[0])
-    whole, cut = smooth(time_s, read, *own, STEADY), smooth(time_s[:2000], read[:2000], *own, STEADY)
-    assert np.array_equal(whole[:2000], cut)
+
+
+def test_with_an_earlier_trial_nothing_later_is_looked_at():
+    unseen, earlier = (
+        as_record(record(arm_patient(ARM), "reaching", seed, duration_s=12.0, sensor=NOISY)) for seed in (7, 8)
+    )
+    assert unseen.angle_rad is not None
+    row = unseen.angle_rad.size // 2
+    turned = np.r_[unseen.angle_rad[:row], 2.0 * unseen.angle_rad[row] - unseen.angle_rad[row:]]
+    own, other = (predict(clean(), one, earlier) for one in (unseen, replace(unseen, angle_rad=turned)))
+    assert np.array_equal(own[:row], other[:row]) and not np.array_equal(own[row:], other[row:])
+    with pytest.raises(BadRequest, match="no joint moves"):
+        predict(clean(), unseen, replace(earlier, angle_rad=np.full_like(earlier.time_s, 1.2)))
 
 
 @pytest.mark.parametrize("comes_and_goes", [True, False])
@@ -73,9 +84,9 @@ def test_what_a_movement_does_in_general_helps_the_causal_filter_where_it_comes_
     read = angle + np.radians(0.3) * np.random.default_rng(2).normal(size=angle.size)
     both = JointMotion.of(time_s, read)
     usual = smooth(time_s, read, both.noise_rad[0], both.jerk[0], STEADY)
-    errors = [
-        rms(found - velocity) for found in (JointMotion.of(time_s, read, causal=True).velocity_rad_s, usual[:, 1])
-    ]
+    again = angle + np.radians(0.3) * np.random.default_rng(5).normal(size=angle.size)
+    paced = JointMotion.until_then(time_s, read, [0], (time_s, again))
+    errors = [rms(found - velocity) for found in (paced.velocity_rad_s, usual[:, 1])]
     assert errors[0] < (0.85 if comes_and_goes else 1.05) * errors[1]
 
 
@@ -83,9 +94,11 @@ def test_a_late_angle_is_told_ahead():
     time_s, angle, velocity = moved()
     late_s = 0.02
     read = np.interp(time_s - late_s, time_s, angle)
-    now = JointMotion.of(time_s, read, causal=True).ahead(late_s)
-    assert rms(now.angle_rad - angle) < 0.1 * rms(read - angle)
-    assert rms(now.velocity_rad_s - velocity) < 0.3 * rms(np.gradient(read, time_s) - velocity)
+    now = JointMotion.until_then(time_s, read, [0], (time_s, read)).ahead(late_s)
+    settled = time_s > 1.0
+    assert rms((now.angle_rad - angle)[settled]) < 0.1 * rms((read - angle)[settled])
+    slope = np.gradient(read, time_s)
+    assert rms((now.velocity_rad_s - velocity)[settled]) < 0.3 * rms((slope - velocity)[settled])
 
 
 def test_steps_are_seen_and_an_angle_that_rests_on_them_does_not_move():
