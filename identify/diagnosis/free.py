@@ -145,6 +145,7 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
     """The best chain with one free effect, with two, …, as far as left-out blocks ask for more.
 
     The likeliest few of each length are extended: which effect is best alone does not say which is best beside others.
+    Held-out rows choose none: where they speak against the best, it ends there.
     """
     found: list[Chain] = []
     beam = list(bases)
@@ -159,6 +160,8 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
         longer.sort(key=lambda chain: -chain.better(reference).gain)
         best = _likeliest(longer)
         if found and not _asked_for(found[-1].left_out[-1], best, thresholds.FURTHER_FREE):
+            break
+        if vetoed(*best.models[-2:]):
             break
         found.append(best)
         unlike: dict[str, Chain] = {}  # of each effect its best form
@@ -192,7 +195,7 @@ def _asked_for(before: LeftOut, chain: Chain, required: tuple[float, float]) -> 
 
 
 def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> list[Chain]:
-    """A chain with each free effect more that left-out blocks ask for, and against which held-out rows do not speak."""
+    """A chain with each free effect more that left-out blocks ask for."""
     base, unseen = chain.models[-1], chain.left_out[-1]
     listed: list[Effect] = []
     for effect in registry().values():
@@ -207,7 +210,7 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
             break
         fitted = trusted(one.fitted)
         longer = chain.with_(fitted, leave_out(fitted), one.effect.id)
-        if _asked_for(unseen, longer, required) and not vetoed(base, fitted):
+        if _asked_for(unseen, longer, required):
             able.append(longer)
     return able
 

@@ -111,7 +111,7 @@ def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str
     if step.added in search.free:
         seen = difference(search.left_out[number], search.left_out[number + 1])
         told = next(effect["shape"]["words"] for effect in model.effects if effect["id"] == step.added)
-        return " ".join([told, seen.words, FREE])
+        return " ".join([told, seen.words_of_choice, FREE])
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
     seen = difference(search.left_out[number], search.left_out[number + 1])
     reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."

@@ -138,7 +138,7 @@ def _free(search: EffectSearch, effect: str, covariance: np.ndarray) -> dict[str
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
         "parameters": describe_parameters(fitted, index, covariance),
-        "left_out": difference(search.left_out[number], search.left_out[number + 1]).words,
+        "left_out": difference(search.left_out[number], search.left_out[number + 1]).words_of_choice,
         **{"axis" if key == "effect" else key: value for key, value in shape.items()},
     }
 

@@ -11,6 +11,8 @@ from stimrig.identify.effects.base import Effect, Form, Parameter, Shape
 
 TIME_S = np.linspace(0.0, 0.5, 101)
 STOPS_S = 0.25
+SLOWS = 0.3
+"""Log of the change of speed above which it says more than the opening."""
 
 
 def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
@@ -27,8 +29,9 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
         f"{1000.0 * stays_s:.0f} ms after the last one; open, the muscle has {np.exp(values['gate_rate']):.2g} times "
         "the speed that it has closed."
     )
+    enters = "rate of fall" if abs(values["gate_rate"]) > SLOWS else "drive"
     axes = "time, pulses for 0.25 s, then none (s)", TIME_S, "opening and speed"
-    return Shape("rate of fall", "time since", words, *axes, {"opening": gate, "speed": rate})
+    return Shape(enters, "time since", words, *axes, {"opening": gate, "speed": rate})
 
 
 EFFECT = Effect(

@@ -246,6 +246,11 @@ class Difference:
             return f"On parts left out of the fit the error rises by {percent:.0f} % ({errors:.1f} standard errors)."
         return f"On parts left out of the fit the error falls by {percent:.0f} % ({errors:.1f} standard errors)."
 
+    @property
+    def words_of_choice(self) -> str:
+        """The same of a form that was chosen among many by just this error."""
+        return f"{self.words} It was chosen among many by these parts: on pulses of another kind it may gain less."
+
 
 def difference(before: LeftOut, after: LeftOut) -> Difference:
     """Compare two models of one record, block by block of the second.

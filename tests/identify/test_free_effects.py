@@ -94,6 +94,26 @@ def test_a_picture_is_finite_and_says_where_it_enters(effect, form: Form):
     assert all(line.shape == shape.at.shape and np.isfinite(line).all() for line in shape.lines.values())
 
 
+def test_where_a_gate_enters_follows_from_its_numbers():
+    effect = registry()["free_gate"]
+    assert effect.shape is not None
+    told = [
+        effect.shape(effect.forms[0], {"gate_s": 0.03, "bend": 2.0, "gate_rate": rate}) for rate in (0.0, -1.0, 1.0)
+    ]
+    assert [one.enters for one in told] == ["drive", "rate of fall", "rate of fall"]
+    assert len({one.words for one in told}) == 3
+
+
+@pytest.mark.slow
+def test_held_out_rows_end_the_search_and_never_choose_another(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+    monkeypatch.setattr(free, "vetoed", lambda before, after: asked.append(after.effects[-1][0]) or "no")
+    with few_effects.only("free_gate", "free_level"):
+        search, verdict = free.searched(*prepare(as_record(record_of_physics("physics", 0))))
+    assert asked == ["free_gate"]
+    assert not search.free and verdict.kind == "unexplained_structure"
+
+
 @made_once
 def found() -> tuple[Diagnosis, Improvement]:
     """Of a muscle of Ding's calcium and bridges."""
