@@ -9,7 +9,8 @@ given, tared on its first rest; those of arms over the error of plain repetition
 `--nudge` fits and improves again with every torque × (1 + 1e-9), `--processor` in a process of its own with the
 arithmetic of another processor, and both compare. `--no-names` leaves out `diagnose`, half of the time; then no name
 counts as untrue. `--second` makes the record that the program chooses after the first, too, and learns from both:
-rows then have `second`, the error with both. `--only-plain` leaves out `improve`, too, and takes a second a record.
+rows then have `second`, the error with both, and `alike`, without and with it on one more PRBS and ramp, since what it
+chooses resembles the second record. `--only-plain` leaves out `improve`, too, and takes a second a record.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from stimrig.identify.diagnosis.free import searched
 from stimrig.identify.diagnosis.result import diagnosis_of
 from stimrig.identify.diagnosis.search import helpful
 from stimrig.identify.estimation.finish import finish
+from stimrig.identify.estimation.left_out import difference, leave_out
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
 from stimrig.identify.records.join import join
@@ -49,6 +51,7 @@ OTHER_PROCESSOR = {
 SURE = 0.9
 """Probability from which a name counts as told for sure."""
 WORSE, CLOSE, MOVES = 1.02, 1.3, 0.01
+PICTURE = {"enters": "where they enter", "driven_by": "what drives them"}
 ARMS = ("arms", "idle")
 """Records of bouts; the stimulator of `idle` goes on below threshold between them."""
 TRUE_OF_ARMS = {"mixed_fibres", "baseline_drift"}
@@ -77,7 +80,12 @@ def score(made: dict[str, Any], model: identify.Model) -> float:
         unseen, repetition = repeated(made)
         predicted = identify.predict(model, as_record(made))[unseen]
         return rms(made["torque_nm"][unseen] - predicted) / rms(made["torque_nm"][unseen] - repetition)
-    unseen = made["unseen"]
+    return over_noise(made, "unseen", model)
+
+
+def over_noise(made: dict[str, Any], which: str, model: identify.Model) -> float:
+    """The model's error on the `unseen` or the `alike` record over the noise, counted from its own zero."""
+    unseen = made[which]
     off = identify.predict(model, as_record(unseen)) - unseen["torque_nm"]
     return rms(off - np.mean(off[unseen["time_s"] < REST_S])) / made["truth"]["noise_sd_nm"]
 
@@ -120,7 +128,7 @@ def look(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
         "named": named,
         "untrue": [name for name, sure in named.items() if sure >= SURE and name not in made["true"]],
         "verdict": improved.verdict if improved else "",
-        "picture": pictured(made, improved.models[-1] if improved else plain),
+        "pictured": pictured(made, improved.models[-1] if improved else plain),
         "phi": plain.noise.ar1,
         "white_nm": plain.noise.white_sd_nm,
         "seconds": seconds,
@@ -129,40 +137,57 @@ def look(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
     }
 
 
-def last_model(record: identify.Record) -> tuple[identify.Model, list[str], np.ndarray | None, str]:
-    """The last model of `improve`, its effects, and the pulse widths of the experiment that the program chooses."""
+def last_model(record: identify.Record) -> tuple[identify.Model, list[str], np.ndarray | None, str, list[float]]:
+    """The last model of `improve`, its effects, and the pulse widths of the experiment that the program chooses.
+
+    Last, how much the logarithm of the error on left-out parts has fallen with its effects, and its standard error.
+    """
     search, verdict = searched(*prepare(record))
-    last = helpful(search)[0][-1].fitted
+    row = helpful(search)[0]
+    model, seen = (
+        finish("maximum-likelihood", row[-1].fitted),
+        difference(*(leave_out(row[at].fitted) for at in (0, -1))),
+    )
     chosen = diagnosis_of(search, verdict).deciding_experiment
     if chosen is None:
-        return finish("maximum-likelihood", last), search.added, None, ""
+        return model, search.added, None, "", [seen.gain, seen.sd]
     played = [build(one["sequence"], dict(one["settings"]), record.pulse_rate_hz) for one in chosen["segments"]]
-    return finish("maximum-likelihood", last), search.added, np.concatenate(played), chosen["text"].partition(" (")[0]
+    return model, search.added, np.concatenate(played), chosen["text"].partition(" (")[0], [seen.gain, seen.sd]
 
 
 def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
     """One record, and both together: the first and the one that the program chose."""
     workers.WORKERS = 1
     record, began = as_record(made), time.perf_counter()
-    first, added, width_us, words = last_model(record)
+    first, added, width_us, words, foretold = last_model(record)
     row = {name: made["truth"][name] for name in ("seed", "disturbed")} | {"kind": made["kind"]}
     row |= {"plain": score(made, identify.fit(record)), "improved": score(made, first), "second": score(made, first)}
     row |= {"added": added, "named": {}, "untrue": [], "verdict": words or "nothing chosen", "stated": 0.0}
-    row |= {"picture": pictured(made, first)}
+    row |= {"pictured": pictured(made, first), "foretold": foretold}
+    row["alike"] = [over_noise(made, "alike", first)] * 2
     if width_us is not None:
         further = as_record(further_record(kinds, made["truth"]["seed"], tuple(row["disturbed"]), width_us))
         both, row["added"], *_ = last_model(join([record, further], [0.0, PAUSE_S]))
-        row["second"] = score(made, both)
+        row["second"], row["alike"][1] = score(made, both), over_noise(made, "alike", both)
     return row | {"seconds": time.perf_counter() - began, "own_nm": []}
 
 
-def pictured(made: dict[str, Any], model: identify.Model) -> list[bool] | None:
-    """Whether the first free effect of a model is right in where it enters and in what drives it; None without one."""
+def pictured(made: dict[str, Any], model: identify.Model) -> dict[str, Any]:
+    """By `PICTURE`: what the first free effect of a model says, and what would be right; empty without one."""
     found = next((effect["shape"] for effect in model.effects if "shape" in effect), None)
     truth = made["truth"]
     if found is None or "enters" not in truth:
-        return None
-    return [found[key] in truth[key] for key in ("enters", "driven_by")]
+        return {}
+    return {key: (found[key], truth[key]) for key in PICTURE}
+
+
+def tell_pictures(rows: list[dict[str, Any]]) -> Iterable[str]:
+    """In how many a picture is right, beside the one answer that would be right most often, always given."""
+    told = [row["pictured"] for row in rows if row["pictured"]]
+    for key, words in PICTURE.items() if told else ():
+        right = sum(said in truth for said, truth in (one[key] for one in told))
+        always = max(sum(word in one[key][1] for one in told) for word in {w for one in told for w in one[key][1]})
+        yield f"free effects {len(told)}: {words} right in {right}; with the best one word every time {always}"
 
 
 def elsewhere(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
@@ -195,7 +220,7 @@ def compared(job: tuple[str, int, Collection[str], Collection[str]]) -> dict[str
     if "processor" in again:
         row["processor"] = moved(row, elsewhere(made, once_more))
     del row["own_nm"]
-    if kind == "sealed":  # names and physics would tell what is in it
+    if kind == "sealed":
         row |= {"kind": "", "added": len(row["added"]), "named": {}, "untrue": ["?" for _ in row["untrue"]]}
     return row
 
@@ -204,6 +229,7 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     """The summary."""
     plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
     second = [row["second"] for row in rows if "second" in row]
+    foretold = np.array([row["foretold"] for row in rows if "foretold" in row and row["added"]])
     unit = "plain repetition" if kind in ARMS else "noise"
     yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
@@ -211,14 +237,20 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
         close = f"within {CLOSE} × {np.sum(np.array(second) <= CLOSE)} of {len(rows)}"
         worse = np.sum(np.array(second) > WORSE * improved)
         yield f"with the record that the program chose: {np.median(second):.2f}, {close}, worse by over 2 %: {worse}"
+        first, both = np.array([row["alike"] for row in rows]).T
+        medians, worse = f"{np.median(first):.2f}, then {np.median(both):.2f}", np.sum(both > WORSE * first)
+        yield f"… on one more PRBS and ramp: {medians}, worse by over 2 %: {worse}"
+    if foretold.size:
+        came = np.array([np.log(row["plain"] / row["improved"]) for row in rows if "foretold" in row and row["added"]])
+        fell, fallen = (100.0 * (1.0 - np.exp(-np.median(one))) for one in (foretold[:, 0], came))
+        short = np.sum(came < foretold[:, 0] - 2.0 * foretold[:, 1])
+        yield f"error on left-out parts falls by {fell:.0f} %, on the unseen record by {fallen:.0f} % (medians);"
+        yield f"… by less, and by over two standard errors, in {short} of {came.size}"
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
     beyond = np.sum(improved > plain + [max(row["stated"], 0.02 * row["plain"]) for row in rows])
     yield f"… and by more than the standard error that it states of itself: {beyond} of {len(rows)}"
     yield f"improved better by 10 % and more: {np.sum(improved <= 0.9 * plain)} of {len(rows)}"
-    told = [row["picture"] for row in rows if row["picture"]]
-    if told:
-        right = np.sum(told, axis=0)
-        yield f"free effects {len(told)}: where they enter right in {right[0]}, what drives them in {right[1]}"
+    yield from tell_pictures(rows)
     yield f"records with a name that is untrue with {SURE} and more: {sum(bool(row['untrue']) for row in rows)}"
     if kind in ARMS:
         held = sum(row["phi"] > 0.985 for row in rows), sum(row["phi"] > 0.9939 for row in rows)
@@ -278,6 +310,8 @@ def main() -> None:
         if asked.set != "sealed":
             print(line(cells(row)), flush=True)
     print(f"\n{asked.set}, seeds {asked.seeds.start} to {asked.seeds.stop - 1}", *tell(asked.set, rows), sep="\n")
+    if asked.set == "sealed":  # names and physics would tell what is in it
+        rows = [row | {"pictured": {}} for row in rows]
     keep(asked.json, rows)
 
 
