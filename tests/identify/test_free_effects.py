@@ -107,7 +107,7 @@ def test_where_a_gate_enters_follows_from_its_numbers():
 @pytest.mark.slow
 def test_held_out_rows_end_the_search_and_never_choose_another(monkeypatch: pytest.MonkeyPatch):
     asked = []
-    monkeypatch.setattr(free, "vetoed", lambda before, after: asked.append(after.effects[-1][0]) or "no")
+    monkeypatch.setattr(free, "vetoed", lambda _before, after: asked.append(after.effects[-1][0]) or "no")
     with few_effects.only("free_gate", "free_level"):
         search, verdict = free.searched(*prepare(as_record(record_of_physics("physics", 0))))
     assert asked == ["free_gate"]
