@@ -9,8 +9,9 @@ given, tared on its first rest; those of arms over the error of plain repetition
 `--nudge` fits and improves again with every torque × (1 + 1e-9), `--processor` in a process of its own with the
 arithmetic of another processor, and both compare. `--no-names` leaves out `diagnose`, half of the time; then no name
 counts as untrue. `--second` makes the record that the program chooses after the first, too, and learns from both:
-rows then have `second`, the error with both, and `alike`, without and with it on one more PRBS and ramp, since what it
-chooses resembles the second record. `--only-plain` leaves out `improve`, too, and takes a second a record.
+rows then have `second`, the error with both, `again`, that with the same test in place of the chosen one, and `alike`,
+without and with it on one more PRBS and ramp, since what it chooses resembles the second record. `--only-plain` leaves
+out `improve`, too, and takes a second a record.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Collection, Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -163,12 +165,18 @@ def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
     row = {name: made["truth"][name] for name in ("seed", "disturbed")} | {"kind": made["kind"]}
     row |= {"plain": score(made, identify.fit(record)), "improved": score(made, first), "second": score(made, first)}
     row |= {"added": added, "named": {}, "untrue": [], "verdict": words or "nothing chosen", "stated": 0.0}
-    row |= {"pictured": pictured(made, first), "foretold": foretold}
+    row |= {"pictured": pictured(made, first), "foretold": foretold if added else None}
     row["alike"] = [over_noise(made, "alike", first)] * 2
     if width_us is not None:
-        further = as_record(further_record(kinds, made["truth"]["seed"], tuple(row["disturbed"]), width_us))
-        both, row["added"], *_ = last_model(join([record, further], [0.0, PAUSE_S]))
-        row["second"], row["alike"][1] = score(made, both), over_noise(made, "alike", both)
+        every = round(record.sample_rate_hz / record.pulse_rate_hz)
+        same_again = made["pulse_width_us"][made["segment"] != "validate"][::every]
+        made_of = partial(further_record, kinds, row["seed"], tuple(row["disturbed"]))
+        both, again = (
+            last_model(join([record, as_record(made_of(chosen_us))], [0.0, PAUSE_S]))
+            for chosen_us in (width_us, same_again)
+        )
+        row |= {"added": both[1], "second": score(made, both[0]), "again": score(made, again[0])}
+        row["alike"][1] = over_noise(made, "alike", both[0])
     return row | {"seconds": time.perf_counter() - began, "own_nm": []}
 
 
@@ -229,7 +237,7 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     """The summary."""
     plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
     second = [row["second"] for row in rows if "second" in row]
-    foretold = np.array([row["foretold"] for row in rows if "foretold" in row and row["added"]])
+    told = [row for row in rows if row.get("foretold")]
     unit = "plain repetition" if kind in ARMS else "noise"
     yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
@@ -238,12 +246,15 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
         worse = np.sum(np.array(second) > WORSE * improved)
         yield f"with the record that the program chose: {np.median(second):.2f}, {close}, worse by over 2 %: {worse}"
         first, both = np.array([row["alike"] for row in rows]).T
+        again = [row.get("again", row["improved"]) for row in rows]
+        yield f"with the same test again in its place: {np.median(again):.2f}"
         medians, worse = f"{np.median(first):.2f}, then {np.median(both):.2f}", np.sum(both > WORSE * first)
         yield f"… on one more PRBS and ramp: {medians}, worse by over 2 %: {worse}"
-    if foretold.size:
-        came = np.array([np.log(row["plain"] / row["improved"]) for row in rows if "foretold" in row and row["added"]])
-        fell, fallen = (100.0 * (1.0 - np.exp(-np.median(one))) for one in (foretold[:, 0], came))
-        short = np.sum(came < foretold[:, 0] - 2.0 * foretold[:, 1])
+    if told:
+        came = np.log([row["plain"] / row["improved"] for row in told])
+        gain, sd = np.array([row["foretold"] for row in told]).T
+        fell, fallen = (100.0 * (1.0 - np.exp(-np.median(one))) for one in (gain, came))
+        short = np.sum(came < gain - 2.0 * sd)
         yield f"error on left-out parts falls by {fell:.0f} %, on the unseen record by {fallen:.0f} % (medians);"
         yield f"… by less, and by over two standard errors, in {short} of {came.size}"
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
