@@ -24,6 +24,7 @@ from stimrig.identify.diagnosis.search import (
     silent,
     without_effect,
 )
+from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, find_effect, registry
@@ -201,18 +202,28 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
     for effect in registry().values():
         if _applicable(effect, base):
             listed += [replace(effect, forms=(form,)) for form in effect.forms] if effect.shape else [effect]
-    tried = scan(base, listed, WORTHLESS, [], progress)
-    able, gains = [], {one.effect.id: one.gain for one in tried}
-    for one in tried:
-        if one.effect.shape is None or gains.get(ZERO.get(one.effect.id, ""), -np.inf) > one.gain:
-            continue
-        if one.gain < thresholds.NEXT_MARGIN:
-            break
-        fitted = trusted(one.fitted)
-        longer = chain.with_(fitted, leave_out(fitted), one.effect.id)
+    tried = scan(base, listed, WORTHLESS, [], partial(_within, progress, 0.0, 0.6))
+    gains = {one.effect.id: one.gain for one in tried}
+    likely = [
+        one
+        for one in tried
+        if one.effect.shape
+        and one.gain >= max(thresholds.NEXT_MARGIN, gains.get(ZERO.get(one.effect.id, ""), thresholds.NEXT_MARGIN))
+    ]
+
+    def judged(number: int) -> tuple[Fitted, LeftOut]:
+        """Without the problem: it holds functions, which cannot be sent between processes."""
+        fitted = trusted(likely[number].fitted)
+        return replace(fitted, problem=None), leave_out(fitted)
+
+    able: dict[int, Chain] = {}
+    for done, (number, (fitted, left_out)) in enumerate(side_by_side(judged, len(likely)), start=1):
+        one = likely[number]
+        progress(0.6 + 0.4 * done / len(likely), f"tried {one.effect.name.lower()}")
+        longer = chain.with_(replace(fitted, problem=one.fitted.problem), left_out, one.effect.id)
         if _asked_for(unseen, longer, required):
-            able.append(longer)
-    return able
+            able[number] = longer
+    return [able[number] for number in sorted(able)]
 
 
 def _applicable(effect: Effect, base: Fitted) -> bool:

@@ -96,8 +96,12 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
         coupling = p[FreeLaw.COUPLING] + 2.0 * max(1.0 - core[m, 1], 0.0)
         gated, slow = p[FreeLaw.GATE_S] > 0.0, p[FreeLaw.FILL_S] > 0.0
         decay = np.exp(-h / p[FreeLaw.GATE_S]) if gated else 0.0
+        first = p[FreeLaw.FIRST_DIRECTION], p[FreeLaw.FIRST_RISING], p[FreeLaw.FIRST_FALLING]
+        second = p[FreeLaw.SECOND_DIRECTION], p[FreeLaw.SECOND_RISING], p[FreeLaw.SECOND_FALLING]
+        bent = np.any(p[: FreeLaw.COUPLING] != 0.0)
         part, y, a, s, c1, c2, last = 0, 0.0, 0.0, 0.0, 0.0, 0.0, -1
-        one_s, two_s = first_s, second_s
+        one_s, two_s, edge = 0.0, 0.0, EDGE * scale_nm
+        b11, b12, b21, b22, b1, b2 = 1.0, 0.0, 0.0, 1.0, 0.0, 0.0
         for k in range(size):
             if part < begins.size and k == begins[part]:
                 y = initial[m, part, 0]
@@ -133,17 +137,20 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
                     c2 = 0.5 * (before + c1) + (c2 - 0.5 * (before + c1)) * decay
                     gate = (1.0 + p[FreeLaw.BEND]) * c2 / (1.0 + p[FreeLaw.BEND] * c2)
                     share, log_rate = share * gate, log_rate + p[FreeLaw.GATE_RATE] * gate
-                edge, x = EDGE * scale_nm, share * w
-                first = p[FreeLaw.FIRST_DIRECTION], p[FreeLaw.FIRST_RISING], p[FreeLaw.FIRST_FALLING]
-                second = p[FreeLaw.SECOND_DIRECTION], p[FreeLaw.SECOND_RISING], p[FreeLaw.SECOND_FALLING]
-                one_s = lag_s(first_s, log_rate + _log_rate(*first, (x - a) / edge, a / scale_nm))
-                two_s = lag_s(second_s, log_rate + _log_rate(*second, (a - y) / edge, y / scale_nm))
-                t = np.sqrt(one_s * two_s)
-                q11, q12, q21, q22 = step_matrix(t, max(0.5 * (one_s + (1.0 - coupling) * two_s) / t, 0.05), h)
-                # from (y - x, (a - y)/two) to (y, a), both as linear functions of (y, a, x)
-                b11, b12, b1 = q11 - q12 / two_s, q12 / two_s, 1.0 - q11
-                b21, b22 = b11 + two_s * q21 - q22, b12 + q22
-                b2 = b1 - two_s * q21
+                x = share * w
+                own, other = log_rate, log_rate
+                if bent:
+                    own += _log_rate(*first, (x - a) / edge, a / scale_nm)
+                    other += _log_rate(*second, (a - y) / edge, y / scale_nm)
+                own, other = lag_s(first_s, own), lag_s(second_s, other)
+                if own != one_s or other != two_s:
+                    one_s, two_s = own, other
+                    t = np.sqrt(one_s * two_s)
+                    q11, q12, q21, q22 = step_matrix(t, max(0.5 * (one_s + (1.0 - coupling) * two_s) / t, 0.05), h)
+                    # from (y - x, (a - y)/two) to (y, a), both as linear functions of (y, a, x)
+                    b11, b12, b1 = q11 - q12 / two_s, q12 / two_s, 1.0 - q11
+                    b21, b22 = b11 + two_s * q21 - q22, b12 + q22
+                    b2 = b1 - two_s * q21
                 y, a = b11 * y + b12 * a + b1 * x, b21 * y + b22 * a + b2 * x
                 if m == 0:
                     yy, ya, yw, ay, aa, aw = (
