@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -162,7 +163,7 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
         best = _likeliest(longer)
         if found and not _asked_for(found[-1].left_out[-1], best, thresholds.FURTHER_FREE):
             break
-        if vetoed(*best.models[-2:]):
+        if any(vetoed(*two) for two in pairwise(best.models[-len(best.added) - 1 :])):
             break
         found.append(best)
         unlike: dict[str, Chain] = {}  # of each effect its best form

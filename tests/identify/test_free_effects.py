@@ -114,6 +114,26 @@ def test_held_out_rows_end_the_search_and_never_choose_another(monkeypatch: pyte
     assert not search.free and verdict.kind == "unexplained_structure"
 
 
+def test_held_out_rows_may_object_to_any_link_of_a_chain(monkeypatch: pytest.MonkeyPatch):
+    """B, second best, is extended too; its own step from the base is asked about although B alone was not taken."""
+
+    def model(name: str) -> SimpleNamespace:
+        return SimpleNamespace(name=name, noise=SimpleNamespace(held=False), log_evidence=0.0)
+
+    def longer(chain: free.Chain, *_: object) -> list[free.Chain]:
+        further = {(): {"A": 1.0, "B": 0.8}, ("B",): {"C": 3.0}}.get(chain.added, {})
+        return [chain.with_(model(name), error, name) for name, error in further.items()]
+
+    def objects(before: SimpleNamespace, after: SimpleNamespace) -> str | None:
+        return "no" if (before.name, after.name) == ("base", "B") else None
+
+    monkeypatch.setattr(free, "_longer", longer)
+    monkeypatch.setattr(free, "vetoed", objects)
+    monkeypatch.setattr(free, "difference", lambda old, new: SimpleNamespace(gain=new - old, errors=10.0 * (new - old)))
+    found = free._extended([free.Chain((model("base"),), (0.0,), ())], silent, (0.0, 0.0))
+    assert [chain.added for chain in found] == [("A",)]
+
+
 @made_once
 def found() -> tuple[Diagnosis, Improvement]:
     """Of a muscle of Ding's calcium and bridges."""
