@@ -30,6 +30,7 @@ POINTS = 4000
 """Largest number of points of a plotted series."""
 TOLD_S = 5e-3
 """Pulses at least this late are reported: a fifth of an interval, more than the jitter of a healthy computer."""
+SHORTEST_S = 3.0
 LEAST = 8
 """Fewer known intervals are not enough for any result."""
 
@@ -55,7 +56,7 @@ def compare(model: Model, record: Record) -> Comparison:
     BadRecord
         Fewer than eight pulse intervals are known.
     """
-    if record.held_out.all():  # held out beside nothing: its noise can be told of these rows alone
+    if np.sum(~record.held_out) < SHORTEST_S * record.sample_rate_hz:  # too little beside them that tells the noise
         record = replace(record, segment_names=("all rows",) * len(record.segment_names))
     grid = make_grid(record)
     if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:

@@ -57,17 +57,19 @@ def predict(model: Muscle, record: Record, earlier: Record | None = None) -> np.
     """Torque that the model predicts for the record's pulse widths, N·m, shape (N,).
 
     No measured torque is used: a controller would predict the same. The angle is smoothed both ways, as a whole record
-    is there; with an `earlier` trial of the same movement from what was read until then alone, as a controller has it
-    while the joint moves: the earlier trial tells how noisy the sensor is and how the joint moves in general. What
-    cannot be foreseen (`unforeseen`) is included only on the rows that it was fitted on.
+    is there; with an `earlier` trial of the same movement from what was read until the end of the pulse interval alone,
+    as a controller has it while the joint moves: the earlier trial tells how noisy the sensor is and how the joint
+    moves in general. What cannot be foreseen (`unforeseen`) is included only on the rows that it was fitted on.
 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, or the record lacks a
-    column it needs. Raises BadRequest: in the earlier trial no joint moves.
+    column it needs. Raises BadRequest: in the earlier trial no joint moves, or it is several recordings.
     """
     refuse_rate(model, record)
     grid = make_grid(record)
     if earlier is None or record.angle_rad is None or isinstance(model.linear, Discrete):
         return predict_on(model, grid)
+    if len(earlier.parts) > 1:
+        raise BadRequest("the earlier trial is several recordings", fix="Give one of them.")
     if earlier.angle_rad is None or earlier.motion is None or not np.any(earlier.motion.jerk > 0.0):
         raise BadRequest("in the earlier trial no joint moves", fix="Give a trial of the same movement and sensor.")
     problem, theta = problem_of(model, grid)

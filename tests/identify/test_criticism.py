@@ -35,11 +35,13 @@ def test_the_tables_add_up_series_fit_a_screen_and_words_name_a_place(compared):
     json.dumps(result.to_dict(), allow_nan=False)
 
 
-def test_a_record_that_is_all_held_out_is_compared_as_a_whole():
+@pytest.mark.parametrize("others", [0, 30])
+def test_a_record_that_is_nearly_all_held_out_is_compared_as_a_whole(others: int):
     record = hidden_muscles.record(seed=3)
     model = identify.fit(record)
-    names = ("validate",) * len(record.segment_names)
-    held, own = compare(model, replace(record, segment_names=names)), compare(model, record)
+    segment = (np.arange(record.time_s.size) < others).astype(record.segment.dtype)
+    held = compare(model, replace(record, segment=segment, segment_names=("validate", "rest")))
+    own = compare(model, record)
     assert held.rms_nm == pytest.approx(own.rms_nm, rel=0.05) and held.held_out is None
     assert held.fitted["samples"] == record.time_s.size and "validate" not in held.where[0]["text"]
 

@@ -66,12 +66,15 @@ def test_with_an_earlier_trial_nothing_later_is_looked_at():
         as_record(record(arm_patient(ARM), "reaching", seed, duration_s=12.0, sensor=NOISY)) for seed in (7, 8)
     )
     assert unseen.angle_rad is not None
-    row = unseen.angle_rad.size // 2
-    turned = np.r_[unseen.angle_rad[:row], 2.0 * unseen.angle_rad[row] - unseen.angle_rad[row:]]
+    row, interval = unseen.angle_rad.size // 2 + 5, round(unseen.sample_rate_hz / unseen.pulse_rate_hz)
+    turned = np.r_[unseen.angle_rad[:row], 2.0 * unseen.angle_rad[row - 1] - unseen.angle_rad[row:]]
     own, other = (predict(clean(), one, earlier) for one in (unseen, replace(unseen, angle_rad=turned)))
-    assert np.array_equal(own[:row], other[:row]) and not np.array_equal(own[row:], other[row:])
+    begin = row - row % interval
+    assert np.array_equal(own[:begin], other[:begin]) and not np.array_equal(own[begin:], other[begin:])
     with pytest.raises(BadRequest, match="no joint moves"):
         predict(clean(), unseen, replace(earlier, angle_rad=np.full_like(earlier.time_s, 1.2)))
+    with pytest.raises(BadRequest, match="several recordings"):
+        predict(clean(), unseen, recorded_by(NOISY))
 
 
 @pytest.mark.parametrize("comes_and_goes", [True, False])
@@ -84,8 +87,10 @@ def test_what_a_movement_does_in_general_helps_the_causal_filter_where_it_comes_
     read = angle + np.radians(0.3) * np.random.default_rng(2).normal(size=angle.size)
     both = JointMotion.of(time_s, read)
     usual = smooth(time_s, read, both.noise_rad[0], both.jerk[0], STEADY)
-    again = angle + np.radians(0.3) * np.random.default_rng(5).normal(size=angle.size)
-    paced = JointMotion.until_then(time_s, read, [0], (time_s, again))
+    before = np.roll(angle, 1700) if comes_and_goes else np.interp(time_s - 3.0, time_s, angle)
+    before += np.radians(0.3) * np.random.default_rng(5).normal(size=angle.size)
+    told = slice(1700, None) if comes_and_goes else slice(None)  # not where its end meets its begin
+    paced = JointMotion.until_then(time_s, read, [0], (time_s[told], before[told]))
     errors = [rms(found - velocity) for found in (paced.velocity_rad_s, usual[:, 1])]
     assert errors[0] < (0.85 if comes_and_goes else 1.05) * errors[1]
 
