@@ -53,6 +53,8 @@ OTHER_PROCESSOR = {
 SURE = 0.9
 """Probability from which a name counts as told for sure."""
 WORSE, CLOSE, MOVES = 1.02, 1.3, 0.01
+SEEN = 0.2
+"""What noise and floor add to the square of an error on left-out parts: two tenths, as ten samples make an interval."""
 PICTURE = {"enters": "where they enter", "driven_by": "what drives them"}
 ARMS = ("arms", "idle")
 """Records of bouts; the stimulator of `idle` goes on below threshold between them."""
@@ -139,10 +141,11 @@ def look(made: dict[str, Any], steps: Collection[str]) -> dict[str, Any]:
     }
 
 
-def last_model(record: identify.Record) -> tuple[identify.Model, list[str], np.ndarray | None, str, list[float]]:
+def last_model(record: identify.Record) -> tuple[identify.Model, list[str], np.ndarray | None, str, list[float] | None]:
     """The last model of `improve`, its effects, and the pulse widths of the experiment that the program chooses.
 
-    Last, how much the logarithm of the error on left-out parts has fallen with its effects, and its standard error.
+    Last, how much the logarithm of the error on left-out parts has fallen with all its effects, and its standard error;
+    None where no effect stays.
     """
     search, verdict = searched(*prepare(record))
     row = helpful(search)[0]
@@ -150,11 +153,12 @@ def last_model(record: identify.Record) -> tuple[identify.Model, list[str], np.n
         finish("maximum-likelihood", row[-1].fitted),
         difference(*(leave_out(row[at].fitted) for at in (0, -1))),
     )
+    foretold = [seen.gain, seen.sd] if len(row) > 1 else None
     chosen = diagnosis_of(search, verdict).deciding_experiment
     if chosen is None:
-        return model, search.added, None, "", [seen.gain, seen.sd]
+        return model, search.added, None, "", foretold
     played = [build(one["sequence"], dict(one["settings"]), record.pulse_rate_hz) for one in chosen["segments"]]
-    return model, search.added, np.concatenate(played), chosen["text"].partition(" (")[0], [seen.gain, seen.sd]
+    return model, search.added, np.concatenate(played), chosen["text"].partition(" (")[0], foretold
 
 
 def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
@@ -165,8 +169,8 @@ def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
     row = {name: made["truth"][name] for name in ("seed", "disturbed")} | {"kind": made["kind"]}
     row |= {"plain": score(made, identify.fit(record)), "improved": score(made, first), "second": score(made, first)}
     row |= {"added": added, "named": {}, "untrue": [], "verdict": words or "nothing chosen", "stated": 0.0}
-    row |= {"pictured": pictured(made, first), "foretold": foretold if added else None}
-    row["alike"] = [over_noise(made, "alike", first)] * 2
+    row |= {"pictured": pictured(made, first), "foretold": foretold}
+    row["alike"] = [over_noise(made, "alike", first)] * 3
     if width_us is not None:
         every = round(record.sample_rate_hz / record.pulse_rate_hz)
         same_again = made["pulse_width_us"][made["segment"] != "validate"][::every]
@@ -176,7 +180,7 @@ def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
             for chosen_us in (width_us, same_again)
         )
         row |= {"added": both[1], "second": score(made, both[0]), "again": score(made, again[0])}
-        row["alike"][1] = over_noise(made, "alike", both[0])
+        row["alike"][1:] = [over_noise(made, "alike", one[0]) for one in (both, again)]
     return row | {"seconds": time.perf_counter() - began, "own_nm": []}
 
 
@@ -194,7 +198,8 @@ def tell_pictures(rows: list[dict[str, Any]]) -> Iterable[str]:
     told = [row["pictured"] for row in rows if row["pictured"]]
     for key, words in PICTURE.items() if told else ():
         right = sum(said in truth for said, truth in (one[key] for one in told))
-        always = max(sum(word in one[key][1] for one in told) for word in {w for one in told for w in one[key][1]})
+        words_there = {word for one in told for word in one[key][1]}
+        always = max((sum(word in one[key][1] for one in told) for word in words_there), default=0)
         yield f"free effects {len(told)}: {words} right in {right}; with the best one word every time {always}"
 
 
@@ -230,6 +235,7 @@ def compared(job: tuple[str, int, Collection[str], Collection[str]]) -> dict[str
     del row["own_nm"]
     if kind == "sealed":
         row |= {"kind": "", "added": len(row["added"]), "named": {}, "untrue": ["?" for _ in row["untrue"]]}
+        row |= {"verdict": ""} | {again: row[again] | {"added": []} for again in ("nudge", "processor") if again in row}
     return row
 
 
@@ -245,13 +251,13 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
         close = f"within {CLOSE} × {np.sum(np.array(second) <= CLOSE)} of {len(rows)}"
         worse = np.sum(np.array(second) > WORSE * improved)
         yield f"with the record that the program chose: {np.median(second):.2f}, {close}, worse by over 2 %: {worse}"
-        first, both = np.array([row["alike"] for row in rows]).T
+        first, both, same = np.array([row["alike"] for row in rows]).T
         again = [row.get("again", row["improved"]) for row in rows]
         yield f"with the same test again in its place: {np.median(again):.2f}"
-        medians, worse = f"{np.median(first):.2f}, then {np.median(both):.2f}", np.sum(both > WORSE * first)
-        yield f"… on one more PRBS and ramp: {medians}, worse by over 2 %: {worse}"
+        medians, worse = [f"{np.median(one):.2f}" for one in (first, both, same)], np.sum(both > WORSE * first)
+        yield f"on one more PRBS and ramp: {medians[0]}, then {medians[1]}, worse by over 2 %: {worse}; or {medians[2]}"
     if told:
-        came = np.log([row["plain"] / row["improved"] for row in told])
+        came = 0.5 * np.log([(row["plain"] ** 2 + SEEN) / (row["improved"] ** 2 + SEEN) for row in told])
         gain, sd = np.array([row["foretold"] for row in told]).T
         fell, fallen = (100.0 * (1.0 - np.exp(-np.median(one))) for one in (gain, came))
         short = np.sum(came < gain - 2.0 * sd)
@@ -309,6 +315,8 @@ def main() -> None:
     made.add_argument("--only-plain", action="store_true", help="without `improve`, too")
     made.add_argument("--jobs", type=int, default=1, help="processes")
     asked = made.parse_args()
+    if asked.second and asked.set in ARMS:
+        made.error("--second: not of arms, whose muscle makes no further record")
     steps = () if asked.only_plain else ("improve",) if asked.no_names else ("improve", "diagnose")
     again = [name for name in ("nudge", "processor", "second") if getattr(asked, name)]
     jobs = [(asked.set, seed, steps, again) for seed in asked.seeds]
