@@ -10,12 +10,17 @@ from typing import Any
 from stimrig import identify
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import load_record
+from stimrig.api.client.errors import NotFound
+from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
 from stimrig.identify.records.join import LEAST_SAMPLES, samples_between
+from stimrig.identify.records.record import Source
 
 
 def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
     """The next experiment of recordings as a test, with the participant whose recordings they are.
+
+    Beside it `recorded_ma`, with what current they were made: empty where no file says it.
 
     Raises
     ------
@@ -24,7 +29,11 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
         be joined to them. All of it is said before anything is played.
     """
     record = load_record(data)
-    owner = _owner(record, data[0], participant)
+    sources = record.source.parts or (record.source,)
+    owner = _owner(sources, data, participant)
+    currents_ma = sorted({source.current_ma for source in sources} - {None})
+    if len(currents_ma) > 1:
+        raise InputError(f"these recordings were made with {' and '.join(f'{one:g} mA' for one in currents_ma)}.")
     if samples_between(record.sample_rate_hz, record.pulse_rate_hz) < LEAST_SAMPLES:
         least = f"{LEAST_SAMPLES * record.pulse_rate_hz:g} Hz"
         raise InputError(
@@ -40,21 +49,44 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
         "kind": "next-experiment",
         "segments": segments,
         "pulse_rate_hz": record.pulse_rate_hz,
+        "recorded_ma": currents_ma,
     }
 
 
-def _owner(record: identify.Record, file: Path, participant: str | None) -> str:
+def _owner(sources: Sequence[Source], data: Sequence[Path], participant: str | None) -> str:
     """Who is stimulated: whose recordings these are."""
-    sources = record.source.parts or (record.source,)
     owners = {source.participant for source in sources} - {""}
     if len(owners) > 1:
         raise InputError(f"these recordings are of several people: {', '.join(sorted(owners))}.")
+    if participant is None:
+        for source, file in zip(sources, data, strict=False):
+            if not source.participant:
+                raise InputError(f"{file} does not say whose it is. Give --participant.")
     owner = next(iter(owners), participant)
-    if owner is None:
-        raise InputError(f"{file} does not say whose it is. Give --participant.")
+    assert owner is not None
     if participant not in (None, owner):
-        raise InputError(f"{file} is a recording of {owner}; --participant is {participant}.")
+        raise InputError(f"{data[0]} is a recording of {owner}; --participant is {participant}.")
     return owner
+
+
+def check_participant(client: Client, code: str, recorded_ma: Sequence[float]) -> None:
+    """See, before anything is played, that the participant is known here, with the limits and the current recorded at.
+
+    Raises
+    ------
+    InputError
+        Somebody who has recordings would be made anew, with default limits; or the current is another one.
+    """
+    try:
+        now_ma = client.participant(code)["profile"]["current_ma"]
+    except NotFound as error:
+        told = "their limits are not known here. Give the --data folder or --url of the recording, or set them first."
+        raise InputError(f"there is no participant {code}: {told}") from error
+    if any(one != now_ma for one in recorded_ma):
+        before = f"{recorded_ma[0]:g} mA"
+        raise InputError(
+            f"the recording was made with {before}, {code} is now stimulated with {now_ma:g} mA: they cannot be joined."
+        )
 
 
 def diagnosed(data: Sequence[Path], recording: bytes) -> dict[str, Any]:

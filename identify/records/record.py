@@ -38,6 +38,8 @@ class Source:
     notes: tuple[str, ...] = ()
     participant: str = ""
     """Whose it is, as a sealed recording says; empty where the file does not say."""
+    current_ma: float | None = None
+    """With what current it was made, as a sealed recording says; None where the file does not say."""
 
 
 def joined_source(parts: Sequence[Source], name: str = "joined", sha256: str = "") -> Source:

@@ -232,6 +232,7 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     doubts = doubts | unknown
     bounds.check_span(time_s[inside], f"{file.name}, /torque/time_s")
     identity, digest, whose = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
+    current_ma = file.number("current_ma", np.nan)
     columns: dict[str, Any] = {"time_s": time_s, "pulse_width_us": width, "torque_nm": torque} | angles
     columns |= {"late_s": late} if pulses.late_s.any() else {}
     columns |= {"doubted": doubts} if doubts.any() else {}
@@ -241,7 +242,14 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
         segment_names=names,
         pulses=pulses,
         pulse_rate_hz=rate,
-        source=Source(path.name, identity, digest, notes=(note,) if note else (), participant=whose),
+        source=Source(
+            name=path.name,
+            recording_id=identity,
+            sha256=digest,
+            notes=(note,) if note else (),
+            participant=whose,
+            current_ma=current_ma if current_ma > 0.0 else None,
+        ),
     )
 
 

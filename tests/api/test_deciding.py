@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from stimrig.api.cli import deciding
 from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.commands.diagnose import next_step
 from stimrig.api.cli.errors import InputError
+from stimrig.api.client.errors import NotFound
 from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.sessions.runner import Runner
@@ -86,7 +88,8 @@ def recordings(monkeypatch: pytest.MonkeyPatch) -> list[list[Path]]:
     def load(data: list[Path]) -> Any:
         assert all(path.exists() for path in data)
         loaded.append(list(data))
-        return SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=Source(participant=OWNER))
+        source = Source(participant=OWNER, current_ma=16.0)
+        return SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=source)
 
     monkeypatch.setattr(deciding, "load_record", load)
     monkeypatch.setattr(deciding.identify, "diagnose", lambda *_: found, raising=False)
@@ -112,6 +115,7 @@ def test_the_verb_asks_for_it_and_diagnoses_all_together(
     assert output.read_bytes() == b"second", "written before the long work that may fail"
     assert sent == {
         "participant": OWNER, "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0,
+        "recorded_ma": [16.0],
     }  # fmt: skip
     assert recordings == [[first]] and told[0]["diagnosis"] == FOUND and "recording" not in told[0]
 
@@ -129,6 +133,7 @@ def test_both_are_diagnosed_together(recordings: list[list[Path]], tmp_path: Pat
         ([OWNER], 400.0, "P2", "a recording of P1; --participant is P2"),
         ([""], 400.0, None, "does not say whose it is. Give --participant"),
         ([OWNER, "P2"], 400.0, None, "of several people: P1, P2"),
+        ([OWNER, ""], 400.0, None, "second.csv does not say whose it is"),
         ([OWNER], 30.0, None, "joined from 50 Hz on"),
     ],
 )
@@ -142,7 +147,55 @@ def test_nobody_is_stimulated_for_a_recording_that_is_anothers_or_cannot_be_join
     monkeypatch.setattr(deciding, "load_record", lambda _: record)
     monkeypatch.setattr(verb, "on_own_services", lambda *_: pytest.fail("it played"))
     with pytest.raises(InputError, match=said):
-        verb.test(participant=participant, decide=[tmp_path / "first.h5"])
+        verb.test(participant=participant, decide=[tmp_path / "first.h5", tmp_path / "second.csv"])
+
+
+@pytest.mark.parametrize(
+    ("recorded_ma", "known", "said"),
+    [
+        ([16.0], True, None), ([], True, None),
+        ([20.0], True, "made with 20 mA, P1 is now stimulated with 16 mA"),
+        ([16.0], False, "no participant P1: their limits are not known here"),
+    ],
+)  # fmt: skip
+def test_nobody_is_stimulated_with_other_limits_or_current_than_recorded(
+    recorded_ma: list[float], known: bool, said: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def participant(_code: str) -> dict[str, Any]:
+        if not known:
+            raise NotFound("GET", "not found")
+        return {"profile": {"current_ma": 16.0}}
+
+    client = SimpleNamespace(participant=participant, model_file=str, recording=bytes)
+    started: list[dict[str, Any]] = []
+    monkeypatch.setattr(verb, "Client", lambda *_: nullcontext(client))
+    monkeypatch.setattr(
+        verb, "run_test", lambda *_, **more: started.append(more) or {"model_id": "", "recording_id": 0}
+    )
+    with pytest.raises(InputError, match=said) if said else nullcontext():
+        verb.through("url", "token", OWNER, asked={"kind": "next-experiment", "recorded_ma": recorded_ma})
+    assert started == ([] if said else [{"kind": "next-experiment"}])
+
+
+def test_recordings_of_two_currents_are_not_continued(
+    recordings: list[list[Path]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    parts = tuple(Source(participant=OWNER, current_ma=one) for one in (16.0, 20.0))
+    record = SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=Source(parts=parts))
+    monkeypatch.setattr(deciding, "load_record", lambda _: record)
+    with pytest.raises(InputError, match="made with 16 mA and 20 mA"):
+        deciding.asked([tmp_path / "first.h5", tmp_path / "second.h5"], None)
+
+
+def test_where_the_recording_cannot_be_written_is_said_before_anything_is_played(
+    recordings: list[list[Path]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(verb, "on_own_services", lambda *_: pytest.fail("it played"))
+    (tmp_path / "file").touch()
+    for output in (tmp_path, tmp_path / "file" / "second.h5"):
+        with pytest.raises(InputError, match="in a folder that can be written"):
+            verb.test(decide=[tmp_path / "first.h5"], output=output)
+    assert recordings == []
 
 
 SITE = ("right", "biceps brachii", None)

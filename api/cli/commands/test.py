@@ -78,6 +78,11 @@ def test(
     if decide and (adaptive or protocol is not None):
         raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
     token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
+    if output is not None:  # now: a folder that is not there would be found after the test
+        with writing(output):
+            output.parent.mkdir(parents=True, exist_ok=True)
+        if output.is_dir() or not os.access(output.parent, os.W_OK):
+            raise InputError(f"{output}: give a file in a folder that can be written.")
     if url and not token:
         raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
     if decide:
@@ -93,7 +98,6 @@ def test(
     recording = found.pop("recording")
     if output is not None:  # first: what was measured is not lost, whatever comes after
         with writing(output):
-            output.parent.mkdir(parents=True, exist_ok=True)
             output.write_bytes(recording)
     if decide:
         found["diagnosis"] = deciding.diagnosed(decide, recording)
@@ -204,11 +208,17 @@ def through(
 
     Raises
     ------
+    InputError
+        As `deciding.check_participant`, where `asked` has `recorded_ma`.
     ServiceError
         The service cannot be reached, or the test did not end in a model.
     """
+    more = dict(asked or {})
+    recorded_ma = more.pop("recorded_ma", None)
     with Client(url, token) as client:
-        document = run_test(client, participant, events, over, **(asked or {}))
+        if recorded_ma is not None:
+            deciding.check_participant(client, participant, recorded_ma)
+        document = run_test(client, participant, events, over, **more)
         best = document["model_id"]
         if (document.get("adaptive") or {}).get("problem"):
             say_aside("  the structure leaves an error: adding what explains it")
