@@ -13,7 +13,7 @@ from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
-from stimrig.identify.estimation.finish import describe_parameters
+from stimrig.identify.estimation.finish import describe_parameters, finish
 from stimrig.identify.estimation.joint import predict_fitted
 from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.plain import moves
@@ -120,9 +120,12 @@ def _plan(experiment: Experiment) -> dict[str, Any]:
 
 
 def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
-    """Whether a further test is planned for what is left; not of a joint that moves, which has tests of its own."""
+    """Whether a further test is planned for what is left; not of a joint that moves, which has tests of its own, and
+    not where the muscle hardly answers: what its dose would be is not known."""
+    if verdict.kind != "unexplained_structure":
+        return False
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)
-    return verdict.kind == "unexplained_structure" and still
+    return still and finish("maximum-likelihood", search.last).quality["gates"]["torque"]["passed"]
 
 
 def _free(search: EffectSearch, effect: str, covariance: np.ndarray) -> dict[str, Any]:

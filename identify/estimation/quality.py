@@ -9,11 +9,13 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
-from stimrig.identify.effects import any_free, depend_on_joint
+from stimrig.identify.effects import depend_on_joint
+from stimrig.identify.errors import BadModel
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
+from stimrig.identify.simulation.joint_surface import Acting, Surfaces
 from stimrig.identify.simulation.predict import refuse_rate
-from stimrig.identify.simulation.pulses import above_rest
+from stimrig.identify.simulation.pulses import Motion, above_rest
 
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
@@ -152,15 +154,21 @@ def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:
 def _stable(model: Model) -> dict[str, Any]:
     linear = model.linear
     stable = linear.stable if isinstance(linear, Discrete) else linear.time_constant_s > 0 and linear.damping > 0
-    names = [str(entry["id"]) for entry in model.effects]
-    if (
-        stable and any_free(names) and not depend_on_joint(names)
-    ):  # rates that switch can pump energy, though each alone damps
-        rng = np.random.default_rng(0)
-        held = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
-        curve_nm = float(np.ptp(model.recruitment(np.linspace(0.0, model.recruitment.basis.largest_us, 101))))
-        stable = bool(np.max(np.abs(above_rest(model, held, PULSES_PER_S))) < TAME * curve_nm)
+    if stable and any(Acting.of(entry).form.stage == "lags" for entry in model.effects):
+        stable = _tame(model)
     return _gate(stable, "refuse", "the dynamics are unstable")
+
+
+def _tame(model: Model) -> bool:
+    """Whether held widths keep the torque in bounds: rates that switch can pump energy, though each alone damps."""
+    rng, joint = np.random.default_rng(0), Surfaces.of(model.effects)
+    held = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
+    curve_nm = float(np.ptp(model.recruitment(np.linspace(0.0, model.recruitment.basis.largest_us, 101))))
+    motion = None if joint is None else Motion.held(joint.reference_rad, held.size)
+    try:
+        return bool(np.max(np.abs(above_rest(model, held, PULSES_PER_S, motion))) < TAME * curve_nm)
+    except BadModel:  # it runs away
+        return False
 
 
 def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:

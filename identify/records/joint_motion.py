@@ -42,7 +42,8 @@ PACES = ((0.3, 3.0, 30.0), (0.3,))
 """Starts of the pace, 1/s² and 1/s: what a movement that comes and goes tells of its next moments."""
 PIECE, LONG_GAP_S = 0.2, 1.0
 """The series of a step is taken in pieces of so little of a pace; over a longer gap nothing is foretold."""
-LOGS, SETTLED = (-9.0, 12.0), {"maxiter": 120, "xatol": 0.03, "fatol": 0.3}
+LOGS, SETTLED = (-9.0, (12.0, 9.0, 6.0)), {"maxiter": 120, "xatol": 0.03, "fatol": 0.3}
+"""Of jerk, spring and drag: no joint swings at over 14 Hz."""
 UNIFORM = 1.0 / np.sqrt(12.0)
 """Standard deviation of what lies evenly within a step."""
 LARGEST_STEP_RAD = 0.035

@@ -23,6 +23,8 @@ from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
 LARGEST_RATE_CHANGE = 0.25
+MOVES_RAD = 0.1
+"""What an earlier trial moves through at least, to tell how the joint moves."""
 
 
 class Muscle(Protocol):
@@ -61,22 +63,36 @@ def predict(model: Muscle, record: Record, earlier: Record | None = None) -> np.
     as a controller has it while the joint moves: the earlier trial tells how noisy the sensor is and how the joint
     moves in general. What cannot be foreseen (`unforeseen`) is included only on the rows that it was fitted on.
 
-    Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, or the record lacks a
-    column it needs. Raises BadRequest: in the earlier trial no joint moves, or it is several recordings.
+    Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, the record lacks a column
+    it needs, or the torque grows without limit. Raises BadRequest: in the earlier trial no joint moves, or it is
+    several recordings.
     """
     refuse_rate(model, record)
     grid = make_grid(record)
     if earlier is None or record.angle_rad is None or isinstance(model.linear, Discrete):
-        return predict_on(model, grid)
+        return _sound(predict_on(model, grid))
     if len(earlier.parts) > 1:
         raise BadRequest("the earlier trial is several recordings", fix="Give one of them.")
-    if earlier.angle_rad is None or earlier.motion is None or not np.any(earlier.motion.jerk > 0.0):
+    if earlier.angle_rad is None or not _moves(earlier.angle_rad):
         raise BadRequest("in the earlier trial no joint moves", fix="Give a trial of the same movement and sensor.")
     problem, theta = problem_of(model, grid)
     first = [part.first for part in record.parts]
     told = earlier.time_s, earlier.angle_rad
     motion = JointMotion.until_then(record.time_s, record.angle_rad, first, told)
-    return _moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0).at_samples(theta)
+    return _sound(_moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0).at_samples(theta))
+
+
+def _moves(angle_rad: np.ndarray) -> bool:
+    """Whether most readings are there, and nine tenths of them lie far enough apart to tell a movement."""
+    known = angle_rad[np.isfinite(angle_rad)]
+    return known.size > 0.5 * angle_rad.size and float(np.ptp(np.percentile(known, (5.0, 95.0)))) > MOVES_RAD
+
+
+def _sound(torque_nm: np.ndarray) -> np.ndarray:
+    """The same torque. Raises BadModel where it is none: rates that switch can make it run away."""
+    if not np.max(np.abs(torque_nm), initial=0.0) <= model_schema.PLAUSIBLE:
+        raise BadModel("the torque that it predicts grows without limit", fix="Do not use this model; fit another one.")
+    return torque_nm
 
 
 def _moved(problem: Problem, motion: JointMotion, **changes: float) -> Problem:
@@ -86,7 +102,7 @@ def _moved(problem: Problem, motion: JointMotion, **changes: float) -> Problem:
 
 def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
     """As `predict`, for a record on its grid."""
-    if isinstance(model.linear, Discrete):
+    if isinstance(model.linear, Discrete) and not model.effects:
         linear, widths_us, narx = model.linear, grid.pulse_width_us, model.extra.get("narx")
         if narx:
             return linear.between(grid, run_narx(narx, grid.held(widths_us)) + narx["baseline_nm"])

@@ -6,16 +6,18 @@ import json
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stimrig import identify
 from stimrig.hardware_sim.physics_records import record_of_physics
-from stimrig.identify.diagnosis import free
+from stimrig.identify.diagnosis import free, result
 from stimrig.identify.diagnosis.search import search_effects, silent
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
-from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.dynamics.grid import make_grid
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.effects import BadEffect, known_form, own_file, registry
 from stimrig.identify.effects.base import Form
@@ -26,6 +28,7 @@ from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
 from stimrig.identify.results import Diagnosis, Improvement
+from stimrig.identify.simulation.predict import problem_of
 from stimrig.identify.simulation.problem import Chosen
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
@@ -304,8 +307,37 @@ def test_a_free_effect_whose_torque_would_run_away_is_not_usable():
         first_direction=-0.35, first_rising=-0.74, first_falling=0.0,
         second_direction=0.6, second_rising=0.66, second_falling=-0.15, coupling=0.86,
     )  # fmt: skip
-    assert np.max(np.abs(wild.predict(as_record(record_of_physics("physics", 0))))) > 1e3, "it does run away"
+    record = as_record(record_of_physics("physics", 0))
+    grown_nm = problem_of(wild, make_grid(record))
+    assert np.max(np.abs(grown_nm[0].at_samples(grown_nm[1]))) > 1e6, "it does run away"
     assert not _stable(wild)["passed"]
+    with pytest.raises(BadModel, match="grows without limit"):
+        wild.predict(record)
+    (entry,) = wild.effects
+    settings = entry["settings"] | {"reference_rad": 1.2, "angle_range_rad": [0.5, 2.0]}
+    passive = registry()["passive_torque"].forms[0]
+    values = {p.name: {"value": p.start[0], "sd": 0.1, "unit": p.unit} for p in passive.parameters}
+    beside = {"id": "passive_torque", "form": passive.name, "parameters": values, "settings": settings}
+    assert not _stable(wild.with_(effects=({**entry, "settings": settings}, beside)))["passed"], (
+        "a joint changes nothing"
+    )
+
+
+def test_effects_beside_discrete_dynamics_are_refused_and_not_left_out():
+    record = hidden_muscles.record(seed=3, rate_hz=100)
+    discrete = identify.fit(record, method="narx")
+    assert isinstance(discrete.linear, Discrete)
+    with pytest.raises(BadModel, match="only second-order dynamics"):
+        discrete.with_(effects=speedy().effects).predict(record)
+
+
+def test_no_dose_is_planned_for_a_muscle_that_hardly_answers(monkeypatch: pytest.MonkeyPatch):
+    search: Any = SimpleNamespace(record=SimpleNamespace(angle_rad=None), last=None)
+    verdict: Any = SimpleNamespace(kind="unexplained_structure")
+    for passed in (True, False):
+        quality = {"gates": {"torque": {"passed": passed}}}
+        monkeypatch.setattr(result, "finish", lambda *_, quality=quality: SimpleNamespace(quality=quality))
+        assert result._undecided(search, verdict) == passed
 
 
 @pytest.mark.parametrize(

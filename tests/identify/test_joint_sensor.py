@@ -71,8 +71,10 @@ def test_with_an_earlier_trial_nothing_later_is_looked_at():
     own, other = (predict(clean(), one, earlier) for one in (unseen, replace(unseen, angle_rad=turned)))
     begin = row - row % interval
     assert np.array_equal(own[:begin], other[:begin]) and not np.array_equal(own[begin:], other[begin:])
-    with pytest.raises(BadRequest, match="no joint moves"):
-        predict(clean(), unseen, replace(earlier, angle_rad=np.full_like(earlier.time_s, 1.2)))
+    noise = np.random.default_rng(0).normal(size=earlier.time_s.size)
+    for still in (np.full_like(noise, 1.2), 1.2 + 0.003 * noise, np.where(noise > 2.0, earlier.angle_rad, np.nan)):
+        with pytest.raises(BadRequest, match="no joint moves"):
+            predict(clean(), unseen, replace(earlier, angle_rad=still))
     with pytest.raises(BadRequest, match="several recordings"):
         predict(clean(), unseen, recorded_by(NOISY))
 
