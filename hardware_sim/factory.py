@@ -11,7 +11,7 @@ from stimrig.hardware_sim.arm import description as arms
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.tissue import bare
 from stimrig.hardware_sim.devices import Devices
-from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.errors import ArmError, PatientError
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.settings import Settings
 
@@ -42,6 +42,8 @@ def make_devices(
         Patient, arm or a setting cannot be used.
     """
     seed = _hidden_seed(settings.patient)
+    if seed is not None and seed < 0:
+        raise PatientError(f"patient '{settings.patient}': give a seed of 0 or above")
     muscle = _muscle(settings.patient) if seed is None else hidden.make(seed, moving=arm is not None)
     return Devices(muscle, settings, None if arm is None else _arm(arm, arm_laws, seed), epoch_us)
 
@@ -59,7 +61,7 @@ def _hidden_seed(patient: str) -> int | None:
 
 def _muscle(patient: str) -> Muscle:
     file = Path(patient)
-    read = file.suffix.lower() in {".toml", ".json"} or (len(patient) < LONGEST_NAME and file.exists())
+    read = file.suffix.lower() in {".toml", ".json"} or (len(patient) < LONGEST_NAME and file.is_file())
     if patient not in patients.NAMES and read:
         return patients.from_file(file)
     return patients.make(patient)
