@@ -23,6 +23,8 @@ from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
 LARGEST_RATE_CHANGE = 0.25
+GROWN = 1e6
+"""Of the recruited torque, from which on a torque is none."""
 MOVES_RAD = 0.1
 """What an earlier trial moves through at least, to tell how the joint moves."""
 
@@ -70,7 +72,7 @@ def predict(model: Muscle, record: Record, earlier: Record | None = None) -> np.
     refuse_rate(model, record)
     grid = make_grid(record)
     if earlier is None or record.angle_rad is None or isinstance(model.linear, Discrete):
-        return _sound(predict_on(model, grid))
+        return _sound(model, record, predict_on(model, grid))
     if len(earlier.parts) > 1:
         raise BadRequest("the earlier trial is several recordings", fix="Give one of them.")
     if earlier.angle_rad is None or not _moves(earlier.angle_rad):
@@ -79,7 +81,8 @@ def predict(model: Muscle, record: Record, earlier: Record | None = None) -> np.
     first = [part.first for part in record.parts]
     told = earlier.time_s, earlier.angle_rad
     motion = JointMotion.until_then(record.time_s, record.angle_rad, first, told)
-    return _sound(_moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0).at_samples(theta))
+    moved = _moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0)
+    return _sound(model, record, moved.at_samples(theta))
 
 
 def _moves(angle_rad: np.ndarray) -> bool:
@@ -88,9 +91,11 @@ def _moves(angle_rad: np.ndarray) -> bool:
     return known.size > 0.5 * angle_rad.size and float(np.ptp(np.percentile(known, (5.0, 95.0)))) > MOVES_RAD
 
 
-def _sound(torque_nm: np.ndarray) -> np.ndarray:
+def _sound(model: Muscle, record: Record, torque_nm: np.ndarray) -> np.ndarray:
     """The same torque. Raises BadModel where it is none: rates that switch can make it run away."""
-    if not np.max(np.abs(torque_nm), initial=0.0) <= model_schema.PLAUSIBLE:
+    widths_us = np.unique(record.pulse_width_us)
+    usual_nm = max(float(np.max(np.abs(model.recruitment(widths_us)))), abs(model.baseline_nm), 1.0)
+    if not np.max(np.abs(torque_nm), initial=0.0) <= GROWN * usual_nm:
         raise BadModel("the torque that it predicts grows without limit", fix="Do not use this model; fit another one.")
     return torque_nm
 
