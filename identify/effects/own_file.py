@@ -105,6 +105,12 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
     if not isinstance(forms, tuple) or not forms or not all(isinstance(form, Form) for form in forms):
         fix = "Give forms=(Form(...),), with a comma before the closing bracket."
         raise BadEffect("forms is no tuple of Form", place=place, fix=fix)
+    if not isinstance(effect.needs, tuple) or not set(effect.needs) <= COLUMNS or not _is_number(effect.prior):
+        message, fix = (
+            f"needs {effect.needs!r}, prior {effect.prior!r}",
+            f"Give columns of {sorted(COLUMNS)}, a number.",
+        )
+        raise BadEffect(message, place=place, fix=fix)
     names = [form.name for form in forms]
     if twice := [name for name in names if names.count(name) > 1]:
         raise BadEffect(f"two forms are called {twice[0]!r}", place=place, fix="Name each form once.")
@@ -175,6 +181,8 @@ def _check_form(form: Form, place: str, path: Path | None) -> None:
         fix = "Give parameters=(Parameter(...),), with a comma before the closing bracket."
         raise BadEffect("parameters is no tuple of Parameter", place=where, fix=fix)
     names = [parameter.name for parameter in form.parameters]
+    if wrong := [name for name in (form.name, *names) if not isinstance(name, str)]:
+        raise BadEffect(f"a name that is {wrong[0]!r}", place=where, fix="Give a text.")
     if twice := [name for name in names if names.count(name) > 1]:
         raise BadEffect(f"two parameters are called {twice[0]!r}", place=where, fix="Name each parameter once.")
     for parameter in form.parameters:
@@ -221,6 +229,11 @@ def _check_free(form: Form, where: str) -> None:
         if own in ranges:
             raise BadEffect(f"{own!r} is set twice", place=where, fix="Give each FreeLaw once, in law or in held.")
         ranges[own] = parameter.lower, parameter.upper
+    idle = [own for own in OF_STATE if own in ranges and FreeLaw.FILL_S not in ranges]
+    if idle:
+        raise BadEffect(
+            f"{idle[0]!r} without FILL_S", place=where, fix="It does nothing: give FILL_S and EMPTY_S, too."
+        )
     if (FreeLaw.FILL_S in ranges) != (FreeLaw.EMPTY_S in ranges):
         raise BadEffect("FILL_S without EMPTY_S, or EMPTY_S without FILL_S", place=where, fix="Give both or none.")
     for own, least in POSITIVE.items():
@@ -230,6 +243,10 @@ def _check_free(form: Form, where: str) -> None:
 
 POSITIVE = {FreeLaw.FILL_S: 0.0, FreeLaw.EMPTY_S: 0.0, FreeLaw.GATE_S: 0.0, FreeLaw.BEND: -1.0}
 """Where the kernel divides by it, or by one more than it."""
+OF_STATE = FreeLaw.GAIN, FreeLaw.RATE, FreeLaw.ZERO, FreeLaw.BY_PULSES, FreeLaw.BY_DRIVE
+COLUMNS = frozenset({"angle_rad", "velocity_rad_s"})
+"""That an effect may need beside pulses and torque."""
+MOST_STARTS = 32
 
 
 def _is_number(value: object) -> bool:
@@ -242,11 +259,13 @@ def _check_parameter(parameter: Parameter, where: str) -> None:
         message = f"scale {parameter.scale!r}, relative {parameter.relative!r}"
         fix = f"scale is one of {', '.join(SCALES)}; relative one of {', '.join(RELATIVE[1:])}, or left out."
         raise BadEffect(message, place=place, fix=fix)
-    try:
-        numbers = np.array([parameter.lower, parameter.upper, *parameter.start], float)
-    except (TypeError, ValueError) as error:
+    starts = parameter.start if isinstance(parameter.start, tuple) else ()
+    given = [parameter.lower, parameter.upper, *starts]
+    if not all(isinstance(one, (int, float)) for one in (*given, parameter.neutral)) or len(starts) > MOST_STARTS:
         message = "a bound or a start that is no number"
-        raise BadEffect(message, place=place, fix="Give lower, upper, neutral, and a tuple of starts.") from error
+        fix = f"Give lower, upper, neutral, and a tuple of at most {MOST_STARTS} starts."
+        raise BadEffect(message, place=place, fix=fix)
+    numbers = np.array(given, float)
     if not np.isfinite(numbers).all() or not parameter.lower < parameter.upper or numbers.size < 3:
         message = f"bounds {parameter.lower} to {parameter.upper}, starts {parameter.start}"
         raise BadEffect(message, place=place, fix="Give finite bounds, the lower one first, and at least one start.")
