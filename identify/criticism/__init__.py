@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.criticism.correlation import correlation_tests
+from stimrig.identify.criticism.correlation import LAGS, correlation_tests
 from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.estimation.fit_statistics import UNDEFINED, figures, rms
@@ -31,8 +31,8 @@ POINTS = 4000
 TOLD_S = 5e-3
 """Pulses at least this late are reported: a fifth of an interval, more than the jitter of a healthy computer."""
 SHORTEST_S = 3.0
-LEAST = 8
-"""Fewer known intervals are not enough for any result."""
+LEAST = LAGS + 1
+"""Fewer known intervals are not enough for any result: the residual is correlated over so many."""
 
 
 def compare(model: Model, record: Record) -> Comparison:
@@ -54,13 +54,14 @@ def compare(model: Model, record: Record) -> Comparison:
     Raises
     ------
     BadRecord
-        Fewer than eight pulse intervals are known.
+        Fewer than `LEAST` pulse intervals are known.
     """
     if np.sum(~record.held_out) < SHORTEST_S * record.sample_rate_hz:  # too little beside them that tells the noise
         record = replace(record, segment_names=("all rows",) * len(record.segment_names))
     grid = make_grid(record)
     if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
-        raise BadRecord("nearly all samples are doubted", place="doubted", fix="Give a record with known pulses.")
+        fix = "Give a longer record, with known pulses."
+        raise BadRecord(f"fewer than {LEAST} pulse intervals are known", place="doubted", fix=fix)
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
     residual = record.torque_nm - predicted
