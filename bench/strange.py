@@ -239,6 +239,28 @@ def compared(job: tuple[str, int, Collection[str], Collection[str]]) -> dict[str
     return row
 
 
+def tell_second(rows: list[dict[str, Any]], improved: np.ndarray, second: list[float]) -> Iterable[str]:
+    """What the chosen record teaches of levels, and of PRBS and ramp; and the same test in its place."""
+    close = f"within {CLOSE} × {np.sum(np.array(second) <= CLOSE)} of {len(rows)}"
+    worse = np.sum(np.array(second) > WORSE * improved)
+    yield f"with the record that the program chose: {np.median(second):.2f}, {close}, worse by over 2 %: {worse}"
+    same_test = [row.get("again", row["improved"]) for row in rows]
+    yield f"with the same test again in its place: {np.median(same_test):.2f}"
+    first, both, same = np.array([row["alike"] for row in rows]).T
+    medians, worse = [f"{np.median(one):.2f}" for one in (first, both, same)], np.sum(both > WORSE * first)
+    yield f"on one more PRBS and ramp: {medians[0]}, then {medians[1]}, worse by over 2 %: {worse}; or {medians[2]}"
+
+
+def tell_promise(rows: list[dict[str, Any]]) -> Iterable[str]:
+    """How far the error fell on left-out parts, beside the unseen record."""
+    came = 0.5 * np.log([(row["plain"] ** 2 + SEEN) / (row["improved"] ** 2 + SEEN) for row in rows])
+    gain, sd = np.array([row["foretold"] for row in rows]).T
+    fell, fallen = (100.0 * (1.0 - np.exp(-np.median(one))) for one in (gain, came))
+    short = np.sum(came < gain - 2.0 * sd)
+    yield f"error on left-out parts falls by {fell:.0f} %, on the unseen record by {fallen:.0f} % (medians);"
+    yield f"… by less, and by over two standard errors, in {short} of {came.size}"
+
+
 def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     """The summary."""
     plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
@@ -248,21 +270,9 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
     if second:
-        close = f"within {CLOSE} × {np.sum(np.array(second) <= CLOSE)} of {len(rows)}"
-        worse = np.sum(np.array(second) > WORSE * improved)
-        yield f"with the record that the program chose: {np.median(second):.2f}, {close}, worse by over 2 %: {worse}"
-        first, both, same = np.array([row["alike"] for row in rows]).T
-        again = [row.get("again", row["improved"]) for row in rows]
-        yield f"with the same test again in its place: {np.median(again):.2f}"
-        medians, worse = [f"{np.median(one):.2f}" for one in (first, both, same)], np.sum(both > WORSE * first)
-        yield f"on one more PRBS and ramp: {medians[0]}, then {medians[1]}, worse by over 2 %: {worse}; or {medians[2]}"
+        yield from tell_second(rows, improved, second)
     if told:
-        came = 0.5 * np.log([(row["plain"] ** 2 + SEEN) / (row["improved"] ** 2 + SEEN) for row in told])
-        gain, sd = np.array([row["foretold"] for row in told]).T
-        fell, fallen = (100.0 * (1.0 - np.exp(-np.median(one))) for one in (gain, came))
-        short = np.sum(came < gain - 2.0 * sd)
-        yield f"error on left-out parts falls by {fell:.0f} %, on the unseen record by {fallen:.0f} % (medians);"
-        yield f"… by less, and by over two standard errors, in {short} of {came.size}"
+        yield from tell_promise(told)
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
     beyond = np.sum(improved > plain + [max(row["stated"], 0.02 * row["plain"]) for row in rows])
     yield f"… and by more than the standard error that it states of itself: {beyond} of {len(rows)}"

@@ -174,10 +174,10 @@ def _reaching(asked: Asked) -> ArmDesign:
     while begin_s < time_s[-1]:
         to = Motion(float(rng.uniform(low, high)))
         lasts_s = lasting_s(at.angle_rad, to.angle_rad, math.radians(rng.uniform(20.0, 90.0)))
-        way = Quintic(begin_s, lasts_s, at, to)
-        for row in np.flatnonzero(time_s >= begin_s):
+        way, end_s = Quintic(begin_s, lasts_s, at, to), begin_s + lasts_s + float(rng.uniform(0.0, 1.0))
+        for row in np.flatnonzero((time_s >= begin_s) & (time_s < end_s)):
             angle[row] = way.at(float(time_s[row])).angle_rad
-        begin_s, at = begin_s + lasts_s + float(rng.uniform(0.0, 1.0)), to
+        begin_s, at = end_s, to
     return ArmDesign(parts, angle)
 
 
@@ -240,7 +240,7 @@ def record(
     seed
         Decides, together with patient and kind, every random number.
     mover
-        `hand` or `robot`; drawn if None. `unseen` moves by waves of 0.05 to 0.6 Hz.
+        `hand` or `robot`; drawn if None. `unseen` moves by waves of 0.05 to 0.6 Hz, `reaching` by itself.
     duration_s
         Length of `passive`, `moving`, `unseen` or `reaching`; 66, 60, 30 and 30 if None. Others have their protocol's.
     parts

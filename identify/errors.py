@@ -33,6 +33,10 @@ class BadModel(IdentifyError):
     """A MODEL.json cannot be read, or cannot be used for the request."""
 
 
+class RunsAway(BadModel):
+    """The torque that a model predicts grows without limit."""
+
+
 class BadRequest(IdentifyError):
     """An unknown method, effect, segment or option."""
 

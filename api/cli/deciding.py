@@ -20,20 +20,21 @@ from stimrig.identify.records.record import Source
 def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
     """The next experiment of recordings as a test, with the participant whose recordings they are.
 
-    Beside it `recorded_ma`, with what current they were made: empty where no file says it.
+    Beside it `recorded_ma`, with what current they were made, mA; None where no file says it.
 
     Raises
     ------
     InputError
-        Nothing is left to decide; it is not known whose they are, or they are another's; or no further recording could
-        be joined to them. All of it is said before anything is played.
+        Nothing is left to decide; it is not known whose they are, or they are another's; they were made with several
+        currents; or no further recording could be joined to them. All of it is said before anything is played.
     """
     record = load_record(data)
     sources = record.source.parts or (record.source,)
     owner = _owner(sources, data, participant)
     currents_ma = sorted({source.current_ma for source in sources} - {None})
     if len(currents_ma) > 1:
-        raise InputError(f"these recordings were made with {' and '.join(f'{one:g} mA' for one in currents_ma)}.")
+        made_with = " and ".join(f"{one:g} mA" for one in currents_ma)
+        raise InputError(f"these recordings were made with {made_with}. Give those of one current.")
     if samples_between(record.sample_rate_hz, record.pulse_rate_hz) < LEAST_SAMPLES:
         least = f"{LEAST_SAMPLES * record.pulse_rate_hz:g} Hz"
         raise InputError(
@@ -49,7 +50,7 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
         "kind": "next-experiment",
         "segments": segments,
         "pulse_rate_hz": record.pulse_rate_hz,
-        "recorded_ma": currents_ma,
+        "recorded_ma": next(iter(currents_ma), None),
     }
 
 
@@ -58,10 +59,10 @@ def _owner(sources: Sequence[Source], data: Sequence[Path], participant: str | N
     owners = {source.participant for source in sources} - {""}
     if len(owners) > 1:
         raise InputError(f"these recordings are of several people: {', '.join(sorted(owners))}.")
-    if participant is None:
-        for source, file in zip(sources, data, strict=False):
-            if not source.participant:
-                raise InputError(f"{file} does not say whose it is. Give --participant.")
+    if participant is None and not all(source.participant for source in sources):
+        silent = [file for file, source in zip(data, sources, strict=False) if not source.participant]
+        which = silent[0] if len(sources) == len(data) else data[0]  # a joined file has several
+        raise InputError(f"{which} does not say whose it is. Give --participant.")
     owner = next(iter(owners), participant)
     assert owner is not None
     if participant not in (None, owner):
@@ -69,8 +70,8 @@ def _owner(sources: Sequence[Source], data: Sequence[Path], participant: str | N
     return owner
 
 
-def check_participant(client: Client, code: str, recorded_ma: Sequence[float]) -> None:
-    """See, before anything is played, that the participant is known here, with the limits and the current recorded at.
+def check_participant(client: Client, code: str, recorded_ma: float | None) -> None:
+    """See, before anything is played, that the participant is known here and stimulated with the recordings' current.
 
     Raises
     ------
@@ -82,11 +83,9 @@ def check_participant(client: Client, code: str, recorded_ma: Sequence[float]) -
     except NotFound as error:
         told = "their limits are not known here. Give the --data folder or --url of the recording, or set them first."
         raise InputError(f"there is no participant {code}: {told}") from error
-    if any(one != now_ma for one in recorded_ma):
-        before = f"{recorded_ma[0]:g} mA"
-        raise InputError(
-            f"the recording was made with {before}, {code} is now stimulated with {now_ma:g} mA: they cannot be joined."
-        )
+    if recorded_ma not in (None, now_ma):
+        now = f"{code} is now stimulated with {now_ma:g} mA"
+        raise InputError(f"the recording was made with {recorded_ma:g} mA, {now}: they cannot be joined.")
 
 
 def diagnosed(data: Sequence[Path], recording: bytes) -> dict[str, Any]:

@@ -31,6 +31,7 @@ POINTS = 4000
 TOLD_S = 5e-3
 """Pulses at least this late are reported: a fifth of an interval, more than the jitter of a healthy computer."""
 SHORTEST_S = 3.0
+"""Less than so much beside `validate` tells no noise: the record is then compared as a whole."""
 LEAST = LAGS + 1
 """Fewer known intervals are not enough for any result: the residual is correlated over so many."""
 
@@ -49,19 +50,20 @@ def compare(model: Model, record: Record) -> Comparison:
     -------
     Comparison
         Fit statistics of all rows, of fitted and of held-out rows; the error by segment, level, direction, time and
-        frequency; tests of the residual; the places of the largest error. Doubted samples count nowhere.
+        frequency; tests of the residual; the places of the largest error. Doubted samples count nowhere. A record that
+        is nearly all `validate` is compared as a whole: `held_out` is None, and `fitted` holds all rows.
 
     Raises
     ------
     BadRecord
         Fewer than `LEAST` pulse intervals are known.
     """
-    if np.sum(~record.held_out) < SHORTEST_S * record.sample_rate_hz:  # too little beside them that tells the noise
+    if np.sum(~record.held_out) < SHORTEST_S * record.sample_rate_hz:  # too few other rows to tell the noise from
         record = replace(record, segment_names=("all rows",) * len(record.segment_names))
     grid = make_grid(record)
     if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
         fix = "Give a longer record, with known pulses."
-        raise BadRecord(f"fewer than {LEAST} pulse intervals are known", place="doubted", fix=fix)
+        raise BadRecord(f"fewer than {LEAST} pulse intervals are known", place="time_s", fix=fix)
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
     residual = record.torque_nm - predicted

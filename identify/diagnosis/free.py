@@ -60,6 +60,11 @@ class Chain:
             added=(*self.added, effect),
         )
 
+    @property
+    def links(self) -> list[tuple[Fitted, Fitted]]:
+        """Each model with a free effect after the one before it."""
+        return list(pairwise(self.models[-len(self.added) - 1 :]))
+
     def better(self, than: LeftOut) -> Difference:
         """How much better its last model predicts left-out blocks."""
         return difference(than, self.left_out[-1])
@@ -163,7 +168,7 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
         best = _likeliest(longer)
         if found and not _asked_for(found[-1].left_out[-1], best, thresholds.FURTHER_FREE):
             break
-        if any(vetoed(*two) for two in pairwise(best.models[-len(best.added) - 1 :])):
+        if any(vetoed(*link) for link in best.links):  # of the second best, extended, the first was not yet asked about
             break
         found.append(best)
         unlike: dict[str, Chain] = {}  # of each effect its best form

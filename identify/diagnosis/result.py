@@ -121,7 +121,7 @@ def _plan(experiment: Experiment) -> dict[str, Any]:
 
 def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
     """Whether a further test is planned for what is left; not of a joint that moves, which has tests of its own, and
-    not where the muscle hardly answers: what its dose would be is not known."""
+    not where the curve is a guess or the muscle hardly answers: the dose would be one, too."""
     if verdict.kind != "unexplained_structure":
         return False
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)

@@ -15,7 +15,7 @@ from stimrig.identify.simulation.problem import Problem
 
 
 def warm() -> None:
-    """Compile (or load from the cache), by fitting four seconds of artificial data with an angle; rare parts later."""
+    """Compile (or load from the cache), by fitting four seconds of artificial data with an angle; rare parts wait."""
     time_s = np.arange(400) / 100.0
     width = np.where((np.floor(time_s * 4) % 2) == 1, 200.0, 0.0)
     torque = np.convolve(width / 100.0, np.exp(-np.arange(40) / 10.0) / 10.0)[:400]

@@ -18,6 +18,8 @@ PARTS = 3
 """Steps within a pulse interval in which the rates are evaluated."""
 EDGE = 0.02
 """Share of the largest torque over which rising turns into falling."""
+LEAST_PRESENT = 0.05
+"""A pulse that is there for a smaller share of an interval tells no width."""
 LOW = 0.25
 """Share of the largest torque that is added to a level before its logarithm is taken."""
 STEEPEST = 3.0
@@ -75,9 +77,9 @@ def filled(state, up, down, step_s):  # pragma: no cover
 def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  # pragma: no cover
     """Boundary states of rows of drives, torque, N·m, and its rate, each of shape (M, K + 1).
 
-    `drive`, (M, K), is held in each interval, `on`, (K,), is 1 where there is a pulse, `rest_s`, (K,), additional rest
-    before an interval; `core`, (M, 2), holds T, s, and ζ, `law`, (M, len(FreeLaw)), what is free. `begins`, `initial`,
-    `scale_nm` and `step_s` are as in `run_core`.
+    `drive`, (M, K), is the mean of each interval, `on`, (K,), the share of it in which a pulse acts, `rest_s`, (K,),
+    additional rest before an interval; `core`, (M, 2), holds T, s, and ζ, `law`, (M, len(FreeLaw)), what is free.
+    `begins`, `initial`, `scale_nm` and `step_s` are as in `run_core`.
 
     Rows that differ from row 0 in their drive alone use its transitions, as in `run_core`.
     """
@@ -98,7 +100,7 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
         decay = np.exp(-h / p[FreeLaw.GATE_S]) if gated else 0.0
         first = p[FreeLaw.FIRST_DIRECTION], p[FreeLaw.FIRST_RISING], p[FreeLaw.FIRST_FALLING]
         second = p[FreeLaw.SECOND_DIRECTION], p[FreeLaw.SECOND_RISING], p[FreeLaw.SECOND_FALLING]
-        bent = np.any(p[: FreeLaw.COUPLING] != 0.0)
+        bent = np.any(p[: FreeLaw.COUPLING] != 0.0)  # all laws of level and direction stand before it
         part, y, a, s, c1, c2, last = 0, 0.0, 0.0, 0.0, 0.0, 0.0, -1
         one_s, two_s, edge = 0.0, 0.0, EDGE * scale_nm
         b11, b12, b21, b22, b1, b2 = 1.0, 0.0, 0.0, 1.0, 0.0, 0.0
@@ -108,9 +110,11 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
                 a = y + initial[m, part, 1] * second_s
                 torque[m, k], rate[m, k] = y, initial[m, part, 1]
                 part += 1
-            if on[k] > 0.0 or not gated:
+            if on[k] > LEAST_PRESENT or not gated:
                 last = k
             w = drive[m, last] if last >= 0 else 0.0
+            if gated and last >= 0:
+                w /= on[last]
             if alike:
                 y, a = (
                     kept[k, 0] * y + kept[k, 1] * a + kept[k, 4] * w,
@@ -138,13 +142,13 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
                     gate = (1.0 + p[FreeLaw.BEND]) * c2 / (1.0 + p[FreeLaw.BEND] * c2)
                     share, log_rate = share * gate, log_rate + p[FreeLaw.GATE_RATE] * gate
                 x = share * w
-                own, other = log_rate, log_rate
+                log_one, log_two = log_rate, log_rate
                 if bent:
-                    own += _log_rate(*first, (x - a) / edge, a / scale_nm)
-                    other += _log_rate(*second, (a - y) / edge, y / scale_nm)
-                own, other = lag_s(first_s, own), lag_s(second_s, other)
-                if own != one_s or other != two_s:
-                    one_s, two_s = own, other
+                    log_one += _log_rate(*first, (x - a) / edge, a / scale_nm)
+                    log_two += _log_rate(*second, (a - y) / edge, y / scale_nm)
+                new_one_s, new_two_s = lag_s(first_s, log_one), lag_s(second_s, log_two)
+                if new_one_s != one_s or new_two_s != two_s:  # else the step is the one before
+                    one_s, two_s = new_one_s, new_two_s
                     t = np.sqrt(one_s * two_s)
                     q11, q12, q21, q22 = step_matrix(t, max(0.5 * (one_s + (1.0 - coupling) * two_s) / t, 0.05), h)
                     # from (y - x, (a - y)/two) to (y, a), both as linear functions of (y, a, x)

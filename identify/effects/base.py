@@ -19,6 +19,8 @@ IDLE_SHARE = 0.1
 STAGES = ("pulse_width", "gain", "speed", "lags", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
+JOINT_COLUMNS = frozenset({"angle_rad", "velocity_rad_s"})
+"""What an effect may need beside pulses and torque."""
 LEAST_RANGE_RAD = 0.1
 """A smaller range of angles counts as this one: of a joint that is held, noise is no shape."""
 
@@ -424,7 +426,7 @@ class Effect:
     @property
     def moves_with_joint(self) -> bool:
         """Whether it depends on the angle or the velocity of the joint."""
-        return not {"angle_rad", "velocity_rad_s"}.isdisjoint(self.needs)
+        return not JOINT_COLUMNS.isdisjoint(self.needs)
 
     @property
     def part(self) -> str:

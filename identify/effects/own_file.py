@@ -15,7 +15,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
-from stimrig.identify.effects.base import STAGES, Effect, Form, Parameter, Scene
+from stimrig.identify.effects.base import JOINT_COLUMNS, STAGES, Effect, Form, Parameter, Scene
 from stimrig.identify.errors import BadRequest, IdentifyError
 
 FIX = "See docs/add-an-effect.md."
@@ -105,12 +105,11 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
     if not isinstance(forms, tuple) or not forms or not all(isinstance(form, Form) for form in forms):
         fix = "Give forms=(Form(...),), with a comma before the closing bracket."
         raise BadEffect("forms is no tuple of Form", place=place, fix=fix)
-    if not isinstance(effect.needs, tuple) or not set(effect.needs) <= COLUMNS or not _is_number(effect.prior):
-        message, fix = (
-            f"needs {effect.needs!r}, prior {effect.prior!r}",
-            f"Give columns of {sorted(COLUMNS)}, a number.",
-        )
-        raise BadEffect(message, place=place, fix=fix)
+    if not isinstance(effect.needs, tuple) or not JOINT_COLUMNS.issuperset(effect.needs):
+        fix = f"Give a tuple of {' and '.join(sorted(JOINT_COLUMNS))}, or leave it out."
+        raise BadEffect(f"needs {effect.needs!r}", place=place, fix=fix)
+    if not _is_number(effect.prior):
+        raise BadEffect(f"prior {effect.prior!r}", place=place, fix="Give a finite number.")
     names = [form.name for form in forms]
     if twice := [name for name in names if names.count(name) > 1]:
         raise BadEffect(f"two forms are called {twice[0]!r}", place=place, fix="Name each form once.")
@@ -244,9 +243,9 @@ def _check_free(form: Form, where: str) -> None:
 POSITIVE = {FreeLaw.FILL_S: 0.0, FreeLaw.EMPTY_S: 0.0, FreeLaw.GATE_S: 0.0, FreeLaw.BEND: -1.0}
 """Where the kernel divides by it, or by one more than it."""
 OF_STATE = FreeLaw.GAIN, FreeLaw.RATE, FreeLaw.ZERO, FreeLaw.BY_PULSES, FreeLaw.BY_DRIVE
-COLUMNS = frozenset({"angle_rad", "velocity_rad_s"})
-"""That an effect may need beside pulses and torque."""
+"""What the slow state does, and what fills it."""
 MOST_STARTS = 32
+"""Each is a fit."""
 
 
 def _is_number(value: object) -> bool:
@@ -261,10 +260,11 @@ def _check_parameter(parameter: Parameter, where: str) -> None:
         raise BadEffect(message, place=place, fix=fix)
     starts = parameter.start if isinstance(parameter.start, tuple) else ()
     given = [parameter.lower, parameter.upper, *starts]
-    if not all(isinstance(one, (int, float)) for one in (*given, parameter.neutral)) or len(starts) > MOST_STARTS:
+    if not all(isinstance(one, (int, float)) for one in (*given, parameter.neutral)):
         message = "a bound or a start that is no number"
-        fix = f"Give lower, upper, neutral, and a tuple of at most {MOST_STARTS} starts."
-        raise BadEffect(message, place=place, fix=fix)
+        raise BadEffect(message, place=place, fix="Give lower, upper, neutral, and a tuple of starts.")
+    if len(starts) > MOST_STARTS:
+        raise BadEffect(f"{len(starts)} starts", place=place, fix=f"Give {MOST_STARTS} at most: each is a fit.")
     numbers = np.array(given, float)
     if not np.isfinite(numbers).all() or not parameter.lower < parameter.upper or numbers.size < 3:
         message = f"bounds {parameter.lower} to {parameter.upper}, starts {parameter.start}"

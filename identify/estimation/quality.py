@@ -10,7 +10,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
 from stimrig.identify.effects import depend_on_joint
-from stimrig.identify.errors import BadModel
+from stimrig.identify.errors import RunsAway
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.joint_surface import Acting, Surfaces
@@ -34,7 +34,7 @@ SEEN = (0.01, 0.99)
 """Shares of the samples: between these angles the joint moved."""
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which the kind of an error does not matter."""
-PROBES, PULSES_PER_S, TAME = 60, 40.0, 4.0
+PROBES, TAME = 60, 4.0
 """A free effect is tried on so many held widths; its torque must stay below so many times the curve's range."""
 
 
@@ -166,8 +166,8 @@ def _tame(model: Model) -> bool:
     curve_nm = float(np.ptp(model.recruitment(np.linspace(0.0, model.recruitment.basis.largest_us, 101))))
     motion = None if joint is None else Motion.held(joint.reference_rad, held.size)
     try:
-        return bool(np.max(np.abs(above_rest(model, held, PULSES_PER_S, motion))) < TAME * curve_nm)
-    except BadModel:  # it runs away
+        return bool(np.max(np.abs(above_rest(model, held, model.pulse_rate_hz, motion))) < TAME * curve_nm)
+    except RunsAway:
         return False
 
 

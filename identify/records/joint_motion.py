@@ -42,8 +42,9 @@ PACES = ((0.3, 3.0, 30.0), (0.3,))
 """Starts of the pace, 1/s² and 1/s: what a movement that comes and goes tells of its next moments."""
 PIECE, LONG_GAP_S = 0.2, 1.0
 """The series of a step is taken in pieces of so little of a pace; over a longer gap nothing is foretold."""
-LOGS, SETTLED = (-9.0, (12.0, 9.0, 6.0)), {"maxiter": 120, "xatol": 0.03, "fatol": 0.3}
-"""Of jerk, spring and drag: no joint swings at over 14 Hz."""
+LOGS = (-9.0, -9.0, -9.0), (12.0, 9.0, 6.0)
+"""Logarithms of the jerk's intensity, rad²/s⁵, and of the pace: no joint swings at over 14 Hz."""
+SETTLED = {"maxiter": 120, "xatol": 0.03, "fatol": 0.3}
 UNIFORM = 1.0 / np.sqrt(12.0)
 """Standard deviation of what lies evenly within a step."""
 LARGEST_STEP_RAD = 0.035
@@ -177,8 +178,8 @@ class JointMotion:
         step_rad = step_of([read_rad])
         noise_rad, jerk = sensor_of(at_s, read_rad, step_rad)
         jerk, pace = pace_of(at_s, read_rad, noise_rad, jerk)
-        one = np.ones(len(first))
-        begun = cls(angle_rad, angle_rad, angle_rad, noise_rad * one, jerk * one, step_rad)
+        noises_rad, jerks = np.full((2, len(first)), [[noise_rad], [jerk]])
+        begun = cls(angle_rad, angle_rad, angle_rad, noises_rad, jerks, step_rad)
         return begun._smoothed(time_s, angle_rad, first, pace)
 
     def read_again(self, time_s: np.ndarray, first: Sequence[int], seed: int = 0) -> JointMotion:

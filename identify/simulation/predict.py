@@ -14,7 +14,7 @@ from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, run_narx
 from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.effects.base import Form, replaced_by
-from stimrig.identify.errors import BadModel, BadRequest
+from stimrig.identify.errors import BadModel, BadRequest, RunsAway
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
@@ -23,10 +23,10 @@ from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
 LARGEST_RATE_CHANGE = 0.25
-GROWN = 1e6
-"""Of the recruited torque, from which on a torque is none."""
+GROWN, LEAST_USUAL_NM = 1e6, 1.0
+"""A prediction beyond so many times the usual torque, recruited or at rest, is no torque."""
 MOVES_RAD = 0.1
-"""What an earlier trial moves through at least, to tell how the joint moves."""
+"""What most readings of an earlier trial lie apart at least: less tells the sensor's noise, not how the joint moves."""
 
 
 class Muscle(Protocol):
@@ -57,13 +57,14 @@ class Muscle(Protocol):
     def extra(self) -> dict[str, Any]: ...
 
 
-def predict(model: Muscle, record: Record, earlier: Record | None = None) -> np.ndarray:
+def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) -> np.ndarray:
     """Torque that the model predicts for the record's pulse widths, N·m, shape (N,).
 
     No measured torque is used: a controller would predict the same. The angle is smoothed both ways, as a whole record
-    is there; with an `earlier` trial of the same movement from what was read until the end of the pulse interval alone,
+    is there; with an `earlier_trial` of the same movement from what was read until the end of the pulse interval alone,
     as a controller has it while the joint moves: the earlier trial tells how noisy the sensor is and how the joint
-    moves in general. What cannot be foreseen (`unforeseen`) is included only on the rows that it was fitted on.
+    moves in general; nothing else asks for one. What cannot be foreseen (`unforeseen`) is included only on the rows
+    that it was fitted on.
 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, the record lacks a column
     it needs, or the torque grows without limit. Raises BadRequest: in the earlier trial no joint moves, or it is
@@ -71,32 +72,32 @@ def predict(model: Muscle, record: Record, earlier: Record | None = None) -> np.
     """
     refuse_rate(model, record)
     grid = make_grid(record)
-    if earlier is None or record.angle_rad is None or isinstance(model.linear, Discrete):
-        return _sound(model, record, predict_on(model, grid))
-    if len(earlier.parts) > 1:
+    if earlier_trial is None or record.angle_rad is None or isinstance(model.linear, Discrete):
+        return _refuse_runaway(model, record, predict_on(model, grid))
+    if len(earlier_trial.parts) > 1:
         raise BadRequest("the earlier trial is several recordings", fix="Give one of them.")
-    if earlier.angle_rad is None or not _moves(earlier.angle_rad):
+    if earlier_trial.angle_rad is None or not _tells_movement(earlier_trial.angle_rad):
         raise BadRequest("in the earlier trial no joint moves", fix="Give a trial of the same movement and sensor.")
     problem, theta = problem_of(model, grid)
     first = [part.first for part in record.parts]
-    told = earlier.time_s, earlier.angle_rad
+    told = earlier_trial.time_s, earlier_trial.angle_rad
     motion = JointMotion.until_then(record.time_s, record.angle_rad, first, told)
     moved = _moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0)
-    return _sound(model, record, moved.at_samples(theta))
+    return _refuse_runaway(model, record, moved.at_samples(theta))
 
 
-def _moves(angle_rad: np.ndarray) -> bool:
+def _tells_movement(angle_rad: np.ndarray) -> bool:
     """Whether most readings are there, and nine tenths of them lie far enough apart to tell a movement."""
     known = angle_rad[np.isfinite(angle_rad)]
     return known.size > 0.5 * angle_rad.size and float(np.ptp(np.percentile(known, (5.0, 95.0)))) > MOVES_RAD
 
 
-def _sound(model: Muscle, record: Record, torque_nm: np.ndarray) -> np.ndarray:
-    """The same torque. Raises BadModel where it is none: rates that switch can make it run away."""
+def _refuse_runaway(model: Muscle, record: Record, torque_nm: np.ndarray) -> np.ndarray:
+    """The same torque. Raises RunsAway where it is none: rates that switch can make it grow without limit."""
     widths_us = np.unique(record.pulse_width_us)
-    usual_nm = max(float(np.max(np.abs(model.recruitment(widths_us)))), abs(model.baseline_nm), 1.0)
+    usual_nm = max(float(np.max(np.abs(model.recruitment(widths_us)))), abs(model.baseline_nm), LEAST_USUAL_NM)
     if not np.max(np.abs(torque_nm), initial=0.0) <= GROWN * usual_nm:
-        raise BadModel("the torque that it predicts grows without limit", fix="Do not use this model; fit another one.")
+        raise RunsAway("the torque that it predicts grows without limit", fix="Do not use this model; fit another one.")
     return torque_nm
 
 

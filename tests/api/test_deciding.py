@@ -115,7 +115,7 @@ def test_the_verb_asks_for_it_and_diagnoses_all_together(
     assert output.read_bytes() == b"second", "written before the long work that may fail"
     assert sent == {
         "participant": OWNER, "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0,
-        "recorded_ma": [16.0],
+        "recorded_ma": 16.0,
     }  # fmt: skip
     assert recordings == [[first]] and told[0]["diagnosis"] == FOUND and "recording" not in told[0]
 
@@ -153,13 +153,13 @@ def test_nobody_is_stimulated_for_a_recording_that_is_anothers_or_cannot_be_join
 @pytest.mark.parametrize(
     ("recorded_ma", "known", "said"),
     [
-        ([16.0], True, None), ([], True, None),
-        ([20.0], True, "made with 20 mA, P1 is now stimulated with 16 mA"),
-        ([16.0], False, "no participant P1: their limits are not known here"),
+        (16.0, True, None), (None, True, None),
+        (20.0, True, "made with 20 mA, P1 is now stimulated with 16 mA"),
+        (16.0, False, "no participant P1: their limits are not known here"),
     ],
 )  # fmt: skip
-def test_nobody_is_stimulated_with_other_limits_or_current_than_recorded(
-    recorded_ma: list[float], known: bool, said: str | None, monkeypatch: pytest.MonkeyPatch
+def test_nobody_is_made_anew_or_stimulated_with_another_current_for_a_recording(
+    recorded_ma: float | None, known: bool, said: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def participant(_code: str) -> dict[str, Any]:
         if not known:

@@ -27,6 +27,7 @@ from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
 from stimrig.identify.results import Diagnosis, Improvement
 from stimrig.identify.simulation.predict import problem_of
 from stimrig.identify.simulation.problem import Chosen
@@ -187,6 +188,22 @@ def test_a_model_with_a_free_effect_is_read_back_predicts_the_same_and_is_invert
     assert inverted.fit_percent is not None and inverted.fit_percent > 90.0
 
 
+@pytest.mark.slow
+def test_a_late_pulse_opens_a_gate_late_and_not_less():
+    """A longer silence costs at least as much torque as a shorter one, however it came about."""
+    model, each, slots = found()[1].models[-1], 40, 160
+    times_s = np.arange(slots * each) / (40.0 * each)
+    lowest_nm = []
+    for late_ms, dropped in ((0.0, 0), (17.0, 0), (0.0, 1), (24.0, 1), (0.0, 2)):  # gaps of 25, 42, 50, 49 and 75 ms
+        width_us = np.where(np.arange(slots) >= 20, 240.0, 0.0)
+        width_us[101 : 101 + dropped] = 0.0
+        late_s = np.where(np.arange(slots) == 100, late_ms / 1e3, 0.0)
+        record = Record.from_arrays(times_s, np.repeat(width_us, each), 0.0 * times_s, late_s=np.repeat(late_s, each))
+        lowest_nm.append(float(model.predict(record)[(times_s > 2.4) & (times_s < 2.9)].min()))
+    full, late, one, late_one, two = lowest_nm
+    assert full > late > one and abs(one - late_one) < 0.3 * (full - one) and one > two
+
+
 def test_where_nothing_is_missing_nothing_free_is_added():
     record = hidden_muscles.record(seed=3, rate_hz=100)
     with few_effects.only(*(effect.id for effect in FREE), "fatigue"):
@@ -300,7 +317,7 @@ def changed(model: Model, **values: float) -> Model:
 
 def test_a_free_effect_whose_torque_would_run_away_is_not_usable():
     tame = speedy()
-    assert _stable(tame)["passed"]
+    assert _stable(tame)["passed"] and _stable(tame.with_(pulse_rate_hz=25.0))["passed"]
     assert isinstance(tame.linear, SecondOrder)
     wild = changed(
         tame.with_(linear=replace(tame.linear, time_constant_s=0.06, damping=0.5)),

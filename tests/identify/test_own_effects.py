@@ -129,7 +129,7 @@ def told(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> str:
         ("1.5, 30.0, 10.0", "30.0, 1.5, 10.0", "bounds 30.0 to 1.5"),
         ("1.5, 30.0, 10.0", "'1.5', 30.0, 10.0", "a bound or a start that is no number"),
         ("1.5, 30.0, 10.0", "1.5, 30.0, None", "a bound or a start that is no number"),
-        ("(5.0,)", "(5.0,) * 10000", "a tuple of at most 32 starts"),
+        ("(5.0,)", "(5.0,) * 10000", "10000 starts. Give 32 at most"),
         ('id="sensor_gain_swing"', 'prior="x", id="sensor_gain_swing"', "prior 'x'"),
         ('id="sensor_gain_swing"', 'needs="angle_rad", id="sensor_gain_swing"', "needs 'angle_rad'"),
         ("1.5, 30.0, 10.0", "1.5, float('inf'), 10.0", "bounds 1.5 to inf"),

@@ -78,11 +78,7 @@ def test(
     if decide and (adaptive or protocol is not None):
         raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
     token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
-    if output is not None:  # now: a folder that is not there would be found after the test
-        with writing(output):
-            output.parent.mkdir(parents=True, exist_ok=True)
-        if output.is_dir() or not os.access(output.parent, os.W_OK):
-            raise InputError(f"{output}: give a file in a folder that can be written.")
+    check_output(output)
     if url and not token:
         raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
     if decide:
@@ -108,6 +104,22 @@ def test(
     if decide:
         say("", "both together", "", *diagnosis_lines(found["diagnosis"]), "")
     say(f"recording      {output or found['test']['recording_url']}")
+
+
+def check_output(output: Path | None) -> None:
+    """See that the recording can be written: a folder that is not there would be found after the test.
+
+    Raises
+    ------
+    InputError
+        It cannot.
+    """
+    if output is None:
+        return
+    with writing(output):
+        output.parent.mkdir(parents=True, exist_ok=True)
+    if output.is_dir() or not os.access(output if output.exists() else output.parent, os.W_OK):
+        raise InputError(f"{output}: give a file in a folder that can be written.")
 
 
 def take_labels(verb: Any) -> None:
@@ -214,10 +226,9 @@ def through(
         The service cannot be reached, or the test did not end in a model.
     """
     more = dict(asked or {})
-    recorded_ma = more.pop("recorded_ma", None)
     with Client(url, token) as client:
-        if recorded_ma is not None:
-            deciding.check_participant(client, participant, recorded_ma)
+        if "recorded_ma" in more:  # it is no request of the service: nobody is made anew for a recording
+            deciding.check_participant(client, participant, more.pop("recorded_ma"))
         document = run_test(client, participant, events, over, **more)
         best = document["model_id"]
         if (document.get("adaptive") or {}).get("problem"):
