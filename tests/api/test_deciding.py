@@ -46,9 +46,9 @@ def test_it_goes_before_the_test_between_rivals_and_the_page_shows_it() -> None:
     ExperimentOut.model_validate(found)
     shown = explanation.tidy_experiment(found, {})
     assert shown["shown"] == ["Levels held at random", "Rest 2 s"] and shown["text"] == DECIDING["text"]
-    assert "stimrig test --decide" in next_step(
-        {"verdict": "unexplained_structure", "deciding_experiment": DECIDING}, ""
-    )
+    left = {"verdict": "unexplained_structure", "deciding_experiment": DECIDING}
+    assert "stimrig test --decide" in next_step(left, "") and "stimrig improve" not in next_step(left, "")
+    assert "stimrig improve DATA -o MODEL.json` adds the free effect" in next_step({**left, "free": [{}]}, "")
 
 
 def test_the_page_says_of_a_test_without_rivals_that_it_teaches_and_of_others_that_they_tell_apart() -> None:

@@ -35,7 +35,8 @@ def diagnose(
 ) -> None:
     """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
 
-    Takes 5 to 30 s. DATA decides: a model given with --model lends its structure, not its numbers.
+    Takes 5 to 30 s, longer where structure is left or with several recordings. DATA decides: a model given with --model
+    lends its structure, not its numbers.
     """
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
@@ -85,8 +86,9 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
 def next_step(found: dict[str, Any], doubt: str) -> str:
     """What to do with a diagnosis."""
     if found["verdict"] == "unexplained_structure":
+        add = "`stimrig improve DATA -o MODEL.json` adds the free effect. " if found.get("free") else ""
         if plan := found.get("deciding_experiment"):
-            return f"{worded(plan['text'])} `stimrig test --decide DATA` plays it and judges both together"
+            return f"{add}{worded(plan['text'])} `stimrig test --decide DATA` plays it and judges both together"
         return (
             "look at the worst places and at electrodes, cell and fixture, and record again; an effect of your own: "
             "docs/add-an-effect.md"

@@ -44,7 +44,7 @@ def improve(
 ) -> None:
     """Add effects one by one to a model's structure as long as the evidence supports it; each step is a model.
 
-    Takes 5 to 40 s. Without -o nothing is kept.
+    Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o nothing is kept.
     """
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
@@ -86,6 +86,8 @@ def report(
 
 def improvement_lines(found: dict[str, Any]) -> list[str]:
     """The steps for people."""
+    from stimrig.identify.effects import any_free
+
     rows = [
         (
             step["added"] or "base model",
@@ -100,6 +102,8 @@ def improvement_lines(found: dict[str, Any]) -> list[str]:
     lines = [f"structure      {in_words(found['structure'])}", "", *table(header, rows), ""]
     lines.append(f"noise          {number(found['noise_sd_nm'], 4)} N·m: of a sample, which no model can explain")
     lines += repetition_lines(found["steps"][-1])
+    added = [step for step in found["steps"] if step["added"]]
+    lines += [f"{step['added']:15}{step['reason']}" for step in added if any_free([step["added"]])]
     lines.append(f"at first       {VERDICTS.get(found['verdict'], found['verdict'])}")
     refused = [f"{row['effect']}: {row['reason']}" for row in found.get("refused") or []]
     if len(refused) > FEW:

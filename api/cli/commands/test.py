@@ -62,7 +62,7 @@ def test(
     decide: Annotated[
         list[Path] | None,
         typer.Option(
-            help="play the next experiment of this recording, and diagnose both together; once for each recording",
+            help="play the next experiment of this recording, and diagnose both together; again for each further one",
             metavar="DATA",
             show_default=False,
         ),
