@@ -31,7 +31,7 @@ import numpy as np
 from bench.common import ROOT, in_processes, keep, line, parser, table
 from stimrig import identify
 from stimrig.hardware_sim.bout_records import Peculiar, record_of_bouts
-from stimrig.hardware_sim.physics_records import DISTURBED, SETS, further_record, record_of_physics
+from stimrig.hardware_sim.physics_records import DISTURBED, SETS, alike_record, further_record, record_of_physics
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.diagnosis.free import searched
 from stimrig.identify.diagnosis.result import diagnosis_of
@@ -149,11 +149,10 @@ def last_model(record: identify.Record) -> tuple[identify.Model, list[str], np.n
     """
     search, verdict = searched(*prepare(record))
     row = helpful(search)[0]
-    model, seen = (
-        finish("maximum-likelihood", row[-1].fitted),
-        difference(*(leave_out(row[at].fitted) for at in (0, -1))),
-    )
-    foretold = [seen.gain, seen.sd] if len(row) > 1 else None
+    model, foretold = finish("maximum-likelihood", row[-1].fitted), None
+    if len(row) > 1:
+        seen = difference(leave_out(row[0].fitted), leave_out(row[-1].fitted))
+        foretold = [seen.gain, seen.sd]
     chosen = diagnosis_of(search, verdict).deciding_experiment
     if chosen is None:
         return model, search.added, None, "", foretold
@@ -170,6 +169,7 @@ def look_twice(made: dict[str, Any], kinds: str) -> dict[str, Any]:
     row |= {"plain": score(made, identify.fit(record)), "improved": score(made, first), "second": score(made, first)}
     row |= {"added": added, "named": {}, "untrue": [], "verdict": words or "nothing chosen", "stated": 0.0}
     row |= {"pictured": pictured(made, first), "foretold": foretold}
+    made = made | {"alike": alike_record(kinds, row["seed"])}
     row["alike"] = [over_noise(made, "alike", first)] * 3
     if width_us is not None:
         every = round(record.sample_rate_hz / record.pulse_rate_hz)
@@ -265,14 +265,14 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     """The summary."""
     plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
     second = [row["second"] for row in rows if "second" in row]
-    told = [row for row in rows if row.get("foretold")]
+    promised = [row for row in rows if row.get("foretold")]
     unit = "plain repetition" if kind in ARMS else "noise"
     yield f"median error over {unit}: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
     if second:
         yield from tell_second(rows, improved, second)
-    if told:
-        yield from tell_promise(told)
+    if promised:
+        yield from tell_promise(promised)
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
     beyond = np.sum(improved > plain + [max(row["stated"], 0.02 * row["plain"]) for row in rows])
     yield f"… and by more than the standard error that it states of itself: {beyond} of {len(rows)}"

@@ -44,9 +44,9 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     -------
     dict
         `time_s`, `pulse_width_us`, `torque_nm`, `segment`, shape (n,), at 400 Hz; `unseen`, the same columns of the
-        second record, whose torque has neither noise nor zero; `alike`, the same of one more PRBS and ramp; `truth`:
-        `kind`, `numbers`, `true` (names that are no mistake), `enters` and `driven_by` (right answers to where the
-        muscle departs from the plain structure, and by what; none of `plain`), `disturbed`, `noise_sd_nm`.
+        second record, whose torque has neither noise nor zero; `truth`: `kind`, `numbers`, `true` (names that are no
+        mistake), `enters` and `driven_by` (right answers to where the muscle departs from the plain structure, and by
+        what; none of `plain`), `disturbed`, `noise_sd_nm`.
 
     Raises
     ------
@@ -65,9 +65,14 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
         made["torque_nm"] += disturbance_nm(one, seed, made["time_s"])
     told = _truth(kinds, muscle) | {"seed": seed, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
     told["true"] = sorted({*told["true"], *(DISTURBED[one] for one in over)} - {""})
-    alike = make_design("full", rng_of(seed, "physics", "alike"), top_us, with_validate=False)
-    unseen = {"unseen": _columns(unseen_design(seed, top_us), muscle), "alike": _columns(alike, muscle)}
-    return made | unseen | {"truth": told}
+    return made | {"unseen": _columns(unseen_design(seed, top_us), muscle), "truth": told}
+
+
+def alike_record(kinds: str, seed: int) -> dict[str, Any]:
+    """One more PRBS and ramp of the muscle of `record_of_physics`, rested: the columns of its `unseen`."""
+    muscle = draw_muscle(kinds, seed)
+    rng, top_us = rng_of(seed, "physics", "alike"), float(muscle.base.largest_width_us)
+    return _columns(make_design("full", rng, top_us, with_validate=False), muscle)
 
 
 def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Floats) -> dict[str, Any]:

@@ -88,14 +88,16 @@ def searched(
     rows = fitted_rows(grid, None) if rows is None else rows
     search = search_effects(grid, raw, rows, lambda done, text: say(0.7 * done, text), most=most, structure=structure)
     verdict = judge(search)
+    if most == 0 or verdict.kind == "nothing_missing":
+        return search, verdict
     believed = _believed(search)
     named = verdict.kind == "effect_missing" and bool(believed or not search.added)
-    if most == 0 or verdict.kind == "nothing_missing" or (named and not _doubted(verdict, search.residuals[-1].left)):
+    if named and not _doubted(verdict, search.residuals[-1].left):
         return search, verdict
     freely = explain_freely(search, believed, named, lambda done, text: say(0.7 + 0.25 * done, text))
     if not freely.free:
         return search, verdict
-    return freely, judge_free(freely, verdict, named and set(believed) < set(freely.added))
+    return freely, judge_free(freely, verdict, named)
 
 
 def _believed(search: EffectSearch) -> list[str]:
@@ -130,7 +132,7 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     alone = [] if named or kept == names else [_with_only(search, kept)]
     stays = whole.left_out[-1]
     first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
-    found = _extended([whole], progress, further) if named else _extended([*alone, whole], progress, first)
+    found = _extended([*alone, whole], progress, further if named else first)
     found = [chain for chain in found if _asked_for(stays, chain, further if named else ANY)]
     return _with_chain(search, found[-1]) if found else search
 

@@ -317,11 +317,10 @@ class _StagePass:
         begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
         shared = setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
         torque, rate = np.zeros((2, len(initial), setup.grid.size + 1))
-        present = np.minimum(setup.grid.held(setup.scene.acting), 1.0)  # of late pulses as the drive
         for part, slower in branches:
             core = self.cores * np.c_[slower, np.ones_like(slower)]
             drive = np.ascontiguousarray(part)
-            found = run_free(drive, present, setup.scene.rest_s, core, laws, *shared)
+            found = run_free(drive, setup.present, setup.scene.rest_s, core, laws, *shared)
             torque, rate = torque + found[0], rate + found[1]
         return torque, rate
 

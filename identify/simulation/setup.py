@@ -75,6 +75,11 @@ class Setup:
         return replace(scene, fitted=self.fitted, pauses_s=pauses, states=self.states)
 
     @cached_property
+    def present(self) -> np.ndarray:
+        """Share of each interval in which a pulse acts, late pulses at their true time, shape (K,)."""
+        return np.minimum(self.grid.held(self.scene.acting), 1.0)
+
+    @cached_property
     def _middle(self) -> np.ndarray:
         """Mean place of the samples within each interval, 0 to 1, shape (K,)."""
         grid = self.grid
