@@ -20,18 +20,19 @@ from stimrig.identify.records.record import Source
 def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
     """The next experiment of recordings as a test, with the participant whose recordings they are.
 
-    Beside it `recorded_ma`, with what current they were made, mA; None where no file says it.
+    Beside it `recorded_ma`, with what current they were made, mA.
 
     Raises
     ------
     InputError
         Nothing is left to decide; it is not known whose they are, or they are another's; they were made with several
-        currents; or no further recording could be joined to them. All of it is said before anything is played.
+        currents, or do not say with which; or no further recording could be joined to them. All of it is said before
+        anything is played.
     """
     record = load_record(data)
     sources = record.source.parts or (record.source,)
     owner = _owner(sources, data, participant)
-    currents_ma = sorted({source.current_ma for source in sources} - {None})
+    currents_ma = sorted({source.current_ma for source in sources if source.current_ma is not None})
     if len(currents_ma) > 1:
         made_with = " and ".join(f"{one:g} mA" for one in currents_ma)
         raise InputError(f"these recordings were made with {made_with}. Give those of one current.")
@@ -40,6 +41,9 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
         raise InputError(
             f"{data[0]}: sampled at {record.sample_rate_hz:.4g} Hz; a further one is joined from {least} on."
         )
+    if any(source.current_ma is None for source in sources):  # a table that others wrote, or that was joined
+        fix = "Give the rig's own recordings (HDF5), each by itself."
+        raise InputError(f"{data[0]} does not say with what current it was made. {fix}")
     with progress_bar() as progress:
         experiment = identify.next_experiment(identify.diagnose(record, None, progress))
     if experiment is None:
@@ -50,7 +54,7 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
         "kind": "next-experiment",
         "segments": segments,
         "pulse_rate_hz": record.pulse_rate_hz,
-        "recorded_ma": next(iter(currents_ma), None),
+        "recorded_ma": currents_ma[0],
     }
 
 

@@ -135,6 +135,8 @@ def test_both_are_diagnosed_together(recordings: list[list[Path]], tmp_path: Pat
         ([OWNER, "P2"], 400.0, None, "of several people: P1, P2"),
         ([OWNER, ""], 400.0, None, "second.csv does not say whose it is"),
         ([OWNER], 30.0, None, "joined from 50 Hz on"),
+        ([OWNER], 400.0, None, "does not say with what current it was made"),
+        (["", ""], 400.0, OWNER, "does not say with what current it was made"),
     ],
 )
 def test_nobody_is_stimulated_for_a_recording_that_is_anothers_or_cannot_be_joined(
