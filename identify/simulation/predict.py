@@ -83,7 +83,7 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
     told = earlier_trial.time_s, earlier_trial.angle_rad
     motion = JointMotion.until_then(record.time_s, record.angle_rad, first, told)
     moved = _moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0)
-    return _refuse_runaway(model, record, moved.at_samples(theta))
+    return _refuse_runaway(model, record, _foreseen(model, record, moved, theta))
 
 
 def _tells_movement(angle_rad: np.ndarray) -> bool:
@@ -113,12 +113,16 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
         if narx:
             return linear.between(grid, run_narx(narx, grid.held(widths_us)) + narx["baseline_nm"])
         return linear.between(grid, linear.on_grid(grid, model.recruitment(widths_us))) + model.baseline_nm
-    problem, theta = problem_of(model, grid)
+    return _foreseen(model, grid.record, *problem_of(model, grid))
+
+
+def _foreseen(model: Muscle, record: Record, problem: Problem, theta: np.ndarray) -> np.ndarray:
+    """Torque at the samples; on held-out rows of its own record without what cannot be foreseen."""
     whole, own = problem.at_samples(theta), unforeseen(model)
-    if not own or not same_data(model, grid.record):
+    if not own or not same_data(model, record):
         return whole
     foreseen = problem.at_samples(theta, frozenset(own)) + sum(mean for mean, _ in own.values())
-    return np.where(grid.record.held_out, foreseen, whole)
+    return np.where(record.held_out, foreseen, whole)
 
 
 def unforeseen(model: Muscle) -> dict[str, tuple[float, float]]:
