@@ -1,8 +1,9 @@
-"""`python -m stimrig.rig.builder`: builds previews for the rig in a process of its own (see `rig.adapters.previews`).
+"""`python -m stimrig.rig.builder previews` (or `live`): what the rig has built by a process of its own.
 
-The first line on standard input holds the rig's limits. Each further line is the request for one preview, and gets one
-line as its reply. The process ends when its standard input ends, or with the rig. It has the lowest priority at the
-processor, and a limit on its memory.
+Previews: the first line on standard input holds the rig's limits; each further line is the request for one preview, and
+gets one line as its reply (see `rig.adapters.builders`). Live: each pickled `Taken` gets two lines (see
+`rig.adapters.builders`). The process ends when its standard input ends, or with the rig. It has a lower priority at
+the processor than the rig, for previews the lowest, and a limit on its memory.
 """
 
 from __future__ import annotations
@@ -19,25 +20,25 @@ MAX_MEMORY_BYTES = 1 << 30
 PR_SET_PDEATHSIG = 1
 
 
-def main() -> int:
-    _modest()
-    from stimrig.rig.control.replies import serve  # after the limits are set: importing numpy takes time
+def main(builds: str) -> int:
+    _modest(5 if builds == "previews" else 0)
+    from stimrig.rig.control import live, replies  # after the limits are set: importing numpy takes time
 
-    serve(sys.stdin.buffer, sys.stdout.buffer)
+    {"previews": replies.serve, "live": live.serve}[builds](sys.stdin.buffer, sys.stdout.buffer)
     return 0
 
 
-def _modest() -> None:
-    """Lowest priority and a memory limit, set before anything else; if memory runs out, this process is ended first."""
+def _modest(nice: int = 5) -> None:
+    """Low priority and a memory limit, set before anything else; if memory runs out, this process is ended first."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the rig, which then ends this process
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.nice(5)
+        os.nice(nice)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500")
     resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY_BYTES, MAX_MEMORY_BYTES))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1]))

@@ -11,6 +11,7 @@ After `shut` has returned, no pulse is written to the line.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,8 +27,6 @@ from stimrig.rig.signals import Ack, LateError, Pulse, PulseStatus
 LATE_ACK_S = 0.015
 """Real seconds. A slower ack is noted in the recording: the pulse may have been felt that late, and at 40 pulses/s the
 next one then follows too closely."""
-LATE_S = 0.002
-"""Rig seconds. Who follows a test learns of pulses that were sent later than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +35,20 @@ class OnItsWay:
 
     index: int
     number: int
+    pulse_width_us: float
     written_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What became of a pulse that was to be felt: its index, the width that was sent (0: none was), when it was written
+    and acknowledged (rig clock, s; NaN: not)."""
+
+    index: int
+    pulse_width_us: float
+    written_s: float
+    acknowledged_s: float
+    status: PulseStatus
 
 
 class Gate:
@@ -74,10 +86,9 @@ class Gate:
         self.ack_delay_s: list[float] = []
         self.charge_uc = 0.0
         self.dropped = 0
-        self.not_sent: list[int] = []
-        """Indices of the pulses that were dropped or refused: the muscle felt none."""
-        self.late: list[tuple[int, float]] = []
-        """Indices of the pulses that were written more than `LATE_S` late, and by how much, s."""
+        self.done: list[Done] = []
+        """In this order it became known; only appended to. A pulse that is on its way is not in it."""
+        self._state_as_armed = ""
         stimulator.listen(self._acknowledged, on_lost)
 
     async def identify(self) -> dict[str, object]:
@@ -91,7 +102,7 @@ class Gate:
     def reset(self) -> None:
         """Clear the counts of the previous test."""
         self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
-        self.charge_uc, self.dropped, self.not_sent, self.late = 0.0, 0, [], []
+        self.charge_uc, self.dropped, self.done = 0.0, 0, []
         self._recent.clear()
 
     async def open(self, journal: Journal, table: dict[str, Limit], halted: Callable[[], bool]) -> None:
@@ -104,6 +115,7 @@ class Gate:
         """
         journal.append_json(Kind.EVENT, {"event": "arm", "time_s": self._clock.now_s()})
         await self._stimulator.arm()
+        _, self._state_as_armed = await self._stimulator.state()
         self._table = table
         self.on_its_way = None  # the device has answered since, so the line is empty
         self._journal = journal
@@ -144,6 +156,13 @@ class Gate:
         if refusal is not None:
             return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))
         return self._send(journal, index, verdict, now_s, due_s, latest_s)
+
+    async def changed(self) -> str | None:
+        """What the device says that it did not say when it was armed; None: it is as it was. Raises DeviceError."""
+        _, state = await self._stimulator.state()
+        if state == self._state_as_armed:
+            return None
+        return f"stimulator: it is {state} after a pause of the computer, it was {self._state_as_armed}"
 
     def feed(self) -> None:
         """Feed the device's watchdog after a health check; does nothing unless a test runs. Raises DeviceError."""
@@ -194,12 +213,10 @@ class Gate:
         except LateError:  # the disk or the line was slow
             return self._skip(journal, index, PulseStatus.DROPPED)
         written_s = self._clock.now_s()
-        self.on_its_way = OnItsWay(index, number, written_s)
+        self.on_its_way = OnItsWay(index, number, pulse.pulse_width_us, written_s)
         self._recent.append((written_s, pulse.charge_uc))
         self.last_pulse_s = written_s
         self.lateness_s.append(written_s - due_s)
-        if written_s - due_s > LATE_S:
-            self.late.append((index, written_s - due_s))
         self.charge_uc += pulse.charge_uc
         journal.append(Kind.WRITTEN, jn.WRITTEN.pack(index, number, written_s))
         return PulseStatus.UNACKNOWLEDGED
@@ -208,7 +225,7 @@ class Gate:
         now_s = self._clock.now_s()
         journal.append(Kind.SKIPPED, jn.SKIPPED.pack(index, status, now_s))
         if status != PulseStatus.REST:
-            self.not_sent.append(index)
+            self.done.append(Done(index, 0.0, math.nan, math.nan, status))
         if status == PulseStatus.DROPPED:
             self.dropped += 1
         if reason:
@@ -256,6 +273,8 @@ class Gate:
         self.on_its_way = None
         self.last_pulse_s = max(ack.time_s, pulse.written_s)
         self.ack_delay_s.append(self.last_pulse_s - pulse.written_s)
+        status = PulseStatus.ACKNOWLEDGED if ack.error is None else PulseStatus.DEVICE_ERROR
+        self.done.append(Done(pulse.index, pulse.pulse_width_us, pulse.written_s, ack.time_s, status))
         if self._recent:
             self._recent[-1] = self.last_pulse_s, self._recent[-1][1]
 

@@ -65,7 +65,7 @@ class Kind(IntEnum):
     ANGLE = 13
 
 
-LaidBy = Literal["plan", "extension", "end"]
+LaidBy = Literal["plan", "extension", "wait", "end"]
 
 
 class Segment(NamedTuple):

@@ -185,6 +185,17 @@ class Machine(Protocol):
         """An adapter that is open already. Raises DeviceError if it is open with other arguments."""
         ...
 
+    head_start_s: float
+    """Real seconds before a pulse is due at which its sender wakes, so that all is looked at by then."""
+
+    def hold_until(self, time_s: float) -> None:
+        """Let nothing else of this process's tasks run until then (rig clock), `head_start_s` at most."""
+        ...
+
+    def blocked_by(self, stood_s: float) -> str:
+        """Why this process has just stood still for so many real seconds, in words; empty: the system does not know."""
+        ...
+
     def undisturbed(self) -> AbstractContextManager[None]:
         """While entered, the tasks run before everything else on this machine, as far as it allows that."""
         ...

@@ -110,6 +110,12 @@ class AdaptivePlan(Message):
     max_torque_time_nms: float = Field(
         gt=0, allow_inf_nan=False, description="measured torque-time at which stimulation ends, N·m·s"
     )
+    patience_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=10,
+        description="rest that is laid for a client that is late, before the fixed plan plays on, s",
+    )
 
 
 class Labels(BaseModel):
@@ -359,7 +365,9 @@ class LaidSegment(Message):
     name: str
     start_s: float
     end_s: float
-    by: Literal["plan", "extension", "end"] = Field(description="end: the rest with which an adaptive test ends")
+    by: Literal["plan", "extension", "wait", "end"] = Field(
+        description="wait: rest for a client that is late; end: the rest with which an adaptive test ends"
+    )
 
 
 class Extended(Message):
@@ -380,6 +388,7 @@ class TorqueSamples(Message):
     host_time_s: list[float] = Field(description="when the host received it, test's clock")
     counter: list[int] = Field(description="the cell's counter, unwrapped; -1: it has none. A gap: samples were lost")
     torque_nm: list[float | None] = Field(description="None: no number came")
+    sync: list[int] = Field(description="stimulator's sync line; 255: there is none")
 
 
 class StateEvent(Message):
@@ -387,11 +396,26 @@ class StateEvent(Message):
     status: Status
 
 
-class LatePulse(Message):
-    """A pulse that was sent late."""
+class Felt(Message):
+    """What became of the pulses since the last live event, as it became known: not the plan, but what was sent.
 
-    index: int
-    by_s: float
+    Times are on the test's clock, s; None: it was not written, or not acknowledged. A recording has the same columns.
+    """
+
+    index: list[int]
+    pulse_width_us: list[float] = Field(description="that was sent; 0: none was")
+    written_time_s: list[float | None]
+    acknowledged_time_s: list[float | None]
+    status: list[int] = Field(description="as `/pulses/status` of a recording")
+
+
+class Pause(Message):
+    """The computer stood still in a test; no current flowed, and the test went on."""
+
+    at_s: float = Field(description="when the first pulse was due that did not go out, test's clock")
+    for_s: float = Field(description="until the test went on, s")
+    blocked_s: float = Field(description="the longest standstill in it, s")
+    cause: str = Field("", description="as far as the system knows it")
 
 
 class LiveEvent(Message):
@@ -413,17 +437,15 @@ class LiveEvent(Message):
     sent_pulses: int = Field(0, description="pulses sent so far")
     charge_uc: float = Field(0.0, description="their charge, one phase, µC")
     torque_time_nms: float = Field(0.0, description="torque above rest times time since the first pulse, N·m·s")
-    laid: int = Field(0, description="pulses that are laid; of a test that is not adaptive all of them")
+    laid: int = Field(
+        0,
+        description="pulses that are laid, without rest for a late client; of a test that is not adaptive all of them",
+    )
     boundary_s: float = Field(0.0, description="where they end on the test's clock, s")
     ended_by: str = Field("", description="why nothing will be laid any more; empty: more may be (see `Extended`)")
     laid_segments: list[LaidSegment] = Field(default_factory=list, description="all that are laid; adaptive tests only")
-    not_sent: list[int] = Field(
-        default_factory=list, description="indices of pulses that were dropped or refused; adaptive tests only"
-    )
-    late: list[LatePulse] = Field(
-        default_factory=list,
-        description="pulses that were sent more than 2 ms late; adaptive tests only, for who subscribed with `samples`",
-    )
+    pauses: list[Pause] = Field(default_factory=list, description="all of the test so far")
+    felt: Felt | None = Field(None, description="for who subscribed with `samples`")
     angle_rad: float | None = Field(None, description="the newest; None without a sensor, or where it gives nothing")
     velocity_rad_s: float | None = Field(None, description="of the last 50 ms, so 25 ms late")
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
@@ -446,7 +468,8 @@ class FinishedEvent(Message):
     summary: dict[str, Any] = Field(
         default_factory=dict,
         description="duration_s, samples, lost_samples, pulses, dropped_pulses, lateness_ms {median, p99, max}, "
-        "ack_delay_ms {median, p99, max}, charge_uc, torque_time_nms, ended_by, alignment {method, error_ms}, "
+        "ack_delay_ms {median, p99, max}, pauses (each as `Pause`), charge_uc, torque_time_nms, ended_by, "
+        "alignment {method, error_ms}, "
         "sample_rate_hz, torque_peak_nm, angle (with a sensor: samples, lost_samples, range_rad, error_ms), "
         "cpu_percent, of a test whose process died dose_is_bound (true: charge_uc, duration_s and pulses may be too "
         "high, never too low) and doubtful_pulses, warnings (sentences for people about possible errors)",

@@ -73,7 +73,7 @@ class ExtendRequest(Message):
     test_id: str
     key: str = Field(description="of the test's start")
     after: int = Field(description="`LiveEvent.laid` that the client saw; refused as late if more was laid since")
-    segments: list[SegmentPlan]
+    segments: list[SegmentPlan] = Field(description="none: this client chooses no more, and the fixed plan plays on")
 
 
 class EnoughRequest(Message):

@@ -1,13 +1,15 @@
 """What is laid out to be played. It grows while it plays, if the test is adaptive; only an end takes laid pulses away.
 
 The sender asks for one pulse after the other. Shortly before it reaches the end of what is laid, the fixed plan's next
-segment is laid, unless a client has laid others by then. So the test never waits, whatever a client does. Each segment
-is in the journal before its first pulse can be played. If a limit of the whole test leaves no room, the test ends well:
-a second without stimulation, and nothing after it.
+segment is laid, unless a client has laid others by then. A plan may have patience with a client that is late: then a
+short rest is laid first, so that no muscle waits under current. So the test never hangs, whatever a client does. Each
+segment is in the journal before its first pulse can be played. If a limit of the whole test leaves no room, the test
+ends well: a second without stimulation, and nothing after it.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +32,8 @@ MAX_CHECKED = 20
 """Extensions that are checked while the test plays towards one boundary; each takes time beside the sender."""
 MAX_NAME = 60
 SAFE_END = SegmentPlan(name="rest", sequence="rest", settings={})
+WAIT = SegmentPlan(name="wait", sequence="rest", settings={})
+WAIT_S = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +79,14 @@ class Score:
         self._table, self._journal = table, journal
         self._tasks, self._clock = tasks, tasks.clock
         self._checking = False
+        self._patience_s = 0.0 if self.adaptive is None else self.adaptive.patience_s
         at_start = test.pieces[:1] if self.adaptive else test.pieces
         self._fixed = deque(test.pieces[len(at_start) :])
         self.laid = Layout(plan.NOTHING, np.empty(0, bool), ())
         for piece in at_start:
             self.laid = self.laid.add_piece(piece, "plan")
+        self.decided = len(self.laid)
+        """Pulses that are laid, without the rest behind them that only waits for a client."""
         self._reached = -1
         self._end_at: int | None = None
         self._checked = 0
@@ -125,20 +132,15 @@ class Score:
         self._reached = index
         return float(self.laid.pulse_width_us[index]) if index < len(self.laid) else None
 
-    def lowered(self, index: int, most_us: float) -> float:
-        """The width of a pulse, at most so much unless it may jump; whoever is told what is laid is told that width."""
-        laid = self.laid
-        if not laid.jumps[index] and laid.pulse_width_us[index] > most_us:
-            laid.pulse_width_us[index] = most_us
-        return float(laid.pulse_width_us[index])
-
     async def extend(self, after: int, chosen: Sequence[SegmentPlan]) -> None:
         """Lay segments behind everything that is laid: all of them, or none.
 
         Parameters
         ----------
         after
-            Length of what was laid when the client decided.
+            `decided` when the client did.
+        chosen
+            None: nothing more comes from this client, so the fixed plan plays on.
 
         Raises
         ------
@@ -152,6 +154,9 @@ class Score:
             It could not be written.
         """
         self._may_grow(after)
+        if not chosen:
+            self._patience_s = 0.0
+            return
         if self._checked >= MAX_CHECKED:
             raise BusyError(f"extend: {MAX_CHECKED} extensions were checked for this boundary; wait for the next")
         self._checked += 1
@@ -165,6 +170,7 @@ class Score:
         self._may_grow(after)  # the test went on meanwhile
         for piece in built:
             self._lay(piece, "extension")
+        self._patience_s = self.adaptive.patience_s if self.adaptive else 0.0
 
     def enough(self, by: str, at_once: bool) -> None:
         """End well: at the next pulse, or where the segment that plays ends. A second call may only end it sooner.
@@ -210,8 +216,8 @@ class Score:
         self._may_change()
         if self.ended_by:
             raise TooLateError(f"test {self.plan.test_id} is ending ({self.ended_by}); nothing more is laid")
-        if after != len(self.laid):
-            raise TooLateError(f"extend.after: {after}, but {len(self.laid)} pulses are laid; look again, then decide")
+        if after != self.decided:
+            raise TooLateError(f"extend.after: {after}, but {self.decided} pulses are laid; look again, then decide")
 
     def _built_and_checked(self, laid: Layout, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
         """Behind what is laid; changes nothing, since it runs beside the sender."""
@@ -238,7 +244,14 @@ class Score:
         refuse(self._table["duration_s"], whole_s, "plan, with its safe end")
 
     def _go_on(self) -> None:
-        """Lay the fixed plan's next segment, or end."""
+        """Lay a rest where a client may still choose, else the fixed plan's next segment, or end."""
+        if self._patience_s > 0:
+            piece = Piece(WAIT, np.zeros(max(1, round(WAIT_S * self.plan.pulse_rate_hz))), jumps=False)
+            self._patience_s -= len(piece.pulse_width_us) / self.plan.pulse_rate_hz
+            with contextlib.suppress(RefusedError):  # no room for it: nor, perhaps, for the fixed plan's next segment
+                self._check(self.laid, [piece])
+                self._lay(piece, "wait")
+                return
         if not self._fixed:
             self._end("plan", "the fixed plan is played", len(self.laid))
             return
@@ -275,3 +288,5 @@ class Score:
         )
         self._journal.append(Kind.LAID, block.to_bytes())
         self.laid, self._checked = following, 0
+        if by != "wait":
+            self.decided = len(following)

@@ -37,6 +37,8 @@ DURATION_S = 50.0
 """The longest test, where nobody says: the opening, some ten seconds of pieces, then the whole default test fit in."""
 TAIL_S = 0.4
 """Silence behind the opening: when it ends, enough was measured to decide what follows."""
+PATIENCE_S = 3.0
+"""Rest in a row that a late answer may cost; it needs no dose. Then the fixed plan plays on."""
 PIECE_S = 2.0
 """The fixed plan is cut into pieces of this length, so that a late answer costs no more."""
 
@@ -170,6 +172,7 @@ def bounds_of(body: TestIn, plan: TestPlan) -> AdaptivePlan:
     return AdaptivePlan(
         max_duration_s=DURATION_S if given_s is None else given_s,
         max_torque_time_nms=AT_STOPPING_TORQUE_S * plan.stopping_torque_nm if given_nm_s is None else given_nm_s,
+        patience_s=PATIENCE_S,
     )
 
 

@@ -1,13 +1,15 @@
 """Follows a test that stops itself: at each boundary asks the adviser what to play, and has the rig lay it.
 
-The rig never waits. What comes too late falls away: the fixed plan's next piece plays, and the next boundary is
-decided with the longer record. Each boundary is asked about twice: early, so that there is an answer whatever happens,
-and late, with the newest samples, which then starts from the early answer's fit and is quick.
+The rig never waits under current. An answer that comes late costs rest. What comes far too late falls away: the fixed
+plan's next piece plays, and the next boundary is decided with the longer record. Each boundary is asked about twice:
+early, so that there is an answer whatever happens, and late, with the newest samples, which then starts from the early
+answer's fit and is quick.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import secrets
 from collections.abc import Callable
@@ -44,6 +46,20 @@ class Answer:
     said: dict[str, Any]
     heard_s: float
     number: int
+
+
+@dataclass
+class News:
+    """What the rig has told since the last question: samples, and what became of pulses, column by column."""
+
+    samples: dict[str, list[Any]] = field(default_factory=dict)
+    felt: dict[str, list[Any]] = field(default_factory=dict)
+
+    def take(self, event: LiveEvent) -> None:
+        """Take one event's."""
+        for held, new in ((self.samples, event.samples), (self.felt, event.felt)):
+            for name, values in {} if new is None else new:
+                held.setdefault(name, []).extend(values)
 
 
 @dataclass
@@ -98,7 +114,7 @@ class Follower(Watcher):
         self.key = secrets.token_urlsafe(24)
         self._fixed = [segment.settings["pulse_width_us"] for segment in plan.segments or []]
         self._added: list[list[float]] = []
-        self._new: dict[str, list[Any]] = {"host_time_s": [], "counter": [], "torque_nm": []}
+        self._new = News()
         self._newest: LiveEvent | None = None
         self._heard_s = 0.0
         self._took_s = 0.0
@@ -116,6 +132,15 @@ class Follower(Watcher):
         """As `Watcher`."""
         return f"The fixed plan plays on: {why}"
 
+    def give_up(self, why: str) -> None:
+        """As `Watcher`; the fixed plan plays on at once, without rest for somebody who would choose."""
+        super().give_up(why)
+        self._tasks.begin(self._leave(self._turn.laid))
+
+    async def _leave(self, laid: int) -> None:
+        with contextlib.suppress(ApiError):  # then it plays on once the rig's patience is over
+            await self.rig.ask(ExtendRequest(test_id=self.plan.test_id, key=self.key, after=laid, segments=[]))
+
     def document(self) -> dict[str, Any]:
         """As `Watcher`."""
         bounds = self.plan.adaptive
@@ -129,9 +154,7 @@ class Follower(Watcher):
     def hear(self, event: LiveEvent) -> None:
         """As `Watcher`."""
         self._newest, self._heard_s = event, self.clock.monotonic_s()
-        if event.samples is not None:
-            for name, values in self._new.items():
-                values.extend(getattr(event.samples, name))
+        self._new.take(event)
         if event.laid != self._turn.laid:
             self._turn = Turn(event.laid)
         if event.ended_by or self.told.state != "choosing":
@@ -160,11 +183,10 @@ class Follower(Watcher):
 
     async def _ask(self, turn: Turn, event: LiveEvent) -> None:
         heard_s = self._heard_s
-        news, self._new = self._new, {name: [] for name in self._new}
+        news, self._new = self._new, News()
         widths, segments = self._played_so_far(event)
         said = await self.adviser.ask(
-            "adaptive_advise", **news, laid_us=widths, not_sent=event.not_sent, segments=segments,
-            late=[(pulse.index, pulse.by_s) for pulse in event.late],
+            "adaptive_advise", samples=news.samples, felt=news.felt, laid_us=widths, segments=segments,
             torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
         )  # fmt: skip
         self._took_s = self.clock.monotonic_s() - heard_s
@@ -235,12 +257,12 @@ class Follower(Watcher):
     def _played_so_far(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
         """Width of each pulse that is laid, and the segments."""
         rate_hz = self.plan.pulse_rate_hz
-        sources = {"plan": iter(self._fixed), "extension": iter(self._added), "end": iter(())}
+        sources: Any = {"plan": iter(self._fixed), "extension": iter(self._added)}
         widths: list[float] = []
         segments = []
         for segment in event.laid_segments:
             count = round(segment.end_s * rate_hz) - len(widths)
-            own = next(sources[segment.by], [])
+            own = next(sources[segment.by], []) if segment.by in sources else []  # rest, while it waits or ends
             segments.append((segment.name, len(widths), len(widths) + count))
             widths += [*own, *[0.0] * count][:count]
         return widths, segments

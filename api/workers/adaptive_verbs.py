@@ -5,7 +5,8 @@ The test that runs stays in this process between two calls: a call brings only t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -21,6 +22,8 @@ NEW_PERSON_SHARE = 1 / 3
 DIGITS = 4
 EARLIEST = 0.02
 """Share of the samples that arrive earliest: what comes later waited somewhere."""
+ON_ITS_WAY, RESTS = 4, 1
+"""Status of a pulse, as in a recording."""
 BINS = 5
 """Means for each pulse interval, where a load cell gives at least twice as many samples: the delay of a sample's way to
 the host, some milliseconds that only a sealed recording corrects, is then within the one sample that the fit allows."""
@@ -102,17 +105,15 @@ class Running:
     max_torque_time_nm_s: float
     largest_us: float
     pulse_rate_hz: float
-    samples: tuple[list[float], list[int], list[float | None]] = field(default_factory=lambda: ([], [], []))
+    samples: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
+    felt: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
     before: Any = None
 
     def advise(
         self,
-        host_time_s: list[float],
-        counter: list[int],
-        torque_nm: list[float | None],
+        samples: dict[str, list[Any]],
+        felt: dict[str, list[Any]],
         laid_us: list[float],
-        not_sent: list[int],
-        late: list[tuple[int, float]],
         segments: list[tuple[str, int, int]],
         torque_time_nm_s: float,
         measured_s: float,
@@ -121,26 +122,26 @@ class Running:
 
         Parameters
         ----------
-        host_time_s, counter, torque_nm
-            Samples that are new, as the rig tells them.
-        laid_us, not_sent, late, segments
-            Widths of all pulses that are laid, µs; which of them the muscle did not feel; which were felt late, and by
-            how much, s; name, first pulse and end of each segment.
+        samples, felt
+            Samples that are new, and what became of pulses since, as the rig tells both.
+        laid_us, segments
+            Widths of all pulses that are laid, µs; name, first pulse and end of each segment.
         torque_time_nm_s, measured_s
             Torque-time that was measured, N·m·s, and until when, s.
         """
         from stimrig.identify.experiments.adaptive import Asked, decide
 
-        for held, new in zip(self.samples, (host_time_s, counter, torque_nm), strict=True):
-            held.extend(new)  # pyright: ignore[reportArgumentType]
-        for index in not_sent:
-            laid_us[index] = 0.0
-        record = record_of(*self.samples, laid_us, late, segments, self.pulse_rate_hz)
+        for held, news in ((self.samples, samples), (self.felt, felt)):
+            for name, new in news.items():
+                held[name].extend(new)
+        record = record_of(self.samples, self.felt, laid_us, segments, self.pulse_rate_hz)
+        played_us = np.array(laid_us, float)
+        played_us[self.felt["index"]] = self.felt["pulse_width_us"]
         committed_nm_s = self._expected(laid_us[round(measured_s * self.pulse_rate_hz) :])
         left_s = max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz)
         left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
         asked = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.known)
-        found = decide(record, laid_us, asked, self.before)
+        found = decide(record, played_us, asked, self.before)
         self.before = found if found.short is not None else self.before
         told = found.to_dict()
         for number, segment in enumerate(
@@ -180,41 +181,55 @@ def rounded(value: Any) -> Any:
 
 
 def record_of(
-    host_time_s: list[float],
-    counter: list[int],
-    torque_nm: list[float | None],
-    laid_us: list[float],
-    late: list[tuple[int, float]],
-    segments: list[tuple[str, int, int]],
+    samples: Mapping[str, Any], felt: Mapping[str, Any], laid_us: list[float], segments: list[tuple[str, int, int]],
     rate_hz: float,
-) -> Any:
-    """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet."""
-    from stimrig.identify.records.record import Pulses, Record
+) -> Any:  # fmt: skip
+    """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet.
 
-    if len(host_time_s) < 2:
+    Pulses are those that were felt, by the same rules as in a sealed recording.
+    """
+    from stimrig.identify.records.felt import felt as felt_pulses
+    from stimrig.identify.records.felt import in_force
+    from stimrig.identify.records.record import Record
+
+    if len(samples["host_time_s"]) < 2:
         return None
-    time_s, torque = sample_times(host_time_s, counter), np.array(torque_nm, float)
+    time_s, torque = sample_times(samples["host_time_s"], samples["counter"]), np.array(samples["torque_nm"], float)
     inside = np.isfinite(torque) & (time_s >= 0) & (time_s < len(laid_us) / rate_hz - 1e-9)
     if not inside.any():
         return None
-    time_s, torque = means(time_s[inside], torque[inside], BINS * rate_hz)
-    slot = np.floor(time_s * rate_hz + 1e-9).astype(int)
-    widths = np.asarray(laid_us, float)
-    starts = np.array([start for _, start, _ in segments])
-    code = np.searchsorted(starts, slot, side="right") - 1
-    due, late_s = np.arange(widths.size) / rate_hz, np.zeros(widths.size)
-    for index, by_s in late:
-        late_s[index] = by_s
+    time_s, torque, sync = time_s[inside], torque[inside], np.array(samples["sync"])[inside]
+    came = int(time_s[-1] * rate_hz) + 1
+    pulses, doubted = felt_pulses(_sent(felt, laid_us[:came], rate_hz), time_s, sync)
+    even_s, torque = means(time_s, torque, BINS * rate_hz)
+    width_us, late_s = in_force(pulses, even_s, rate_hz)
+    code = np.searchsorted([start for _, start, _ in segments], even_s * rate_hz + 1e-9, side="right") - 1
     return Record.from_arrays(
-        time_s,
-        widths[slot],
+        even_s,
+        width_us,
         torque,
         code,
         segment_names=[name for name, _, _ in segments],
-        late_s=late_s[slot],
-        pulses=Pulses(due, widths, late_s, np.zeros(widths.size, bool)),
+        late_s=late_s,
+        doubted=np.interp(even_s, time_s, doubted) > 0,
+        pulses=pulses,
         pulse_rate_hz=rate_hz,
     )
+
+
+def _sent(felt: Mapping[str, Any], laid_us: list[float], rate_hz: float) -> Any:
+    """What is known of each pulse; one of which nothing was told yet is on its way."""
+    from stimrig.identify.records.felt import Sent
+
+    widths_us = np.array(laid_us, float)
+    written_s, acknowledged_s = np.full(widths_us.size, np.nan), np.full(widths_us.size, np.nan)
+    status = np.where(widths_us > 0, ON_ITS_WAY, RESTS)
+    index = np.array(felt["index"], int)
+    told = index < widths_us.size
+    columns = {"pulse_width_us": widths_us, "written_time_s": written_s, "acknowledged_time_s": acknowledged_s}
+    for name, column in {**columns, "status": status}.items():
+        column[index[told]] = np.array(felt[name], float)[told]
+    return Sent(np.arange(widths_us.size) / rate_hz, widths_us, written_s, acknowledged_s, status, 1.0 / rate_hz)
 
 
 def means(time_s: Any, torque_nm: Any, rate_hz: float) -> tuple[Any, Any]:

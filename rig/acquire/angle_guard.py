@@ -86,9 +86,9 @@ class AngleGuard:
         """The test's clock runs: from now on the joint may not stand still for long. From any thread."""
         self._moving = True
 
-    def fault(self) -> str | None:
-        """What must end the test; asked before each pulse, rests included. None: nothing."""
-        return self._ending(self._stale())
+    def fault(self, stood_s: float = 0.0) -> str | None:
+        """What must end the test; asked before each pulse, rests included. None: nothing. `stood_s`: see `Health`."""
+        return self._ending(self._stale(stood_s))
 
     def fault_at_end(self) -> str | None:
         """What only the whole test shows, and must make it a fault."""
@@ -100,10 +100,10 @@ class AngleGuard:
             self._note(found)
         return found if self.needed else None
 
-    def _stale(self) -> str | None:
+    def _stale(self, stood_s: float = 0.0) -> str | None:
         if self._receiver is None:
             return "angle sensor: this rig has none" if self.needed else None
-        age_s = self._receiver.data_age_s(self._clock.now_s()) / self._clock.speed
+        age_s = self._receiver.data_age_s(self._clock.now_s()) / self._clock.speed - stood_s
         if age_s <= self._watch.stale_angle_s:
             return None
         if not np.isfinite(age_s):

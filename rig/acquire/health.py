@@ -19,8 +19,6 @@ from stimrig.rig.machine import Machine
 from stimrig.rig.tasks import Signal
 
 SYNC_PERIOD_S = 0.5
-STALL_S = 0.25
-"""Real seconds: if the sender is later than this, the test ends."""
 MIN_FREE_BYTES = 8 * 2**20
 """With less than this a running test ends, while its recording can still be sealed."""
 
@@ -93,30 +91,28 @@ class Health:
         disk: DiskWatch,
         clock: Clock,
         watch: Watch,
-        angle: Callable[[], str | None],
+        angle: Callable[[float], str | None],
     ) -> None:
         self._gate, self._receiver, self._disk, self._clock, self._watch = gate, receiver, disk, clock, watch
         self._angle = angle
 
-    def fault(self, due_s: float) -> str | None:
+    def fault(self, stood_s: float = 0.0) -> str | None:
         """What is wrong, in words; None: all checks pass.
 
         Parameters
         ----------
-        due_s
-            When the sender should have asked; its own lateness is checked, too.
+        stood_s
+            Real seconds for which this computer has just stood still: what came meanwhile could not be taken, so a
+            silence counts without them.
         """
         now_s, speed, watch = self._clock.now_s(), self._clock.speed, self._watch
-        late_s = (now_s - due_s) / speed
-        if not (late_s <= STALL_S):
-            return f"the computer was blocked for {late_s:.1f} s; close other programs"
-        age_s = self._receiver.age_s(now_s) / speed
+        age_s = self._receiver.age_s(now_s) / speed - stood_s
         if not (age_s <= watch.stale_torque_s):
             return f"load cell: torque is stale, the newest sample is {age_s * 1e3:.0f} ms old"
-        if (wrong := self._angle()) is not None:
+        if (wrong := self._angle(stood_s)) is not None:
             return wrong
         pulse = self._gate.on_its_way
-        if pulse is not None and not ((now_s - pulse.written_s) / speed <= watch.missing_ack_s):
+        if pulse is not None and not ((now_s - pulse.written_s) / speed - stood_s <= watch.missing_ack_s):
             return f"stimulator: a pulse was not acknowledged within {watch.missing_ack_s * 1e3:.0f} ms"
         if not (self._disk.age_s() <= watch.stale_disk_s):
             return f"disk: the journal could not be written for {watch.stale_disk_s:g} s; the disk is too slow or gone"

@@ -1,7 +1,8 @@
 """One test, played in a task of its own: arm, send a pulse at each deadline, stop, confirm the stop.
 
 Deadlines are absolute on the monotonic clock. Health is checked before each pulse. A pulse that is late, or that comes
-due before the previous one is acknowledged, is dropped and recorded, never sent in a burst.
+due before the previous one is acknowledged, is dropped and recorded, never sent in a burst. So is one that came due in
+a pause of the computer (`rig.acquire.pauses`); the plan goes on where its clock is.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from stimrig.rig.acquire.angle_guard import AngleGuard
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.acquire.evidence import AROUND_S, stop_device, watch_decay
 from stimrig.rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
+from stimrig.rig.acquire.pauses import Pauses
 from stimrig.rig.acquire.plausibility import PlausibilityCheck
 from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.clock import Clock
@@ -127,7 +129,9 @@ class TestRun:
         """Called when the device has been stopped and the torque watched."""
         self.t0_s: float | None = None
         self.told_pulses = 0
-        """How many pulses earlier live events contained; who makes these events counts here, in a thread of its own."""
+        """How many of `Gate.done` live events have told; who makes these events counts here, in a thread of its own."""
+        self.pauses: Pauses | None = None
+        """From its arming on."""
         self._table = table
         self.journal = journal
         self.gate = gate
@@ -159,11 +163,12 @@ class TestRun:
         self._receiver.record(self.journal, (torque.lo, torque.hi), self._fault, self._plausibility.fault)
         self._angle.record(self.journal, self._fault)
         disk = DiskWatch(self.journal, self._machine)
-        self._health = Health(self.gate, self._receiver, disk, self._clock, self._watch, self._angle.fault)
+        health = Health(self.gate, self._receiver, disk, self._clock, self._watch, self._angle.fault)
+        self.pauses = Pauses(health, self.gate, self._receiver, self.journal, self._machine, self.halt.signal)
         try:
             if await self._arm():
                 with self._machine.undisturbed():
-                    await self._play()
+                    await self._play(self.pauses)
         except (DeviceError, JournalError) as error:
             self._fault(str(error))
         except Exception as error:  # a bug in this program must stop stimulation, too
@@ -231,7 +236,7 @@ class TestRun:
         await self.gate.open(self.journal, self._table, self.halt.signal.is_set)
         return self.gate.is_open
 
-    async def _play(self) -> None:
+    async def _play(self, pauses: Pauses) -> None:
         clock, current_ma = self._clock, self.plan.profile.current_ma
         period_s = 1 / self.plan.pulse_rate_hz
         t0_s = clock.now_s() + LEAD_S * clock.speed
@@ -240,24 +245,25 @@ class TestRun:
         self._angle.started()
         self.started.set()
         late_s = self._watch.late_pulse_periods * period_s
-        index, resting, felt_us = 0, True, 0.0
+        index, resting, rise = 0, True, Rise(self._table["width_rise_us"].hi)
         while (width_us := self.score.pulse(index, self.torque_time_nms)) is not None:
             due_s = t0_s + index * period_s
             if resting and width_us > 0:
                 resting = False
                 self._at_rest()
-            if await self._tasks.wait(due_s, self.halt.signal):
+            if await self._tasks.wait(due_s - self._machine.head_start_s * clock.speed, self.halt.signal):
                 return
-            wrong = self._health.fault(due_s)
-            if wrong is not None:
+            if (wrong := await pauses.fault(due_s, t0_s)) is not None:
                 self._fault(wrong)
+            if self.halt.signal.is_set():
                 return
-            # after pulses that were left out the width climbs back within the limit
-            width_us = self.score.lowered(index, felt_us + self._table["width_rise_us"].hi)
+            if due_s < pauses.until_s:
+                rise.begin_anew()
+            asked_us = rise.limited(width_us, bool(self.score.laid.jumps[index]))
             self.gate.feed()
-            status = self.gate.fire(index, Pulse(width_us, current_ma), due_s, due_s + late_s)
-            if status in (PulseStatus.UNACKNOWLEDGED, PulseStatus.REST):  # none is sent that the device makes too short
-                felt_us = width_us if status is PulseStatus.UNACKNOWLEDGED else 0.0
+            self._machine.hold_until(due_s)
+            status = self.gate.fire(index, Pulse(asked_us, current_ma), due_s, due_s + late_s)
+            rise.take(status, asked_us, width_us)
             index += 1
         await self._tasks.wait(t0_s + index * period_s, self.halt.signal)
 
@@ -321,6 +327,7 @@ class TestRun:
         gate, speed, angle = self.gate, self._clock.speed, self._angle_counts
         summary: dict[str, Any] = {
             "duration_s": self._duration_s,
+            "pauses": [pause.model_dump() for pause in self.pauses.all] if self.pauses else [],
             **asdict(self._counts),
             "pulses": self.sent,
             "dropped_pulses": gate.dropped,
@@ -346,6 +353,27 @@ class TestRun:
         if self._rest_nm is None or not (lo_nm <= hi_nm):
             return None
         return max(hi_nm - self._rest_nm, self._rest_nm - lo_nm)
+
+
+class Rise:
+    """How wide the next pulse may be: after pulses that were left out the width climbs back within the limit."""
+
+    def __init__(self, most_us: float) -> None:
+        self._most_us, self._felt_us, self._anew = most_us, 0.0, False
+
+    def begin_anew(self) -> None:
+        """The muscle rested in a pause: the width climbs from nothing, also where the sequence may jump."""
+        self._felt_us, self._anew = 0.0, True
+
+    def limited(self, width_us: float, jumps: bool) -> float:
+        """A planned width, or as much of it as may follow the last pulse."""
+        return width_us if jumps and not self._anew else min(width_us, self._felt_us + self._most_us)
+
+    def take(self, status: PulseStatus, asked_us: float, width_us: float) -> None:
+        """What became of a pulse. One that the device would make too short counts as none."""
+        if status in (PulseStatus.UNACKNOWLEDGED, PulseStatus.REST):
+            self._felt_us = asked_us if status is PulseStatus.UNACKNOWLEDGED else 0.0
+            self._anew = self._anew and asked_us < width_us
 
 
 def spread_ms(durations_s: list[float]) -> dict[str, float]:

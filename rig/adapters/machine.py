@@ -8,6 +8,7 @@ import logging
 import math
 import os
 import queue
+import resource
 import threading
 import time
 import uuid
@@ -103,6 +104,7 @@ class Driver:
 def undisturbed() -> Iterator[None]:
     """No garbage collection, and real-time priority for this thread if the system allows it."""
     gc.collect()
+    gc.freeze()
     gc.disable()
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     with contextlib.suppress(OSError):
@@ -113,6 +115,43 @@ def undisturbed() -> Iterator[None]:
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, policy, parameters)
         gc.enable()
+        gc.unfreeze()
+
+
+HOLD_S = 0.00025
+"""Real seconds: the last part of a wait for a deadline, in which nothing else runs; a sleep ends later than asked."""
+MOST_OF_IT = 0.5
+"""Of a standstill: what explains so much of it is told as its cause."""
+PAGES = 200
+"""Pages read back from the disk: less delay nobody."""
+
+
+class Strain:
+    """What kept this thread from running, as far as Linux counts it."""
+
+    def __init__(self) -> None:
+        self._before = self._counted()
+
+    def cause(self, stood_s: float) -> str:
+        """Why it stood still since the last call, in words."""
+        before, self._before = self._before, self._counted()
+        waited_s, stolen_s, pages = (now - then for now, then in zip(self._before, before, strict=True))
+        if pages >= PAGES:
+            return "memory was read back from the disk"
+        if stolen_s >= MOST_OF_IT * stood_s:
+            return "the host of this virtual machine was busy"
+        return "other programs kept the processor" if waited_s >= MOST_OF_IT * stood_s else ""
+
+    @staticmethod
+    def _counted() -> tuple[float, float, int]:
+        """Seconds for which this thread waited for a processor, and all of them for the host; pages that were read."""
+        try:
+            waited_s = 1e-9 * int(Path("/proc/thread-self/schedstat").read_text().split()[1])
+            with Path("/proc/stat").open() as file:
+                stolen_s = int(file.readline().split()[8]) / os.sysconf("SC_CLK_TCK")
+        except (OSError, ValueError, IndexError):
+            return 0.0, 0.0, 0
+        return waited_s, stolen_s, resource.getrusage(resource.RUSAGE_SELF).ru_majflt
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -125,6 +164,8 @@ class LocalMachine:
         self.driver = Driver(clock)
         self.tasks, self.boot_id = self.driver.tasks, boot_id()
         self.disk: Disk = Files()
+        self.head_start_s = 0.0015
+        self._strain = Strain()
 
     def port(self, path: str, **arguments: Any) -> SerialPort:
         return SerialPort(path, self.tasks.clock, self.driver.post, **arguments)
@@ -134,6 +175,17 @@ class LocalMachine:
 
     def shared_bus(self, arguments: dict[str, Any], name: str) -> CanBus | None:
         return CanBus.find(arguments, name)
+
+    def hold_until(self, time_s: float) -> None:
+        clock = self.tasks.clock
+        left_s = (time_s - clock.now_s()) / clock.speed
+        if left_s > HOLD_S:
+            time.sleep(min(left_s, self.head_start_s) - HOLD_S)
+        while 0 < time_s - clock.now_s() <= HOLD_S * clock.speed:
+            pass
+
+    def blocked_by(self, stood_s: float) -> str:
+        return self._strain.cause(stood_s)
 
     def undisturbed(self) -> AbstractContextManager[None]:
         return undisturbed()

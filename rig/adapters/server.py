@@ -1,6 +1,6 @@
 """The Unix socket: requests in, replies and events out, one JSON object per line. Also starts the stop socket.
 
-Requests are tasks of the rig, in its own thread; previews are built in another process. The numbers of
+Requests are tasks of the rig, in its own thread; previews and live events are built in other processes. The numbers of
 connections, of waiting requests and of bytes in a request are limited; requests above a limit are refused at once.
 """
 
@@ -16,12 +16,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stimrig.rig.adapters.previews import Previews
+from stimrig.rig.adapters.builders import LiveLines, Previews
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connections, StopServer
 from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
 from stimrig.rig.errors import BusyError, ConfigError, PlanError, RigError
-from stimrig.rig.messages import Event, LiveEvent, StateEvent, Status, stop_socket
+from stimrig.rig.messages import Event, StateEvent, Status, stop_socket
 from stimrig.rig.requests import LONGEST_LINE, StopRequest
 
 log = logging.getLogger("rig.socket")
@@ -53,11 +53,13 @@ class Server:
         self._server: asyncio.Server | None = None
         self._stop_server: StopServer | None = None
         self._previews: Previews | None = None
+        self._live_lines = LiveLines()
 
     def publish(self, event: Event) -> None:
         """Send an event to all subscribers; may be called from any thread."""
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._send_all, event)
+            line = to_line(event)
+            self._loop.call_soon_threadsafe(self._send_all, line, line)
 
     async def start(self, rig: Rig, ask: Ask, path: Path) -> None:
         """Listen on `path` and on the stop socket; only this user and group may connect.
@@ -81,7 +83,8 @@ class Server:
                 f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
             ) from None
         self._keep(self._loop.create_task(self._live()))
-        self._keep(self._loop.create_task(self._previews.warm()))
+        for builder in (self._previews, self._live_lines):
+            self._keep(self._loop.create_task(builder.warm()))
 
     async def close(self) -> None:
         if self._server is not None:
@@ -91,8 +94,9 @@ class Server:
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        if self._previews is not None:
-            await self._previews.close()
+        for builder in (self._previews, self._live_lines):
+            if builder is not None:
+                await builder.close()
 
     def _keep(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
@@ -101,16 +105,11 @@ class Server:
     async def _live(self) -> None:
         while True:
             await asyncio.sleep(LIVE_PERIOD_S)
-            event = self.rig.live(samples=any(self._subscribers.values()))
-            if event is not None:
-                self._send_all(event)
+            taken = self.rig.take_live(samples=any(self._subscribers.values()))
+            if taken is not None and self._subscribers:
+                self._send_all(*await self._live_lines.of(taken), live=True)
 
-    def _send_all(self, event: Event) -> None:
-        if not self._subscribers:
-            return
-        full = to_line(event)
-        with_samples = isinstance(event, LiveEvent) and event.samples is not None
-        plain = to_line(event.model_copy(update={"samples": None, "angle": None, "late": []})) if with_samples else full
+    def _send_all(self, full: bytes = b"", plain: bytes = b"", live: bool = False) -> None:
         for writer, samples in tuple(self._subscribers.items()):
             if writer.transport.is_closing():  # it left while its subscription was still being answered
                 self._subscribers.pop(writer, None)
@@ -119,7 +118,7 @@ class Server:
             if waiting > DEAD_BYTES:
                 self._subscribers.pop(writer, None)
                 writer.transport.abort()
-            elif waiting < SLOW_BYTES or not isinstance(event, LiveEvent):
+            elif waiting < SLOW_BYTES or not live:
                 writer.write(full if samples else plain)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -1,9 +1,14 @@
-"""Data for a page's chart: envelope of the torque, and the pulses, since the last event."""
+"""Data for a page's chart: envelope of the torque, and the pulses as they were sent, since the last event.
+
+The rig's process only takes what is new (`take`). Another one makes the event of it and its JSON (`serve`), so that no
+pulse waits for either.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+import pickle
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +16,43 @@ from numpy.typing import NDArray
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.run import TestRun
-from stimrig.rig.messages import LatePulse, LiveEvent, TorqueSamples
+from stimrig.rig.control.replies import to_line
+from stimrig.rig.gate import Done
+from stimrig.rig.messages import Felt, LaidSegment, LiveEvent, TorqueSamples
 
 BIN_S = 0.01
-IDLE = {
-    "test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "pulse_time_s": [], "pulse_width_us": [],
-    "dropped_pulses": 0,
-}  # fmt: skip
+IDLE = {"test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "dropped_pulses": 0}
 
 
-def live_event(
+class Taken(NamedTuple):
+    """What is new since the last time, as arrays and plain values.
+
+    Attributes
+    ----------
+    fields
+        Of the event, as they are.
+    blocks, angles
+        Of torque and of angles, as they came.
+    done
+        Pulses of which it is known what became of them.
+    segments, pulse_rate_hz
+        Of the test; of one that is not adaptive no segments.
+    """
+
+    fields: dict[str, Any]
+    origin_s: float
+    samples: bool
+    blocks: list[NDArray[Any]]
+    angles: list[NDArray[Any]]
+    done: list[Done]
+    segments: tuple[tuple[Any, ...], ...] = ()
+    pulse_rate_hz: float = 1.0
+
+
+def take(
     receiver: Receiver, run: TestRun | None, origin_s: float, now_s: float, samples: bool, angle: AngleReceiver | None
-) -> LiveEvent | None:
-    """The newest torque as minimum and maximum of bins of 10 ms, or None if there is none.
+) -> Taken | None:
+    """What is new, or None if there is no new torque.
 
     Parameters
     ----------
@@ -36,52 +65,87 @@ def live_event(
     angle
         The angle sensor's receiver; None: the rig has none.
     """
-    blocks = []
-    while receiver.live:
-        blocks.append(receiver.live.popleft())
+    blocks = _emptied(receiver.live)
     if not blocks:
         return None
-    found = np.concatenate(blocks)
-    bins = np.floor((found["host_time_s"] - origin_s) / BIN_S)
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(bins) > 0) + 1])
-    torque_nm = found["torque_nm"]
-    return LiveEvent(
-        time_s=np.round(bins[starts] * BIN_S, 4).tolist(),
-        torque_min_nm=_finite(np.fmin.reduceat(torque_nm, starts)),
-        torque_max_nm=_finite(np.fmax.reduceat(torque_nm, starts)),
-        torque_age_s=max(0.0, receiver.age_s(now_s)),
-        lost_samples=receiver.counts.lost_samples,
-        samples=_samples(found, origin_s) if samples else None,
-        **({} if angle is None else _angle_fields(angle, origin_s, samples)),
-        **(IDLE if run is None else _run_fields(run, now_s, samples)),
-    )
+    fields = {"torque_age_s": max(0.0, receiver.age_s(now_s)), "lost_samples": receiver.counts.lost_samples}
+    if angle is not None:
+        fields |= {"angle_rad": finite(angle.angle_rad), "velocity_rad_s": finite(angle.velocity_rad_s), "angle": []}
+    angles = [] if angle is None else _emptied(angle.live)
+    if run is None:
+        return Taken({**fields, **IDLE}, origin_s, samples, blocks, angles, [])
+    done = run.gate.done[run.told_pulses :]
+    run.told_pulses += len(done)
+    segments = run.score.laid.segments if run.score.adaptive else ()  # they hold every pulse before
+    return Taken({**fields, **_of_run(run)}, origin_s, samples, blocks, angles, done, segments, run.plan.pulse_rate_hz)
 
 
-def _run_fields(run: TestRun, now_s: float, samples: bool) -> dict[str, Any]:
-    rate_hz, laid = run.plan.pulse_rate_hz, run.score.laid
-    reached = 0 if run.t0_s is None else int(np.floor((now_s - run.t0_s) * rate_hz)) + 1
-    pulses = range(run.told_pulses, max(run.told_pulses, min(reached, len(laid))))
-    found: dict[str, Any] = {
+def _emptied(queue: Any) -> list[NDArray[Any]]:
+    found = []
+    while queue:
+        found.append(queue.popleft())
+    return found
+
+
+def _of_run(run: TestRun) -> dict[str, Any]:
+    return {
         "test_id": run.plan.test_id,
         "segment": run.segment(),
         "elapsed_s": run.elapsed_s(),
         "duration_s": run.score.longest_s,
-        "pulse_time_s": [index / rate_hz for index in pulses],
-        "pulse_width_us": laid.pulse_width_us[pulses.start : pulses.stop].tolist(),
         "dropped_pulses": run.gate.dropped,
         "sent_pulses": run.sent,
         "charge_uc": run.gate.charge_uc,
         "torque_time_nms": float(np.nan_to_num(run.torque_time_nms)),
-        "laid": len(laid),
-        "boundary_s": len(laid) / rate_hz,
+        "laid": run.score.decided,
+        "boundary_s": run.score.decided / run.plan.pulse_rate_hz,
         "ended_by": run.ended_by,
+        "pauses": run.pauses.all if run.pauses else [],
     }
-    if run.score.adaptive:  # whoever chooses its pieces needs these; the segments last: they hold every pulse before
-        late = tuple(run.gate.late) if samples else ()
-        found["not_sent"] = list(run.gate.not_sent)
-        found["late"] = [LatePulse(index=index, by_s=round(by_s, 6)) for index, by_s in late]
-        found["laid_segments"] = run.score.segments()
-    return found
+
+
+def live_event(taken: Taken) -> LiveEvent:
+    """The newest torque as minimum and maximum of bins of 10 ms, and the pulses."""
+    found, rate_hz = np.concatenate(taken.blocks), taken.pulse_rate_hz
+    bins = np.floor((found["host_time_s"] - taken.origin_s) / BIN_S)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(bins) > 0) + 1])
+    fields = dict(taken.fields)
+    if "angle" in fields:
+        fields["angle"] = _rows(taken) if taken.samples else None
+    return LiveEvent(
+        **fields,
+        time_s=np.round(bins[starts] * BIN_S, 4).tolist(),
+        torque_min_nm=_finite(np.fmin.reduceat(found["torque_nm"], starts)),
+        torque_max_nm=_finite(np.fmax.reduceat(found["torque_nm"], starts)),
+        pulse_time_s=[pulse.index / rate_hz for pulse in taken.done],
+        pulse_width_us=[pulse.pulse_width_us for pulse in taken.done],
+        laid_segments=[
+            LaidSegment(name=name, start_s=start / rate_hz, end_s=end / rate_hz, by=by)
+            for name, start, end, by in taken.segments
+        ],
+        samples=_samples(found, taken.origin_s) if taken.samples else None,
+        felt=_felt(taken.done, taken.origin_s) if taken.samples else None,
+    )
+
+
+def lines(taken: Taken) -> tuple[bytes, bytes]:
+    """The event as JSON, one line each: with every sample if they are wanted, and without."""
+    event = live_event(taken)
+    full = to_line(event)
+    if not taken.samples:
+        return full, full
+    return full, to_line(event.model_copy(update={"samples": None, "angle": None, "felt": None}))
+
+
+def serve(requests: BinaryIO, replies: BinaryIO) -> None:
+    """Make the lines of what is taken, until the end of input."""
+    while True:
+        try:
+            taken = pickle.load(requests)
+        except EOFError:
+            return
+        replies.writelines(lines(taken))
+        replies.flush()
 
 
 def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
@@ -90,19 +154,30 @@ def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
         host_time_s=(found["host_time_s"] - origin_s).round(6).tolist(),
         counter=found["counter"].tolist(),
         torque_nm=[value if math.isfinite(value) else None for value in torque_nm],
+        sync=found["sync"].tolist(),
     )
 
 
-def _angle_fields(angle: AngleReceiver, origin_s: float, samples: bool) -> dict[str, Any]:
-    """The newest angle, and all since the last event if they are wanted."""
+def _felt(done: list[Done], origin_s: float) -> Felt:
+    def times(name: str) -> list[float | None]:
+        return [finite(round(getattr(pulse, name) - origin_s, 6)) for pulse in done]
+
+    return Felt(
+        index=[pulse.index for pulse in done],
+        pulse_width_us=[pulse.pulse_width_us for pulse in done],
+        written_time_s=times("written_s"),
+        acknowledged_time_s=times("acknowledged_s"),
+        status=[int(pulse.status) for pulse in done],
+    )
+
+
+def _rows(taken: Taken) -> list[list[float | None]]:
+    """Every angle since the last event."""
     rows: list[list[float | None]] = []
-    while angle.live:
-        block = angle.live.popleft()
-        if samples:
-            block = (block - [origin_s, 0.0, 0.0]).round(6).tolist()
-            rows += [[row[0], finite(row[1]), finite(row[2])] for row in block]
-    newest = {"angle_rad": finite(angle.angle_rad), "velocity_rad_s": finite(angle.velocity_rad_s)}
-    return {**newest, "angle": rows if samples else None}
+    for block in taken.angles:
+        moved = (block - [taken.origin_s, 0.0, 0.0]).round(6).tolist()
+        rows += [[row[0], finite(row[1]), finite(row[2])] for row in moved]
+    return rows
 
 
 def finite(value: float | None) -> float | None:

@@ -14,7 +14,7 @@ from stimrig.rig.config import RigConfig
 from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibrating import Calibrations
 from stimrig.rig.control.calibration import check_profile, check_range
-from stimrig.rig.control.live import finite, live_event
+from stimrig.rig.control.live import Taken, finite, live_event, take
 from stimrig.rig.control.memory import LatchFile, Rest, Result
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
@@ -121,6 +121,11 @@ class Rig:
         return None
 
     def live(self, samples: bool = False) -> LiveEvent | None:
+        """`take_live`, made an event here."""
+        taken = self.take_live(samples)
+        return None if taken is None else live_event(taken)
+
+    def take_live(self, samples: bool = False) -> Taken | None:
         """Torque and pulses since the last call, every sample if asked for; None if there is no new torque.
 
         It only reads, and takes what waits to be shown: it may be called from another thread than the tasks'.
@@ -129,10 +134,7 @@ class Rig:
         if receiver is None:
             return None
         origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-        event = live_event(receiver, run, origin_s, now_s, samples, self.pair.angle)
-        if event is not None and run is not None:
-            run.told_pulses += len(event.pulse_time_s)
-        return event
+        return take(receiver, run, origin_s, now_s, samples, self.pair.angle)
 
     async def open(self) -> None:
         """Seal what a crash left, then connect; a missing device is reported in the status, not raised.

@@ -255,6 +255,8 @@ class FakeRig:
         score = self._running(request)
         if request.key != self.key:
             raise m_refusal("bad-plan", "Wrong key", "extend.key: not the key")
+        if not request.segments:
+            return score.told(request.test_id)
         if code := "refused" if self.refuses_extensions else score.extend(request.after, request.segments):
             raise m_refusal(code, "Not laid", f"extend: {code}")
         return score.told(request.test_id)
@@ -415,7 +417,7 @@ class FakeRig:
                 sent_pulses=sum(1 for width in widths[:last] if width),
                 charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
                 torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
-                samples=self._samples(torque, start, end), **self.arm.live(start, end),
+                samples=self._samples(torque, start, end), felt=_felt(widths[:last], first), **self.arm.live(start, end),
             )
         )  # fmt: skip
 
@@ -423,7 +425,7 @@ class FakeRig:
         counter = list(range(round(start * self.rate_hz), round(end * self.rate_hz)))
         return m.TorqueSamples(
             host_time_s=[k / self.rate_hz + 0.0005 * (k % 3) for k in counter], counter=counter,
-            torque_nm=[torque[k] for k in counter],
+            torque_nm=[torque[k] for k in counter], sync=[255] * len(counter),
         )  # fmt: skip
 
     def _finish(self, event: m.FinishedEvent) -> None:
@@ -454,6 +456,16 @@ class FakeRig:
                 },
             )
         )  # fmt: skip
+
+
+def _felt(widths: list[float], first: int) -> m.Felt:
+    """Each pulse since the first was sent and acknowledged in time."""
+    index = [k for k in range(first, len(widths)) if widths[k]]
+    due = [k / PULSE_RATE_HZ for k in index]
+    return m.Felt(
+        index=index, pulse_width_us=[widths[k] for k in index], written_time_s=due,
+        acknowledged_time_s=[s + 0.001 for s in due], status=[0] * len(index),
+    )  # fmt: skip
 
 
 def told_next(known: m.CalibrationStatus) -> m.CalibrationStatus:

@@ -20,9 +20,9 @@ from stimrig.identify.experiments.knowledge import LEAST_PERCENT, MOST_PERCENT, 
 from stimrig.rig.messages import (
     AHEAD,
     AdaptivePlan,
+    Felt,
     FinishedEvent,
     LaidSegment,
-    LatePulse,
     LiveEvent,
     Profile,
     SegmentPlan,
@@ -59,7 +59,7 @@ def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service:
         from stimrig.api.store.tables import Test
 
         plan = session.get(Test, document["id"]).plan
-    assert plan["adaptive"] == {"max_duration_s": 50.0, "max_torque_time_nms": 360.0}
+    assert plan["adaptive"] == {"max_duration_s": 50.0, "max_torque_time_nms": 360.0, "patience_s": 3.0}
     assert "key" not in plan and service.rig.key not in str(plan)
 
 
@@ -82,7 +82,7 @@ def test_only_new_samples_are_sent_and_none_is_lost(
     adviser.ask = listening
     assert played(client)["adaptive"]["ended"] == "known-enough"
     advised = [arguments for arguments in asked if arguments]
-    counters = [number for arguments in advised for number in arguments["counter"]]
+    counters = [number for arguments in advised for number in arguments["samples"]["counter"]]
     assert counters == list(range(len(counters))) and len(counters) > 800
     for arguments in advised:
         assert len(arguments["laid_us"]) == arguments["segments"][-1][2]
@@ -293,7 +293,7 @@ def adaptive() -> AdaptiveTests:
 
 
 def row(max_duration_s: float = 45.0, planned: tuple[str, ...] = ("opening", "prbs", "validate")) -> Test:
-    bounds = {"max_duration_s": max_duration_s, "max_torque_time_nms": 360.0}
+    bounds = {"max_duration_s": max_duration_s, "max_torque_time_nms": 360.0, "patience_s": 3.0}
     segments = [{"name": name, "start_s": 0.0, "end_s": 1.0} for name in planned]
     plan = {"adaptive": bounds, "target": {}, "reach": None, "preview": {"segments": segments}}
     return Test(id="T1", participant="P017", kind="adaptive", state="running", plan=plan, summary={})
@@ -365,7 +365,10 @@ class World:
                 test_id=test_id, segment="opening", elapsed_s=self.now_s, duration_s=45.0, time_s=[],
                 torque_min_nm=[], torque_max_nm=[], pulse_time_s=[], pulse_width_us=[], torque_age_s=0.0,
                 lost_samples=0, dropped_pulses=0, sent_pulses=0, charge_uc=0.0, torque_time_nms=0.0, ended_by="",
-                samples=None, laid=30, boundary_s=FIRST_S, not_sent=[4], late=[LatePulse(index=2, by_s=0.01)],
+                samples=None, laid=30, boundary_s=FIRST_S,
+                felt=Felt(
+                    index=[4], pulse_width_us=[0.0], written_time_s=[None], acknowledged_time_s=[None], status=[2]
+                ),
                 laid_segments=[LaidSegment(name="opening", start_s=0.0, end_s=FIRST_S, by="plan")],
             )  # fmt: skip
             for _ in range(5):
@@ -411,7 +414,16 @@ def test_the_newest_answer_is_sent_at_once(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_adviser_learns_what_the_muscle_felt(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World([SAID])
     followed(world, 40.0, monkeypatch)
-    assert (world.asked[0]["not_sent"], world.asked[0]["late"]) == ([4], [(2, 0.01)])
+    told = world.asked[0]["felt"]
+    assert set(told["index"]) == {4} and set(told["status"]) == {2} and len(told["index"]) > 100, "all since the start"
+    assert told.keys() == Felt.model_fields.keys()
+
+
+def test_a_chooser_that_gives_up_has_the_fixed_plan_play_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World([{**SAID, "kind": "misfit", "segments": []}])
+    followed(world, 40.0, monkeypatch)
+    [(_, request)] = world.requests
+    assert (request.after, request.segments) == (30, [])
 
 
 @pytest.mark.parametrize(
@@ -428,4 +440,4 @@ def test_an_answer_that_cannot_be_used_is_told(
     world = World([answer])
     told = followed(world, 40.0, monkeypatch).told
     assert told.state == "fixed" and told.problem.startswith("The fixed plan plays on: ") and why in told.problem
-    assert world.requests == []
+    assert [request for _, request in world.requests if request.segments] == []

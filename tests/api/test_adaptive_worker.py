@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,21 @@ class Cell:
             "host_time_s": [float(k / self.rate_hz + late[k]) for k in numbers],
             "counter": [k + 4000 for k in numbers],
             "torque_nm": [float(torque[k] + noise[k]) for k in numbers],
+            "sync": [255] * len(numbers),
         }
+
+
+def felt(widths: list[float], until: int, not_sent: Sequence[int] = (), late_s: dict[int, float] | None = None) -> Any:
+    """What became of the pulses before one, as live events tell it."""
+    index = [i for i in range(until) if widths[i] > 0]
+    written = [None if i in not_sent else i / PULSE_RATE_HZ + (late_s or {}).get(i, 0.0) for i in index]
+    return {
+        "index": index,
+        "pulse_width_us": [0.0 if i in not_sent else widths[i] for i in index],
+        "written_time_s": written,
+        "acknowledged_time_s": [None if t is None else t + 0.001 for t in written],
+        "status": [2 if i in not_sent else 0 for i in index],
+    }
 
 
 def test_times_are_those_of_the_samples_that_waited_nowhere() -> None:
@@ -67,21 +82,47 @@ def test_lost_samples_and_none_move_nothing() -> None:
     for lost in ((0, 0), (1600, 1900)):
         news = Cell(muscle, 2).news(widths, 2.5, lost)
         news["torque_nm"][100] = None
-        records.append(verbs.record_of(*news.values(), widths, [], segments, PULSE_RATE_HZ))
+        records.append(verbs.record_of(news, felt(widths, 100), widths, segments, PULSE_RATE_HZ))
     whole, holed = records
     assert whole.time_s.size - holed.time_s.size == pytest.approx(300 / 8, abs=2)
     kept = np.isin(whole.time_s, holed.time_s)
     assert np.abs(np.interp(holed.time_s, whole.time_s[kept], whole.torque_nm[kept]) - holed.torque_nm).max() < 0.05
-    assert np.array_equal(holed.pulses.width_us, widths)
+    assert np.array_equal(holed.pulses.width_us, widths[: holed.pulses.width_us.size])
+    assert holed.pulses.width_us.size >= 2.5 * PULSE_RATE_HZ - 1 and not holed.doubted[holed.time_s < 2.4].any()
 
 
 def test_a_late_pulse_is_late_in_the_record() -> None:
     news = Cell(sigmoid(72), 2).news(OPENING, 2.5)
-    record = verbs.record_of(*news.values(), OPENING, [(30, 0.004)], [("opening", 0, len(OPENING))], 40.0)
+    told = felt(OPENING, 100, late_s={30: 0.004})
+    record = verbs.record_of(news, told, OPENING, [("opening", 0, len(OPENING))], 40.0)
     late = (record.time_s >= 30 / 40.0) & (record.time_s < 31 / 40.0)
     assert late.sum() == verbs.BINS
-    assert np.array_equal(record.late_s, np.where(late, 0.004, 0.0))
-    assert record.pulses.late_s[30] == 0.004
+    assert np.allclose(record.late_s, np.where(late, 0.004, 0.0))
+    assert record.pulses.late_s[30] == pytest.approx(0.004)
+
+
+def test_a_pause_is_a_gap_in_the_record_and_what_is_not_told_yet_is_doubted() -> None:
+    """The muscle felt nothing in it, whatever was planned; the newest pulses may still be on their way."""
+    news, gap = Cell(sigmoid(72), 2).news(OPENING, 2.0), range(40, 56)
+    record = verbs.record_of(news, felt(OPENING, 70, gap), OPENING, [("opening", 0, len(OPENING))], 40.0)
+    inside = (record.time_s >= 40 / 40.0) & (record.time_s < 56 / 40.0)
+    after = (record.time_s > 56 / 40.0) & (record.time_s < 72 / 40.0)
+    assert not record.pulse_width_us[inside].any() and record.pulse_width_us[after].all()
+    assert record.pulses.lost[40:56].all()
+    assert np.array_equal(record.doubted, record.time_s >= 70 / 40.0 + record.pulses.time_s[0])
+
+
+def test_a_sync_line_tells_when_a_pulse_was_felt_whose_acknowledgement_was_read_late() -> None:
+    """As where the computer stood still between a pulse and its acknowledgement."""
+    news = Cell(sigmoid(72), 2, way_s=0.0).news(OPENING, 2.5)
+    told = felt(OPENING, 100)
+    told["acknowledged_time_s"][30] += 0.6
+    rising = {round((t + 0.0005) * 1600) + 1 for t in told["written_time_s"]}
+    for line, doubts in ((False, True), (True, False)):
+        if line:
+            news["sync"] = [int(k in rising) for k in range(len(news["sync"]))]
+        record = verbs.record_of(news, told, OPENING, [("opening", 0, len(OPENING))], 40.0)
+        assert (record.doubted is not None and bool(record.doubted.any())) is doubts
 
 
 def test_a_slow_cell_keeps_its_samples() -> None:
@@ -96,15 +137,18 @@ def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
     muscle = sigmoid(seed)
     cell = Cell(muscle, seed)
     verbs.begin(quiet, **HOW)
-    widths, segments = list(OPENING), [("opening", 0, len(OPENING))]
+    widths, segments, told_before = list(OPENING), [("opening", 0, len(OPENING))], 0
     for _ in range(30):
         end_s = len(widths) / PULSE_RATE_HZ
         not_sent = np.flatnonzero(np.random.default_rng(seed).random(2000)[: len(widths)] < dropped).tolist()
-        felt = [0.0 if index in not_sent else width for index, width in enumerate(widths)]
-        dose = float(np.sum(muscle.curve(np.array(felt)))) / PULSE_RATE_HZ
-        news = cell.news(felt, end_s - 0.4)
-        laid = {"laid_us": list(widths), "not_sent": not_sent, "late": [], "segments": segments}
-        told = verbs.advise(quiet, **news, **laid, torque_time_nm_s=dose, measured_s=end_s - 0.4)
+        felt_us = [0.0 if index in not_sent else width for index, width in enumerate(widths)]
+        dose = float(np.sum(muscle.curve(np.array(felt_us)))) / PULSE_RATE_HZ
+        news = cell.news(felt_us, end_s - 0.4)
+        until = round((end_s - 0.4) * PULSE_RATE_HZ) + 1
+        new = {name: values[told_before:] for name, values in felt(widths, until, not_sent).items()}
+        told_before += len(new["index"])
+        laid = {"laid_us": list(widths), "segments": segments}
+        told = verbs.advise(quiet, samples=news, felt=new, **laid, torque_time_nm_s=dose, measured_s=end_s - 0.4)
         json.dumps(told, allow_nan=False)
         if told["kind"] != "next":
             break
@@ -125,18 +169,14 @@ def test_what_was_late_or_not_sent_reaches_the_decision(monkeypatch: pytest.Monk
     seen: list[Any] = []
 
     def decide(record: Any, laid_us: Any, *_: Any) -> Decision:
-        seen.append((record.pulses.late_s[30], laid_us[31]))
+        seen.append((round(record.pulses.late_s[30], 6), laid_us[31]))
         return Decision("spent")
 
     monkeypatch.setattr(adaptive, "decide", decide)
     verbs.begin(quiet, **HOW)
-    laid = {
-        "laid_us": list(OPENING),
-        "not_sent": [31],
-        "late": [(30, 0.004)],
-        "segments": [("opening", 0, len(OPENING))],
-    }
-    verbs.advise(quiet, **Cell(sigmoid(72), 2).news(OPENING, 2.5), **laid, torque_time_nm_s=1.0, measured_s=2.5)
+    laid = {"laid_us": list(OPENING), "segments": [("opening", 0, len(OPENING))]}
+    news = {"samples": Cell(sigmoid(72), 2).news(OPENING, 2.5), "felt": felt(OPENING, 100, [31], {30: 0.004})}
+    verbs.advise(quiet, **news, **laid, torque_time_nm_s=1.0, measured_s=2.5)
     assert seen == [(0.004, 0.0)]
 
 

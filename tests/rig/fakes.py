@@ -293,9 +293,10 @@ FIXED = [rest(0.5), hold("first"), SegmentPlan(name="ramp", sequence="ramp", set
 
 
 def adaptive(
-    folder: Path, max_duration_s: float = 10.0, max_nms: float = 1e4, fixed: list[SegmentPlan] = FIXED, **more: Any
-) -> VirtualRig:
-    bounds = AdaptivePlan(max_duration_s=max_duration_s, max_torque_time_nms=max_nms)
+    folder: Path, max_duration_s: float = 10.0, max_nms: float = 1e4, fixed: list[SegmentPlan] = FIXED,
+    patience_s: float = 0.0, **more: Any,
+) -> VirtualRig:  # fmt: skip
+    bounds = AdaptivePlan(max_duration_s=max_duration_s, max_torque_time_nms=max_nms, patience_s=patience_s)
     return VirtualRig(folder, fixed, adaptive=bounds, **more)
 
 

@@ -248,7 +248,6 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
 
 
 WRONG: dict[str, tuple[list[SegmentPlan], type[RigError], str]] = {
-    "nothing": ([], PlanError, "0 segments; give 1 to 8"),
     "too many": ([rest(0.1)] * (MAX_EXTENSION_SEGMENTS + 1), PlanError, "9 segments"),
     "ten thousand": ([rest(0.1)] * 10_000, PlanError, "10000 segments"),
     "too long": ([rest(MAX_EXTENSION_S), rest(1.0)], RefusedError, "at most 30 s an extension"),
@@ -445,3 +444,27 @@ def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path
     assert np.all(planned_us[-40:] == 0)
     assert np.array_equal(np.floor(planned_us[planned_us >= 1]), sent_us)
     assert len(recording.names) <= 200
+
+
+def test_a_late_client_costs_rest_and_its_answer_still_counts(tmp_path: Path):
+    """A plan that has patience: rest is laid in short pieces, and what was decided before it is laid behind it."""
+    rig = adaptive(tmp_path, patience_s=3.0)
+    rig.at(1.2, lambda: extend(rig, 20, [hold("added")]))
+    rig.at(2.2, lambda: extend(rig, rig.run.score.decided, []))
+    rig.execute()
+    recording = rig.recording()
+    assert recording.names == ["rest", "wait", "wait", "wait", "added", "first", "ramp", "rest"]
+    planned_us = recording.columns["pulses/pulse_width_us"]
+    assert not planned_us[20:50].any() and planned_us[50:90].all(), "nothing flowed while it waited"
+
+
+def test_a_client_that_never_comes_back_costs_its_patience_once(tmp_path: Path):
+    rig = adaptive(tmp_path, patience_s=0.5)
+    rig.execute()
+    assert rig.recording().names == ["rest", "wait", "wait", "first", "ramp", "rest"]
+
+
+def test_patience_is_part_of_the_bounds(tmp_path: Path):
+    rig = adaptive(tmp_path, max_duration_s=3.6, patience_s=3.0)
+    result = rig.execute()
+    assert (result.outcome, result.summary["duration_s"] <= 3.6) == ("completed", True)

@@ -63,22 +63,20 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     live.wait("running")
     live.wait_pulses(5)
     assert extend(live, 44).laid == 68
-    run = live.rig.player.run
-    assert run is not None
-    run.gate.late, run.gate.not_sent = [(3, 0.004)], [4]
     event = live.rig.live(samples=True)
     assert event is not None and event.samples is not None and event.pulse_time_s
     assert (event.laid, event.boundary_s, event.duration_s) == (68, 1.7, 60.0)
     assert [(s.name, s.by) for s in event.laid_segments] == [("rest", "plan"), *[("added", "extension")] * 2]
     assert len(event.samples.torque_nm) == len(event.samples.counter) == len(event.samples.host_time_s) > 0
     assert np.all(np.diff(event.samples.counter) == 1)
-    assert [(late.index, late.by_s) for late in event.late] == [(3, 0.004)]
-    assert event.not_sent == [4]
+    assert event.felt is not None and event.felt.index == list(range(20, 20 + len(event.felt.index)))
+    assert (event.felt.pulse_width_us, event.felt.status) == (event.pulse_width_us, [0] * len(event.pulse_width_us))
+    assert all(a < b for a, b in zip(event.felt.written_time_s, event.felt.acknowledged_time_s, strict=True) if a and b)
     assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event, "read as it was sent"
     live.machine.wait(0.1)
     plain = live.rig.live()
     assert plain is not None
-    assert (plain.late, plain.samples) == ([], None), "only who chooses pieces needs them"
+    assert (plain.felt, plain.samples) == (None, None), "only who chooses pieces needs them"
     assert live.rig.status().duration_s == 60.0
     ending = live.ask(live.rig.player.enough(EnoughRequest(test_id="one", by="nurse")))
     assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))

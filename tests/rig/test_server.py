@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from stimrig.rig import __main__ as program
-from stimrig.rig.adapters import previews
-from stimrig.rig.adapters.previews import Previews
+from stimrig.rig.adapters import builders
+from stimrig.rig.adapters.builders import Previews
 from stimrig.rig.adapters.server import LONG_LINE_BYTES, Server
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
 from stimrig.rig.control.replies import internal_error
@@ -150,12 +150,12 @@ def test_one_that_takes_too_long_is_ended_and_the_next_is_built(monkeypatch: pyt
         asked = Previews(HARD_LIMITS, 1.0)
         await asked.warm()
         first = asked._process
-        monkeypatch.setattr(previews, "MAX_BUILD_S", 0.0)
+        monkeypatch.setattr(builders, "MAX_BUILD_S", 0.0)
         with pytest.raises(BusyError, match="not built within"):
             await asked.reply(REQUEST)
         assert first is not None
         assert first.returncode is not None
-        monkeypatch.setattr(previews, "MAX_BUILD_S", 60.0)
+        monkeypatch.setattr(builders, "MAX_BUILD_S", 60.0)
         reply = json.loads(await asked.reply(REQUEST))
         assert (reply["id"], reply["ok"], reply["body"]["duration_s"]) == (3, True, pytest.approx(38.7))
         await asked.close()
@@ -164,13 +164,13 @@ def test_one_that_takes_too_long_is_ended_and_the_next_is_built(monkeypatch: pyt
 
 
 def test_who_would_wait_for_too_long_is_refused_at_once(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(previews, "MAX_BUILD_S", 60.0)
+    monkeypatch.setattr(builders, "MAX_BUILD_S", 60.0)
 
     async def run() -> None:
         asked = Previews(HARD_LIMITS, 1.0)
         found = await asyncio.gather(*(asked.reply(REQUEST) for _ in range(40)), return_exceptions=True)
-        assert [isinstance(one, bytes) for one in found[: previews.MAX_WAITING]] == [True] * previews.MAX_WAITING
-        assert all(isinstance(one, BusyError) for one in found[previews.MAX_WAITING :])
+        assert [isinstance(one, bytes) for one in found[: builders.MAX_WAITING]] == [True] * builders.MAX_WAITING
+        assert all(isinstance(one, BusyError) for one in found[builders.MAX_WAITING :])
         assert json.loads(await asked.reply(REQUEST))["ok"]
         await asked.close()
 

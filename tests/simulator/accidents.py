@@ -72,6 +72,20 @@ def host_pauses(life: Life, chance: random.Random) -> str:
     return f"for {for_s:.3f} s"
 
 
+def host_is_disturbed(life: Life, chance: random.Random) -> str:
+    """For a while a share of the computer's time is taken away, in pieces of 20 to 800 ms."""
+    share, until_s = chance.choice((0.1, 0.3)), life.world.now_s + chance.uniform(1.0, 8.0)
+
+    def next_piece() -> None:
+        piece_s = chance.uniform(0.02, 0.8)
+        if life.world.now_s < until_s and not life.quiet:
+            life.computer.pause(piece_s)
+            life.world.after(piece_s + chance.expovariate(share / (1 - share) / 0.41), next_piece)
+
+    next_piece()
+    return f"{share:g} of the time until {until_s:.3f} s"
+
+
 def step_stalls(life: Life, chance: random.Random) -> str:
     """The computer stands still in the middle of a step: between a written intent and its command, for instance."""
     life.computer.stall_next_s = for_s = 10 ** chance.uniform(-3, 0.3)
@@ -157,5 +171,8 @@ LIBRARY: dict[str, Accident] = {
     for name, found in [*globals().items()]
     if isfunction(found) and found.__module__ == __name__ and not name.startswith("_")
 }
-ODDS = {"device_fault": 6.0, "line_stalls": 3.0, "line_deviates": 3.0, "host_pauses": 3.0, "step_stalls": 2.0}
+ODDS = {
+    "device_fault": 6.0, "line_stalls": 3.0, "line_deviates": 3.0, "host_pauses": 3.0, "host_is_disturbed": 3.0,
+    "step_stalls": 2.0,
+}  # fmt: skip
 """How often, beside 1 for the others."""

@@ -100,6 +100,7 @@ class Process:
         self.boot_id = f"boot-{computer.boots}"
         self.on_death: Callable[[], None] = lambda: None
         """Called as it dies by itself."""
+        self.head_start_s = 0.0
         self.works = 0
         """Pieces of work, of the disk for the most part, that are under way."""
         self._ports, self._simulated_disk = ports, disk
@@ -125,6 +126,11 @@ class Process:
 
     def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:  # noqa: ARG002
         return self._ports.shared_bus(self)
+
+    def hold_until(self, time_s: float) -> None: ...
+
+    def blocked_by(self, stood_s: float) -> str:  # noqa: ARG002
+        return ""
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:

@@ -74,6 +74,7 @@ class VirtualMachine:
         self.disk: Disk = disk or Files()
         self.boot_id = "this-boot"
         self._ids = count(1)
+        self.head_start_s = 0.0
 
     def port(self, path: str, **arguments: Any) -> Port:
         raise NotImplementedError(path, arguments)
@@ -83,6 +84,11 @@ class VirtualMachine:
 
     def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:  # noqa: ARG002
         return None
+
+    def hold_until(self, time_s: float) -> None: ...
+
+    def blocked_by(self, stood_s: float) -> str:  # noqa: ARG002
+        return ""
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:

@@ -1,0 +1,124 @@
+"""What the rig has built by processes beside it, `stimrig.rig.builder`: previews, and the JSON of live events.
+
+So neither a plan nor what pages are told takes memory or processor time from the rig's sender. Previews are built one
+at a time, with limits on memory and time; requests that would have to wait too long are refused at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import pickle
+import sys
+from dataclasses import asdict
+
+from stimrig.rig.control.live import Taken
+from stimrig.rig.errors import BusyError, PlanError
+from stimrig.rig.limits import Limit
+
+log = logging.getLogger("rig.builders")
+
+MAX_WAITING = 8
+MAX_BUILD_S = 30.0
+"""Real seconds allowed for one preview. The longest test needs 0.1 s of processor time, at the lowest priority."""
+MAX_LIVE_S = 5.0
+"""Real seconds allowed for one live event."""
+MAX_REPLY_BYTES = 8_000_000
+
+
+class Builder:
+    """One such process, started when first needed, and again if it has died or taken too long."""
+
+    def __init__(self, builds: str, first: bytes = b"") -> None:
+        self._builds, self._first = builds, first
+        self._one = asyncio.Lock()
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def warm(self) -> None:
+        """Start it, so that the first request does not wait for it."""
+        async with self._one:
+            await self._begin()
+
+    async def close(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            await process.wait()
+
+    async def _begin(self) -> asyncio.subprocess.Process:
+        if self._process is None or self._process.returncode is not None:
+            self._process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "stimrig.rig.builder", self._builds,
+                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_REPLY_BYTES,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            )  # fmt: skip
+            assert self._process.stdin is not None
+            self._process.stdin.write(self._first)
+        return self._process
+
+    async def _ask(self, request: bytes, lines: int = 1) -> list[bytes]:
+        process = await self._begin()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(request)
+        await process.stdin.drain()
+        replies = [await process.stdout.readline() for _ in range(lines)]
+        if not replies[-1].endswith(b"\n"):
+            raise ConnectionError("the builder has died")
+        return replies
+
+
+class Previews(Builder):
+    """Sends requests for previews to their builder."""
+
+    def __init__(self, table: dict[str, Limit], speed: float) -> None:
+        rows = {name: asdict(row) for name, row in table.items()}
+        super().__init__("previews", json.dumps({"table": rows, "speed": speed}).encode() + b"\n")
+        self._waiting = 0
+
+    async def reply(self, line: bytes, angle_set_at_utc: str | None = None) -> bytes:
+        """Reply to a preview request; both are one line of JSON. `angle_set_at_utc`: see `check_range`.
+
+        Raises
+        ------
+        BusyError
+            Too many requests are waiting.
+        PlanError
+            It took too much memory.
+        """
+        if self._waiting >= MAX_WAITING:
+            raise BusyError(f"previews: {self._waiting} requests are waiting; try again in a moment")
+        self._waiting += 1
+        request = json.dumps(angle_set_at_utc).encode() + b"\n" + line.rstrip(b"\n") + b"\n"
+        try:
+            async with self._one:
+                return (await asyncio.wait_for(self._ask(request), MAX_BUILD_S))[0]
+        except TimeoutError:
+            await self.close()
+            raise BusyError(f"preview: not built within {MAX_BUILD_S:g} s, the computer is busy; try again") from None
+        except (OSError, ValueError):
+            await self.close()
+            raise PlanError("preview: it could not be built; make the plan shorter") from None
+        finally:
+            self._waiting -= 1
+
+
+class LiveLines(Builder):
+    """Has live events made."""
+
+    def __init__(self) -> None:
+        super().__init__("live")
+
+    async def of(self, taken: Taken) -> list[bytes]:
+        """The event with every sample, and without; nothing where it could not be made: no test waits for a page."""
+        try:
+            async with self._one:
+                return await asyncio.wait_for(self._ask(pickle.dumps(taken), 2), MAX_LIVE_S)
+        except (OSError, ValueError) as error:  # a timeout is one, too
+            log.warning("a live event was lost: %r", error)
+            await self.close()
+            return []
