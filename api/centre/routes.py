@@ -30,7 +30,7 @@ from stimrig.api.centre.responses import (
     WarningOut,
 )
 from stimrig.api.clock import unix_of
-from stimrig.api.errors import NotFoundError, invalid
+from stimrig.api.errors import invalid, require_found
 from stimrig.api.store.centre_tables import CentreModel, CentreRecording, CentreRig
 from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
 from stimrig.api.web.responses.base import describe_answer
@@ -118,9 +118,7 @@ def sessions(
 async def model_file(context: Ctx, _who: ModelReader, rig: str, model_id: str) -> Response:
     """MODEL.json, as the rig made it; refused where it differs from its hash."""
     key = (await asyncio.to_thread(the_rig, context.store, rig)).id, model_id[:64]
-    row = await asyncio.to_thread(context.store.get, CentreModel, key)
-    if row is None:
-        raise NotFoundError("model", model_id[:64])
+    row = require_found(await asyncio.to_thread(context.store.get, CentreModel, key), "model", model_id[:64])
     return await hand_out(context, row.file, f"{row.participant}-{row.id}.json", "application/json")
 
 
@@ -158,8 +156,7 @@ async def recording(context: Ctx, _who: ModelReader, recording_id: int) -> Respo
     """A recording, HDF5; refused where it differs from its hash."""
     known = 0 < recording_id < 2**53
     row = await asyncio.to_thread(context.store.get, CentreRecording, recording_id) if known else None
-    if row is None:
-        raise NotFoundError("recording", str(recording_id)[:40], "GET /v1/recordings lists them.")
+    require_found(row, "recording", str(recording_id)[:40], "GET /v1/recordings lists them.")
     return await hand_out(context, row.file, f"{row.participant}-{row.recording_id}.h5", HDF5)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
 from stimrig.api.models.carried_structure import CarriedStructure
 from stimrig.api.models.explanation import require_evidence
@@ -53,10 +53,8 @@ class Analyses:
 
     def path(self, recording_id: str) -> str:
         """Where a recording lies."""
-        recording: Recording | None = self.store.get(Recording, recording_id)
-        if recording is None:
-            raise NotFoundError("recording", recording_id, "A model's document names its recording.")
-        return recording.path
+        recording = self.store.get(Recording, recording_id)
+        return require_found(recording, "recording", recording_id, "A model's document names its recording.").path
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
         """Measurement against model; with another recording's id, the model against that one."""

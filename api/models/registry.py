@@ -14,7 +14,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
 from stimrig.api.models.places import Site, in_words, kept, place_of, site_of, site_of_recording
 from stimrig.api.models.tracking import Limits
@@ -138,10 +138,8 @@ class Versions:
 
     def get(self, model_id: str) -> Model:
         """A version by its id."""
-        row = self.store.get(Model, model_id)
-        if row is None:
-            raise NotFoundError("model", model_id, "GET /v1/participants/{code}/models lists a participant's.")
-        return row
+        fix = "GET /v1/participants/{code}/models lists a participant's."
+        return require_found(self.store.get(Model, model_id), "model", model_id, fix)
 
     def of(self, participant: str, since_utc: str = "") -> list[dict[str, Any]]:
         """A participant's versions as clients see them, newest first; with `since_utc` those made since then.

@@ -18,7 +18,7 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
@@ -256,10 +256,7 @@ def _user_named(session: Session, name: str) -> User | None:
 
 
 def _known_user(session: Session, name: str) -> User:
-    row = _user_named(session, name)
-    if row is None:
-        raise NotFoundError("user", name, "GET /v1/users lists them.")
-    return row
+    return require_found(_user_named(session, name), "user", name, "GET /v1/users lists them.")
 
 
 MOST_STRANGERS, MOST_KNOWN = 8, 64
