@@ -156,7 +156,7 @@ async def recording(context: Ctx, _who: ModelReader, recording_id: int) -> Respo
     """A recording, HDF5; refused where it differs from its hash."""
     known = 0 < recording_id < 2**53
     row = await asyncio.to_thread(context.store.get, CentreRecording, recording_id) if known else None
-    require_found(row, "recording", str(recording_id)[:40], "GET /v1/recordings lists them.")
+    row = require_found(row, "recording", str(recording_id)[:40], "GET /v1/recordings lists them.")
     return await hand_out(context, row.file, f"{row.participant}-{row.recording_id}.h5", HDF5)
 
 

@@ -81,8 +81,7 @@ class Analyses:
 
     def first_version(self, model: Model) -> Model:
         """The first version made from the model's recording: what is found of its plain structure is kept with it."""
-        rows = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc, limit=1)
-        return rows[0]
+        return self.store.first(Model, Model.recording_id == model.recording_id, order=Model.created_utc)
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """The diagnosis if it has been made."""

@@ -269,8 +269,7 @@ class Versions:
 
     def decision(self, model_id: str) -> Approval | None:
         """The newest decision on a version."""
-        found = self.store.all(Approval, Approval.model_id == model_id, order=Approval.id.desc(), limit=1)
-        return found[0] if found else None
+        return self.store.first(Approval, Approval.model_id == model_id, order=Approval.id.desc())
 
     def approved(self, participant: str) -> Approval | None:
         """The approval that holds for a participant today."""

@@ -84,6 +84,10 @@ class Store:
         with self.read() as session:
             return list(session.scalars(query))
 
+    def first(self, table: Any, *where: Any, order: Any = None) -> Any:
+        """The first of these, or None."""
+        return next(iter(self.all(table, *where, order=order, limit=1)), None)
+
     def seen(self, clock: Clock, *about: About) -> Seen:
         """The version of what rests on these entries of the audit trail; without `about`, on any."""
         with self.read() as session:
