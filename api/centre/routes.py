@@ -31,7 +31,7 @@ from stimrig.api.centre.responses import (
 )
 from stimrig.api.clock import unix_of
 from stimrig.api.errors import invalid, require_found
-from stimrig.api.store.centre_tables import CentreModel, CentreRecording, CentreRig
+from stimrig.api.store.centre_tables import CentreModel, CentreRecording
 from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.routes.operation import Figures
@@ -167,15 +167,11 @@ class RigIn(BaseModel):
     name: Annotated[str, StringConstraints(min_length=1, max_length=60)]
 
 
-def rig_document(row: CentreRig) -> dict[str, Any]:
-    """A rig, without what is nobody's business."""
-    return {name: value for name, value in row.as_dict().items() if name not in SECRET}
-
-
 @v1.get("/rigs", tags=["rigs"], **describe_answer(list[RigOut]))
 def list_rigs(context: Ctx, _who: ModelReader) -> list[dict[str, Any]]:
-    """All rigs, by name."""
-    return [rig_document(row) for row in context.rigs.all()]
+    """All rigs, by name, without what is nobody's business."""
+    rows = [row.as_dict() for row in context.rigs.all()]
+    return [{name: value for name, value in row.items() if name not in SECRET} for row in rows]
 
 
 @v1.post("/rigs", tags=["rigs"], status_code=201, **describe_answer(RigKeyOut, 201, "added"))

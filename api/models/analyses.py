@@ -16,7 +16,7 @@ from stimrig.api.models.carried_structure import CarriedStructure
 from stimrig.api.models.explanation import require_evidence
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, audit
+from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Model, Recording
 from stimrig.api.workers.pool import Call, Pool
 
@@ -76,12 +76,10 @@ class Analyses:
     def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
         """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
         if is_plain(model):
-            return self.first_version(model), "diagnosis", {}
+            # what is found of the plain structure is kept with the first version made from the recording
+            own = Model.recording_id == model.recording_id
+            return self.store.first(Model, own, order=Model.created_utc), "diagnosis", {}
         return model, OWN_DIAGNOSIS, {"model_json": stored_model.text(model)}
-
-    def first_version(self, model: Model) -> Model:
-        """The first version made from the model's recording: what is found of its plain structure is kept with it."""
-        return self.store.first(Model, Model.recording_id == model.recording_id, order=Model.created_utc)
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """The diagnosis if it has been made."""
@@ -221,9 +219,8 @@ class Analyses:
             model_json, model.participant, model.recording_id, by, parent_id=model.id, added_effect=",".join(added)
         )
         if force or reason:
-            with self.store.write() as session:
-                action = "force effect" if force else "add effect"
-                audit.write(session, self.clock.utc(), by, action, row.id, effects=added, reason=reason)
+            action = "force effect" if force else "add effect"
+            self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
         return row
 
     async def improve(self, model: Model, by: str, on_call: OnCall | None = None) -> tuple[dict[str, Any], list[Model]]:

@@ -50,13 +50,6 @@ def is_reason(text: str) -> bool:
     )
 
 
-def refuse_without(verdict: str, reason: str) -> None:
-    """Refuse to approve a model that is not usable without a reason. Raises ApiError (422): what to write."""
-    if verdict in POOR and not is_reason(reason):
-        title = "This model is not usable: say why it is approved all the same"
-        raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
-
-
 @dataclass(frozen=True)
 class Served:
     """What the controller fetches: the bytes and their tag."""
@@ -214,7 +207,9 @@ class Versions:
         row = self.get(model_id)
         if approved:
             stored_model.whole(row)
-            refuse_without(self.quality(row)["verdict"], reason)
+            if self.quality(row)["verdict"] in POOR and not is_reason(reason):
+                title = "This model is not usable: say why it is approved all the same"
+                raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
         with self.store.write() as session:
             if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
@@ -282,8 +277,8 @@ class Versions:
         return {code: row for code, row in found.items() if row.expires_utc is None or row.expires_utc > now}
 
     def last_approved(self, participant: str) -> Model | None:
-        """The version approved last, whether or not that still holds."""
-        last = self.last_approval(participant)
+        """The version approved last and not rejected since, whether or not its day is over."""
+        last = self._last_approvals([participant]).get(participant)
         return None if last is None else self.get(last.model_id)
 
     def last_approval(self, participant: str) -> Approval | None:
