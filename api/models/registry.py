@@ -281,10 +281,6 @@ class Versions:
         last = self._last_approvals([participant]).get(participant)
         return None if last is None else self.get(last.model_id)
 
-    def last_approval(self, participant: str) -> Approval | None:
-        """The newest approval of a version that was not rejected since; its day may be over."""
-        return self._last_approvals([participant]).get(participant)
-
     def _last_approvals(self, participants: Collection[str], without: Collection[str] = ()) -> dict[str, Approval]:
         query = select(Approval).where(Approval.participant.in_(participants)).order_by(Approval.id.desc())
         rejected = set(without)
