@@ -73,7 +73,7 @@ def note(store: Store, clock: Clock, sha256: str, ok: bool, words: str = "") -> 
             return
         row.checked_utc, row.ok = now, ok
         if ok:
-            warnings.mended(session, now, "damaged", sha256)
+            warnings.end(session, now, "damaged", CentreWarning.subject == sha256)
             return
         of = select(CentreItem.rig_id).where(CentreItem.file == sha256).distinct().limit(100)
         rigs = session.scalars(of).all()
