@@ -9,7 +9,8 @@ them. `load` puts two busy processes on each core. Pauses come only while a test
 A seed names the muscle, the noise and the pattern of pauses. `sigmoid` patients have the curves of
 `tests.harness.adaptive`, `shaped` ones are the emulator's `plain:SEED`, of eight shapes. "Unseen" is 100 % less the
 best fit of the model's prediction to the clean torque of random levels; each seed is first played in the way `idle`,
-and the ratio of both errors is told. `--idle FILE` takes those rows from an earlier run.
+and the ratio of both errors is told. `--idle FILE` takes those rows from an earlier run. Rigs beside each other take
+time from one another: idle tests on more rigs than cores are not idle.
 
 The emulator's electrodes tell which pulses were felt. Broken are limits of width, current, distance, rate and charge,
 and the climb: after more than 0.25 s of dropped pulses the first is at most 50 µs wide, and each next one at most 50 µs
