@@ -95,7 +95,8 @@ def played(running: Any, client: Any, muscle: Muscle, seed: int, settings: argpa
         except NotCompleted as error:
             test = error.document
     stood = disturber.stood
-    row = {"pauses": len(stood), "paused_s": sum(one.ended_s - one.began_s for one in stood)}
+    row: dict[str, Any] = {"pauses": len(stood), "paused_s": sum(one.ended_s - one.began_s for one in stood)}
+    row["stood"] = [(round(one.began_s, 3), round(one.ended_s, 3), one.rig) for one in stood]
     row |= outcome(test) | wire(running, client, test, muscle, stood)
     if test["model_id"] is not None:
         model = Model.from_json(json.dumps(client.model_file(test["model_id"])))
