@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from stimrig.rig.messages import Problem as RigProblem
 
+T = TypeVar("T")
 RIG_STATUS = {
     "refused": 422,
     "rest-needed": 422,
@@ -48,6 +49,13 @@ class NotFoundError(ApiError):
 
     def __init__(self, what: str, name: str, fix: str = "") -> None:
         super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {fix}".strip())
+
+
+def require_found(found: T | None, what: str, name: str, fix: str = "") -> T:
+    """What was asked for. Raises NotFoundError where it is None."""
+    if found is None:
+        raise NotFoundError(what, name, fix)
+    return found
 
 
 def invalid(detail: str, **extra: Any) -> ApiError:

@@ -48,6 +48,7 @@ class Patient(ilc.Service):
     def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As the controller's, up to ten times."""
         for _ in range(10):
+            self.client.participant(self.participant)  # a trial is a decision: on what the person sees now
             try:
                 return super().play(widths_us)
             except (ilc.HaltedError, ilc.ServiceError) as error:

@@ -92,6 +92,15 @@ def test_the_pattern_is_the_seed_s_and_stops_five_percent_of_the_time() -> None:
     assert sum(pause.which is None for pause in first) == pytest.approx(2000, rel=0.1)
 
 
+def test_share_and_bounds_of_the_pauses_can_be_given() -> None:
+    drawn = list(itertools.islice(pattern(7, 0.2, 0.02, 0.3), 4000))
+    paused_s, between_s = sum(pause.duration_s for pause in drawn), sum(pause.after_s for pause in drawn)
+    assert paused_s / (paused_s + between_s) == pytest.approx(0.2, rel=0.1)
+    assert 0.02 <= min(pause.duration_s for pause in drawn) < 0.03
+    assert 0.29 < max(pause.duration_s for pause in drawn) <= 0.3
+    assert {len(pause.of([1, 2, 3])) for pause in drawn} == {1, 3}
+
+
 @pytest.mark.slow
 def test_processes_and_their_orphans_stand_still_as_often_as_is_told(
     tmp_path: Path, disturb: Callable[..., subprocess.Popen[str]]

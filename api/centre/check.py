@@ -73,7 +73,7 @@ def note(store: Store, clock: Clock, sha256: str, ok: bool, words: str = "") -> 
             return
         row.checked_utc, row.ok = now, ok
         if ok:
-            warnings.mended(session, now, "damaged", sha256)
+            warnings.end(session, now, "damaged", CentreWarning.subject == sha256)
             return
         of = select(CentreItem.rig_id).where(CentreItem.file == sha256).distinct().limit(100)
         rigs = session.scalars(of).all()
@@ -111,7 +111,7 @@ def unseen(store: Store, clock: Clock) -> None:
 def _note(spool: Spool, trouble: str | None) -> None:
     """Warn of the bucket while it cannot be used; nothing is written while all is well."""
     open_ones = (CentreWarning.kind == "bucket", CentreWarning.ended_utc.is_(None))
-    known = bool(spool.store.all(CentreWarning, *open_ones, limit=1))
+    known = spool.store.first(CentreWarning, *open_ones) is not None
     if known != (trouble is not None):
         with spool.store.write() as session:
             warnings.holds(session, spool.clock.utc(), None, "bucket", trouble is not None, words=trouble or "")

@@ -10,7 +10,7 @@ from sqlalchemy import Select, exists, select, tuple_
 
 from stimrig.api.centre import clean
 from stimrig.api.clock import local_day
-from stimrig.api.errors import NotFoundError, invalid
+from stimrig.api.errors import invalid, require_found
 from stimrig.api.models.stored_model import VERDICTS
 from stimrig.api.store import Store
 from stimrig.api.store.centre_tables import (
@@ -27,6 +27,7 @@ from stimrig.api.store.centre_tables import (
 PARTICIPANTS, SESSIONS = 50, 12
 MOST_IN_A_SESSION = 400
 """Recordings, tests, models of a page of sessions."""
+MOST_IN_A_TREND = 200
 VERDICT_NAMES = (*VERDICTS, "unknown")
 LAST = "\U0010ffff"
 """Sorts after every text."""
@@ -71,10 +72,8 @@ def asked(
 
 def the_rig(store: Store, name: str) -> CentreRig:
     """A rig by its name. Raises NotFoundError."""
-    found = store.all(CentreRig, CentreRig.name == name[:80], limit=1)
-    if not found:
-        raise NotFoundError("rig", name[:80], "GET /v1/rigs lists them.")
-    return found[0]
+    row = store.first(CentreRig, CentreRig.name == name[:80])
+    return require_found(row, "rig", name[:80], "GET /v1/rigs lists them.")
 
 
 def participants(store: Store, asked: Search, limit: int = PARTICIPANTS) -> tuple[list[dict[str, Any]], str | None]:
@@ -123,8 +122,7 @@ def person(store: Store, code: str) -> list[dict[str, Any]]:
 
 def require(store: Store, code: str) -> None:
     """Whether there is such a participant. Raises NotFoundError."""
-    if not person(store, code):
-        raise NotFoundError("participant", code, "GET /v1/participants lists them.")
+    require_found(person(store, code) or None, "participant", code, "GET /v1/participants lists them.")
 
 
 def sessions(
@@ -178,7 +176,7 @@ def _fill(store: Store, code: str, found: list[dict[str, Any]]) -> None:
                 one[name].append(row)
 
 
-def stood(store: Store, code: str, limit: int = 200) -> list[dict[str, Any]]:
+def stood(store: Store, code: str) -> list[dict[str, Any]]:
     """A participant's newest sessions with a model, each with that model, oldest first: what a trend is drawn from."""
     own, made = CentreSession, CentreModel
     query = (
@@ -187,7 +185,7 @@ def stood(store: Store, code: str, limit: int = 200) -> list[dict[str, Any]]:
         .join(CentreRig, CentreRig.id == own.rig_id)
         .where(own.participant == code, own.model_id.is_not(None))
         .order_by(own.day.desc(), own.rig_id.desc())
-        .limit(limit)
+        .limit(MOST_IN_A_TREND)
     )
     with store.read() as session:
         rows = session.execute(query).all()

@@ -17,7 +17,7 @@ from stimrig.api.outbox.chain import BEGIN, NOWHERE, Position, item_hash
 from stimrig.api.outbox.messages import BatchIn, HelloIn, ItemIn
 from stimrig.api.store import Store
 from stimrig.api.store.audit import canonical, digest, storable
-from stimrig.api.store.centre_tables import CentreChain, CentreItem, CentreRig
+from stimrig.api.store.centre_tables import CentreChain, CentreItem, CentreRig, CentreWarning
 from stimrig.identify.json_text import BadJson, parse
 
 MOST_BATCH_BYTES = 4_000_000
@@ -121,7 +121,7 @@ class Ingest:
         free, total = row.disk_free_bytes, row.disk_total_bytes
         full = free is not None and total is not None and free < min(LEAST_DISK_SHARE * total, LEAST_DISK_BYTES)
         warnings.holds(session, now, row.id, "disk", full, free_gb=round((free or 0) / 1e9, 2))
-        warnings.end(session, now, row.id, "unseen")
+        warnings.end(session, now, "unseen", CentreWarning.rig_id == row.id)
 
     def take(self, rig: CentreRig, batch: BatchIn) -> Position:
         """All items of a batch, or none; where the chain stands then.

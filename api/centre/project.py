@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from sqlalchemy import select
@@ -116,9 +116,7 @@ class Projector:
         code, key = clean.code(body.get("participant")), clean.text(item.key, 64)
         if code is None or not key:
             return False
-        row = self._get(CentreModel, (self.rig.id, key))
-        if row is None:
-            row = self._add(CentreModel(rig_id=self.rig.id, id=key), (self.rig.id, key))
+        row = self._row(CentreModel, rig_id=self.rig.id, id=key)
         row.participant, row.created_utc = code, clean.label(body.get("created_utc"), self._at(item))
         row.recording_id = clean.text(body.get("recording_id"), 64)
         row.parent_id, row.method = clean.text(body.get("parent_id"), 64), clean.text(body.get("method"), 40)
@@ -129,9 +127,7 @@ class Projector:
         elif item.file not in (None, row.file):  # a version never changes
             self._tell("changed", key, kept=row.file[:12], told=str(item.file)[:12])
         for effect in row.effects:
-            if self._get(CentreEffect, (effect, code, self.rig.id)) is None:
-                new = CentreEffect(effect=effect, participant=code, rig_id=self.rig.id)
-                self._add(new, (effect, code, self.rig.id))
+            self._row(CentreEffect, effect=effect, participant=code, rig_id=self.rig.id)
         day = self._day_of(row)
         if day.approved_by is None and row.created_utc >= (day.model_utc or ""):
             self._stands(day, row)
@@ -182,11 +178,7 @@ class Projector:
         return clean.label(item.at_utc, self.now_utc)
 
     def _person(self, code: str) -> CentreParticipant:
-        row = self._get(CentreParticipant, (code, self.rig.id))
-        if row is None:
-            row = CentreParticipant(code=code, rig_id=self.rig.id, sessions=0, recordings=0)
-            self._add(row, (code, self.rig.id))
-        return row
+        return self._row(CentreParticipant, {"sessions": 0, "recordings": 0}, code=code, rig_id=self.rig.id)
 
     def _day(self, code: str, at_utc: str) -> CentreSession:
         """The session of a time."""
@@ -225,6 +217,11 @@ class Projector:
         if (table, key) not in self._rows:
             self._rows[table, key] = self.session.get(table, key)
         return self._rows[table, key]
+
+    def _row(self, table: Any, more: Mapping[str, Any] = {}, **key: Any) -> Any:
+        """The row of a key, whose columns are named in their order; one that is not there begins with `more`."""
+        place = tuple(key.values())
+        return self._get(table, place) or self._add(table(**key, **more), place)
 
     def _add(self, row: Any, key: tuple[Any, ...]) -> Any:
         self.session.add(row)

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from starlette.requests import HTTPConnection
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.people.auth import unauthorized
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit
@@ -60,8 +60,7 @@ class Rigs:
         """The rig's key opens nothing any more; what it pushed stays. Raises NotFoundError."""
         with self.store.write() as session:
             row = session.scalars(select(CentreRig).where(CentreRig.name == name)).first()
-            if row is None:
-                raise NotFoundError("rig", name[:80], "GET /v1/rigs lists them.")
+            row = require_found(row, "rig", name[:80], "GET /v1/rigs lists them.")
             if row.revoked_utc is None:
                 row.revoked_utc = now = self.clock.utc()
                 audit.write(session, now, by, "revoke rig", name)
@@ -70,8 +69,7 @@ class Rigs:
         return self.store.all(CentreRig, order=CentreRig.name)
 
     def named(self, name: str) -> CentreRig | None:
-        found = self.store.all(CentreRig, CentreRig.name == name, limit=1)
-        return found[0] if found else None
+        return self.store.first(CentreRig, CentreRig.name == name)
 
     def identify(self, connection: HTTPConnection) -> CentreRig:
         """The rig whose key a request carries; looked up each time, so that a revoked one ends at once everywhere.
@@ -84,13 +82,13 @@ class Rigs:
         kind, _, text = connection.headers.get("authorization", "").partition(" ")
         if kind.lower() != "bearer" or not text.strip():
             raise unauthorized("Send the rig's key: `Authorization: Bearer KEY`.")
-        found = self.store.all(CentreRig, CentreRig.key_hash == digest(text.strip()), limit=1)
-        if not found:
+        found: CentreRig | None = self.store.first(CentreRig, CentreRig.key_hash == digest(text.strip()))
+        if found is None:
             self.guesses.unknown_token(place_of(connection.client.host if connection.client else ""))
             raise unauthorized(REFUSED)
-        if found[0].revoked_utc is not None:
+        if found.revoked_utc is not None:
             raise unauthorized(REFUSED)
-        return found[0]
+        return found
 
 
 def still(session: Session, rig: CentreRig, hold: bool = True) -> CentreRig:

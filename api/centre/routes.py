@@ -30,8 +30,8 @@ from stimrig.api.centre.responses import (
     WarningOut,
 )
 from stimrig.api.clock import unix_of
-from stimrig.api.errors import NotFoundError, invalid
-from stimrig.api.store.centre_tables import CentreModel, CentreRecording, CentreRig
+from stimrig.api.errors import invalid, require_found
+from stimrig.api.store.centre_tables import CentreModel, CentreRecording
 from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.routes.operation import Figures
@@ -118,9 +118,7 @@ def sessions(
 async def model_file(context: Ctx, _who: ModelReader, rig: str, model_id: str) -> Response:
     """MODEL.json, as the rig made it; refused where it differs from its hash."""
     key = (await asyncio.to_thread(the_rig, context.store, rig)).id, model_id[:64]
-    row = await asyncio.to_thread(context.store.get, CentreModel, key)
-    if row is None:
-        raise NotFoundError("model", model_id[:64])
+    row = require_found(await asyncio.to_thread(context.store.get, CentreModel, key), "model", model_id[:64])
     return await hand_out(context, row.file, f"{row.participant}-{row.id}.json", "application/json")
 
 
@@ -158,8 +156,7 @@ async def recording(context: Ctx, _who: ModelReader, recording_id: int) -> Respo
     """A recording, HDF5; refused where it differs from its hash."""
     known = 0 < recording_id < 2**53
     row = await asyncio.to_thread(context.store.get, CentreRecording, recording_id) if known else None
-    if row is None:
-        raise NotFoundError("recording", str(recording_id)[:40], "GET /v1/recordings lists them.")
+    row = require_found(row, "recording", str(recording_id)[:40], "GET /v1/recordings lists them.")
     return await hand_out(context, row.file, f"{row.participant}-{row.recording_id}.h5", HDF5)
 
 
@@ -170,15 +167,11 @@ class RigIn(BaseModel):
     name: Annotated[str, StringConstraints(min_length=1, max_length=60)]
 
 
-def rig_document(row: CentreRig) -> dict[str, Any]:
-    """A rig, without what is nobody's business."""
-    return {name: value for name, value in row.as_dict().items() if name not in SECRET}
-
-
 @v1.get("/rigs", tags=["rigs"], **describe_answer(list[RigOut]))
 def list_rigs(context: Ctx, _who: ModelReader) -> list[dict[str, Any]]:
-    """All rigs, by name."""
-    return [rig_document(row) for row in context.rigs.all()]
+    """All rigs, by name, without what is nobody's business."""
+    rows = [row.as_dict() for row in context.rigs.all()]
+    return [{name: value for name, value in row.items() if name not in SECRET} for row in rows]
 
 
 @v1.post("/rigs", tags=["rigs"], status_code=201, **describe_answer(RigKeyOut, 201, "added"))

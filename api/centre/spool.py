@@ -18,7 +18,7 @@ from stimrig.api.centre.bucket import Bucket, BucketError, failed, first_line
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.store import Store
-from stimrig.api.store.centre_tables import CentreFile, CentreRig, CentreWanted
+from stimrig.api.store.centre_tables import CentreFile, CentreRig, CentreWanted, CentreWarning
 from stimrig.api.whole_file import sha256_of
 
 MOST_PIECE_BYTES = 8_000_000
@@ -112,7 +112,7 @@ class Spool:
         with self.store.write() as session:
             session.merge(CentreFile(sha256=sha256, bytes=length, whole_utc=now, checked_utc=now, ok=True))
             session.execute(delete(CentreWanted).where(CentreWanted.sha256 == sha256))
-            warnings.mended(session, now, "damaged", sha256)
+            warnings.end(session, now, "damaged", CentreWarning.subject == sha256)
         part.unlink(missing_ok=True)
 
     def settle(self) -> int:

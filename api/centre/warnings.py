@@ -38,17 +38,8 @@ def tell(session: Session, now_utc: str, rig_id: int | None, kind: str, subject:
     session.flush()
 
 
-def end(session: Session, now_utc: str, rig_id: int | None, kind: str) -> None:
-    """It holds no longer: what comes after is told anew."""
-    _end(session, now_utc, kind, CentreWarning.rig_id == rig_id)
-
-
-def mended(session: Session, now_utc: str, kind: str, subject: str) -> None:
-    """It holds no longer, of whichever rig it was told."""
-    _end(session, now_utc, kind, CentreWarning.subject == subject)
-
-
-def _end(session: Session, now_utc: str, kind: str, of: ColumnElement[bool]) -> None:
+def end(session: Session, now_utc: str, kind: str, of: ColumnElement[bool]) -> None:
+    """It holds no longer, of a rig or of a subject: what comes after is told anew."""
     query = select(CentreWarning).where(of, CentreWarning.kind == kind, CentreWarning.ended_utc.is_(None))
     for row in session.scalars(query):
         row.ended_utc = now_utc
@@ -59,7 +50,7 @@ def holds(session: Session, now_utc: str, rig_id: int | None, kind: str, true: b
     if true:
         tell(session, now_utc, rig_id, kind, **detail)
     else:
-        end(session, now_utc, rig_id, kind)
+        end(session, now_utc, kind, CentreWarning.rig_id == rig_id)
 
 
 def listed(store: Store, acknowledged: bool = False, before: int | None = None) -> list[dict[str, Any]]:

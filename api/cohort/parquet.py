@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from itertools import islice
 from typing import Any, Literal, NamedTuple
 
@@ -178,10 +179,7 @@ def samples(record: WholeRecord, who: Who) -> pa.Table:
         "segment_index": pa.array(index, pa.int64(), mask=index < 0),
         "held_out": pa.array(np.isin(index, [i for i, name in enumerate(names) if name == HELD_OUT])),
     }
-    for field in schema_of("samples"):
-        if field.name not in made:
-            made[field.name] = _numbers(columns.get(field.name), field, size)
-    return _table("samples", made)
+    return _table("samples", made, columns, size)
 
 
 def pulses(record: WholeRecord, who: Who) -> pa.Table:
@@ -194,10 +192,7 @@ def pulses(record: WholeRecord, who: Who) -> pa.Table:
     made["status"] = _texts(status, STATUS)
     planned_s = columns.get("planned_time_s", np.empty(0))
     made["segment"] = _texts(segment_at(record, planned_s), [name for name, _, _ in record.segments])
-    for field in schema_of("pulses"):
-        if field.name not in made:
-            made[field.name] = _numbers(columns.get(field.name), field, size)
-    return _table("pulses", made)
+    return _table("pulses", made, columns, size)
 
 
 def segment_at(record: WholeRecord, time_s: np.ndarray) -> np.ndarray:
@@ -262,6 +257,9 @@ def _numbers(column: Any, field: Any, size: int) -> pa.Array:
     return pa.array(whole.astype(bool if field.type == pa.bool_() else np.int64), field.type, mask=missing)
 
 
-def _table(name: str, made: dict[str, Any]) -> pa.Table:
+def _table(name: str, made: dict[str, Any], columns: Mapping[str, Any], size: int) -> pa.Table:
+    """A table with the columns that were made; the others are a record's numbers."""
     schema = schema_of(name)
+    numbers = {field.name: field for field in schema if field.name not in made}
+    made |= {column: _numbers(columns.get(column), field, size) for column, field in numbers.items()}
     return pa.Table.from_arrays([made[field.name] for field in schema], schema=schema)

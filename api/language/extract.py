@@ -157,17 +157,13 @@ class _Sentences(ast.NodeVisitor):
         message = pattern_of(node)
         if _is_sentence(re.sub(r"%\(\w+\)s", "", message)):
             self.found.append(message)
-        for branch in (branch for part in ast.walk(node) if isinstance(part, ast.IfExp) for branch in _branches(part)):
-            self.found += [branch] if re.search("[A-Za-z]{2}", branch) else []
+        for part in ast.walk(node):
+            if isinstance(part, ast.IfExp):  # the words of `'low' if error > 0 else 'high'`
+                self.found += [said for said in map(_text, (part.body, part.orelse)) if re.search("[A-Za-z]{2}", said)]
 
 
 def _text(node: ast.expr) -> str:
     return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
-
-
-def _branches(choice: ast.IfExp) -> list[str]:
-    """The words of `'low' if error > 0 else 'high'`."""
-    return [_text(choice.body), _text(choice.orelse)]
 
 
 def _is_sentence(text: str) -> bool:

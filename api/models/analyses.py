@@ -10,13 +10,13 @@ from collections.abc import Callable
 from typing import Any
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
 from stimrig.api.models.carried_structure import CarriedStructure
 from stimrig.api.models.explanation import require_evidence
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, audit
+from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Model, Recording
 from stimrig.api.workers.pool import Call, Pool
 
@@ -53,10 +53,8 @@ class Analyses:
 
     def path(self, recording_id: str) -> str:
         """Where a recording lies."""
-        recording: Recording | None = self.store.get(Recording, recording_id)
-        if recording is None:
-            raise NotFoundError("recording", recording_id, "A model's document names its recording.")
-        return recording.path
+        recording = self.store.get(Recording, recording_id)
+        return require_found(recording, "recording", recording_id, "A model's document names its recording.").path
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
         """Measurement against model; with another recording's id, the model against that one."""
@@ -78,13 +76,10 @@ class Analyses:
     def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
         """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
         if is_plain(model):
-            return self.first_version(model), "diagnosis", {}
+            # what is found of the plain structure is kept with the first version made from the recording
+            own = Model.recording_id == model.recording_id
+            return self.store.first(Model, own, order=Model.created_utc), "diagnosis", {}
         return model, OWN_DIAGNOSIS, {"model_json": stored_model.text(model)}
-
-    def first_version(self, model: Model) -> Model:
-        """The first version made from the model's recording: what is found of its plain structure is kept with it."""
-        rows = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc, limit=1)
-        return rows[0]
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """The diagnosis if it has been made."""
@@ -224,9 +219,8 @@ class Analyses:
             model_json, model.participant, model.recording_id, by, parent_id=model.id, added_effect=",".join(added)
         )
         if force or reason:
-            with self.store.write() as session:
-                action = "force effect" if force else "add effect"
-                audit.write(session, self.clock.utc(), by, action, row.id, effects=added, reason=reason)
+            action = "force effect" if force else "add effect"
+            self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
         return row
 
     async def improve(self, model: Model, by: str, on_call: OnCall | None = None) -> tuple[dict[str, Any], list[Model]]:

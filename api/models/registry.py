@@ -14,7 +14,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
 from stimrig.api.models.places import Site, in_words, kept, place_of, site_of, site_of_recording
 from stimrig.api.models.tracking import Limits
@@ -48,13 +48,6 @@ def is_reason(text: str) -> bool:
         and len(set(letters)) >= DIFFERENT
         and not any(re.search(r"(.)\1{3}", word) for word in words)
     )
-
-
-def refuse_without(verdict: str, reason: str) -> None:
-    """Refuse to approve a model that is not usable without a reason. Raises ApiError (422): what to write."""
-    if verdict in POOR and not is_reason(reason):
-        title = "This model is not usable: say why it is approved all the same"
-        raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
 
 
 @dataclass(frozen=True)
@@ -138,10 +131,8 @@ class Versions:
 
     def get(self, model_id: str) -> Model:
         """A version by its id."""
-        row = self.store.get(Model, model_id)
-        if row is None:
-            raise NotFoundError("model", model_id, "GET /v1/participants/{code}/models lists a participant's.")
-        return row
+        fix = "GET /v1/participants/{code}/models lists a participant's."
+        return require_found(self.store.get(Model, model_id), "model", model_id, fix)
 
     def of(self, participant: str, since_utc: str = "") -> list[dict[str, Any]]:
         """A participant's versions as clients see them, newest first; with `since_utc` those made since then.
@@ -216,7 +207,9 @@ class Versions:
         row = self.get(model_id)
         if approved:
             stored_model.whole(row)
-            refuse_without(self.quality(row)["verdict"], reason)
+            if self.quality(row)["verdict"] in POOR and not is_reason(reason):
+                title = "This model is not usable: say why it is approved all the same"
+                raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
         with self.store.write() as session:
             if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
@@ -271,8 +264,7 @@ class Versions:
 
     def decision(self, model_id: str) -> Approval | None:
         """The newest decision on a version."""
-        found = self.store.all(Approval, Approval.model_id == model_id, order=Approval.id.desc(), limit=1)
-        return found[0] if found else None
+        return self.store.first(Approval, Approval.model_id == model_id, order=Approval.id.desc())
 
     def approved(self, participant: str) -> Approval | None:
         """The approval that holds for a participant today."""
@@ -285,13 +277,9 @@ class Versions:
         return {code: row for code, row in found.items() if row.expires_utc is None or row.expires_utc > now}
 
     def last_approved(self, participant: str) -> Model | None:
-        """The version approved last, whether or not that still holds."""
-        last = self.last_approval(participant)
+        """The version approved last and not rejected since, whether or not its day is over."""
+        last = self._last_approvals([participant]).get(participant)
         return None if last is None else self.get(last.model_id)
-
-    def last_approval(self, participant: str) -> Approval | None:
-        """The newest approval of a version that was not rejected since; its day may be over."""
-        return self._last_approvals([participant]).get(participant)
 
     def _last_approvals(self, participants: Collection[str], without: Collection[str] = ()) -> dict[str, Approval]:
         query = select(Approval).where(Approval.participant.in_(participants)).order_by(Approval.id.desc())

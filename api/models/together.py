@@ -10,7 +10,7 @@ from pathlib import Path
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models.analyses import Analyses, OnCall
 from stimrig.api.models.places import Site, site_of_recording
 from stimrig.api.store import audit, uploads
@@ -59,9 +59,8 @@ def _ids(effects: Sequence[str]) -> list[str]:
 def _find_recordings(analyses: Analyses, participant: str, recordings: Sequence[str]) -> list[Recording]:
     rows = []
     for identity in recordings:
-        row: Recording | None = analyses.store.get(Recording, identity)
-        if row is None:
-            raise NotFoundError("recording", identity, "GET /v1/participants/{code}/tests names those of its tests.")
+        fix = "GET /v1/participants/{code}/tests names those of its tests."
+        row = require_found(analyses.store.get(Recording, identity), "recording", identity, fix)
         if row.participant != participant:
             detail = f"{identity} is a recording of {row.participant}, the model is to be one of {participant}."
             raise ApiError(422, "other-participant", "The recording is another participant's", detail)

@@ -202,8 +202,7 @@ class TrackedVersions:
     def newest(self, approval_id: int) -> Tracked | None:
         """The trial after which something was served last."""
         conditions = (Tracked.approval_id == approval_id, Tracked.document.is_not(None))
-        found = self.store.all(Tracked, *conditions, order=Tracked.number.desc(), limit=1)
-        return found[0] if found else None
+        return self.store.first(Tracked, *conditions, order=Tracked.number.desc())
 
     def served(self, participant: str) -> Served | None:
         """The newest tracked version of the approval that holds, else the approved model itself; None without one.
@@ -217,11 +216,11 @@ class TrackedVersions:
         if approved is None:
             return None
         conditions = (Tracked.approval_id == approved.approval_id, Tracked.etag.is_not(None))
-        newest = self.store.all(Tracked.etag, *conditions, order=Tracked.number.desc(), limit=1)
-        if not newest:
+        newest = self.store.first(Tracked.etag, *conditions, order=Tracked.number.desc())
+        if newest is None:
             return approved
         found = self._served.get(participant)
-        if found is None or (found.approval_id, found.etag) != (approved.approval_id, f'"{newest[0]}"'):
+        if found is None or (found.approval_id, found.etag) != (approved.approval_id, f'"{newest}"'):
             row = self.newest(approved.approval_id)
             assert row is not None
             found = self._served[participant] = _served(row)

@@ -161,8 +161,8 @@ def append(path: Path, noted: Iterable[Receipt]) -> None:
 
 def head(store: Store, clock: Clock) -> Receipt:
     """The trail's present end."""
-    newest = store.all(AuditEntry, order=AuditEntry.seq.desc(), limit=1)
-    seq, hash_, at_utc = (newest[0].seq, newest[0].hash, newest[0].at_utc) if newest else (0, GENESIS, "")
+    newest = store.first(AuditEntry, order=AuditEntry.seq.desc())
+    seq, hash_, at_utc = (newest.seq, newest.hash, newest.at_utc) if newest else (0, GENESIS, "")
     return Receipt(seq=seq, hash=hash_, noted_utc=clock.utc(), at_utc=at_utc)
 
 

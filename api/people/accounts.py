@@ -18,7 +18,7 @@ from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
@@ -76,7 +76,7 @@ class People:
             self.guesses.password(name, place, known)
             right = await self.passwords.verify(lane, row.password_hash if row else None, password)
         if not right or row is None:
-            await asyncio.to_thread(self._note, name[:80], "sign in refused", address=address)
+            await asyncio.to_thread(self.store.note, self.clock, name[:80], "sign in refused", "page", address=address)
             raise unauthorized("Name and password do not match.")
         token: Token = await asyncio.to_thread(self.store.get, Token, row.token_hash)
         if token.revoked:
@@ -116,7 +116,7 @@ class People:
         if held is None:
             raise ApiError(409, "no-password", "There is no password to confirm", "Signed in with a token.")
         if not await self._right(held, principal.name, password):
-            await asyncio.to_thread(self._note, principal.name, "confirmation refused")
+            await asyncio.to_thread(self.store.note, self.clock, principal.name, "confirmation refused", "page")
             detail = "Nothing was decided. Go back and enter it again."
             raise unauthorized(detail, "wrong-password", "The password does not match")
         await asyncio.to_thread(self._confirm, held)
@@ -147,7 +147,7 @@ class People:
             return
         by_token = principal.session_hash is None
         if not await self._right(held.hash, principal.name, secret, held.token_hash if by_token else None):
-            await asyncio.to_thread(self._note, principal.name, "unlock refused")
+            await asyncio.to_thread(self.store.note, self.clock, principal.name, "unlock refused", "page")
             title = "The token does not match" if by_token else "The password does not match"
             raise unauthorized("The page stays locked. Enter it again.", "wrong-password", title)
         await asyncio.to_thread(self.auth.idle.unlock, held.hash, principal.name)
@@ -242,10 +242,6 @@ class People:
             row = _known_user(session, name)
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
 
-    def _note(self, who: str, action: str, **detail: Any) -> None:
-        with self.store.write() as session:
-            audit.write(session, self.clock.utc(), who, action, "page", **detail)
-
 
 def _user_named(session: Session, name: str) -> User | None:
     """The person of a name as it was typed; the exact one first, as names from before were told apart by case."""
@@ -256,10 +252,7 @@ def _user_named(session: Session, name: str) -> User | None:
 
 
 def _known_user(session: Session, name: str) -> User:
-    row = _user_named(session, name)
-    if row is None:
-        raise NotFoundError("user", name, "GET /v1/users lists them.")
-    return row
+    return require_found(_user_named(session, name), "user", name, "GET /v1/users lists them.")
 
 
 MOST_STRANGERS, MOST_KNOWN = 8, 64

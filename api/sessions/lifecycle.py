@@ -267,8 +267,7 @@ class Follower:
         if not self.store.several:
             return None
         of_others = (Test.state.in_(PLAYED_STATES), Test.rig == self.rig, Test.followed_by != self.holds.me)
-        found = self.store.all(Test, *of_others, limit=1)
-        return found[0] if found else None
+        return self.store.first(Test, *of_others)
 
     def left(self) -> list[Test]:
         """Open tests of this rig that nobody follows any more; from now on this service does."""

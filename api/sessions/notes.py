@@ -10,7 +10,7 @@ from sqlalchemy import and_, func, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, NotFoundError, require_found
 from stimrig.api.sessions.requests import NoteIn, NoteKind
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.tables import AuditEntry, Note, Participant, Test
@@ -70,8 +70,7 @@ class Notes:
         return note
 
     def _check(self, session: Session, participant: str, body: NoteIn) -> None:
-        if session.get(Participant, participant) is None:
-            raise NotFoundError("participant", participant)
+        require_found(session.get(Participant, participant), "participant", participant)
         count = session.scalar(select(func.count()).where(Note.participant == participant)) or 0
         if count >= MOST:
             detail = f"{participant} has {count} notes, as many as are kept. Write the next one elsewhere."

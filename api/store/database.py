@@ -20,7 +20,7 @@ from sqlalchemy.orm import Session, sessionmaker
 from stimrig.api import owner_only
 from stimrig.api.clock import Clock, local_day
 from stimrig.api.errors import ApiError
-from stimrig.api.store import migrations
+from stimrig.api.store import audit, migrations
 from stimrig.api.store.migrations import WRITES
 from stimrig.api.store.seen import About, Seen, check, newest
 
@@ -84,6 +84,10 @@ class Store:
         with self.read() as session:
             return list(session.scalars(query))
 
+    def first(self, table: Any, *where: Any, order: Any = None) -> Any:
+        """The first of these, or None."""
+        return next(iter(self.all(table, *where, order=order, limit=1)), None)
+
     def seen(self, clock: Clock, *about: About) -> Seen:
         """The version of what rests on these entries of the audit trail; without `about`, on any."""
         with self.read() as session:
@@ -97,6 +101,11 @@ class Store:
         """Refuse to ask a question about what has changed since the page was shown. Raises ChangedError."""
         with self.read() as session:
             check(session, *about)
+
+    def note(self, clock: Clock, who: str, action: str, subject: str, **detail: Any) -> None:
+        """Append an entry to the audit trail in a transaction of its own."""
+        with self.write() as session:
+            audit.write(session, clock.utc(), who, action, subject, **detail)
 
     def listen(self, event_name: str, heard: Callable[..., None]) -> None:
         """Hear an event of every session that writes, e.g. `before_commit`."""

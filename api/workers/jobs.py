@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.workers.pool import Call, Pool
 
 log = logging.getLogger("stimrig.jobs")
@@ -101,10 +101,8 @@ class Jobs:
             job.done.set()
 
     def get(self, job_id: str) -> Job:
-        job = self.all.get(job_id)
-        if job is None:
-            raise NotFoundError("job", job_id, "A restart of the service forgets jobs; ask for the result again.")
-        return job
+        fix = "A restart of the service forgets jobs; ask for the result again."
+        return require_found(self.all.get(job_id), "job", job_id, fix)
 
     def cancel(self, job: Job) -> None:
         """End the work; what is done already stays done."""

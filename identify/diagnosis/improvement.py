@@ -7,13 +7,7 @@ from typing import Any
 
 from stimrig.identify.diagnosis import structure_of
 from stimrig.identify.diagnosis.free import searched
-from stimrig.identify.diagnosis.search import (
-    MOST,
-    EffectSearch,
-    Progress,
-    Step,
-    helpful,
-)
+from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful
 from stimrig.identify.diagnosis.thresholds import RISE
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import words
@@ -108,12 +102,11 @@ def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str
     if step.added in search.detected:
         return "The samples show it directly, before any fit."
     number = search.added.index(step.added)
+    seen = difference(search.left_out[number], search.left_out[number + 1])
     if step.added in search.free:
-        seen = difference(search.left_out[number], search.left_out[number + 1])
         told = next(effect["shape"]["words"] for effect in model.effects if effect["id"] == step.added)
         return " ".join([told, seen.words_of_choice, FREE])
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
-    seen = difference(search.left_out[number], search.left_out[number + 1])
     reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
     unasked = [] if find_effect(step.added).predictable else ["It cannot be foreseen: it need not predict."]
     return " ".join([reason, seen.words, *unasked, *_rising(before.statistics, step.statistics)])

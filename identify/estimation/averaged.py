@@ -59,7 +59,7 @@ def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
     covariance[at, at] += (LEAST_SD * short.plateau_nm) ** 2 * np.eye(short.basis.size)
     hessian = _inverse(covariance)
     # The draws' centre is where data and prior balance: nothing pulls the curve away from it.
-    own = setup.with_(roughness=_positive((hessian - information)[at, at]), curve_nm=theta[at])
+    own = setup.with_(roughness=positive((hessian - information)[at, at]), curve_nm=theta[at])
     problem = Problem(own, [])
     residual = setup.target_nm - mean
     shown = float(np.trace(np.linalg.solve(hessian + 1e-12 * np.diag(np.diag(hessian)), information)))
@@ -117,7 +117,8 @@ def _inverse(covariance: np.ndarray) -> np.ndarray:
     return inverse / size[:, None] / size[None, :]
 
 
-def _positive(matrix: np.ndarray) -> np.ndarray:
+def positive(matrix: np.ndarray) -> np.ndarray:
+    """The nearest matrix that is symmetric and has no negative eigenvalue."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return (vectors * np.maximum(values, 0.0)) @ vectors.T
 

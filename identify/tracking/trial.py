@@ -18,6 +18,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.effects import Parameter, Scene, form
 from stimrig.identify.errors import BadRecord
+from stimrig.identify.estimation.averaged import positive
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.predict import problem_of
@@ -280,9 +281,7 @@ def _marginal(found: _Fit, seen: np.ndarray, own_sd: np.ndarray) -> tuple[np.nda
     # Relative to where the fit began: there the trial's own parameters have their prior mean.
     vector = found.bend @ found.moved + found.slope
     taken = np.linalg.solve(joint[told:, told:], np.c_[joint[told:, :told], vector[told:]])
-    matrix = joint[:told, :told] - joint[:told, told:] @ taken[:, :-1]
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    information = positive(joint[:told, :told] - joint[:told, told:] @ taken[:, :-1])
     return vector[:told] - joint[:told, told:] @ taken[:, -1] + information @ seen, information
 
 

@@ -48,19 +48,26 @@ class Pause:
     duration_s: float
     which: float | None
 
+    def of(self, pids: list[int]) -> list[int]:
+        """Those of the processes that stand still."""
+        return pids if self.which is None else [pids[int(self.which * len(pids))]]
 
-def pattern(seed: int, share: float = SHARE) -> Iterator[Pause]:
+
+def pattern(
+    seed: int, share: float = SHARE, shortest_s: float = SHORTEST_S, longest_s: float = LONGEST_S
+) -> Iterator[Pause]:
     """The pauses of a seed, without end.
 
     Parameters
     ----------
     seed : the same seed, the same pauses.
     share : of the time, on average.
+    shortest_s, longest_s : of a pause.
     """
     draw = random.Random(seed)
-    gap_s = (SHORTEST_S + LONGEST_S) / 2 * (1 - share) / share
+    gap_s = (shortest_s + longest_s) / 2 * (1 - share) / share
     while True:
-        after_s, duration_s = draw.expovariate(1 / gap_s), draw.uniform(SHORTEST_S, LONGEST_S)
+        after_s, duration_s = draw.expovariate(1 / gap_s), draw.uniform(shortest_s, longest_s)
         all_at_once, which = draw.random() < 0.5, draw.random()
         yield Pause(after_s, duration_s, None if all_at_once else which)
 
@@ -193,10 +200,9 @@ class Disturbed:
         pids = [pid for pid in below(os.getpid()) if pid != guardian.process.pid]
         if not pids:
             return False
-        chosen = pids if pause.which is None else [pids[int(pause.which * len(pids))]]
         began_s = time.monotonic()
         try:
-            guardian.stop(chosen)
+            guardian.stop(pause.of(pids))
             ended = self._ended.wait(pause.duration_s)
         finally:
             guardian.resume()

@@ -281,13 +281,17 @@ def run_lines(found: dict[str, Any]) -> list[str]:
         "(column `error` says why)",
         f"this run       {found['computed']} computed, {found['done_before']} done before, {found['took_s']:g} s",
     ]
-    if found["left_out"]:
-        lines.append(f"left out       {found['left_out']} that --select does not mean")
-    if found["copies"]:
-        lines.append(f"copies         {found['copies']} files with the content of another: counted once")
+    lines += passed_over(found, "counted")
     if not found["records"] + found["left_out"]:
         lines.append("Nothing was found. A folder is searched for .h5, .hdf5, .csv, .tsv, .txt and .mat files.")
     return [*lines, f"written to     {found['output']}"]
+
+
+def passed_over(found: dict[str, Any], done: str) -> list[str]:
+    """Records that were not meant, and files whose content was there already."""
+    left_out, copies = found["left_out"], found["copies"]
+    lines = [f"left out       {left_out} that --select does not mean"] if left_out else []
+    return lines + ([f"copies         {copies} files with the content of another: {done} once"] if copies else [])
 
 
 def changed_lines(found: dict[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.commands.cohort import Columns, Given, Select, Token, need_extra
+from stimrig.api.cli.commands.cohort import Columns, Given, Select, Token, need_extra, passed_over
 from stimrig.api.cli.errors import CommandError, InputError
 from stimrig.api.cli.terminal import Json, say, say_json
 
@@ -70,8 +70,4 @@ def report(found: dict[str, Any]) -> list[str]:
     lines = [f"records        {found['records']}: {found['written']} written now, {found['done_before']} done before"]
     if found["errors"]:
         lines.append(f"not exported   {found['errors']}; {found['errors_file']} says why")
-    if found["left_out"]:
-        lines.append(f"left out       {found['left_out']} that --select does not mean")
-    if found["copies"]:
-        lines.append(f"copies         {found['copies']} files with the content of another: exported once")
-    return [*lines, f"written to     {found['output']}"]
+    return [*lines, *passed_over(found, "exported"), f"written to     {found['output']}"]

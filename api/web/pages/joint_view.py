@@ -50,15 +50,11 @@ def _gather(context: Context, row: Participant, found: dict[str, Any]) -> dict[s
         "range_rad": profiles.range_of(row.profile),
         "may_start": starting.calibrated(context, row).may_start,
         "archived": next_view.step(context, row).kind == "archived",
-        "held": [{**each, "deg": _deg(each["angle_rad"])} for each in found["targets"]],
+        "held": [{**each, "deg": starting.allowed_deg({"target_rad": each["angle_rad"]})} for each in found["targets"]],
         "allowed": None if found["next_rad"] is None else starting.allowed_deg({"target_rad": found["next_rad"]}),
         "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],
         "kinds_lacking": [kind for kind in (PASSIVE, HELD, MOVING) if not any(test.kind == kind for test in rows)],
     }
-
-
-def _deg(angle_rad: float) -> tuple[float, float] | None:
-    return starting.allowed_deg({"target_rad": angle_rad})
 
 
 def _recorded_today(context: Context, code: str) -> list[Test]:

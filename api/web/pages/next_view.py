@@ -214,11 +214,8 @@ def step(context: Context, row: Participant) -> Step:
 
 def _last_test(context: Context, code: str) -> Test | None:
     """The newest test of today."""
-    found = context.store.all(
-        Test, Test.participant == code, Test.requested_utc >= context.clock.start_of_day_utc(),
-        order=Test.requested_utc.desc(), limit=1,
-    )  # fmt: skip
-    return found[0] if found else None
+    today = (Test.participant == code, Test.requested_utc >= context.clock.start_of_day_utc())
+    return context.store.first(Test, *today, order=Test.requested_utc.desc())
 
 
 def _counts(version: dict[str, Any]) -> bool:

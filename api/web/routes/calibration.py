@@ -158,12 +158,6 @@ async def sound(context: Context, code: str) -> dict[str, Any]:
     return found
 
 
-def note(context: Context, by: str, action: str, code: str, **detail: Any) -> None:
-    """An entry in the audit trail."""
-    with context.store.write() as session:
-        audit.write(session, context.clock.utc(), by, action, code, **detail)
-
-
 def _store(
     context: Context, code: str, result: messages.CalibrationResult, by: str, identity: str
 ) -> dict[str, Any] | None:  # fmt: skip
@@ -239,8 +233,8 @@ async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response:
         found = await sound(context, code)
         check_seen(found)
         await context.rig.ask(requests.CalibrateMarkRequest(threshold=body.threshold))
-    width_us = found["pulse_width_us"]
-    await asyncio.to_thread(note, context, who.name, f"mark {body.threshold}", code, pulse_width_us=width_us)
+    action, told = f"mark {body.threshold}", {"pulse_width_us": found["pulse_width_us"]}
+    await asyncio.to_thread(context.store.note, context.clock, who.name, action, code, **told)
     return tagged(response, await standing(context, code))
 
 

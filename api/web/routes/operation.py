@@ -6,6 +6,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import APIRouter
@@ -13,12 +14,12 @@ from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from prometheus_client import generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
-from sqlalchemy import func, select, text
+from sqlalchemy import text
 
 from stimrig.api import schemas
 from stimrig.api.errors import NotFoundError
 from stimrig.api.outbox import status
-from stimrig.api.store.tables import AuditEntry, Model, Participant, Test
+from stimrig.api.store.tables import Model, Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import SchemaOut, SchemasOut, describe_answer
@@ -53,22 +54,17 @@ def metrics(context: Ctx) -> Response:
     return Response(generate_latest(Figures(lambda: figures(context))), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
+@dataclass(frozen=True)
 class Figures:
-    """Figures that are read when they are asked for.
+    """Figures that are read when they are asked for: `collect` gives one family after the other."""
 
-    Parameters
-    ----------
-    collect : callable
-        Gives one family after the other.
-    """
-
-    def __init__(self, collect: Callable[[], Iterator[Metric]]) -> None:
-        self.collect = collect
+    collect: Callable[[], Iterator[Metric]]
 
 
 def figures(context: Context) -> Iterator[Metric]:
     """The service's figures, one family after the other."""
     rig, newest = context.rig, context.runner.hub.newest
+    approved = context.versions.all_approved(context.store.all(Participant.code))
     tests = GaugeMetricFamily("stimrig_tests", "Tests by state", labels=["state"])
     for state, count in sorted(Counter(row.state for row in context.store.all(Test)).items()):
         tests.add_metric([state], count)
@@ -78,8 +74,8 @@ def figures(context: Context) -> Iterator[Metric]:
         ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
         ("stimrig_rig_age_seconds", "Time since the rig spoke", -1.0 if rig.age_s is None else rig.age_s),
         ("stimrig_models", "Model versions", len(context.store.all(Model.id))),
-        ("stimrig_approved_models", "Participants with one approved today", _approved(context)),
-        ("stimrig_audit_entries", "Entries of the audit trail", _audit_entries(context)),
+        ("stimrig_approved_models", "Participants with one approved today", len(approved)),
+        ("stimrig_audit_entries", "Entries of the audit trail", context.store.seen(context.clock).entry),
         ("stimrig_free_disk_bytes", "Free where the data lie", shutil.disk_usage(context.settings.data_dir).free),
         ("stimrig_live_listeners", "Open live channels", context.runner.hub.listeners),
         ("stimrig_lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
@@ -111,15 +107,6 @@ def _centre(context: Context) -> Iterator[Metric]:
         ("stimrig_outbox_contact_age_seconds", "Time since it answered; -1: never", age_s),
     ):
         yield GaugeMetricFamily(name, words, value)
-
-
-def _approved(context: Context) -> int:
-    return len(context.versions.all_approved(context.store.all(Participant.code)))
-
-
-def _audit_entries(context: Context) -> int:
-    with context.store.read() as session:
-        return session.scalar(select(func.max(AuditEntry.seq))) or 0
 
 
 schemas_router = APIRouter(prefix="/v1/schemas", tags=["schemas"])

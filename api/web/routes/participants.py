@@ -15,7 +15,7 @@ from sqlalchemy import Row, func, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import local_day
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models.places import Site, in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions import notes, profiles
@@ -53,18 +53,12 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
 
 def find(context: Context, code: str) -> Participant:
     """A participant by its code; 404 where there is none."""
-    row = context.store.get(Participant, code)
-    if row is None:
-        raise NotFoundError("participant", code, "POST /v1/participants makes one.")
-    return row
+    return require_found(context.store.get(Participant, code), "participant", code, "POST /v1/participants makes one.")
 
 
 def within(session: Session, code: str) -> Participant:
     """The same in a transaction that changes it."""
-    row = session.get(Participant, code)
-    if row is None:
-        raise NotFoundError("participant", code)
-    return row
+    return require_found(session.get(Participant, code), "participant", code)
 
 
 @in_limits_turn

@@ -14,7 +14,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.store import audit, seen, uploads
@@ -72,8 +72,7 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
         404 no such recording; 410 its file is gone.
     """
     row = context.store.get(Recording, recording_id)
-    if row is None:
-        raise NotFoundError("recording", recording_id, "A test's document names its recording.")
+    require_found(row, "recording", recording_id, "A test's document names its recording.")
     path = Path(row.path)
     if not path.is_file():
         detail = f"The file of recording {recording_id!r} is not in its place ({path.name}). Restore it from a backup."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -11,7 +12,7 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions.requests import StopIn, TestIn
 from stimrig.api.sessions.stops import StopResult
-from stimrig.api.store import audit, seen
+from stimrig.api.store import seen
 from stimrig.api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
 from stimrig.api.web.guards import Press
 from stimrig.api.web.middleware import wants_html
@@ -87,17 +88,12 @@ async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
     A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
     """
     latch = seen.sent.get()
-
-    def note(action: str, **detail: Any) -> None:
-        with context.store.write() as session:
-            audit.write(session, context.clock.utc(), who.name, action, "rig", **detail)
-
-    shown = context.rig.latches.get(latch)
-    await asyncio.to_thread(note, "re-arm", reason=shown and shown["detail"]["reason"])
+    shown, note = context.rig.latches.get(latch), partial(context.store.note, context.clock, who.name)
+    await asyncio.to_thread(note, "re-arm", "rig", reason=shown and shown["detail"]["reason"])
     try:
         await context.rig.ask(RearmRequest(by=who.name, latch=latch))
     except ApiError as error:
-        await asyncio.to_thread(note, "re-arm refused", why=error.detail)
+        await asyncio.to_thread(note, "re-arm refused", "rig", why=error.detail)
         if error.code != "rig-latch-changed":
             raise
         status = await context.rig.fresh_status()

@@ -12,7 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api import language
 from stimrig.api.clinical_words import missing_words
-from stimrig.api.errors import ApiError, NotFoundError, forbidden
+from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.playing import other_than
@@ -32,15 +32,13 @@ LOOK_S = 1.0
 GOODBYE_S = 2.0
 """So long it waits for a client that reads nothing to hear why it is closed."""
 RAN_BY = "set who ran it"
+LISTED = "GET /v1/tests lists them."
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
 
 
 def find(context: Context, test_id: str) -> Test:
     """A test by its id; 404 where there is none."""
-    row = context.store.get(Test, test_id)
-    if row is None:
-        raise NotFoundError("test", test_id, "GET /v1/tests lists them.")
-    return row
+    return require_found(context.store.get(Test, test_id), "test", test_id, LISTED)
 
 
 @router.post("", status_code=202, **describe_answer(TestOut, 202, "begun; see `Location`"))
@@ -71,9 +69,7 @@ def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -
 def set_ran_by(context: Ctx, who: Tester, test_id: str, body: RanByIn) -> dict[str, Any]:
     """Say who ran a test at the rig, where that was not who asked for it."""
     with context.store.write() as session:
-        row = session.get(Test, test_id)
-        if row is None:
-            raise NotFoundError("test", test_id, "GET /v1/tests lists them.")
+        row = require_found(session.get(Test, test_id), "test", test_id, LISTED)
         seen.check(session, seen.actions_on(test_id, RAN_BY))
         row.ran_by = other_than(row.requested_by, body.ran_by)
         audit.write(session, context.clock.utc(), who.name, RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)

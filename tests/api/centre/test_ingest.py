@@ -288,7 +288,7 @@ def test_what_was_acknowledged_keeps_no_new_warning_back(
         for _ in range(times):
             with centre.context.store.write() as session:
                 warnings.tell(session, now, rig_id, "clock", difference_s=5.0)
-                warnings.end(session, now, rig_id, "clock")
+                warnings.end(session, now, "clock", CentreWarning.rig_id == rig_id)
 
     flap(5)
     assert len(centre.warnings()) == 3
