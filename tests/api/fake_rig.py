@@ -417,7 +417,8 @@ class FakeRig:
                 sent_pulses=sum(1 for width in widths[:last] if width),
                 charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
                 torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
-                samples=self._samples(torque, start, end), felt=_felt(widths[:last], first), **self.arm.live(start, end),
+                samples=self._samples(torque, start, end), felt=_felt(widths[:last], first),
+                **self.arm.live(start, end),
             )
         )  # fmt: skip
 
