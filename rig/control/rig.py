@@ -134,7 +134,8 @@ class Rig:
         if receiver is None:
             return None
         origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-        return take(receiver, run, origin_s, now_s, samples, self.pair.angle)
+        on_its_clock = run is None or run.t0_s is not None  # before a test's clock runs, samples have no time on it
+        return take(receiver, run, origin_s, now_s, samples and on_its_clock, self.pair.angle)
 
     async def open(self) -> None:
         """Seal what a crash left, then connect; a missing device is reported in the status, not raised.
