@@ -371,9 +371,10 @@ class Rise:
 
     def take(self, status: PulseStatus, asked_us: float, width_us: float) -> None:
         """What became of a pulse. One that the device would make too short counts as none."""
-        if status in (PulseStatus.UNACKNOWLEDGED, PulseStatus.REST):
-            self._felt_us = asked_us if status is PulseStatus.UNACKNOWLEDGED else 0.0
-            self._anew = self._anew and asked_us < width_us
+        if status is PulseStatus.UNACKNOWLEDGED:
+            self._felt_us, self._anew = asked_us, self._anew and asked_us < width_us
+        elif status is PulseStatus.REST:
+            self._felt_us = 0.0
 
 
 def spread_ms(durations_s: list[float]) -> dict[str, float]:

@@ -39,12 +39,12 @@ REST_S, REST_BETWEEN_TRAINS_S = 1.0, 0.5
 MOST_RISE_UC = 1.0
 MOST_STEP_US = 50.0
 TRAIN_RATE_HZ = 40.0
-LATEST, EARLY = 0.4, 0.1
+LATEST, EARLY = 0.2, 0.1
 """Of a period: what is later than the first is left out; within the second are those that came in time."""
 BLIND_S = 0.1
 """Without a sample read for so long, nothing is sent."""
-DECIDED_S = 0.02
-"""From the look at a sensor to the command; 0.4 of the longest period of these lives."""
+DECIDED_S = 0.01
+"""From the look at a sensor to the command; 0.2 of the longest period of these lives."""
 UNANSWERED_S = 0.68
 """Without an acknowledgement for 0.1 s a test ends, at the next pulse; after a standstill within 0.5 s."""
 TAKEN_BACK_S = 0.05
