@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import ctypes
 import json
 import logging
 import os
@@ -82,6 +83,8 @@ log = logging.getLogger("rig")
 SWITCH_INTERVAL_S = 0.0005
 """How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
 PROCESS_PRIORITY = 10
+LOCK_ALL = 1 | 2 | 4
+"""Of mlockall: what is there, what will be, each page once it is touched."""
 HUNG_S = 5.0
 """Real seconds after which the rig's thread counts as hung."""
 BEAT_PERIOD_S = 0.5
@@ -133,6 +136,7 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PROCESS_PRIORITY))
+    ctypes.CDLL(None).mlockall(LOCK_ALL)  # what was touched stays in memory; without the right it does nothing
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -413,8 +413,8 @@ class Pause(Message):
     """The computer stood still in a test; no current flowed, and the test went on."""
 
     at_s: float = Field(description="when the first pulse was due that did not go out, test's clock")
-    for_s: float = Field(description="until the test went on, s")
-    blocked_s: float = Field(description="the longest standstill in it, s")
+    for_s: float = Field(description="until the test went on, test's clock")
+    blocked_s: float = Field(description="the longest standstill in it, real seconds")
     cause: str = Field("", description="as far as the system knows it")
 
 

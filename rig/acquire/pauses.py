@@ -85,9 +85,10 @@ class Pauses:
                     return wrong
         if (wrong := await self._gate.changed()) is None:
             self.until_s = self._clock.now_s()
-            pause = Pause(at_s=due_s - t0_s, for_s=self._since(due_s), blocked_s=longest_s, cause=cause)
+            pause = Pause(at_s=due_s - t0_s, for_s=self.until_s - due_s, blocked_s=longest_s, cause=cause)
             self.all.append(pause)
-            self._journal.append_json(Kind.EVENT, {"event": "pause", **pause.model_dump()})
+            event = {"event": "pause", "time_s": self.until_s, **pause.model_dump()}
+            self._journal.append_json(Kind.EVENT, event)
         return wrong
 
     def _too_much(self, stood_s: float, due_s: float) -> str | None:

@@ -69,6 +69,9 @@ STAMPING = ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")
 """Timestamps of these interfaces are the sender's or the kernel's, of the others the host's at reading."""
 READ_TIMEOUT_S = 0.02
 JOIN_S = 2.0
+SO_RCVBUFFORCE = 33
+BUFFER_BYTES = 4_000_000
+"""About 5000 frames: three seconds of a cell at 1600 samples/s."""
 
 _open: dict[tuple[str, ...], CanBus] = {}
 _registering = threading.Lock()
@@ -210,6 +213,7 @@ class CanBus:
             except Exception as error:
                 last = error
                 break
+            _size_buffer(bus)
             if isinstance(bus, slcanBus) and isinstance(bus.serialPortOrig, serial.Serial):
                 bus.serialPortOrig = cast("Any", ReadAhead(bus.serialPortOrig))
             return bus
@@ -250,6 +254,16 @@ class _Gathering:
         block = self.listener.decode(self._frames, self.damaged, self.errors)
         self._frames, self.damaged, self.errors, self.end_s = [], 0, 0, math.inf
         post(lambda: self.listener.take(block))
+
+
+def _size_buffer(bus: can.BusABC) -> None:
+    """Room in the kernel for the frames of a pause: by default SocketCAN keeps about 300, a fifth of a second's."""
+    line = getattr(bus, "socket", None)
+    if isinstance(line, socket.socket):
+        for option in (SO_RCVBUFFORCE, socket.SO_RCVBUF):  # the first needs a right, the second has a limit
+            with contextlib.suppress(OSError):
+                line.setsockopt(socket.SOL_SOCKET, option, BUFFER_BYTES)
+                return
 
 
 def place_of(arguments: dict[str, Any]) -> str:

@@ -137,10 +137,10 @@ class Strain:
         before, self._before = self._before, self._counted()
         waited_s, stolen_s, pages = (now - then for now, then in zip(self._before, before, strict=True))
         if pages >= PAGES:
-            return "memory was read back from the disk"
+            return "the computer read memory back from its disk"
         if stolen_s >= MOST_OF_IT * stood_s:
-            return "the host of this virtual machine was busy"
-        return "other programs kept the processor" if waited_s >= MOST_OF_IT * stood_s else ""
+            return "the host of this virtual computer was busy"
+        return "other programs kept the computer's processor" if waited_s >= MOST_OF_IT * stood_s else ""
 
     @staticmethod
     def _counted() -> tuple[float, float, int]:

@@ -92,6 +92,8 @@ class Calibration:
         self._check_shortest()
         self._width_us = 0.0
         self._left_us: set[float] = set()
+        self._whole = True
+        """Whether the last train was felt as it was planned."""
         self._marks_us: dict[Threshold, float] = {}
         self._trains: list[CalibrationTrain] = []
         self._charge_uc = 0.0
@@ -192,12 +194,13 @@ class Calibration:
         )
 
     def played(self, width_us: float, torque_rise_nm: float | None, finished: FinishedEvent) -> None:
-        """Record a train that has ended. One of which no pulse was sent moves nothing: the next step begins as before.
+        """Record a train that has ended. One that was not felt whole moves nothing: the next step begins as before.
 
-        A computer that stands still for a moment drops the pulses that are late by then, perhaps all of a short train.
+        A computer that stands still for a moment drops the pulses that are due by then, perhaps all of a short train.
         """
         pulses = int(finished.summary.get("pulses", 0))
-        if pulses > 0:
+        self._whole = pulses > 0 and not finished.summary.get("pauses")
+        if self._whole:
             if width_us < self._width_us:
                 self._left_us.add(self._width_us)
             self._width_us = width_us
@@ -215,15 +218,15 @@ class Calibration:
         Raises
         ------
         PlanError
-            No train was played yet, nothing of the last one was sent, or the order sensory <= motor <= comfort would be
+            No train was played yet, the last one was not felt whole, or the order sensory <= motor <= comfort would be
             broken.
         """
         if not self._trains:
             raise PlanError("calibration: no train was played yet; step up first, then mark")
-        if self._trains[-1].pulses == 0:
+        if not self._whole:
             raise PlanError(
-                f"calibration: no pulse of train {self._trains[-1].number} was sent, the computer was busy; step "
-                "again, then mark"
+                f"calibration: train {self._trains[-1].number} was not sent whole, the computer was busy; step again, "
+                "then mark"
             )
         marks: dict[Threshold, float] = {**self._marks_us, threshold: self._width_us}
         known = [(name, marks[name]) for name in ORDER if name in marks]

@@ -33,6 +33,8 @@ REST_S = 0.1
 DOUBTFUL_ALIGNMENT_MS = 5.0
 DOUBTFUL_RATE = 0.02
 """Beyond these a recording's times are uncertain, and its finished event says so. A larger rate error is a fault."""
+READ_S = 0.03
+"""Before a pause, and while it ends: a period, and what is read at once."""
 ROUNDED_US = 1.0
 """A width that is lower than planned by more was not only rounded to the device's step."""
 
@@ -123,7 +125,8 @@ def _angle_summary(recording: Recording) -> dict[str, Any]:
 def warnings(recording: Recording) -> list[str]:
     """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
     alignment, attributes = recording.alignment, recording.attributes
-    found = [*_disturbed_line(recording), *_sensor_warnings(recording)]
+    pauses = [event for event in recording.events if event.get("event") == "pause"]
+    found = [*_paused(pauses), *_disturbed_line(recording, pauses), *_sensor_warnings(recording)]
     if attributes["journal_note"]:
         found.append(f"journal: {attributes['journal_note']}")
     nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
@@ -164,10 +167,29 @@ def _sensor_warnings(recording: Recording) -> list[str]:
     return found
 
 
-def _disturbed_line(recording: Recording) -> list[str]:
-    """Warnings about late acknowledgements, acknowledgements of what was not sent, dropped pulses and what followed."""
+def _paused(pauses: list[dict[str, Any]]) -> list[str]:
+    """That the computer stood still, for how long, and why, as far as it is known."""
+    if not pauses:
+        return []
+    count, whole_s = len(pauses), sum(pause["for_s"] for pause in pauses)
+    found = f"the computer stopped for {whole_s:.1f} s; no current flowed meanwhile, and the test went on"
+    if count > 1:
+        found = f"the computer stopped {count} times, {whole_s:.1f} s in all; no current flowed, and the test went on"
+    return [found, *sorted({pause["cause"] for pause in pauses} - {""})]
+
+
+def _disturbed_line(recording: Recording, pauses: list[dict[str, Any]]) -> list[str]:
+    """Warnings about late acknowledgements, acknowledgements of what was not sent, dropped pulses and what followed.
+
+    An acknowledgement that was read after a pause says nothing of the line.
+    """
     named = [event.get("event") for event in recording.events]
-    late_s = [event["delay_s"] for event in recording.events if event.get("event") == "late_ack"]
+    spans_s = [(pause["time_s"] - pause["for_s"] - READ_S, pause["time_s"]) for pause in pauses]
+    late_s = [
+        event["delay_s"]
+        for event in recording.events
+        if event.get("event") == "late_ack" and not any(lo <= event["time_s"] <= hi for lo, hi in spans_s)
+    ]
     found = []
     if unasked := named.count("unasked_ack"):
         found.append(
@@ -181,7 +203,8 @@ def _disturbed_line(recording: Recording) -> list[str]:
             "meanwhile were dropped"
         )
     planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
-    if weaker := int(np.count_nonzero(planned_us - sent_us > ROUNDED_US)):
+    weaker = int(np.count_nonzero(planned_us - sent_us > ROUNDED_US))
+    if weaker and not pauses:
         found.append(
             f"stimulator: {weaker} pulses were narrower than planned, since after dropped pulses the width climbs back "
             "no faster than its limit"

@@ -115,7 +115,9 @@ class Settings(LineSettings):
 class P24(LineStimulator[Settings]):
     """Driver of one P24 on one serial port; see `rig.devices.Stimulator` for what the methods promise."""
 
-    steps = Steps(pulse_width_us=1.0, current_ma=0.5, shortest_us=1.0)
+    steps = Steps(
+        pulse_width_us=1.0, current_ma=0.5, shortest_us=10.0
+    )  # the vendor's library: "every value < 10 = 10 µs"
     framing = SCIENCEMODE_4
     serial = {"baudrate": 3_000_000, "stopbits": 2, "rtscts": True}  # noqa: RUF012
 

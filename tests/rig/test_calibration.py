@@ -393,7 +393,7 @@ def test_a_train_of_which_nothing_was_sent_moves_nothing() -> None:
     for _ in range(3):
         assert calibration.next_width_us(UP) == 75
         calibration.played(75.0, 0.0, nothing)
-    with pytest.raises(PlanError, match="no pulse of train 6 was sent"):
+    with pytest.raises(PlanError, match="train 6 was not sent whole"):
         calibration.mark("sensory")
     calibration.played(calibration.next_width_us("down"), 0.0, nothing)
     assert play(calibration, UP) == 75, "nobody stepped back from it"

@@ -45,6 +45,9 @@ function addFrame(message) {
   if (message.duration_s) state.duration = message.duration_s;
   state.time.push(...message.time_s); state.low.push(...message.torque_min_nm); state.high.push(...message.torque_max_nm);
   state.pulseTime.push(...message.pulse_time_s); state.width.push(...message.pulse_width_us);
+  if (message.pauses.length) {
+    say("paused", words.paused.replace("{time}", shown(message.pauses[message.pauses.length - 1].for_s.toFixed(1)))); byId("paused").hidden = false;
+  }
   if (data.sensor) takeAngles(message);
   if (state.test.joint) showTorqueTime(message.torque_time_nms);
   if (!state.test.adaptive && !(state.test.joint && state.test.joint.coverage)) return;
