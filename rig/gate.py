@@ -159,7 +159,10 @@ class Gate:
 
     async def changed(self) -> str | None:
         """What the device says that it did not say when it was armed; None: it is as it was. Raises DeviceError."""
-        _, state = await self._stimulator.state()
+        try:
+            _, state = await self._stimulator.state()
+        except DeviceError:  # its answer may have come while the computer stood still again
+            _, state = await self._stimulator.state()
         if state == self._state_as_armed:
             return None
         return f"stimulator: it is {state} after a pause of the computer, it was {self._state_as_armed}"
@@ -224,8 +227,7 @@ class Gate:
     def _skip(self, journal: Journal, index: int, status: PulseStatus, reason: str = "") -> PulseStatus:
         now_s = self._clock.now_s()
         journal.append(Kind.SKIPPED, jn.SKIPPED.pack(index, status, now_s))
-        if status != PulseStatus.REST:
-            self.done.append(Done(index, 0.0, math.nan, math.nan, status))
+        self.done.append(Done(index, 0.0, math.nan, math.nan, status))
         if status == PulseStatus.DROPPED:
             self.dropped += 1
         if reason:

@@ -241,6 +241,8 @@ def test_who_follows_a_test_learns_what_became_of_each_pulse(tmp_path: Path):
     acked = pytest.approx(setup.stimulator.acked_s[0])
     assert setup.gate.done[0] == Done(3, 100, written[0], acked, PulseStatus.ACKNOWLEDGED)
     assert setup.gate.done[1].pulse_width_us == 120
+    setup.gate.fire(5, Pulse(0.4, 20.0), setup.clock.now_s(), setup.clock.now_s())
+    assert setup.gate.done[2].status == PulseStatus.REST, "too short for the device: nothing was felt, and it is known"
 
 
 @pytest.mark.parametrize(
