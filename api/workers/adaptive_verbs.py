@@ -197,7 +197,8 @@ def record_of(
     if len(samples["host_time_s"]) < 2:
         return None
     time_s, torque = sample_times(samples["host_time_s"], samples["counter"]), np.array(samples["torque_nm"], float)
-    inside = np.isfinite(torque) & (time_s >= 0) & (time_s < len(laid_us) / rate_hz - 1e-9)
+    whole_s = min(np.floor(time_s[-1] * rate_hz), len(laid_us)) / rate_hz  # of an interval's begin a mean is noisy
+    inside = np.isfinite(torque) & (time_s >= 0) & (time_s < whole_s - 1e-9)
     if not inside.any():
         return None
     time_s, torque, sync = time_s[inside], torque[inside], np.array(samples["sync"])[inside]

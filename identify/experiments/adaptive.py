@@ -39,6 +39,9 @@ LEAST_S = 2.0
 """A record that is shorter tells nothing: the opening is played."""
 ALARM = 1e-3
 """P-value of a residual test below which the structure fits badly; each test is asked about ten times in one test."""
+CONFIRMED_S = 1.0
+"""A structure fits badly where it still does with a record that is longer by so much: by chance one test in a thousand
+fails, and each is asked about again and again."""
 EXCESS = 1.5
 """A residual larger than this many times the samples' noise is none of noise."""
 ROUNDS = 3
@@ -67,6 +70,7 @@ class Decision:
     knowledge: Knowledge | None = None  # the bands as they are; None before the first fit
     expected_torque_time_nm_s: float = 0.0  # of the segments, by the mean curve
     short: Short | None = field(default=None, repr=False)  # the fit, which makes the next call faster (`before`)
+    doubted_s: float | None = None  # length of the record with which the structure first fitted badly; None: it fits
 
     def to_dict(self) -> dict:
         """Plain values, for the test's document and the page."""
@@ -131,7 +135,12 @@ def decide(
         return Decision("misfit", words=f"No model can be fitted ({error}). The rest of the fixed test is played.")
     known = knowledge(short)
     if wrong:
-        return Decision("misfit", words=f"{wrong} The rest of the fixed test is played.", knowledge=known, short=short)
+        long_s = short.grid.size * short.grid.step_s
+        since_s = long_s if before is None or before.doubted_s is None else before.doubted_s
+        if long_s - since_s >= CONFIRMED_S or not _finite(short):
+            words = f"{wrong} The rest of the fixed test is played."
+            return Decision("misfit", words=words, knowledge=known, short=short)
+        return replace(_next(short, known, np.asarray(played_us, float), asked), doubted_s=since_s)
     if known.reaches(asked.target) and _settled(short):
         return Decision("enough", words=f"Enough is known. {_state(known)}", knowledge=known, short=short)
     return _next(short, known, np.asarray(played_us, float), asked)
