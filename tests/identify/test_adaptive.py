@@ -131,7 +131,7 @@ def test_a_misfit_beside_a_disturbance_is_still_one():
 @pytest.mark.slow
 @pytest.mark.parametrize("run_away", [lambda t: 0.02 * np.exp(2.0 * t), lambda t: 3.0 * np.sin(20.0 * t)])
 def test_torque_that_runs_away_is_never_enough(run_away):
-    widths = np.r_[np.zeros(20), np.linspace(0.0, 300.0, 40), np.full(12, 300.0), np.zeros(20), np.full(100, 150.0)]
+    widths = np.r_[np.zeros(20), np.linspace(0.0, 300.0, 40), np.full(12, 300.0), np.zeros(20), np.full(140, 150.0)]
     time_s = np.arange(widths.size * 10) / 400.0
     torque = run_away(time_s) + noise(1)[: time_s.size]
     decision = None
