@@ -472,7 +472,8 @@ class FinishedEvent(Message):
         "alignment {method, error_ms}, "
         "sample_rate_hz, torque_peak_nm, angle (with a sensor: samples, lost_samples, range_rad, error_ms), "
         "cpu_percent, of a test whose process died dose_is_bound (true: charge_uc, duration_s and pulses may be too "
-        "high, never too low) and doubtful_pulses, warnings (sentences for people about possible errors)",
+        "high, never too low) and doubtful_pulses, warnings (sentences for people about possible errors), "
+        "notes (sentences about what happened and leaves nothing in doubt)",
     )
 
 

@@ -124,6 +124,7 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any] | None) -> list[
         f"{number(late.get('median'), 3)}, p99 {number(late.get('p99'), 3)}, max {number(late.get('max'), 3)} ms",
         f"clocks         aligned by {aligned.get('method')}, error {number(aligned.get('error_ms'), 4)} ms",
         *(f"in doubt       {words}" for words in summary.get("warnings") or []),
+        *(f"note           {words}" for words in summary.get("notes") or []),
         *adaptive_lines(test.get("adaptive")),
         *(model_report(model) if model else []),
         *carried_lines((test.get("fit") or {}).get("carried")),

@@ -109,6 +109,7 @@ def summary_of(recording: Recording, counted: dict[str, Any]) -> dict[str, Any]:
         "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
         "alignment": {**asdict(alignment), "error_ms": finite(alignment.error_ms)},
         "warnings": [*warnings(recording), *dose],
+        "notes": notes(recording),
     }
 
 
@@ -125,8 +126,7 @@ def _angle_summary(recording: Recording) -> dict[str, Any]:
 def warnings(recording: Recording) -> list[str]:
     """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
     alignment, attributes = recording.alignment, recording.attributes
-    pauses = [event for event in recording.events if event.get("event") == "pause"]
-    found = [*_paused(pauses), *_disturbed_line(recording, pauses), *_sensor_warnings(recording)]
+    found = [*_disturbed_line(recording), *_sensor_warnings(recording)]
     if attributes["journal_note"]:
         found.append(f"journal: {attributes['journal_note']}")
     nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
@@ -167,8 +167,13 @@ def _sensor_warnings(recording: Recording) -> list[str]:
     return found
 
 
-def _paused(pauses: list[dict[str, Any]]) -> list[str]:
-    """That the computer stood still, for how long, and why, as far as it is known."""
+def _pauses(recording: Recording) -> list[dict[str, Any]]:
+    return [event for event in recording.events if event.get("event") == "pause"]
+
+
+def notes(recording: Recording) -> list[str]:
+    """What happened and leaves nothing in doubt: that the computer stood still, for how long, and why, if it is known."""
+    pauses = _pauses(recording)
     if not pauses:
         return []
     count, whole_s = len(pauses), sum(pause["for_s"] for pause in pauses)
@@ -178,12 +183,13 @@ def _paused(pauses: list[dict[str, Any]]) -> list[str]:
     return [found, *sorted({pause["cause"] for pause in pauses} - {""})]
 
 
-def _disturbed_line(recording: Recording, pauses: list[dict[str, Any]]) -> list[str]:
+def _disturbed_line(recording: Recording) -> list[str]:
     """Warnings about late acknowledgements, acknowledgements of what was not sent, dropped pulses and what followed.
 
     An acknowledgement that was read after a pause says nothing of the line.
     """
     named = [event.get("event") for event in recording.events]
+    pauses = _pauses(recording)
     spans_s = [(pause["time_s"] - pause["for_s"] - READ_S, pause["time_s"]) for pause in pauses]
     late_s = [
         event["delay_s"]

@@ -383,6 +383,19 @@ def test_another_width_than_the_one_shown_is_not_sent() -> None:
             calibration.check_shown(36.0, shown_us)
 
 
+def test_a_train_that_was_not_felt_whole_marks_nothing() -> None:
+    """Nor does a step go on from it: nobody knows what its width feels like."""
+    calibration = stepped()
+    assert play(calibration, UP) == 25
+    broken = FinishedEvent(test_id="c1.002", outcome="completed", summary={"pulses": 9, "pauses": [{"for_s": 0.6}]})
+    calibration.played(calibration.next_width_us(UP), 0.0, broken)
+    with pytest.raises(PlanError, match="train 2 was not sent whole"):
+        calibration.mark("sensory")
+    assert (calibration.status().pulse_width_us, calibration.next_width_us(UP)) == (25, 50)
+    assert play(calibration, UP) == 50
+    calibration.mark("sensory")
+
+
 def test_a_train_of_which_nothing_was_sent_moves_nothing() -> None:
     """Each step is one from the last train that was felt, however many were dropped in between."""
     calibration = stepped()
