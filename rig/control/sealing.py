@@ -172,7 +172,7 @@ def _pauses(recording: Recording) -> list[dict[str, Any]]:
 
 
 def notes(recording: Recording) -> list[str]:
-    """What happened and leaves nothing in doubt: that the computer stood still, for how long, and why, if it is known."""
+    """What happened and leaves nothing in doubt: that the computer stood still, for how long, and why, if known."""
     pauses = _pauses(recording)
     if not pauses:
         return []

@@ -130,6 +130,7 @@ class TestSummary(Document):
     charge_uc: float | None = Field(None, description="charge of one phase, summed over the pulses, µC")
     torque_peak_nm: float | None = Field(None, description="N·m")
     warnings: list[str] = Field([], description="what is in doubt, in sentences")
+    notes: list[str] = Field([], description="what happened and leaves nothing in doubt, in sentences")
 
 
 class WorkOut(Document):
