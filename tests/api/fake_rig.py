@@ -101,6 +101,7 @@ class FakeRig:
         self.loses_ends = False
         self.finished: m.FinishedEvent | None = None
         self.warnings: list[str] = []
+        self.pauses: list[m.Pause] = []
         self.torque_age_s = 0.004
         self.cell_speaks = True
         self.device_back = True
@@ -418,7 +419,7 @@ class FakeRig:
                 charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
                 torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
                 samples=self._samples(torque, start, end), felt=_felt(widths[:last], first),
-                **self.arm.live(start, end),
+                pauses=self.pauses, **self.arm.live(start, end),
             )
         )  # fmt: skip
 
@@ -453,6 +454,9 @@ class FakeRig:
                     "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3}, "charge_uc": sum(widths) * 20 / 1000,
                     "alignment": {"method": "sync", "error_ms": 0.02}, "sample_rate_hz": self.rate_hz,
                     "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0, "warnings": self.warnings,
+                    "notes": ["the computer stopped for 0.6 s; no current flowed meanwhile, and the test went on"] * len(
+                        self.pauses[:1]
+                    ),
                     "ended_by": "stopped" if stopped else score.ended_by,
                 },
             )

@@ -16,7 +16,7 @@ from stimrig.api.charts import model_charts
 from stimrig.api.store.tables import Test
 from stimrig.api.web.pages.views import limits_of
 from stimrig.api.workers.curves import recorded
-from stimrig.rig.messages import Bound, Status
+from stimrig.rig.messages import Bound, Pause, Status
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service, signed_in, soon
 from tests.api.test_stop_right import stops_noted
@@ -51,6 +51,16 @@ def test_everything_is_on_one_screen(running: Any) -> None:
         heights = [running.locator(f"#{name}-chart").bounding_box()["height"] for name in ("torque", "width")]
         assert heights[0] > 180 and heights[1] > 110, heights
         assert running.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.browser
+def test_a_pause_of_the_computer_is_told_in_plain_words_and_frightens_nobody(running: Any, service: Service) -> None:
+    told = running.locator("#paused")
+    assert not told.is_visible()
+    service.rig.pauses = [Pause(at_s=3.0, for_s=0.64, blocked_s=0.5)]
+    told.get_by_text("The computer stopped for 0.6 s. No current flowed meanwhile. The test goes on.").wait_for()
+    assert "bad" not in (told.get_attribute("class") or "") and told.get_attribute("role") == "status"
+    service.rig.pauses = []
 
 
 LIMIT_PIXELS = """(id) => { const c = document.getElementById(id), pen = c.getContext('2d');
