@@ -454,9 +454,7 @@ class FakeRig:
                     "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3}, "charge_uc": sum(widths) * 20 / 1000,
                     "alignment": {"method": "sync", "error_ms": 0.02}, "sample_rate_hz": self.rate_hz,
                     "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0, "warnings": self.warnings,
-                    "notes": ["the computer stopped for 0.6 s; no current flowed meanwhile, and the test went on"] * len(
-                        self.pauses[:1]
-                    ),
+                    "notes": [STOPPED] * len(self.pauses[:1]),
                     "ended_by": "stopped" if stopped else score.ended_by,
                 },
             )
@@ -480,6 +478,9 @@ def told_next(known: m.CalibrationStatus) -> m.CalibrationStatus:
         widths |= {"repeat": known.pulse_width_us, "down": known.pulse_width_us - known.step_us}
     found = {name: width for name, width in widths.items() if 1 <= width <= known.ceiling_us}
     return m.CalibrationStatus.model_validate({**known.model_dump(), "next_us": found})
+
+
+STOPPED = "the computer stopped for 0.6 s; no current flowed meanwhile, and the test went on"
 
 
 class m_refusal(Exception):
