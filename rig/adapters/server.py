@@ -58,8 +58,7 @@ class Server:
     def publish(self, event: Event) -> None:
         """Send an event to all subscribers; may be called from any thread."""
         if self._loop is not None and not self._loop.is_closed():
-            line = to_line(event)
-            self._loop.call_soon_threadsafe(self._send_all, line, line)
+            self._loop.call_soon_threadsafe(lambda: self._send_all(*[to_line(event)] * 2))
 
     async def start(self, rig: Rig, ask: Ask, path: Path) -> None:
         """Listen on `path` and on the stop socket; only this user and group may connect.
