@@ -1,9 +1,9 @@
 """`python -m stimrig.rig.builder previews` (or `live`): what the rig has built by a process of its own.
 
 Previews: the first line on standard input holds the rig's limits; each further line is the request for one preview, and
-gets one line as its reply (see `rig.adapters.builders`). Live: each pickled `Taken` gets two lines (see
-`rig.adapters.builders`). The process ends when its standard input ends, or with the rig. It has a lower priority at
-the processor than the rig, for previews the lowest, and a limit on its memory.
+gets one line as its reply. Live: each pickled `Taken` gets two lines. Both are asked by `rig.adapters.builders`. The
+process ends when its standard input ends, or with the rig. It has a lower priority at the processor than the rig, for
+previews the lowest, and a limit on its memory.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def main(builds: str) -> int:
     return 0
 
 
-def _modest(nice: int = 5) -> None:
+def _modest(nice: int) -> None:
     """Low priority and a memory limit, set before anything else; if memory runs out, this process is ended first."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the rig, which then ends this process

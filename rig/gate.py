@@ -41,7 +41,7 @@ class OnItsWay:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What became of a pulse that was to be felt: its index, the width that was sent (0: none was), when it was written
+    """What became of a pulse: its index, the width that was sent (0: none was), when it was written
     and acknowledged (rig clock, s; NaN: not)."""
 
     index: int
@@ -140,6 +140,7 @@ class Gate:
         if journal is None or not self.is_open:
             return PulseStatus.REFUSED
         if pulse.pulse_width_us == 0:
+            self._note(index, PulseStatus.REST)
             return PulseStatus.REST
         verdict = admit(pulse, self._table, self._stimulator.steps)
         if isinstance(verdict, Refusal):
@@ -227,13 +228,17 @@ class Gate:
     def _skip(self, journal: Journal, index: int, status: PulseStatus, reason: str = "") -> PulseStatus:
         now_s = self._clock.now_s()
         journal.append(Kind.SKIPPED, jn.SKIPPED.pack(index, status, now_s))
-        self.done.append(Done(index, 0.0, math.nan, math.nan, status))
+        self._note(index, status)
         if status == PulseStatus.DROPPED:
             self.dropped += 1
         if reason:
             event = status.name.lower()
             journal.append_json(Kind.EVENT, {"event": event, "index": index, "reason": reason, "time_s": now_s})
         return status
+
+    def _note(self, index: int, status: PulseStatus) -> None:
+        """Of a pulse that was not sent."""
+        self.done.append(Done(index, 0.0, math.nan, math.nan, status))
 
     def _too_close(self, now_s: float) -> str:
         """Why too little time has certainly passed since the previous pulse; empty if enough has."""

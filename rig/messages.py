@@ -374,7 +374,7 @@ class Extended(Message):
     """What is laid of an adaptive test, and what its bounds leave."""
 
     test_id: str
-    laid: int = Field(description="pulses that are laid, those of width 0 included")
+    laid: int = Field(description="pulses that are laid, those of width 0 included, without rest for a late client")
     boundary_s: float = Field(description="where they end on the test's clock, s")
     ended_by: str = Field(description="why nothing will follow: plan, enough, limit, torque_time; empty: more may")
     duration_left_s: float
@@ -396,7 +396,7 @@ class StateEvent(Message):
     status: Status
 
 
-class Felt(Message):
+class PulseOutcomes(Message):
     """What became of the pulses since the last live event, as it became known: not the plan, but what was sent.
 
     Times are on the test's clock, s; None: it was not written, or not acknowledged. A recording has the same columns.
@@ -445,7 +445,7 @@ class LiveEvent(Message):
     ended_by: str = Field("", description="why nothing will be laid any more; empty: more may be (see `Extended`)")
     laid_segments: list[LaidSegment] = Field(default_factory=list, description="all that are laid; adaptive tests only")
     pauses: list[Pause] = Field(default_factory=list, description="all of the test so far")
-    felt: Felt | None = Field(None, description="for who subscribed with `samples`")
+    outcomes: PulseOutcomes | None = Field(None, description="for who subscribed with `samples`")
     angle_rad: float | None = Field(None, description="the newest; None without a sensor, or where it gives nothing")
     velocity_rad_s: float | None = Field(None, description="of the last 50 ms, so 25 ms late")
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")

@@ -140,7 +140,7 @@ class Score:
         after
             `decided` when the client did.
         chosen
-            None: nothing more comes from this client, so the fixed plan plays on.
+            Empty: nothing more comes from this client, so the fixed plan plays on.
 
         Raises
         ------
@@ -200,8 +200,8 @@ class Score:
         charge_uc = float(np.sum(laid.pulse_width_us)) * self.plan.profile.current_ma * 1e-3
         return Extended(
             test_id=self.plan.test_id,
-            laid=len(laid),
-            boundary_s=len(laid) / rate_hz,
+            laid=self.decided,
+            boundary_s=self.decided / rate_hz,
             ended_by=self.ended_by,
             duration_left_s=max(0.0, self.longest_s - len(laid) / rate_hz),
             charge_left_uc=max(0.0, self._table["charge_per_test_uc"].hi - charge_uc),

@@ -53,11 +53,11 @@ class News:
     """What the rig has told since the last question: samples, and what became of pulses, column by column."""
 
     samples: dict[str, list[Any]] = field(default_factory=dict)
-    felt: dict[str, list[Any]] = field(default_factory=dict)
+    outcomes: dict[str, list[Any]] = field(default_factory=dict)
 
     def take(self, event: LiveEvent) -> None:
         """Take one event's."""
-        for held, new in ((self.samples, event.samples), (self.felt, event.felt)):
+        for held, new in ((self.samples, event.samples), (self.outcomes, event.outcomes)):
             for name, values in {} if new is None else new:
                 held.setdefault(name, []).extend(values)
 
@@ -165,7 +165,7 @@ class Follower(Watcher):
         early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
         if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
             turn.asked = 2 if left_s <= LATE_S else 1
-            self._asking = self.begin(self._ask(turn, event))
+            self._asking = self.begin(self._ask(turn))
         elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
             self.begin(self._carry_out(turn, turn.answer))
 
@@ -181,12 +181,13 @@ class Follower(Watcher):
 
     # ---- deciding ------------------------------------------------------------------------------------------
 
-    async def _ask(self, turn: Turn, event: LiveEvent) -> None:
-        heard_s = self._heard_s
-        news, self._new = self._new, News()
+    async def _ask(self, turn: Turn) -> None:
+        # the newest event of all that were heard until now: news of pulses and what is laid belong together
+        event, heard_s, news, self._new = self._newest, self._heard_s, self._new, News()
+        assert event is not None
         widths, segments = self._played_so_far(event)
         said = await self.adviser.ask(
-            "adaptive_advise", samples=news.samples, felt=news.felt, laid_us=widths, segments=segments,
+            "adaptive_advise", samples=news.samples, outcomes=news.outcomes, laid_us=widths, segments=segments,
             torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
         )  # fmt: skip
         self._took_s = self.clock.monotonic_s() - heard_s

@@ -22,6 +22,8 @@ SAME_ANGLE_RAD = math.radians(2.5)
 """A held test was at an angle that is listed where it is as near as this: half of the steps of the list."""
 SETTLED_S = 0.5
 """After stimulation has begun: then the torque is that of the level."""
+NEXT_PULSES = 1.5
+"""Periods after the newest pulse for which the muscle is taken to be stimulated."""
 TELL_S = 0.2
 """Pages hear this often how much was seen."""
 
@@ -210,6 +212,8 @@ class JointWatcher(Watcher):
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self._since_s: float | None = None
+        """Since when pulses follow one another, and the newest one, on the test's clock."""
+        self._last_s = 0.0
         self._told_s = -TELL_S
 
     def problem(self, why: str) -> str:
@@ -227,8 +231,8 @@ class JointWatcher(Watcher):
         for at_s, width_us in zip(event.pulse_time_s, event.pulse_width_us, strict=True):
             if not (width_us > 0.0):
                 self._since_s = None
-            elif self._since_s is None:
-                self._since_s = at_s
+            else:
+                self._since_s, self._last_s = self._since_s or at_s, at_s
         for row in event.angle or []:
             self._take(row)
         if told.state == "watching" and told.coverage.enough and not event.ended_by:
@@ -250,7 +254,8 @@ class JointWatcher(Watcher):
         """Without stimulation everything counts in a passive test, and nothing in another one."""
         if self.plan.kind == PASSIVE:
             return True
-        return self._since_s is not None and time_s - self._since_s >= SETTLED_S
+        flows = time_s - self._last_s <= NEXT_PULSES / self.plan.pulse_rate_hz  # else what became of it is not told yet
+        return flows and self._since_s is not None and time_s - self._since_s >= SETTLED_S
 
     async def _say_enough(self) -> None:
         try:

@@ -20,12 +20,6 @@ Progress = Callable[[float, str], None]
 NEW_PERSON_SHARE = 1 / 3
 """Of the torque that stops a test: the guess of a new person's torque at the largest width."""
 DIGITS = 4
-EARLIEST = 0.02
-"""Share of the samples that arrive earliest: what comes later waited somewhere."""
-ON_ITS_WAY, RESTS = 4, 1
-"""Status of a pulse, as in a recording."""
-DRAWN = 5
-"""Lines: after them the promptest few in a hundred are left."""
 BINS = 5
 """Means for each pulse interval, where a load cell gives at least twice as many samples: the delay of a sample's way to
 the host, some milliseconds that only a sealed recording corrects, is then within the one sample that the fit allows."""
@@ -108,13 +102,13 @@ class Running:
     largest_us: float
     pulse_rate_hz: float
     samples: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
-    felt: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
+    outcomes: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
     before: Any = None
 
     def advise(
         self,
         samples: dict[str, list[Any]],
-        felt: dict[str, list[Any]],
+        outcomes: dict[str, list[Any]],
         laid_us: list[float],
         segments: list[tuple[str, int, int]],
         torque_time_nm_s: float,
@@ -124,7 +118,7 @@ class Running:
 
         Parameters
         ----------
-        samples, felt
+        samples, outcomes
             Samples that are new, and what became of pulses since, as the rig tells both.
         laid_us, segments
             Widths of all pulses that are laid, µs; name, first pulse and end of each segment.
@@ -133,12 +127,12 @@ class Running:
         """
         from stimrig.identify.experiments.adaptive import Asked, decide
 
-        for held, news in ((self.samples, samples), (self.felt, felt)):
+        for held, news in ((self.samples, samples), (self.outcomes, outcomes)):
             for name, new in news.items():
                 held[name].extend(new)
-        record = record_of(self.samples, self.felt, laid_us, segments, self.pulse_rate_hz)
+        record = record_of(self.samples, self.outcomes, laid_us, segments, self.pulse_rate_hz)
         played_us = np.array(laid_us, float)
-        played_us[self.felt["index"]] = self.felt["pulse_width_us"]
+        played_us[self.outcomes["index"]] = self.outcomes["pulse_width_us"]
         committed_nm_s = self._expected(laid_us[round(measured_s * self.pulse_rate_hz) :])
         left_s = max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz)
         left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
@@ -183,15 +177,14 @@ def rounded(value: Any) -> Any:
 
 
 def record_of(
-    samples: Mapping[str, Any], felt: Mapping[str, Any], laid_us: list[float], segments: list[tuple[str, int, int]],
+    samples: Mapping[str, Any], outcomes: Mapping[str, Any], laid_us: list[float], segments: list[tuple[str, int, int]],
     rate_hz: float,
 ) -> Any:  # fmt: skip
     """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet.
 
     Pulses are those that were felt, by the same rules as in a sealed recording.
     """
-    from stimrig.identify.records.felt import felt as felt_pulses
-    from stimrig.identify.records.felt import in_force
+    from stimrig.identify.records.pulse_times import in_force, locate_pulses
     from stimrig.identify.records.record import Record
 
     if len(samples["host_time_s"]) < 2:
@@ -203,7 +196,7 @@ def record_of(
         return None
     time_s, torque, sync = time_s[inside], torque[inside], np.array(samples["sync"])[inside]
     came = int(time_s[-1] * rate_hz) + 1
-    pulses, doubted = felt_pulses(_sent(felt, laid_us[:came], rate_hz), time_s, sync)
+    pulses, doubted = locate_pulses(_sent(outcomes, laid_us[:came], rate_hz), time_s, sync)
     even_s, torque = means(time_s, torque, BINS * rate_hz)
     width_us, late_s = in_force(pulses, even_s, rate_hz)
     code = np.searchsorted([start for _, start, _ in segments], even_s * rate_hz + 1e-9, side="right") - 1
@@ -220,18 +213,18 @@ def record_of(
     )
 
 
-def _sent(felt: Mapping[str, Any], laid_us: list[float], rate_hz: float) -> Any:
+def _sent(outcomes: Mapping[str, Any], laid_us: list[float], rate_hz: float) -> Any:
     """What is known of each pulse; one of which nothing was told yet is on its way."""
-    from stimrig.identify.records.felt import Sent
+    from stimrig.identify.records.pulse_times import ON_ITS_WAY, RESTS, Sent
 
     widths_us = np.array(laid_us, float)
     written_s, acknowledged_s = np.full(widths_us.size, np.nan), np.full(widths_us.size, np.nan)
     status = np.where(widths_us > 0, ON_ITS_WAY, RESTS)
-    index = np.array(felt["index"], int)
+    index = np.array(outcomes["index"], int)
     told = index < widths_us.size
     columns = {"pulse_width_us": widths_us, "written_time_s": written_s, "acknowledged_time_s": acknowledged_s}
     for name, column in {**columns, "status": status}.items():
-        column[index[told]] = np.array(felt[name], float)[told]
+        column[index[told]] = np.array(outcomes[name], float)[told]
     return Sent(np.arange(widths_us.size) / rate_hz, widths_us, written_s, acknowledged_s, status, 1.0 / rate_hz)
 
 
@@ -248,23 +241,27 @@ def means(time_s: Any, torque_nm: Any, rate_hz: float) -> tuple[Any, Any]:
 def sample_times(host_time_s: list[float], counter: list[int]) -> Any:
     """When the samples were taken, on the test's clock: evenly by the cell's counter, set by those that came earliest.
 
-    Samples arrive late and never early, after a pause of the computer all of it at once. So the line through their
-    arrivals is drawn again and again, each time through those below the last one.
+    Samples arrive late and never early, after a pause of the computer all of it at once: so no arrival lies below the
+    line. Of such lines it is the highest one in the record's middle, an edge of the arrivals' lower convex hull.
     """
-    host = np.array(host_time_s, float)
-    number = np.array(counter, float)
+    host, number = np.array(host_time_s, float), np.array(counter, float)
     if number.min() < 0:  # the cell has none
         number = np.arange(host.size, dtype=float)
     number -= number[0]
-    early = np.ones(host.size, bool)
-    slope = 0.0
-    for _ in range(DRAWN):
-        slope, first = np.polyfit(number[early], host[early], 1)
-        below = early & (host <= slope * number + first)
-        if below.sum() <= 2 or np.ptp(number[below]) <= 0.5 * np.ptp(number):
-            break
-        early = below
-    return slope * number + float(np.quantile(host - slope * number, EARLIEST))
+    hull: list[Any] = []
+    for point in np.column_stack([number, host])[np.r_[np.diff(host) > 0, True]]:  # the last of those that came at once
+        while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
+            hull.pop()
+        hull.append(point)
+    corners = np.array(hull)
+    after = int(np.clip(np.searchsorted(corners[:, 0], number.mean()), 1, len(corners) - 1))
+    (left, left_s), (right, right_s) = corners[after - 1], corners[after]
+    return left_s + (right_s - left_s) / (right - left) * (number - left)
+
+
+def _turn(one: Any, two: Any, three: Any) -> float:
+    """Above 0: the way from one point to the third turns upwards at the second."""
+    return (two[0] - one[0]) * (three[1] - one[1]) - (two[1] - one[1]) * (three[0] - one[0])
 
 
 _running: list[Running] = []

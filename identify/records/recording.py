@@ -10,8 +10,8 @@ import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
-from stimrig.identify.records.felt import Sent, felt, in_force
 from stimrig.identify.records.hdf5 import FIX, StrictFile
+from stimrig.identify.records.pulse_times import Sent, in_force, locate_pulses
 from stimrig.identify.records.record import Pulses, Record, Source
 
 FORMAT = "stimrig-recording"
@@ -23,11 +23,11 @@ GROUP = "/angle"
 
 
 def read_pulses(file: StrictFile, time_s: np.ndarray, pulse_rate_hz: float) -> tuple[Pulses, np.ndarray]:
-    """As `felt`. Raises BadRecord: columns of different lengths, no widths, or out of order."""
+    """As `locate_pulses`. Raises BadRecord: columns of different lengths, no widths, or out of order."""
     sync = file.numbers("/torque/sync") if file.has("/torque/sync") else np.full(time_s.size, 255.0)
     if sync.size != time_s.size:
         raise file.bad("columns of different lengths", "/torque/sync")
-    return felt(_sent(file, 1.0 / pulse_rate_hz), time_s, sync)
+    return locate_pulses(_sent(file, 1.0 / pulse_rate_hz), time_s, sync)
 
 
 def _sent(file: StrictFile, interval_s: float) -> Sent:

@@ -257,7 +257,7 @@ class TestRun:
                 self._fault(wrong)
             if self.halt.signal.is_set():
                 return
-            if due_s < pauses.until_s:
+            if due_s < pauses.until_s and width_us > 0:
                 rise.begin_anew()
             asked_us = rise.limited(width_us, bool(self.score.laid.jumps[index]))
             self.gate.feed()

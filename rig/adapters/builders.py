@@ -113,12 +113,13 @@ class LiveLines(Builder):
     def __init__(self) -> None:
         super().__init__("live")
 
-    async def of(self, taken: Taken) -> list[bytes]:
+    async def make(self, taken: Taken) -> list[bytes]:
         """The event with every sample, and without; nothing where it could not be made: no test waits for a page."""
-        try:
-            async with self._one:
-                return await asyncio.wait_for(self._ask(pickle.dumps(taken), 2), MAX_LIVE_S)
-        except (OSError, ValueError) as error:  # a timeout is one, too
-            log.warning("a live event was lost: %r", error)
-            await self.close()
-            return []
+        async with self._one:
+            for _ in range(2):  # what became of a pulse is told once: it is worth a new process
+                try:
+                    return await asyncio.wait_for(self._ask(pickle.dumps(taken), 2), MAX_LIVE_S)
+                except (OSError, ValueError) as error:  # a timeout is one, too
+                    log.warning("a live event could not be made: %r", error)
+                    await self.close()
+        return []

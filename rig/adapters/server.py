@@ -106,7 +106,7 @@ class Server:
             await asyncio.sleep(LIVE_PERIOD_S)
             taken = self.rig.take_live(samples=any(self._subscribers.values()))
             if taken is not None and self._subscribers:
-                self._send_all(*await self._live_lines.of(taken), live=True)
+                self._send_all(*await self._live_lines.make(taken), live=True)
 
     def _send_all(self, full: bytes = b"", plain: bytes = b"", live: bool = False) -> None:
         for writer, samples in tuple(self._subscribers.items()):

@@ -18,7 +18,7 @@ from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.run import TestRun
 from stimrig.rig.control.replies import to_line
 from stimrig.rig.gate import Done
-from stimrig.rig.messages import Felt, LaidSegment, LiveEvent, TorqueSamples
+from stimrig.rig.messages import LaidSegment, LiveEvent, PulseOutcomes, TorqueSamples
 
 BIN_S = 0.01
 IDLE = {"test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "dropped_pulses": 0}
@@ -124,7 +124,7 @@ def live_event(taken: Taken) -> LiveEvent:
             for name, start, end, by in taken.segments
         ],
         samples=_samples(found, taken.origin_s) if taken.samples else None,
-        felt=_felt(taken.done, taken.origin_s) if taken.samples else None,
+        outcomes=_outcomes(taken.done, taken.origin_s) if taken.samples else None,
     )
 
 
@@ -134,7 +134,7 @@ def lines(taken: Taken) -> tuple[bytes, bytes]:
     full = to_line(event)
     if not taken.samples:
         return full, full
-    return full, to_line(event.model_copy(update={"samples": None, "angle": None, "felt": None}))
+    return full, to_line(event.model_copy(update={"samples": None, "angle": None, "outcomes": None}))
 
 
 def serve(requests: BinaryIO, replies: BinaryIO) -> None:
@@ -158,11 +158,11 @@ def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
     )
 
 
-def _felt(done: list[Done], origin_s: float) -> Felt:
+def _outcomes(done: list[Done], origin_s: float) -> PulseOutcomes:
     def times(name: str) -> list[float | None]:
         return [finite(round(getattr(pulse, name) - origin_s, 6)) for pulse in done]
 
-    return Felt(
+    return PulseOutcomes(
         index=[pulse.index for pulse in done],
         pulse_width_us=[pulse.pulse_width_us for pulse in done],
         written_time_s=times("written_s"),

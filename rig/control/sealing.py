@@ -33,6 +33,8 @@ REST_S = 0.1
 DOUBTFUL_ALIGNMENT_MS = 5.0
 DOUBTFUL_RATE = 0.02
 """Beyond these a recording's times are uncertain, and its finished event says so. A larger rate error is a fault."""
+CLIMB_S = 0.5
+"""After a pause: so long the width may climb back."""
 READ_S = 0.03
 """Before a pause, and while it ends: a period, and what is read at once."""
 ROUNDED_US = 1.0
@@ -209,12 +211,20 @@ def _disturbed_line(recording: Recording) -> list[str]:
             "meanwhile were dropped"
         )
     planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
-    weaker = int(np.count_nonzero(planned_us - sent_us > ROUNDED_US))
-    if weaker and not pauses:
+    if weaker := int(np.count_nonzero((planned_us - sent_us > ROUNDED_US) & ~_climbing(recording, pauses))):
         found.append(
             f"stimulator: {weaker} pulses were narrower than planned, since after dropped pulses the width climbs back "
             "no faster than its limit"
         )
+    return found
+
+
+def _climbing(recording: Recording, pauses: list[dict[str, Any]]) -> NDArray[np.bool_]:
+    """Pulses that come so soon after a pause that it tells why they are narrow."""
+    planned_s = recording.columns["pulses/planned_time_s"]
+    found = np.zeros(len(planned_s), bool)
+    for pause in pauses:
+        found |= (planned_s >= pause["at_s"]) & (planned_s <= pause["at_s"] + pause["for_s"] + CLIMB_S)
     return found
 
 

@@ -418,7 +418,7 @@ class FakeRig:
                 sent_pulses=sum(1 for width in widths[:last] if width),
                 charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
                 torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
-                samples=self._samples(torque, start, end), felt=_felt(widths[:last], first),
+                samples=self._samples(torque, start, end), outcomes=_outcomes(widths[:last], first),
                 pauses=self.pauses, **self.arm.live(start, end),
             )
         )  # fmt: skip
@@ -461,11 +461,11 @@ class FakeRig:
         )  # fmt: skip
 
 
-def _felt(widths: list[float], first: int) -> m.Felt:
+def _outcomes(widths: list[float], first: int) -> m.PulseOutcomes:
     """Each pulse since the first was sent and acknowledged in time."""
     index = [k for k in range(first, len(widths)) if widths[k]]
     due = [k / PULSE_RATE_HZ for k in index]
-    return m.Felt(
+    return m.PulseOutcomes(
         index=index, pulse_width_us=[widths[k] for k in index], written_time_s=due,
         acknowledged_time_s=[s + 0.001 for s in due], status=[0] * len(index),
     )  # fmt: skip

@@ -20,11 +20,11 @@ from stimrig.identify.experiments.knowledge import LEAST_PERCENT, MOST_PERCENT, 
 from stimrig.rig.messages import (
     AHEAD,
     AdaptivePlan,
-    Felt,
     FinishedEvent,
     LaidSegment,
     LiveEvent,
     Profile,
+    PulseOutcomes,
     SegmentPlan,
     TestPlan,
 )
@@ -366,7 +366,7 @@ class World:
                 torque_min_nm=[], torque_max_nm=[], pulse_time_s=[], pulse_width_us=[], torque_age_s=0.0,
                 lost_samples=0, dropped_pulses=0, sent_pulses=0, charge_uc=0.0, torque_time_nms=0.0, ended_by="",
                 samples=None, laid=30, boundary_s=FIRST_S,
-                felt=Felt(
+                outcomes=PulseOutcomes(
                     index=[4], pulse_width_us=[0.0], written_time_s=[None], acknowledged_time_s=[None], status=[2]
                 ),
                 laid_segments=[LaidSegment(name="opening", start_s=0.0, end_s=FIRST_S, by="plan")],
@@ -411,12 +411,12 @@ def test_the_newest_answer_is_sent_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert at_s == pytest.approx(FIRST_S - AHEAD / 40.0 - adaptive_follower.LATE_S, abs=0.03)
 
 
-def test_the_adviser_learns_what_the_muscle_felt(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_adviser_learns_what_the_muscle_outcomes(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World([SAID])
     followed(world, 40.0, monkeypatch)
-    told = world.asked[0]["felt"]
+    told = world.asked[0]["outcomes"]
     assert set(told["index"]) == {4} and set(told["status"]) == {2} and len(told["index"]) > 100, "all since the start"
-    assert told.keys() == Felt.model_fields.keys()
+    assert told.keys() == PulseOutcomes.model_fields.keys()
 
 
 def test_a_chooser_that_gives_up_has_the_fixed_plan_play_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -148,7 +148,7 @@ def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
         new = {name: values[told_before:] for name, values in felt(widths, until, not_sent).items()}
         told_before += len(new["index"])
         laid = {"laid_us": list(widths), "segments": segments}
-        told = verbs.advise(quiet, samples=news, felt=new, **laid, torque_time_nm_s=dose, measured_s=end_s - 0.4)
+        told = verbs.advise(quiet, samples=news, outcomes=new, **laid, torque_time_nm_s=dose, measured_s=end_s - 0.4)
         json.dumps(told, allow_nan=False)
         if told["kind"] != "next":
             break
@@ -175,7 +175,7 @@ def test_what_was_late_or_not_sent_reaches_the_decision(monkeypatch: pytest.Monk
     monkeypatch.setattr(adaptive, "decide", decide)
     verbs.begin(quiet, **HOW)
     laid = {"laid_us": list(OPENING), "segments": [("opening", 0, len(OPENING))]}
-    news = {"samples": Cell(sigmoid(72), 2).news(OPENING, 2.5), "felt": felt(OPENING, 100, [31], {30: 0.004})}
+    news = {"samples": Cell(sigmoid(72), 2).news(OPENING, 2.5), "outcomes": felt(OPENING, 100, [31], {30: 0.004})}
     verbs.advise(quiet, **news, **laid, torque_time_nm_s=1.0, measured_s=2.5)
     assert seen == [(0.004, 0.0)]
 

@@ -69,14 +69,15 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     assert [(s.name, s.by) for s in event.laid_segments] == [("rest", "plan"), *[("added", "extension")] * 2]
     assert len(event.samples.torque_nm) == len(event.samples.counter) == len(event.samples.host_time_s) > 0
     assert np.all(np.diff(event.samples.counter) == 1)
-    assert event.felt is not None and event.felt.index == list(range(20, 20 + len(event.felt.index)))
-    assert (event.felt.pulse_width_us, event.felt.status) == (event.pulse_width_us, [0] * len(event.pulse_width_us))
-    assert all(a < b for a, b in zip(event.felt.written_time_s, event.felt.acknowledged_time_s, strict=True) if a and b)
+    told = event.outcomes
+    assert told is not None and told.index == list(range(len(told.index))) and len(told.index) > 20
+    assert (told.pulse_width_us, told.status) == (event.pulse_width_us, [1] * 20 + [0] * (len(told.index) - 20))
+    assert all(a < b for a, b in zip(told.written_time_s, told.acknowledged_time_s, strict=True) if a and b)
     assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event, "read as it was sent"
     live.machine.wait(0.1)
     plain = live.rig.live()
     assert plain is not None
-    assert (plain.felt, plain.samples) == (None, None), "only who chooses pieces needs them"
+    assert (plain.outcomes, plain.samples) == (None, None), "only who chooses pieces needs them"
     assert live.rig.status().duration_s == 60.0
     ending = live.ask(live.rig.player.enough(EnoughRequest(test_id="one", by="nurse")))
     assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))

@@ -123,9 +123,9 @@ def test_a_stimulator_that_restarts_in_a_test_is_told():
 def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: Path, up_s: float):
     """The width climbs back by at most the limit a pulse, so the test goes on and startles nobody."""
     rig = VirtualRig(tmp_path, [SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": up_s, "down_s": 1.0})])
-    rig.at(0.01, lambda: rig.clock.advance(0.16))
+    rig.at(0.01, lambda: rig.clock.advance(0.11))  # too short for a pause: the width climbs from where it was
     result = rig.execute()
-    assert result.outcome == "completed"
+    assert (result.outcome, result.summary["pauses"]) == ("completed", [])
     widths_us = [0, *(pulse.pulse_width_us for _, pulse in rig.stimulator.sent)]
     assert max(np.diff(widths_us)) <= 50
     columns = rig.recording().columns

@@ -178,7 +178,7 @@ def test_who_would_wait_for_too_long_is_refused_at_once(monkeypatch: pytest.Monk
 
 
 def test_memory_is_bounded():
-    code = "import stimrig.rig.builder as b; b._modest(); bytearray(2 << 30)"
+    code = "import stimrig.rig.builder as b; b._modest(5); bytearray(2 << 30)"
     ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert "MemoryError" in ended.stderr
 

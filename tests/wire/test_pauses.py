@@ -36,7 +36,8 @@ def test_a_rig_that_stands_still_goes_on_and_loses_no_sample(make_bench: Callabl
     event = client.wait_finished("t")
     assert (event["outcome"], event["summary"]["lost_samples"]) == ("completed", 0), event["reason"]
     pauses = event["summary"]["pauses"]
-    assert len(pauses) >= 3 and max(pause["blocked_s"] for pause in pauses) >= STOOD_S - 0.03
+    assert sum(pause["for_s"] for pause in pauses) >= 3 * (STOOD_S - 0.03), "two that follow one another may be one"
+    assert max(pause["blocked_s"] for pause in pauses) >= STOOD_S - 0.03
     assert "the test went on" in event["summary"]["notes"][0]
     with h5py.File(Path(event["recording_path"])) as file:
         status, sent_us = file["pulses/status"][:], file["pulses/sent_pulse_width_us"][:]
@@ -45,7 +46,7 @@ def test_a_rig_that_stands_still_goes_on_and_loses_no_sample(make_bench: Callabl
     assert len(left_out) >= 3 * round(40 * (STOOD_S - 0.03))
     for pause in pauses:  # after each the width climbs from nothing
         after = np.flatnonzero((planned_s > pause["at_s"]) & np.isfinite(sent_us))[:1]
-        assert all(sent_us[after] <= 50)
+        assert len(after) and sent_us[after[0]] <= 50
     felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
     assert all(two["time_s"] - one["time_s"] >= 0.008 for one, two in pairwise(felt))
 

@@ -254,8 +254,8 @@ def check_clock(_settings: Settings) -> Iterator[Finding]:
     yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, fix)
 
 
-def check_priority(_settings: Settings) -> Iterator[Finding]:
-    """May the rig's sender run before everything else?"""
+def check_rights(_settings: Settings) -> Iterator[Finding]:
+    """May the rig's sender run before everything else, from memory that stays?"""
     rights = {
         "priority": (
             f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({SENDER_PRIORITY}))",

@@ -89,6 +89,7 @@ addEventListener("pageshow", () => { leaving = false; });
 function showTest(test, told) {
   const wasOpen = !state.test.done;
   state.test = test;
+  if (test.state !== "running") byId("paused").hidden = true;
   const tag = byId("state");
   tag.textContent = words.states[test.state] || test.state; tag.className = "tag tag-" + test.state;
   const job = test.identification;

@@ -14,7 +14,8 @@ import numpy as np
 from stimrig.identify.records import bounds
 from stimrig.identify.records.record import FORGOTTEN_S, Pulses
 
-SENT_AND_ACKNOWLEDGED, DROPPED, REFUSED = 0, 2, 3
+SENT_AND_ACKNOWLEDGED, RESTS, DROPPED, REFUSED, ON_ITS_WAY = range(5)
+"""What became of a pulse, `/pulses/status` of a recording."""
 PROMPT = 0.05
 """Lateness counts from this quantile of a recording's pulses: a lag that all share is a delay, which the fit finds."""
 LEAST_LATE_S = 1e-3
@@ -48,7 +49,7 @@ class Sent:
         return (self.status == SENT_AND_ACKNOWLEDGED) & np.isfinite(self.written_s)
 
 
-def felt(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[Pulses, np.ndarray]:
+def locate_pulses(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[Pulses, np.ndarray]:
     """The pulses on their even slots with what they were late, and the samples that are doubted, bool, (N,).
 
     Parameters
