@@ -14,6 +14,7 @@ import ctypes
 import json
 import logging
 import os
+import resource
 import signal
 import socket
 import sys
@@ -136,7 +137,8 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PROCESS_PRIORITY))
-    ctypes.CDLL(None).mlockall(LOCK_ALL)  # what was touched stays in memory; without the right it does nothing
+    if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY or os.geteuid() == 0:
+        ctypes.CDLL(None).mlockall(LOCK_ALL)  # what was touched stays in memory; within a limit later memory would fail
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -255,8 +255,13 @@ def safe_end(widths_us: NDArray[np.float64], pulse_rate_hz: float) -> int:
     return max(0, round(SAFE_END_S * pulse_rate_hz) - resting)
 
 
-def check_steps(test: PlannedTest, steps: Steps) -> None:
-    """Refuse a plan whose pulses this stimulator would all round to zero. Raises PlanError."""
+def check_steps(test: PlannedTest, steps: Steps, rise: Limit) -> None:
+    """Refuse a plan whose pulses this stimulator would all round to zero, be it as they climb. Raises PlanError."""
+    if not (rise.hi >= steps.shortest_us):
+        raise PlanError(
+            f"width_rise_us: at most {rise.hi:g} µs a pulse is allowed, and this stimulator's smallest pulse is "
+            f"{steps.shortest_us:g} µs: nothing would be sent; allow more"
+        )
     widest_us, current_ma = float(test.pulse_width_us.max()), test.plan.profile.current_ma
     if widest_us > 0 and (steps.width_us(widest_us) == 0 or steps.current(current_ma) == 0):
         raise PlanError(

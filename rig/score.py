@@ -224,7 +224,7 @@ class Score:
         before = len(laid)
         most = min(MAX_EXTENSION_SEGMENTS, plan.MAX_SEGMENTS - len(laid.segments) - len(self._fixed) - 1)
         if not (1 <= len(chosen) <= most):
-            raise PlanError(f"extend.segments: {len(chosen)} segments; give 1 to {most}")
+            raise PlanError(f"extend.segments: {len(chosen)} segments; give at most {max(most, 0)}")
         for number, segment in enumerate(chosen, start=1):
             if not (1 <= len(segment.name) <= MAX_NAME and segment.name.isprintable()):
                 raise PlanError(f"extend.segments: name {number} must have 1 to {MAX_NAME} printable characters")

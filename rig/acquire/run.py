@@ -245,7 +245,7 @@ class TestRun:
         self._angle.started()
         self.started.set()
         late_s = self._watch.late_pulse_periods * period_s
-        index, resting, rise = 0, True, Rise(self._table["width_rise_us"].hi)
+        index, resting, rise = 0, True, Rise(self._table["width_rise_us"].hi, self.plan.pulse_rate_hz)
         while (width_us := self.score.pulse(index, self.torque_time_nms)) is not None:
             due_s = t0_s + index * period_s
             if resting and width_us > 0:
@@ -355,24 +355,40 @@ class TestRun:
         return max(hi_nm - self._rest_nm, self._rest_nm - lo_nm)
 
 
-class Rise:
-    """How wide the next pulse may be: after pulses that were left out the width climbs back within the limit."""
+MISSED_S = 0.1
+"""Rig seconds of pulses in a row that were left out: then the muscle has rested."""
+CLIMB = 10
+"""Pulses: after a rest that was not planned no more are held back."""
 
-    def __init__(self, most_us: float) -> None:
-        self._most_us, self._felt_us, self._anew = most_us, 0.0, False
+
+class Rise:
+    """How wide the next pulse may be: after pulses that were left out the width climbs back within the limit.
+
+    Parameters
+    ----------
+    most_us
+        The largest step from one pulse to the next, µs.
+    """
+
+    def __init__(self, most_us: float, pulse_rate_hz: float) -> None:
+        self._most_us, self._most_missed = most_us, max(1, round(MISSED_S * pulse_rate_hz))
+        self._felt_us, self._missed, self._climb = 0.0, 0, 0
 
     def begin_anew(self) -> None:
-        """The muscle rested in a pause: the width climbs from nothing, also where the sequence may jump."""
-        self._felt_us, self._anew = 0.0, True
+        """The muscle has rested: the width climbs from nothing, also where the sequence may jump."""
+        self._felt_us, self._climb = 0.0, CLIMB
 
     def limited(self, width_us: float, jumps: bool) -> float:
         """A planned width, or as much of it as may follow the last pulse."""
-        return width_us if jumps and not self._anew else min(width_us, self._felt_us + self._most_us)
+        return width_us if jumps and not self._climb else min(width_us, self._felt_us + self._most_us)
 
     def take(self, status: PulseStatus, asked_us: float, width_us: float) -> None:
         """What became of a pulse. One that the device would make too short counts as none."""
+        self._missed = self._missed + 1 if status is PulseStatus.DROPPED else 0
+        if self._missed >= self._most_missed:
+            self.begin_anew()
         if status is PulseStatus.UNACKNOWLEDGED:
-            self._felt_us, self._anew = asked_us, self._anew and asked_us < width_us
+            self._felt_us, self._climb = asked_us, self._climb - 1 if self._climb and asked_us < width_us else 0
         elif status is PulseStatus.REST:
             self._felt_us = 0.0
 

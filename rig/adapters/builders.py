@@ -118,7 +118,8 @@ class LiveLines(Builder):
         async with self._one:
             for _ in range(2):  # what became of a pulse is told once: it is worth a new process
                 try:
-                    return await asyncio.wait_for(self._ask(pickle.dumps(taken), 2), MAX_LIVE_S)
+                    found = await asyncio.wait_for(self._ask(pickle.dumps(taken), 2), MAX_LIVE_S)
+                    return found if found[0].strip() else []
                 except (OSError, ValueError) as error:  # a timeout is one, too
                     log.warning("a live event could not be made: %r", error)
                     await self.close()

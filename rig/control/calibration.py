@@ -40,6 +40,9 @@ MAX_VALID_S = 25 * 3600.0
 """A day, and the hour that is added when summer time ends."""
 OWNER = "calibration request"
 
+MOST_MISSED = 0.1
+"""Share of a train's pulses that may be missing: one with more feels weaker than its width."""
+
 
 class Calibration:
     """An open calibration.
@@ -199,8 +202,9 @@ class Calibration:
         A computer that stands still for a moment drops the pulses that are due by then, perhaps all of a short train.
         """
         pulses = int(finished.summary.get("pulses", 0))
-        self._whole = pulses > 0 and not finished.summary.get("pauses")
-        if self._whole:
+        missed = int(finished.summary.get("dropped_pulses", 0))
+        self._whole = pulses > 0 and not finished.summary.get("pauses") and missed <= MOST_MISSED * pulses
+        if self._whole or (pulses > 0 and width_us < self._width_us):  # who steps down is never taken back up
             if width_us < self._width_us:
                 self._left_us.add(self._width_us)
             self._width_us = width_us

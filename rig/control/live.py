@@ -6,6 +6,7 @@ pulse waits for either.
 
 from __future__ import annotations
 
+import logging
 import math
 import pickle
 from typing import Any, BinaryIO, NamedTuple
@@ -19,6 +20,8 @@ from stimrig.rig.acquire.run import TestRun
 from stimrig.rig.control.replies import to_line
 from stimrig.rig.gate import Done
 from stimrig.rig.messages import LaidSegment, LiveEvent, PulseOutcomes, TorqueSamples
+
+log = logging.getLogger("rig.live")
 
 BIN_S = 0.01
 IDLE = {"test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "dropped_pulses": 0}
@@ -74,7 +77,7 @@ def take(
     angles = [] if angle is None else _emptied(angle.live)
     if run is None:
         return Taken({**fields, **IDLE}, origin_s, samples, blocks, angles, [])
-    done = run.gate.done[run.told_pulses :]
+    done = run.gate.done[run.told_pulses :] if run.pauses else []  # before its arming they are of the last test
     run.told_pulses += len(done)
     segments = run.score.laid.segments if run.score.adaptive else ()  # they hold every pulse before
     return Taken({**fields, **_of_run(run)}, origin_s, samples, blocks, angles, done, segments, run.plan.pulse_rate_hz)
@@ -144,7 +147,11 @@ def serve(requests: BinaryIO, replies: BinaryIO) -> None:
             taken = pickle.load(requests)
         except EOFError:
             return
-        replies.writelines(lines(taken))
+        try:
+            replies.writelines(lines(taken))
+        except Exception:  # this one is lost, the next may do
+            log.exception("a live event could not be made")
+            replies.writelines((b"\n", b"\n"))
         replies.flush()
 
 

@@ -218,7 +218,7 @@ class Rig:
             needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
             check_profile(request.profile, now_s, needs_widths, longest_s)
             check_range(request, self.joint.set_at_utc)
-            plan.check_steps(test, self.pair.steps)
+            plan.check_steps(test, self.pair.steps, table["width_rise_us"])
             self.rest.check(test, table["rest_between_tests_s"])
             self.joint.check(request, table)
             self.player.refuse_withdrawn(request.test_id)

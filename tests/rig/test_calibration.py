@@ -394,6 +394,23 @@ def test_a_train_that_was_not_felt_whole_marks_nothing() -> None:
     assert (calibration.status().pulse_width_us, calibration.next_width_us(UP)) == (25, 50)
     assert play(calibration, UP) == 50
     calibration.mark("sensory")
+    for missed, marked in ((1, True), (4, False)):
+        few = FinishedEvent(test_id="c1.004", outcome="completed", summary={"pulses": 16, "dropped_pulses": missed})
+        calibration.played(75.0, 0.0, few)
+        if marked:
+            calibration.mark("motor")
+        else:
+            with pytest.raises(PlanError, match="not sent whole"):
+                calibration.mark("motor")
+
+
+def test_who_steps_down_is_never_taken_back_up_by_a_pause() -> None:
+    calibration = stepped()
+    assert play(calibration, UP, UP, UP) == 75
+    broken = FinishedEvent(test_id="c1.004", outcome="completed", summary={"pulses": 9, "pauses": [{"for_s": 0.6}]})
+    down_us = calibration.next_width_us("down")
+    calibration.played(down_us, 0.0, broken)
+    assert calibration.next_width_us("repeat") == down_us < 75
 
 
 def test_a_train_of_which_nothing_was_sent_moves_nothing() -> None:

@@ -71,7 +71,7 @@ DOUBTS: dict[str, tuple[Fault, str]] = {
     "a cell that was silent before": (
         lambda r: (setattr(r.cell, "silent", True), r.at(-0.165 + 0.15, lambda: r.clock.advance(0.4))), "stale"),
     "a cell that counts on another clock": (
-        lambda r: (setattr(r.cell, "skip", -1200), r.clock.advance(0.4)), "load cell: torque"),
+        lambda r: (setattr(r.cell, "skip", -1200), r.clock.advance(0.4)), "in order again"),
     "no acknowledgement of the last pulse": (
         lambda r: (setattr(r.stimulator, "ack_delay_s", None), r.at(-0.165 + 0.03, lambda: r.clock.advance(0.4))),
         "not acknowledged"),
@@ -97,7 +97,7 @@ def test_what_is_not_whole_after_it_ends_the_test_and_nothing_is_sent(rig: Virtu
 
 
 def test_long_ones_again_and_again_end_the_test(rig: VirtualRig):
-    paused(rig, (1.0, 0.8), (2.5, 0.8), (4.0, 0.8))
+    paused(rig, (1.0, 0.95), (2.5, 0.95), (4.0, 0.95))
     result = rig.execute()
     assert (result.outcome, len(result.summary["pauses"])) == ("fault", 2)
     assert "blocked 3 times within 10 s" in result.reason
@@ -110,10 +110,70 @@ def test_short_ones_again_and_again_do_not(rig: VirtualRig):
 
 
 def test_one_that_follows_before_all_is_whole_is_part_of_it(rig: VirtualRig):
-    paused(rig, (BEGAN_S, 0.7), (BEGAN_S + 0.75, 0.7))
+    paused(rig, (BEGAN_S, 0.5), (BEGAN_S + 0.55, 0.5))
     result = rig.execute()
     (pause,) = result.summary["pauses"]
-    assert result.outcome == "completed" and 1.45 <= pause["for_s"] <= 1.6 and pause["blocked_s"] < 0.75
+    assert result.outcome == "completed" and 1.05 <= pause["for_s"] <= 1.2 and pause["blocked_s"] < 0.55
+
+
+def test_no_current_comes_back_after_a_series_of_them_without_end(rig: VirtualRig):
+    paused(rig, *((BEGAN_S + 0.33 * number, 0.3) for number in range(12)))
+    result = rig.execute()
+    assert result.outcome == "fault" and result.summary["pauses"] == []
+    assert rig.stimulator.sent[-1][0] < 1000.0 + 0.17 + BEGAN_S
+
+
+@pytest.mark.parametrize("for_s", [0.07, 0.095])
+def test_many_that_are_too_short_for_a_pause_make_no_strong_pulse_on_a_rested_muscle(tmp_path: Path, for_s: float):
+    rig = VirtualRig(tmp_path, [hold(on_s=6.0)])
+    rig.cell.noise_nm = 0.01
+    paused(rig, *((3.0125 + 0.1 * number, for_s) for number in range(20)))
+    result = rig.execute()
+    assert result.outcome == "completed"
+    times = np.array([time_s for time_s, _ in rig.stimulator.sent])
+    widths_us = np.array([pulse.pulse_width_us for _, pulse in rig.stimulator.sent])
+    after = np.flatnonzero(np.diff(times) > 0.12) + 1
+    assert np.all(widths_us[after] <= 50)
+
+
+@pytest.mark.parametrize("answers_s", [0.45, 5.0])
+def test_who_stops_waits_for_no_answer_of_the_stimulator(rig: VirtualRig, answers_s: float):
+    slow_to_tell(rig, answers_s)
+    stop_s = 0.165 + BEGAN_S + 0.4 + 0.25
+    rig.at(stop_s - 0.165, lambda: rig.halt.set("stopped", "enough"))
+    paused(rig, (BEGAN_S, 0.4))
+    stopped_s: list[float] = []
+    stop = rig.stimulator.stop
+
+    async def noted() -> None:
+        stopped_s.append(rig.clock.now_s())
+        await stop()
+
+    rig.stimulator.stop = noted
+    assert rig.execute().outcome == "stopped"
+    assert stopped_s[0] - (1000.0 + stop_s) < 0.02
+    assert rig.stimulator.sent[-1][0] < 1000.0 + 0.165 + BEGAN_S + 0.01
+
+
+def test_a_cell_that_dies_while_the_stimulator_is_asked_ends_the_test_without_a_pulse(rig: VirtualRig):
+    slow_to_tell(rig, 0.45)
+    rig.at(BEGAN_S + 0.5, lambda: setattr(rig.cell, "silent", True))
+    paused(rig, (BEGAN_S, 0.4))
+    result = rig.execute()
+    assert result.outcome == "fault" and "torque is stale" in result.reason
+    assert rig.stimulator.sent[-1][0] < 1000.0 + 0.165 + BEGAN_S + 0.01
+
+
+def slow_to_tell(rig: VirtualRig, answers_s: float) -> None:
+    """Its state, once it plays."""
+    state = rig.stimulator.state
+
+    async def later() -> tuple[bool, str]:
+        if rig.stimulator.sent and not rig.halt.cause:
+            await rig.machine.tasks.sleep(answers_s)
+        return await state()
+
+    rig.stimulator.state = later
 
 
 @pytest.mark.parametrize("cause", ["stopped", "withdrawn"])
