@@ -201,9 +201,9 @@ def writing(path: Path) -> Iterator[None]:
 
 def say_json(found: dict[str, Any]) -> None:
     """One JSON object, nothing else."""
-    from stimrig.api.workers.json_values import clean
+    from stimrig.identify.json_text import json_value
 
-    print(json.dumps(clean(found), ensure_ascii=False, allow_nan=False))
+    print(json.dumps(json_value(found), ensure_ascii=False, allow_nan=False))
 
 
 def say(*lines: str) -> None:

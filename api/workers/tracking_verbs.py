@@ -12,7 +12,7 @@ import numpy as np
 
 from stimrig import identify
 from stimrig.api.record_files import begun
-from stimrig.api.workers.json_values import clean
+from stimrig.identify.json_text import json_value
 
 Progress = Callable[[float, str], None]
 MOST_MISSED = 50
@@ -76,7 +76,7 @@ def track(
         moved = model_for_next(model, step, bounds)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
-    told = clean(step.to_dict()) | {"moved": list(bounds)}
+    told = json_value(step.to_dict()) | {"moved": list(bounds)}
     return {"error_percent": error, "step": told, "model": moved.to_json(None)}
 
 
