@@ -176,10 +176,7 @@ def _scans(rows: Iterable[tuple[str, str, dict[str, Any]]]) -> Iterator[dict[str
 def grid(record: WholeRecord) -> tuple[float, float, np.ndarray, bool]:
     """Rate (Hz), start (s), each sample's place on the even grid, and whether the grid gives the times back.
 
-    Raises
-    ------
-    NoExport
-        The samples lie on no even grid, or it would be longer than any record.
+    Raises NoExport: the samples lie on no even grid, or it would be longer than any record.
     """
     time_s = record.samples["time_s"]
     rate_hz, start_s = record.sample_rate_hz, float(time_s[0])

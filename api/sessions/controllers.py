@@ -46,13 +46,7 @@ class PlanIn(Body):
 
 
 def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
-    """The plan, as it is kept with the key.
-
-    Raises
-    ------
-    ApiError
-        422: wider than the participant's limits.
-    """
+    """The plan, as it is kept with the key. Raises ApiError: 422 wider than the participant's limits."""
     for name in ("current_ma", "max_pulse_width_us"):
         asked, own = getattr(plan, name), participant.profile.get(name)
         if own is None or not asked <= own:
@@ -65,11 +59,8 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
 async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: TestIn) -> Test:
     """Start a test; where a controller's key asks for it, within its plan.
 
-    Raises
-    ------
-    ApiError
-        403: outside the key or its plan, and by how much; 409: no model of its participant is approved; else as
-        `Runner.start`.
+    Raises ApiError: 403 outside the key or its plan, and by how much; 409 no model of its participant is approved; else
+    as `Runner.start`.
     """
     if who.participant is None:
         if len(seen.sent.get()) == MODEL_TAG:  # it would be played within the participant's limits: those were not seen

@@ -100,13 +100,7 @@ def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
 
 
 def second_order(model: Any) -> Any:
-    """The model, if it can be followed.
-
-    Raises
-    ------
-    BadModel
-        Its dynamics are not of second order.
-    """
+    """The model, if it can be followed. Raises BadModel: its dynamics are not of second order."""
     from stimrig.identify.dynamics.linear import SecondOrder
 
     if not isinstance(model.linear, SecondOrder):
