@@ -132,11 +132,8 @@ class Journals:
 PULSE_CHANNELS = (("pulse_width", "µs"), ("current", "mA"), ("index", "1"))
 
 
-class NoLibraryError(RigError):
-    """LSL is not installed."""
-
-    code = "no-library"
-    title = "LSL is not installed"
+class NoLibraryError(RigError, code="no-library", title="LSL is not installed"):
+    """It names what to install."""
 
 
 def library() -> Any:
