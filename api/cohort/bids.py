@@ -25,10 +25,7 @@ from stimrig.identify.records.cells import cell_text
 Words = dict[str, dict[str, Any]]
 
 PHYSIO: Words = {
-    "time_s": {
-        "Description": "time of the sample, test's clock, where the even rate does not give it",
-        "Units": "s",
-    },
+    "time_s": {"Description": "time of the sample, test's clock, where the even rate does not give it", "Units": "s"},
     "torque_nm": {"Description": "elbow torque, zero offset not removed; n/a: the sample was lost", "Units": "N.m"},
     "angle_rad": {"Description": "joint angle", "Units": "rad"},
     "velocity_rad_s": {"Description": "angular velocity of the joint", "Units": "rad/s"},

@@ -232,12 +232,7 @@ class PacketLine:
     """
 
     def __init__(
-        self,
-        machine: Machine,
-        port: Port,
-        name: str,
-        framing: Framing,
-        on_packet: Callable[[Packet, float], None],
+        self, machine: Machine, port: Port, name: str, framing: Framing, on_packet: Callable[[Packet, float], None]
     ) -> None:
         self.port = name
         self.last_written_s = -1e9
