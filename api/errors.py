@@ -8,13 +8,7 @@ if TYPE_CHECKING:
     from stimrig.rig.messages import Problem as RigProblem
 
 T = TypeVar("T")
-RIG_STATUS = {
-    "refused": 422,
-    "rest-needed": 422,
-    "bad-plan": 422,
-    "disconnected": 503,
-    "internal": 502,
-}
+RIG_STATUS = {"refused": 422, "rest-needed": 422, "bad-plan": 422, "disconnected": 503, "internal": 502}
 """Which HTTP status answers each of the rig's refusals; every other one is answered by 409."""
 
 

@@ -24,10 +24,7 @@ class ServerSettings(BaseSettings):
 
     Every field has an environment variable, its name behind a prefix.
 
-    Raises
-    ------
-    SettingsError
-        A value does not hold; the message names its environment variable.
+    Raises SettingsError: a value does not hold; the message names its environment variable.
     """
 
     data_dir: Path

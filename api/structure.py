@@ -15,10 +15,7 @@ PLAIN = "plain"
 def held_by(model: Any | None, record: Any) -> list[str]:
     """The effects of a model with their forms, as a diagnosis of this record takes them; none for no model.
 
-    Raises
-    ------
-    IdentifyError
-        The model holds for another pulse rate, or effects do not stand on it.
+    Raises IdentifyError: the model holds for another pulse rate, or effects do not stand on it.
     """
     from stimrig.identify.diagnosis import structure_of
     from stimrig.identify.simulation.predict import refuse_rate

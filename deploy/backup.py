@@ -45,10 +45,7 @@ def make(rig_data: Path, api_data: Path, to: Path) -> Path:
     The database is copied first, then journals, then recordings: what the database names is then in the copy, and a
     test that ends meanwhile is in it as a journal, as a recording, or as both.
 
-    Raises
-    ------
-    BackupError
-        No database, no room, or the copy does not hold; a partial copy keeps the suffix `.partial`.
+    Raises BackupError: no database, no room, or the copy does not hold; a partial copy keeps the suffix `.partial`.
     """
     source = api_data / "stimrig.db"
     if not source.is_file():
@@ -80,10 +77,7 @@ def make(rig_data: Path, api_data: Path, to: Path) -> Path:
 def verify(backup: Path) -> dict[str, int]:
     """Check a backup: every file, none too many, the database, and that each recording it names is there unchanged.
 
-    Raises
-    ------
-    BackupError
-        What does not hold.
+    Raises BackupError: what does not hold.
     """
     sums = _manifest(backup)
     present = {str(path.relative_to(backup)) for path in backup.rglob("*") if path.is_file()} - {MANIFEST}
@@ -110,10 +104,8 @@ def verify(backup: Path) -> dict[str, int]:
 def restore(backup: Path, rig_data: Path, api_data: Path, force: bool) -> list[str]:
     """Put a backup back; what happened, in words. The rig comes up latched: a person looks first.
 
-    Raises
-    ------
-    BackupError
-        The backup does not hold, a process uses the data, or there are data and no `force`. Nothing was touched.
+    Raises BackupError: the backup does not hold, a process uses the data, or there are data and no `force`. Nothing was
+    touched.
     """
     verify(backup)
     if _locked(rig_data / "rig.lock"):

@@ -28,10 +28,7 @@ class SoupError(Exception):
 def pins(text: str, name: str = LOCK.name) -> list[tuple[str, str, str]]:
     """Name, version and marker of each package in a locked list.
 
-    Raises
-    ------
-    SoupError
-        A line that is neither a pin, a hash nor a comment.
+    Raises SoupError: a line that is neither a pin, a hash nor a comment.
     """
     found = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -53,10 +50,7 @@ def notes() -> dict[str, Any]:
 def render() -> str:
     """The list as Markdown.
 
-    Raises
-    ------
-    SoupError
-        A package without a note, a note without a package, or an unknown class.
+    Raises SoupError: a package without a note, a note without a package, or an unknown class.
     """
     written, locked = notes(), pins(LOCK.read_text("utf-8"))
     packages, extras = written["package"], written["extra"]

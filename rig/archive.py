@@ -127,10 +127,7 @@ def place(recording: Recording, folder: Path) -> Path:
 def seal(recording: Recording, folder: Path, disk: Disk) -> Sealed:
     """Seal a recording into `folder` and verify what was written.
 
-    Raises
-    ------
-    RecordingError
-        Disk error, or the file reads back differently; the journal is not touched.
+    Raises RecordingError: disk error, or the file reads back differently; the journal is not touched.
     """
     path = place(recording, folder)
     data = to_bytes(recording)
@@ -158,10 +155,7 @@ def _numbers(found: object) -> h5py.Dataset:
 def verify(path: Path, file: io.BytesIO | None = None) -> str:
     """Read a sealed recording back and return its content's SHA-256; `file`: what was read of it already.
 
-    Raises
-    ------
-    RecordingError
-        Not a recording, or its content does not match its hash.
+    Raises RecordingError: not a recording, or its content does not match its hash.
     """
     try:
         with h5py.File(file or path, "r") as opened:

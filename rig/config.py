@@ -135,10 +135,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
     The line may set the clock's speed and the watch, and needs no calibration. It must therefore never lead to a real
     stimulator: its port must be a pseudo-terminal.
 
-    Raises
-    ------
-    ConfigError
-        The line is not valid, or its port is not a pseudo-terminal.
+    Raises ConfigError: the line is not valid, or its port is not a pseudo-terminal.
     """
     try:
         text = ready if ready.lstrip().startswith("{") else Path(ready).read_text("utf-8")

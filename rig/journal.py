@@ -109,10 +109,7 @@ class Journal:
 
     After the first failure every further `append` raises: a journal with a gap must not look complete.
 
-    Raises
-    ------
-    JournalError
-        The disk gives an error.
+    Raises JournalError: the disk gives an error.
     """
 
     def __init__(self, log: Log) -> None:
@@ -123,13 +120,7 @@ class Journal:
         self._written(lambda: log.append(MAGIC))
 
     def append(self, kind: Kind, payload: bytes) -> None:
-        """Write one block through to the kernel.
-
-        Raises
-        ------
-        JournalError
-            The disk gave an error, now or before.
-        """
+        """Write one block through to the kernel. Raises JournalError: the disk gave an error, now or before."""
         head = _BLOCK.pack(MARK, kind, self._number & 0xFFFF, len(payload), 0)[:_CRC_AT]
         crc = zlib.crc32(payload, zlib.crc32(head))
         self._written(lambda: self._log.append(head + _LENGTH.pack(crc) + payload))
@@ -201,10 +192,7 @@ def read(path: Path) -> JournalContents:
 def parse(path: Path, data: bytes) -> JournalContents:
     """What a journal's bytes say, complete or partial: only damaged blocks are lost.
 
-    Raises
-    ------
-    RecordingError
-        Not a journal.
+    Raises RecordingError: not a journal.
     """
     start = len(MAGIC)
     damaged = sum(a != b for a, b in zip(data[:start], MAGIC, strict=False)) if len(data) > start else 0

@@ -220,10 +220,7 @@ def refuse(limit: Limit, value: float, place: str) -> None:
 def tightened(table: dict[str, Limit], name: str, hi: float, owner: str, lo: float | None = None) -> dict[str, Limit]:
     """The table with one row's range narrowed, never widened.
 
-    Raises
-    ------
-    RefusedError
-        The bound is not a number, or no value would be left.
+    Raises RefusedError: the bound is not a number, or no value would be left.
     """
     row = table[name]
     if lo is not None and not (lo <= row.hi):
@@ -244,10 +241,7 @@ def at_least(table: dict[str, Limit], name: str, lo: float, owner: str) -> dict[
 def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "participant's profile") -> dict[str, Limit]:
     """The table as this participant's profile narrows it.
 
-    Raises
-    ------
-    RefusedError
-        The profile holds a number that makes no sense (negative, NaN).
+    Raises RefusedError: the profile holds a number that makes no sense (negative, NaN).
     """
     table = tightened(table, "pulse_width_us", profile.max_pulse_width_us, owner)
     table = tightened(table, "current_ma", profile.current_ma, owner)
@@ -269,10 +263,7 @@ def _for_torque(table: dict[str, Limit], max_torque_nm: float, owner: str) -> di
 def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
     """The table as profile and request narrow it: of hard limit, rig file, profile and request the tightest wins.
 
-    Raises
-    ------
-    RefusedError
-        A bound that makes no sense.
+    Raises RefusedError: a bound that makes no sense.
     """
     table = for_profile(table, request.profile)
     owner = "request"

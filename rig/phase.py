@@ -146,10 +146,7 @@ class Phase:
     def rearm(self) -> Phase:
         """A person has checked participant and rig, and both devices have just answered.
 
-        Raises
-        ------
-        BusyError
-            A test is in progress, or a calibration is open.
+        Raises BusyError: a test is in progress, or a calibration is open.
         """
         if self.busy:
             raise BusyError(f"test {self.test_id} is {self.state}; nothing to re-arm")

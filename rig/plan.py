@@ -273,10 +273,7 @@ def check_steps(test: PlannedTest, steps: Steps, rise: Limit) -> None:
 def preview(test: PlannedTest, recruitment: RecruitmentTable | None = None) -> Preview:
     """Duration, dose and pulses, to be shown before the test is played.
 
-    Raises
-    ------
-    PlanError
-        The recruitment table is not a curve.
+    Raises PlanError: the recruitment table is not a curve.
     """
     rate_hz = test.plan.pulse_rate_hz
     torque_time_nms = None

@@ -65,10 +65,7 @@ LIBRARY: dict[str, Callable[[float], list[SegmentPlan]]] = {"paper": paper, "sho
 def segments(protocol_id: str, max_pulse_width_us: float) -> list[SegmentPlan]:
     """Segments of the protocol of that id.
 
-    Raises
-    ------
-    PlanError
-        There is no protocol of that id; the message lists the known ones.
+    Raises PlanError: there is no protocol of that id; the message lists the known ones.
     """
     if protocol_id not in LIBRARY:
         raise PlanError(f"protocol {protocol_id!r} is unknown; use one of {', '.join(LIBRARY)}")

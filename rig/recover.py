@@ -43,10 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 def recover(path: Path, folder: Path) -> dict[str, Any]:
     """Seal what the journal holds into the folder, and return a summary.
 
-    Raises
-    ------
-    RecordingError
-        Not a journal, nothing to seal, a disk error, or another recording of that name exists.
+    Raises RecordingError: not a journal, nothing to seal, a disk error, or another recording of that name exists.
     """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: no such folder; make it, or give another with -o")

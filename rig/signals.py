@@ -48,13 +48,7 @@ class Ack:
 
 
 SAMPLE = np.dtype(
-    [
-        ("host_time_s", "<f8"),
-        ("stamp_s", "<f8"),
-        ("torque_nm", "<f8"),
-        ("counter", "<i8"),
-        ("sync", "u1"),
-    ]
+    [("host_time_s", "<f8"), ("stamp_s", "<f8"), ("torque_nm", "<f8"), ("counter", "<i8"), ("sync", "u1")]
 )
 """One torque sample: host receive time (rig clock), the transport's own stamp (NaN: none), torque in N·m, the
 cell's counter (raw from a device, unwrapped after the receiver; −1: none), sync line (255: none)."""

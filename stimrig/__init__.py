@@ -41,21 +41,9 @@ _PLACES = {
 }
 
 __all__ = [
-    "Client",
-    "Model",
-    "Record",
-    "carry",
-    "compare",
-    "diagnose",
-    "effects",
-    "errors",
-    "fit",
-    "improve",
-    "next_experiment",
-    "plot",
-    "predict",
-    "read",
-]
+    "Client", "Model", "Record", "carry", "compare", "diagnose", "effects", "errors", "fit", "improve",
+    "next_experiment", "plot", "predict", "read",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -18,21 +18,7 @@ from stimrig.api.client.errors import (
 from stimrig.identify.errors import BadModel, BadRecord, BadRequest, Cancelled, IdentifyError, NotIdentifiable
 
 __all__ = [
-    "BadModel",
-    "BadRecord",
-    "BadRequest",
-    "Cancelled",
-    "Conflict",
-    "Forbidden",
-    "IdentifyError",
-    "Invalid",
-    "NotCompleted",
-    "NotFound",
-    "NotIdentifiable",
-    "Refused",
-    "ServiceError",
-    "TooManyRequests",
-    "Unauthorized",
-    "Unavailable",
-    "Unreachable",
-]
+    "BadModel", "BadRecord", "BadRequest", "Cancelled", "Conflict", "Forbidden", "IdentifyError", "Invalid",
+    "NotCompleted", "NotFound", "NotIdentifiable", "Refused", "ServiceError", "TooManyRequests", "Unauthorized",
+    "Unavailable", "Unreachable",
+]  # fmt: skip

@@ -48,10 +48,7 @@ def check(
 ) -> Iterator[CheckedFile]:
     """Check all files that were not checked since `before_utc`; each is noted when it is done, so a cut run goes on.
 
-    Raises
-    ------
-    BucketError
-        The bucket cannot be read at all.
+    Raises BucketError: the bucket cannot be read at all.
     """
     after, own = "", CentreFile
     while names := store.all(own.sha256, own.sha256 > after, _not_since(before_utc), order=own.sha256, limit=PAGE):

@@ -98,10 +98,7 @@ class Context(Parts):
     def one_more_of(self, rig_id: int) -> Iterator[None]:
         """Around a piece of a rig's file: a rig sends one, and one more after a line that broke; each is in memory.
 
-        Raises
-        ------
-        ApiError
-            503: there are as many.
+        Raises ApiError: 503 there are as many.
         """
         if self.putting[rig_id] >= MOST_PUTS_OF_A_RIG:
             raise ApiError(503, "crowded", "Too many pieces at once", "Send one after the other. Try again later.")

@@ -50,13 +50,7 @@ def asked(
     store: Store, q: str = "", rig: str | None = None, from_: str | None = None, to: str | None = None,
     effect: str | None = None, verdict: str | None = None, after: str | None = None,
 ) -> Search:  # fmt: skip
-    """A search, each part checked.
-
-    Raises
-    ------
-    ApiError
-        422: a part does not hold; 404: no such rig.
-    """
+    """A search, each part checked. Raises ApiError: 422 a part does not hold; 404 no such rig."""
     for name, given in (("from", from_), ("to", to)):
         if given and clean.a_day(given) is None:
             raise invalid(f"{name}: give a day as 2026-11-23")

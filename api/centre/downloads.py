@@ -21,13 +21,7 @@ IN_MEMORY = 8_000_000
 
 
 async def hand_out(context: Context, sha256: str | None, name: str, kind: str) -> Response:
-    """The answer.
-
-    Raises
-    ------
-    ApiError
-        404: it has not come yet; 500 `file-damaged`; 503: the bucket cannot be read.
-    """
+    """The answer. Raises ApiError: 404 it has not come yet; 500 `file-damaged`; 503 the bucket cannot be read."""
     row = await asyncio.to_thread(context.store.get, CentreFile, sha256) if sha256 else None
     if row is None or sha256 is None:
         raise NotFoundError("file", name, "The rig has not sent it yet; what is waiting stands on the page of rigs.")

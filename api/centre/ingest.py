@@ -39,13 +39,7 @@ class Item:
 
 
 def read(model: type[BaseModel], raw: bytes) -> Any:
-    """A body of a rig, strictly.
-
-    Raises
-    ------
-    ApiError
-        400: no sound JSON; 422: a field does not hold.
-    """
+    """A body of a rig, strictly. Raises ApiError: 400 no sound JSON; 422 a field does not hold."""
     try:
         return model.model_validate(parse(raw, deepest=DEEPEST))
     except BadJson as error:
@@ -57,13 +51,7 @@ def read(model: type[BaseModel], raw: bytes) -> Any:
 
 
 def checked(sent: ItemIn) -> Item:
-    """The item, its hashes compared.
-
-    Raises
-    ------
-    ApiError
-        422 `hash-differs`.
-    """
+    """The item, its hashes compared. Raises ApiError: 422 `hash-differs`."""
     try:
         text = canonical(sent.body)
         held = digest(text) == sent.sha256 and item_hash(sent.model_dump(exclude={"body"})) == sent.hash
@@ -126,10 +114,7 @@ class Ingest:
     def take(self, rig: CentreRig, batch: BatchIn) -> Position:
         """All items of a batch, or none; where the chain stands then.
 
-        Raises
-        ------
-        ApiError
-            401: the key was revoked meanwhile; 409 `out-of-order`, `forked`; 422 `hash-differs`.
+        Raises ApiError: 401 the key was revoked meanwhile; 409 `out-of-order`, `forked`; 422 `hash-differs`.
         """
         items = [checked(sent) for sent in batch.items]  # before the database is held
         now = self.clock.utc()

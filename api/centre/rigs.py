@@ -31,10 +31,7 @@ class Rigs:
     def add(self, name: str, by: str) -> str:
         """A new rig, or a new key for one whose key was revoked; the key's text, which is shown this once.
 
-        Raises
-        ------
-        ApiError
-            422: no name for a rig; 409: the rig has a key.
+        Raises ApiError: 422 no name for a rig; 409 the rig has a key.
         """
         if not NAME.fullmatch(name) or name != name.strip():
             detail = (
@@ -74,10 +71,7 @@ class Rigs:
     def identify(self, connection: HTTPConnection) -> CentreRig:
         """The rig whose key a request carries; looked up each time, so that a revoked one ends at once everywhere.
 
-        Raises
-        ------
-        ApiError
-            401: no key, unknown, or revoked; 429: too many that were none.
+        Raises ApiError: 401 no key, unknown, or revoked; 429 too many that were none.
         """
         kind, _, text = connection.headers.get("authorization", "").partition(" ")
         if kind.lower() != "bearer" or not text.strip():

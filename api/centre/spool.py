@@ -55,10 +55,7 @@ class Spool:
     def put(self, rig: CentreRig, sha256: str, offset: int, data: bytes) -> dict[str, Any]:
         """Append a piece; once it is whole the file goes into the bucket.
 
-        Raises
-        ------
-        ApiError
-            404: no item names it; 409 `other-offset`; 422 `hash-differs`; 507 `bucket-failed`.
+        Raises ApiError: 404 no item names it; 409 `other-offset`; 422 `hash-differs`; 507 `bucket-failed`.
         """
         length, whole = self._wanted(rig, sha256)
         if whole:
@@ -118,10 +115,7 @@ class Spool:
     def settle(self) -> int:
         """Bring into the bucket what is whole and could not be kept before; throw away what nobody waits for.
 
-        Raises
-        ------
-        BucketError
-            It still cannot.
+        Raises BucketError: it still cannot.
         """
         count = 0
         for part in sorted(self.folder.glob("*/*.part")):

@@ -44,10 +44,7 @@ class Child:
     def start(self) -> dict[str, Any]:
         """Start it and wait for its ready line.
 
-        Raises
-        ------
-        LaunchError
-            It ended instead, or said nothing: its own last line is the message.
+        Raises LaunchError: it ended instead, or said nothing: its own last line is the message.
         """
         line = read_line(self._launch(subprocess.PIPE), READY_S)
         try:

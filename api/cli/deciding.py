@@ -22,12 +22,9 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
 
     Beside it `recorded_ma`, with what current they were made, mA.
 
-    Raises
-    ------
-    InputError
-        Nothing is left to decide; it is not known whose they are, or they are another's; they were made with several
-        currents, or do not say with which; or no further recording could be joined to them. All of it is said before
-        anything is played.
+    Raises InputError: nothing is left to decide; it is not known whose they are, or they are another's; they were made
+    with several currents, or do not say with which; or no further recording could be joined to them. All of it is said
+    before anything is played.
     """
     record = load_record(data)
     sources = record.source.parts or (record.source,)
@@ -77,10 +74,8 @@ def _owner(sources: Sequence[Source], data: Sequence[Path], participant: str | N
 def check_participant(client: Client, code: str, recorded_ma: float | None) -> None:
     """See, before anything is played, that the participant is known here and stimulated with the recordings' current.
 
-    Raises
-    ------
-    InputError
-        Somebody who has recordings would be made anew, with default limits; or the current is another one.
+    Raises InputError: somebody who has recordings would be made anew, with default limits; or the current is another
+    one.
     """
     try:
         now_ma = client.participant(code)["profile"]["current_ma"]

@@ -232,10 +232,7 @@ class Services:
     def watch(self) -> list[str]:
         """Start again what died; what happened, in words.
 
-        Raises
-        ------
-        LaunchError
-            The emulator ended, or a process does not stay up.
+        Raises LaunchError: the emulator ended, or a process does not stay up.
         """
         if self.emulator is not None and not self.emulator.alive():
             raise self.emulator.failure()

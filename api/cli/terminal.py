@@ -67,13 +67,7 @@ def names(text: str | None) -> tuple[str, ...]:
 
 
 def load_model(path: Path) -> Any:
-    """A model from its file.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or holds no model.
-    """
+    """A model from its file. Raises InputError: the file cannot be read, or holds no model."""
     if path.suffix.lower() == ".mat":
         raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
     try:
@@ -129,10 +123,7 @@ def load_held(path: Path | None, data: Sequence[Path], columns: list[str] | None
     """A record, of one file or of several; the model whose structure is meant on it (none: the plain one); the effects
     that this holds.
 
-    Raises
-    ------
-    InputError
-        As `load_model`; the model is one of another pulse rate, or one that effects do not stand on.
+    Raises InputError: as `load_model`; the model is one of another pulse rate, or one that effects do not stand on.
     """
     from stimrig.api.structure import held_by
 
@@ -145,13 +136,7 @@ def load_held(path: Path | None, data: Sequence[Path], columns: list[str] | None
 
 
 def write(path: Path, text: str) -> None:
-    """Write a file.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
+    """Write a file. Raises InputError: it cannot be written."""
     with writing(path):
         path.write_text(text, "utf-8")
 
@@ -159,10 +144,7 @@ def write(path: Path, text: str) -> None:
 def write_model(path: Path, model: Any) -> None:
     """Write a model: as MODEL.json, or where the name ends in .mat as a MAT file for other tools.
 
-    Raises
-    ------
-    InputError
-        It cannot be written.
+    Raises InputError: it cannot be written.
     """
     if path.suffix.lower() != ".mat":
         write(path, model.to_json())
@@ -171,13 +153,7 @@ def write_model(path: Path, model: Any) -> None:
 
 
 def write_mat(path: Path, variables: dict[str, Any]) -> None:
-    """Write variables as a MAT file.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
+    """Write variables as a MAT file. Raises InputError: it cannot be written."""
     from stimrig.identify import plain_mat
 
     with writing(path):
@@ -186,13 +162,7 @@ def write_mat(path: Path, variables: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Around the writing of a file: one line where it cannot be written.
-
-    Raises
-    ------
-    InputError
-        It cannot.
-    """
+    """Around the writing of a file: one line where it cannot be written. Raises InputError: it cannot."""
     try:
         yield
     except OSError as error:
@@ -201,9 +171,9 @@ def writing(path: Path) -> Iterator[None]:
 
 def say_json(found: dict[str, Any]) -> None:
     """One JSON object, nothing else."""
-    from stimrig.api.workers.json_values import clean
+    from stimrig.identify.json_text import json_value
 
-    print(json.dumps(clean(found), ensure_ascii=False, allow_nan=False))
+    print(json.dumps(json_value(found), ensure_ascii=False, allow_nan=False))
 
 
 def say(*lines: str) -> None:

@@ -256,10 +256,7 @@ class Client(Connection):
         With `tracked` it is as it was tracked to the last trial, within the limits of the approval; its key `tracking`
         says how, and in `ask` why a new test is needed, if one is.
 
-        Raises
-        ------
-        NotFound
-            No model is approved today.
+        Raises NotFound: no model is approved today.
         """
         headers = {"If-None-Match": known.etag} if known else {}
         params = {"tracked": True} if tracked else {}
@@ -271,10 +268,7 @@ class Client(Connection):
     def tracking(self, participant: str) -> Tracking:
         """The trials since the approval that holds: how gain, threshold and time scale moved, and whether to ask.
 
-        Raises
-        ------
-        NotFound
-            No model is approved today.
+        Raises NotFound: no model is approved today.
         """
         return self.get(f"/v1/participants/{participant}/tracking")
 

@@ -25,10 +25,7 @@ from stimrig.identify.records.cells import cell_text
 Words = dict[str, dict[str, Any]]
 
 PHYSIO: Words = {
-    "time_s": {
-        "Description": "time of the sample, test's clock, where the even rate does not give it",
-        "Units": "s",
-    },
+    "time_s": {"Description": "time of the sample, test's clock, where the even rate does not give it", "Units": "s"},
     "torque_nm": {"Description": "elbow torque, zero offset not removed; n/a: the sample was lost", "Units": "N.m"},
     "angle_rad": {"Description": "joint angle", "Units": "rad"},
     "velocity_rad_s": {"Description": "angular velocity of the joint", "Units": "rad/s"},
@@ -176,10 +173,7 @@ def _scans(rows: Iterable[tuple[str, str, dict[str, Any]]]) -> Iterator[dict[str
 def grid(record: WholeRecord) -> tuple[float, float, np.ndarray, bool]:
     """Rate (Hz), start (s), each sample's place on the even grid, and whether the grid gives the times back.
 
-    Raises
-    ------
-    NoExport
-        The samples lie on no even grid, or it would be longer than any record.
+    Raises NoExport: the samples lie on no even grid, or it would be longer than any record.
     """
     time_s = record.samples["time_s"]
     rate_hz, start_s = record.sample_rate_hz, float(time_s[0])

@@ -101,10 +101,7 @@ class Changes:
 def compared(old: Path, new: Path) -> Changes:
     """Compare two tables of results, record by record (by SHA-256; by address where a record could not be read).
 
-    Raises
-    ------
-    CohortError
-        A file is no table of results, or they are of two verbs.
+    Raises CohortError: a file is no table of results, or they are of two verbs.
     """
     before, after = _options(old), _options(new)
     if before["verb"] != after["verb"]:

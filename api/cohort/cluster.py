@@ -56,13 +56,7 @@ class Workers:
 
 
 def memory_of(text: str) -> int:
-    """Bytes of a size such as 1GB or 800MiB.
-
-    Raises
-    ------
-    CohortError
-        It is none, or too small for any fit.
-    """
+    """Bytes of a size such as 1GB or 800MiB. Raises CohortError: it is none, or too small for any fit."""
     try:
         found = parse_bytes(text)
     except (ValueError, TypeError):
@@ -158,13 +152,7 @@ def _remote(workers: Workers) -> Iterator[Client]:
 
 
 def check_versions(client: Client) -> None:
-    """Refuse workers whose stimrig or Python is another one.
-
-    Raises
-    ------
-    CohortError
-        Names the first such worker.
-    """
+    """Refuse workers whose stimrig or Python is another one. Raises CohortError: names the first such worker."""
     asked = (("stimrig", software_version(), importlib.metadata.version, ("stimrig",)),
              ("Python", platform.python_version(), platform.python_version, ()))  # fmt: skip
     for what, mine, ask, arguments in asked:

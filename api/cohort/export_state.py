@@ -97,10 +97,7 @@ class State:
     def label(self, code: str) -> str:
         """The label of a code: its letters and digits; the same for the same code.
 
-        Raises
-        ------
-        ValueError
-            Another code has that label, or nothing is left of it.
+        Raises ValueError: another code has that label, or nothing is left of it.
         """
         label = "".join(letter for letter in code if letter.isascii() and letter.isalnum())
         if not label:

@@ -16,8 +16,8 @@ from stimrig import identify
 from stimrig.api.cohort.select import FIELDS, Selection, as_day
 from stimrig.api.cohort.tasks import Task
 from stimrig.api.workers import confinement
-from stimrig.api.workers.json_values import clean
 from stimrig.identify.errors import BadRecord, BadRequest, IdentifyError, NotIdentifiable
+from stimrig.identify.json_text import json_value
 from stimrig.identify.records import HDF5_MAGIC, bounds
 from stimrig.identify.records.hdf5 import StrictFile
 
@@ -77,7 +77,7 @@ def compute(progress: Callable[..., None], file: str, name: str, known: Row, tas
         "processor_s": round(time.process_time() - processor_s, 4),
         "worker_memory_mb": now and round(now[1] / 1e6, 1),
     }
-    return {"row": clean(row)}
+    return {"row": json_value(row)}
 
 
 def add_answer(path: Path, task: Task, row: dict[str, Any]) -> bool:

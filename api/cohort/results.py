@@ -163,13 +163,7 @@ class Results:
         return row["status"]
 
     def flush(self) -> None:
-        """Bring what waits to the disk, as a part of its own.
-
-        Raises
-        ------
-        CutOffError
-            The disk does not take it.
-        """
+        """Bring what waits to the disk, as a part of its own. Raises CutOffError: the disk does not take it."""
         if not self.waiting:
             return
         with self._kept(self.folder), whole_file(self.folder / f"{self._next:08d}.parquet") as file:
@@ -180,10 +174,7 @@ class Results:
     def join(self) -> dict[str, int]:
         """Write the output and take the parts away; rows by status.
 
-        Raises
-        ------
-        CutOffError
-            The disk does not take it; the parts stay.
+        Raises CutOffError: the disk does not take it; the parts stay.
         """
         self.flush()
         files = [*([self.output] if self.output.exists() else []), *self._parts()]

@@ -65,30 +65,21 @@ class Source(Protocol):
     def check(self) -> None:
         """Look whether the place is there, before workers are started for it.
 
-        Raises
-        ------
-        CohortError
-            It is not there, or does not let us in.
+        Raises CohortError: it is not there, or does not let us in.
         """
         next(self.entries(Selection()), None)
 
     def entries(self, selection: Selection) -> Iterator[Entry]:
         """Every record, one after the other; those that cannot be meant may be left out.
 
-        Raises
-        ------
-        CohortError
-            The place is not there, or does not let us in.
+        Raises CohortError: the place is not there, or does not let us in.
         """
         ...
 
     def open(self, entry: Entry, most_bytes: int) -> bytes:
         """The content of a record, of a larger one its first `most_bytes` + 1.
 
-        Raises
-        ------
-        SourceError
-            It cannot be fetched.
+        Raises SourceError: it cannot be fetched.
         """
         ...
 
@@ -302,10 +293,8 @@ def _bounded(line: Connection, path: str, most_bytes: int) -> bytes:
 def sources_of(addresses: Sequence[str], token: str = "", scheduler: str = "") -> list[Source]:
     """A source for each address; `scheduler`: where they are sent to, with the token; empty: to this machine only.
 
-    Raises
-    ------
-    CohortError
-        An address that cannot be used, a centre without a token, or a token that would travel in the clear.
+    Raises CohortError: an address that cannot be used, a centre without a token, or a token that would travel in the
+    clear.
     """
     if not addresses:
         raise CohortError("DATA is missing. Give files, folders, s3://… or the https://… of a centre.")

@@ -150,13 +150,7 @@ class Statistics:
 
 
 def read_statistics(file: Path) -> Statistics:
-    """Read a table of results.
-
-    Raises
-    ------
-    CohortError
-        It is none, or empty.
-    """
+    """Read a table of results. Raises CohortError: it is none, or empty."""
     found = Statistics(options_of(file))
     numbers: dict[str, int] = {}
     for row in rows_of(file, COLUMNS):

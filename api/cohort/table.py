@@ -174,13 +174,7 @@ def kept_rows(files: Sequence[Path]) -> tuple[set[int], dict[str, int]]:
 
 
 def rows_of(file: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Rows of a table, some at a time.
-
-    Raises
-    ------
-    CohortError
-        It is damaged, or no such table.
-    """
+    """Rows of a table, some at a time. Raises CohortError: it is damaged, or no such table."""
     try:
         with pq.ParquetFile(file) as table:
             for batch in table.iter_batches(ROWS_AT_ONCE, columns=list(columns)):
@@ -215,10 +209,7 @@ def groups(files: Sequence[Path], kept: set[int]) -> Iterator[pa.Table]:
 def options_of(file: Path) -> dict[str, Any]:
     """The options that a table of results was made with.
 
-    Raises
-    ------
-    CohortError
-        It is no table of results, or there is no such file.
+    Raises CohortError: it is no table of results, or there is no such file.
     """
     if not file.exists():
         raise CohortError(f"{file}: no such file. Give the -o of `stimrig cohort fit`, `diagnose` or `improve`.")

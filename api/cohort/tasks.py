@@ -80,10 +80,7 @@ def _in_words(value: Any) -> str:
 def checked(task: Task) -> Task:
     """The task, whose options can be used on some record.
 
-    Raises
-    ------
-    CohortError
-        An unknown method or effect, a column that cannot be meant.
+    Raises CohortError: an unknown method or effect, a column that cannot be meant.
     """
     from stimrig.identify.effects import find_effect
     from stimrig.identify.methods import method_of

@@ -69,10 +69,7 @@ class WholeRecord:
 def read_whole(content: bytes, path: Path, known: Known, columns: Sequence[str] = ()) -> WholeRecord:
     """Read a record whose bytes lie at `path`, too, and of which this is known (`describe`).
 
-    Raises
-    ------
-    BadRecord
-        As `identify.read` does.
+    Raises BadRecord: as `identify.read` does.
     """
     said, sealed = dict(known), content.startswith(HDF5_MAGIC)
     record = read(path, () if sealed else columns, said)

@@ -18,7 +18,7 @@ from babel.messages.catalog import Catalog
 from babel.messages.extract import extract_from_file
 from babel.messages.pofile import write_po
 
-from stimrig.api.language.words import CODES, DEFAULT, HERE, catalogue, first
+from stimrig.api.language import CODES, DEFAULT, HERE, catalogue, first
 
 ROOT = HERE.parents[1]
 KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}

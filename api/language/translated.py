@@ -15,7 +15,7 @@ from itertools import islice
 
 from markupsafe import Markup
 
-from stimrig.api.language.words import DEFAULT, catalogue, code, first, localised
+from stimrig.api.language import DEFAULT, catalogue, code, first, localised
 
 _PLACE = re.compile(r"%\((\w+)\)s")
 _END = re.compile(r"(?<=[.!?;:,]) ")

@@ -175,11 +175,8 @@ class Analyses:
     ) -> Model:
         """A new version: the model's effects and these, fitted together anew.
 
-        Raises
-        ------
-        ApiError
-            409: an effect is in it already, or the recording does not ask for it and nobody forces it; 422: no such
-            effect, or the data do not allow the fit.
+        Raises ApiError: 409 an effect is in it already, or the recording does not ask for it and nobody forces it; 422
+        no such effect, or the data do not allow the fit.
         """
         twice = [effect for effect in added if effect in model.effects]
         if twice:

@@ -38,10 +38,7 @@ class CarriedStructure:
         It is plain where a structure is carried over after it, and where nothing in the recording looks like an effect
         of the site's: a test that a person went through gives a model.
 
-        Raises
-        ------
-        ApiError
-            The recording gives no model in the plain structure either.
+        Raises ApiError: the recording gives no model in the plain structure either.
         """
         earlier = await asyncio.to_thread(self.versions.last_approved, participant)
         effects, warning = list(self.settings.structure) if earlier is None else [], ""
@@ -107,10 +104,7 @@ async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -
 
     A worker reads the library.
 
-    Raises
-    ------
-    OSError
-        Which, and what there is; or why the library cannot be read.
+    Raises OSError: which, and what there is; or why the library cannot be read.
     """
     if not settings.structure and not settings.effects_dir:
         return

@@ -339,13 +339,7 @@ def noisy(comparison: dict[str, Any]) -> bool:
 
 
 def require_evidence(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[str]) -> None:
-    """Refuse effects that the recording does not ask for.
-
-    Raises
-    ------
-    ApiError
-        409, with the reason for each effect.
-    """
+    """Refuse effects that the recording does not ask for. Raises ApiError: 409, with the reason for each effect."""
     found = {effect: reason for effect in added if (reason := refusal(diagnosis, present, effect))}
     if found:
         detail = " ".join(f"{effect}: {reason}" for effect, reason in found.items())

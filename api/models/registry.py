@@ -170,10 +170,7 @@ class Versions:
 
         One that is not usable comes into use by nobody's silence: then the controller gets what was approved before.
 
-        Raises
-        ------
-        ApiError
-            409: there is nothing before it.
+        Raises ApiError: 409 there is nothing before it.
         """
         row = self.get(model_id)
         if row.parent_id is None:

@@ -207,10 +207,7 @@ class TrackedVersions:
     def served(self, participant: str) -> Served | None:
         """The newest tracked version of the approval that holds, else the approved model itself; None without one.
 
-        Raises
-        ------
-        ApiError
-            500: the approved model is damaged.
+        Raises ApiError: 500 the approved model is damaged.
         """
         approved = self.versions.served(participant)
         if approved is None:

@@ -135,29 +135,24 @@ class PushError(Exception):
 
     state = "refused"
 
+    def __init_subclass__(cls, state: str = "refused") -> None:
+        cls.state = state
 
-class UnreachableError(PushError):
+
+class UnreachableError(PushError, state="unreachable"):
     """No answer came."""
 
-    state = "unreachable"
 
-
-class KeyRefusedError(PushError):
+class KeyRefusedError(PushError, state="key-refused"):
     """The centre does not know the rig's key, or not any more."""
 
-    state = "key-refused"
 
-
-class WrongAnswerError(PushError):
+class WrongAnswerError(PushError, state="wrong-answer"):
     """What answered does not speak as a centre does."""
 
-    state = "wrong-answer"
 
-
-class BucketError(PushError):
+class BucketError(PushError, state="bucket-failed"):
     """The centre cannot keep files at the moment: its bucket is full or gone."""
-
-    state = "bucket-failed"
 
 
 class RefusedError(PushError):

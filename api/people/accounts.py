@@ -39,13 +39,7 @@ class People:
         self.passwords = Passwords()
 
     async def add(self, name: str, password: str, scopes: list[Scope], by: str) -> User:
-        """A new person.
-
-        Raises
-        ------
-        ApiError
-            409: the name is taken.
-        """
+        """A new person. Raises ApiError: 409 the name is taken."""
         return await asyncio.to_thread(self._add, name, await self.passwords.hash(password), scopes, by)
 
     def _add(self, name: str, hashed: str, scopes: list[Scope], by: str) -> User:
@@ -64,10 +58,7 @@ class People:
     async def sign_in(self, name: str, password: str, address: str) -> str:
         """Open a session; its cookie.
 
-        Raises
-        ------
-        ApiError
-            401 wrong name or password (not said which); 429 too many tries.
+        Raises ApiError: 401 wrong name or password (not said which); 429 too many tries.
         """
         place = place_of(address)
         row, known = await asyncio.to_thread(self._look_up, name, place)
@@ -107,10 +98,7 @@ class People:
     async def confirm(self, principal: Principal, password: str) -> None:
         """The password once more: good for one approval within two minutes.
 
-        Raises
-        ------
-        ApiError
-            401 wrong password; 409 signed in with a token; 429 too many tries.
+        Raises ApiError: 401 wrong password; 409 signed in with a token; 429 too many tries.
         """
         held = principal.session_hash
         if held is None:
@@ -137,10 +125,7 @@ class People:
     async def unlock(self, principal: Principal, secret: str) -> None:
         """Go on in a locked session, by its person's password or by the token that it was opened with.
 
-        Raises
-        ------
-        ApiError
-            401 it is not the right one; 429 too many tries.
+        Raises ApiError: 401 it is not the right one; 429 too many tries.
         """
         held = principal.page_session
         if held is None or not principal.locked:
@@ -159,10 +144,7 @@ class People:
     async def confirmed(self, request: Request, principal: Principal) -> None:
         """Refuse an approval of a person who has not given the password again; a form may carry it in `password`.
 
-        Raises
-        ------
-        ApiError
-            403: the password is asked for.
+        Raises ApiError: 403 the password is asked for.
         """
         if principal.session_hash is None:
             return
@@ -198,10 +180,7 @@ class People:
     async def change_password(self, name: str, password: str, who: Principal) -> str | None:
         """A new password. The person's sessions end; the one that made the change goes on under a new cookie, if any.
 
-        Raises
-        ------
-        ApiError
-            404: nobody of that name.
+        Raises ApiError: 404 nobody of that name.
         """
         return await asyncio.to_thread(self._change_password, name, await self.passwords.hash(password), who)
 
@@ -279,13 +258,7 @@ class Passwords:
 
     @contextmanager
     def room(self, known: bool) -> Iterator[Lane]:
-        """A place in the lane.
-
-        Raises
-        ------
-        ApiError
-            429: too many wait already.
-        """
+        """A place in the lane. Raises ApiError: 429 too many wait already."""
         lane = self._known if known else self._strangers
         if lane.inside >= lane.most:
             problem = ApiError(429, "too-many-tries", "Too many people sign in at once", "Try again in 2 s.")
@@ -332,10 +305,7 @@ ALPHABETS = frozenset({"LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE"})
 def written_name(text: str) -> str:
     """A name in the one way that it is stored: composed (NFC), every run of white space one space, none at the ends.
 
-    Raises
-    ------
-    ValueError
-        In a sentence for people: what the name holds that it cannot, or how long it is.
+    Raises ValueError: in a sentence for people: what the name holds that it cannot, or how long it is.
     """
     composed = unicodedata.normalize("NFC", text).strip()
     spaced = "".join(" " if unicodedata.category(sign) == "Zs" else sign for sign in composed)

@@ -182,10 +182,7 @@ class Auth:
         Guesses are held to a pace by the place they come from. A token that was drawn opens all the same: nobody
         guesses its 256 bits, and others' guesses must not keep a controller out. A right token always presses stop.
 
-        Raises
-        ------
-        ApiError
-            401: unknown, revoked or expired; 429: too many that were none.
+        Raises ApiError: 401 unknown, revoked or expired; 429 too many that were none.
         """
         token, place = self.store.get(Token, digest(text)), place_of(address)
         if token is None:

@@ -25,11 +25,7 @@ from stimrig.api.store.tables import Participant, Test, Token
 
 LONGEST_S = 300.0
 HALTED = "The rig is stopped. A person looks at participant and rig and re-arms it."
-NEUTRAL = {
-    "rig-busy": "The rig is in use. Wait until it is free.",
-    "rig-latched": HALTED,
-    "rig-uncertain": HALTED,
-}
+NEUTRAL = {"rig-busy": "The rig is in use. Wait until it is free.", "rig-latched": HALTED, "rig-uncertain": HALTED}
 """What a key is told instead of words that may name another participant."""
 SAME_RATE = 1e-3
 """Share by which a pulse rate may differ from the model's: what writing and reading a number leaves."""
@@ -46,13 +42,7 @@ class PlanIn(Body):
 
 
 def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
-    """The plan, as it is kept with the key.
-
-    Raises
-    ------
-    ApiError
-        422: wider than the participant's limits.
-    """
+    """The plan, as it is kept with the key. Raises ApiError: 422 wider than the participant's limits."""
     for name in ("current_ma", "max_pulse_width_us"):
         asked, own = getattr(plan, name), participant.profile.get(name)
         if own is None or not asked <= own:
@@ -65,11 +55,8 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
 async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: TestIn) -> Test:
     """Start a test; where a controller's key asks for it, within its plan.
 
-    Raises
-    ------
-    ApiError
-        403: outside the key or its plan, and by how much; 409: no model of its participant is approved; else as
-        `Runner.start`.
+    Raises ApiError: 403 outside the key or its plan, and by how much; 409 no model of its participant is approved; else
+    as `Runner.start`.
     """
     if who.participant is None:
         if len(seen.sent.get()) == MODEL_TAG:  # it would be played within the participant's limits: those were not seen

@@ -39,11 +39,8 @@ class JointTests(Watched):
     async def planned(self, body: TestIn, plan: messages.TestPlan, preview_s: float) -> Planned:
         """The plan of a guided test.
 
-        Raises
-        ------
-        ApiError
-            409: the rig has no angle sensor, or no angle is left to hold; 422: the participant has no range of angles,
-            or one that is too small, or the target is not in it; what the rig refuses.
+        Raises ApiError: 409 the rig has no angle sensor, or no angle is left to hold; 422 the participant has no range
+        of angles, or one that is too small, or the target is not in it; what the rig refuses.
         """
         range_rad = self.range_of(plan)
         asked, longest_s = body.angle or AngleIn(), body.max_duration_s

@@ -85,10 +85,8 @@ class Kind:
     async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:  # noqa: ARG002
         """The plan to play; with an angle, one that the joint's angle may stop, too.
 
-        Raises
-        ------
-        ApiError
-            409: the rig has no angle sensor; 422: the participant has no range of angles; what the kind or rig refuses.
+        Raises ApiError: 409 the rig has no angle sensor; 422 the participant has no range of angles; what the kind or
+        rig refuses.
         """
         if body.angle is not None:
             watched = AnglePlan(range_rad=self.range_of(plan), still_s=body.angle.still_s)

@@ -88,10 +88,7 @@ class Notes:
     def strike(self, participant: str, note_id: str, by: str) -> Note:
         """Mark a note as wrong; it stays readable, with who struck it. Striking it again changes nothing.
 
-        Raises
-        ------
-        ApiError
-            404: the participant has no such note.
+        Raises ApiError: 404 the participant has no such note.
         """
         with self.store.write() as session:
             note = session.get(Note, note_id)

@@ -102,10 +102,7 @@ class Questions:
     def find(self, participant: str, number: str, who: Principal) -> Question:
         """One that may still be answered by this person, or has been.
 
-        Raises
-        ------
-        ApiError
-            410: not asked, asked of somebody else, or too long ago.
+        Raises ApiError: 410 not asked, asked of somebody else, or too long ago.
         """
         found = self._all.get(number)
         if found is None or found.participant != participant or found.asker != (who.name, who.csrf):

@@ -99,10 +99,7 @@ class RigClient:
     async def request(self, message: Any, timeout_s: float | None = None) -> messages.Reply:
         """Ask the rig; its answer, whatever it is.
 
-        Raises
-        ------
-        ApiError
-            503: no rig, or it does not answer in time. 422: longer than the rig hears out.
+        Raises ApiError: 503 no rig, or it does not answer in time. 422 longer than the rig hears out.
         """
         timeout_s = self.patience_s if timeout_s is None else timeout_s
         if self._writer is None or isinstance(message, APART):
@@ -278,10 +275,7 @@ async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[messages
 
     On a connection of its own: the lasting one carries what pages draw.
 
-    Raises
-    ------
-    ApiError
-        503: the rig cannot be reached, or the connection broke before the end.
+    Raises ApiError: 503 the rig cannot be reached, or the connection broke before the end.
     """
     try:
         reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)

@@ -277,10 +277,7 @@ class Runner(Playing):
     async def stop(self, reason: str, by: str) -> messages.StopEvidence:
         """Stop the rig; the audit entry comes after, so that nothing delays the command.
 
-        Raises
-        ------
-        ApiError
-            503: the rig cannot be reached, or it could not confirm that stimulation has stopped.
+        Raises ApiError: 503 the rig cannot be reached, or it could not confirm that stimulation has stopped.
         """
         self._halted_s = self.clock.monotonic_s()
         subject = self.current.test_id if self.current else "rig"
@@ -300,10 +297,7 @@ class Runner(Playing):
     async def enough(self, row: Test, by: str) -> messages.Extended:
         """End a running test that may be ended early well: enough is known, was seen, or was borne.
 
-        Raises
-        ------
-        ApiError
-            409: it does not run, or is ending; 422: it has a fixed plan.
+        Raises ApiError: 409 it does not run, or is ending; 422 it has a fixed plan.
         """
         found = await self.rig.ask_for(messages.Extended, requests.EnoughRequest(test_id=row.id, by=by, at_once=True))
         self.kinds[row.kind].said_enough(row.id)

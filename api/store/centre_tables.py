@@ -72,10 +72,7 @@ class CentreItem(Table):
     previous: Mapped[str] = mapped_column(String)
     hash: Mapped[str] = mapped_column(String)
     body: Mapped[str | None] = mapped_column(Text, default=None)
-    __table_args__ = (
-        Index("ix_centre_items_told", "rig_id", "kind", "key"),
-        Index("ix_centre_items_file", "file"),
-    )
+    __table_args__ = (Index("ix_centre_items_told", "rig_id", "kind", "key"), Index("ix_centre_items_file", "file"))
 
 
 class CentreFile(Table):

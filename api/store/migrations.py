@@ -38,10 +38,7 @@ class SchemaError(Exception):
 def bring_up(engine: Engine) -> None:
     """Make or upgrade the tables; all of it is done, or nothing.
 
-    Raises
-    ------
-    SchemaError
-        The database is newer than the software, or lacks a column that no revision adds.
+    Raises SchemaError: the database is newer than the software, or lacks a column that no revision adds.
     """
     with engine.connect() as connection:
         at = MigrationContext.configure(connection).get_current_revision()

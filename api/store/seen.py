@@ -153,10 +153,7 @@ def known(session: Session, seen: Seen) -> bool:
 def check(session: Session, *about: About) -> None:
     """Refuse a decision on what has changed since it was shown. In the decision's own transaction.
 
-    Raises
-    ------
-    ChangedError
-        With each change: what, by whom, when, and what was there before.
+    Raises ChangedError: with each change: what, by whom, when, and what was there before.
     """
     seen = shown.get()
     if seen is None:

@@ -135,11 +135,8 @@ Of the models it is the approved one, and what was tracked from it under the app
 def refuse_outside(versions: Versions, who: Principal, method: str, path: str) -> None:
     """Let pass who is bound to nobody, and a key on what it opens.
 
-    Raises
-    ------
-    ApiError
-        403: the key is of another site; or, the same for what is another participant's, for what is not there, and for
-        routes that no key opens. 409: a model is asked, and none of the key's participant is approved.
+    Raises ApiError: 403 the key is of another site; or, the same for what is another participant's, for what is not
+    there, and for routes that no key opens. 409 a model is asked, and none of the key's participant is approved.
     """
     if who.participant is None:
         return
@@ -204,10 +201,7 @@ MOST_TAGS = 20
 async def note_version(request: Request) -> None:
     """Note what the request was decided on, for `stimrig.api.store.seen.check`.
 
-    Raises
-    ------
-    ApiError
-        428: it does not say; 409: another day has begun since, or what it says is no version.
+    Raises ApiError: 428 it does not say; 409 another day has begun since, or what it says is no version.
     """
     found = decisions.find(request.method, request.url.path)
     if found is None:

@@ -249,10 +249,7 @@ async def _refuse_form() -> Message:
 def sound(body: bytes) -> Any:
     """What JSON says; None where it says nothing. Refused where it would be read in two ways, or no route takes it.
 
-    Raises
-    ------
-    HTTPException
-        400, with what is wrong in one line.
+    Raises HTTPException: 400, with what is wrong in one line.
     """
     if not body.strip():
         return None

@@ -70,10 +70,7 @@ def configuration(app: ASGIApp) -> uvicorn.Config:
 def refuse_open_door(settings: ServerSettings) -> None:
     """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
 
-    Raises
-    ------
-    OSError
-        The host is not loopback, and TLS in front has not been vouched for.
+    Raises OSError: the host is not loopback, and TLS in front has not been vouched for.
     """
     if loopback(settings.host) or (settings.tls_proxy and settings.secure_cookies):
         return

@@ -114,10 +114,7 @@ def taken() -> tuple[int, int] | None:
 def _shut_network() -> None:
     """Refuse every system call that makes a socket, reaches another process, or changes who may open a file.
 
-    Raises
-    ------
-    OSError
-        Not on this system.
+    Raises OSError: not on this system.
     """
     known = FORBIDDEN.get(platform.machine())
     if known is None:
@@ -137,13 +134,7 @@ def _shut_network() -> None:
 
 
 def _shut_files(reads: Iterable[Path], writes: Iterable[Path]) -> None:
-    """Leave only these folders open, and what Python needs.
-
-    Raises
-    ------
-    OSError
-        Not on this system.
-    """
+    """Leave only these folders open, and what Python needs. Raises OSError: not on this system."""
     version = _ask("syscall", CREATE_RULESET, 0, 0, 1)
     handled = (1 << 13) - 1
     for least, right in ((2, 1 << 13), (3, TRUNCATE), (5, 1 << 15)):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
-from stimrig.api.workers.json_values import clean
+from stimrig.identify.json_text import json_value
 
 Progress = Callable[[float, str], None]
 POINTS = 2400
@@ -31,7 +31,7 @@ def page_curves(data: str, progress: Progress, model_json: str) -> dict[str, Any
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     progress(0.5, "predicting")
-    return clean(curves(identify.Model.from_json(model_json), record))
+    return json_value(curves(identify.Model.from_json(model_json), record))
 
 
 def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:

@@ -164,10 +164,8 @@ class Adviser:
     async def ask(self, verb: str, **arguments: Any) -> dict[str, Any]:
         """Its answer.
 
-        Raises
-        ------
-        ApiError
-            The worker refused, took too long or died; the next question starts a new one, which knows of no test.
+        Raises ApiError: the worker refused, took too long or died; the next question starts a new one, which knows of
+        no test.
         """
         async with self._turn:
             if verb == "adaptive_advise" and await self.worker.start() is not self._knows:

@@ -12,7 +12,7 @@ import numpy as np
 
 from stimrig import identify
 from stimrig.api.record_files import begun
-from stimrig.api.workers.json_values import clean
+from stimrig.identify.json_text import json_value
 
 Progress = Callable[[float, str], None]
 MOST_MISSED = 50
@@ -76,7 +76,7 @@ def track(
         moved = model_for_next(model, step, bounds)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
-    told = clean(step.to_dict()) | {"moved": list(bounds)}
+    told = json_value(step.to_dict()) | {"moved": list(bounds)}
     return {"error_percent": error, "step": told, "model": moved.to_json(None)}
 
 
@@ -100,13 +100,7 @@ def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
 
 
 def second_order(model: Any) -> Any:
-    """The model, if it can be followed.
-
-    Raises
-    ------
-    BadModel
-        Its dynamics are not of second order.
-    """
+    """The model, if it can be followed. Raises BadModel: its dynamics are not of second order."""
     from stimrig.identify.dynamics.linear import SecondOrder
 
     if not isinstance(model.linear, SecondOrder):

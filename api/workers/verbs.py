@@ -16,7 +16,7 @@ from stimrig.api.record_files import export_csv, find_recording, joined, plain_c
 from stimrig.api.structure import held_by
 from stimrig.api.workers import adaptive_verbs, tracking_verbs
 from stimrig.api.workers.curves import comparison, page_curves, recorded
-from stimrig.api.workers.json_values import clean
+from stimrig.identify.json_text import json_value
 
 Progress = Callable[[float, str], None]
 SIGNATURE_POINTS = 900
@@ -58,14 +58,14 @@ def fit(
 def figures(progress: Progress, model_json: str) -> dict[str, Any]:
     """Threshold, plateau and dynamics with their standard deviations, of a model from before these were stored."""
     progress(0.1, "reading the model")
-    return clean({"figures": identify.Model.from_json(model_json).figures()})
+    return json_value({"figures": identify.Model.from_json(model_json).figures()})
 
 
 def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """The structure of an earlier model on a new recording: the finding, and the carried model where there is one."""
     record = identify.read(Path(data))
     found = identify.carry(record, identify.Model.from_json(model_json), progress)
-    return {"json": found.models[1].to_json() if len(found.models) > 1 else None, "found": clean(found.finding())}
+    return {"json": found.models[1].to_json() if len(found.models) > 1 else None, "found": json_value(found.finding())}
 
 
 def diagnosis(
@@ -92,7 +92,7 @@ def diagnosed(record: Any, progress: Progress, model_json: str | None = None) ->
     planned = experiment(found["missing"], found["deciding_experiment"])
     # A list of widths is one of pulses: at another rate it would be another test, and could not be joined.
     found["experiment"] = planned and {**planned, "pulse_rate_hz": record.pulse_rate_hz}
-    return clean(found)
+    return json_value(found)
 
 
 def mentioned(found: dict[str, Any]) -> set[str]:
@@ -196,14 +196,14 @@ def invert(
     else:
         reference = Reference.of(reference_torque_nm, time_s, angle_rad=angle_rad, pulse_rate_hz=rate_hz)
     found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole)
-    return clean(found.to_dict())
+    return json_value(found.to_dict())
 
 
 def effects(progress: Progress) -> dict[str, Any]:
     from stimrig.identify import effects as library
 
     progress(0.5, "reading the library")
-    return clean({"effects": library.library()})
+    return json_value({"effects": library.library()})
 
 
 def warm(progress: Progress) -> dict[str, Any]:

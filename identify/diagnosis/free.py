@@ -54,10 +54,7 @@ class Chain:
     def with_(self, fitted: Fitted, unseen: LeftOut, effect: str) -> Chain:
         """With one model more."""
         return replace(
-            self,
-            models=(*self.models, fitted),
-            left_out=(*self.left_out, unseen),
-            added=(*self.added, effect),
+            self, models=(*self.models, fitted), left_out=(*self.left_out, unseen), added=(*self.added, effect)
         )
 
     @property

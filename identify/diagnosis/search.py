@@ -12,12 +12,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.residual import (
-    ResidualStructure,
-    quiet_rows,
-    residual_structure,
-    vetoed,
-)
+from stimrig.identify.diagnosis.residual import ResidualStructure, quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
 from stimrig.identify.dynamics.grid import Grid

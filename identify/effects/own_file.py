@@ -36,13 +36,7 @@ class BadEffect(IdentifyError):
 
 
 def effect_of(path: Path) -> Effect:
-    """The effect of a file.
-
-    Raises
-    ------
-    BadEffect
-        With the file, the line where there is one, and what to do.
-    """
+    """The effect of a file. Raises BadEffect: with the file, the line where there is one, and what to do."""
     spec = importlib.util.spec_from_file_location(f"stimrig_effect_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise BadEffect("not a Python file", place=str(path), fix=FIX)
@@ -87,13 +81,7 @@ def _place(path: Path, error: BaseException) -> str:
 
 
 def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
-    """An effect that can be fitted.
-
-    Raises
-    ------
-    BadEffect
-        What of it cannot be.
-    """
+    """An effect that can be fitted. Raises BadEffect: what of it cannot be."""
     if not isinstance(effect, Effect):
         message = f"EFFECT is a {type(effect).__name__}, not an Effect"
         raise BadEffect(message, place=place, fix="Give EFFECT = Effect(...).")

@@ -164,11 +164,7 @@ class JointMotion:
 
     @classmethod
     def until_then(
-        cls,
-        time_s: np.ndarray,
-        angle_rad: np.ndarray,
-        first: Sequence[int],
-        earlier: tuple[np.ndarray, np.ndarray],
+        cls, time_s: np.ndarray, angle_rad: np.ndarray, first: Sequence[int], earlier: tuple[np.ndarray, np.ndarray]
     ) -> JointMotion:
         """At each reading from those until then alone, as a controller has them.
 

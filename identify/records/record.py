@@ -167,10 +167,7 @@ class Record(Summarised):
         With `segment_names`, `segment` gives an index into them for each row: a million rows need not hold a million
         names.
 
-        Raises
-        ------
-        BadRecord
-            Lengths differ, there is nothing, or an optional column is not finite.
+        Raises BadRecord: lengths differ, there is nothing, or an optional column is not finite.
         """
         time_s = np.ascontiguousarray(time_s, float)
         size = time_s.size

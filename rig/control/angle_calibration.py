@@ -152,10 +152,7 @@ def _slope(first: AnglePose, second: AnglePose) -> float:
 def _check_poses(kept: AngleCalibration) -> AngleCalibration:
     """A calibration out of its file, if it is what its two poses make: a digit that changed is noticed, too.
 
-    Raises
-    ------
-    ValueError
-        It is not.
+    Raises ValueError: it is not.
     """
     if len(kept.poses) != 2:
         raise ValueError(f"it has {len(kept.poses)} poses")

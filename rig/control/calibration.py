@@ -219,11 +219,8 @@ class Calibration:
     def mark(self, threshold: Threshold) -> None:
         """Mark the last train's width as that threshold.
 
-        Raises
-        ------
-        PlanError
-            No train was played yet, the last one was not felt whole, or the order sensory <= motor <= comfort would be
-            broken.
+        Raises PlanError: no train was played yet, the last one was not felt whole, or the order sensory <= motor <=
+        comfort would be broken.
         """
         if not self._trains:
             raise PlanError("calibration: no train was played yet; step up first, then mark")

@@ -88,10 +88,7 @@ class StepRule:
 def rule_of(request: CalibrateStartRequest, table: Mapping[str, Limit]) -> StepRule:
     """The steps that a request gets under a rig's limits; the current must have been checked.
 
-    Raises
-    ------
-    RefusedError
-        The earlier calibration makes no sense.
+    Raises RefusedError: the earlier calibration makes no sense.
     """
     amperes = request.current_ma * 1e-3
     rise_us = table["calibration_rise_uc"].hi / amperes
@@ -113,10 +110,7 @@ def marks_of(last: Profile | None, current_ma: float) -> dict[Threshold, float]:
 
     With a higher current every pulse is stronger than it was, so the old marks would be too high: none is used.
 
-    Raises
-    ------
-    RefusedError
-        The marks are not above 0 and in their order, or the current is no number.
+    Raises RefusedError: the marks are not above 0 and in their order, or the current is no number.
     """
     if last is None or last.sensory_pulse_width_us is None or last.motor_pulse_width_us is None:
         return {}

@@ -129,13 +129,7 @@ def library(kind: Kind) -> dict[str, ModuleType]:
 
 
 def find(kind: Kind, device_id: object) -> ModuleType:
-    """The module of a device.
-
-    Raises
-    ------
-    ConfigError
-        Unknown id; the message lists the known ones.
-    """
+    """The module of a device. Raises ConfigError: unknown id; the message lists the known ones."""
     known = library(kind)
     if not isinstance(device_id, str) or device_id not in known:
         raise ConfigError(f"{kind}.device: unknown device {device_id!r}; use one of: {', '.join(known)}")

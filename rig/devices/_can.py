@@ -27,13 +27,7 @@ PACKAGED = "torque_default"
 
 
 def load(dbc: str) -> Database:
-    """Read a DBC file, or the packaged one of that name.
-
-    Raises
-    ------
-    ConfigError
-        Missing, or not a DBC file.
-    """
+    """Read a DBC file, or the packaged one of that name. Raises ConfigError: missing, or not a DBC file."""
     try:
         if "/" not in dbc and not dbc.endswith(".dbc"):
             text = resources.files("stimrig.rig.devices").joinpath(f"{dbc}.dbc").read_text("utf-8")
@@ -156,10 +150,7 @@ class SampleFrame:
         """Values of one frame; NaN where the description has a word for a value (`VAL_`, as "no reading"), and in a
         frame that reports a fault.
 
-        Raises
-        ------
-        WireError
-            The frame is too short for the description.
+        Raises WireError: the frame is too short for the description.
         """
         try:
             values = cast(

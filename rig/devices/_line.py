@@ -42,10 +42,8 @@ def stuff(payload: bytes) -> bytes:
 def unstuff(stuffed: bytes) -> bytes:
     """The inverse of `stuff`.
 
-    Raises
-    ------
-    WireError
-        The last byte is an escape, or there is a start or stop byte: a wrong length took it from the next frame.
+    Raises WireError: the last byte is an escape, or there is a start or stop byte: a wrong length took it from the next
+    frame.
     """
     if START in stuffed or STOP in stuffed:
         raise WireError("a start or stop byte within the payload")
@@ -111,10 +109,7 @@ class Framing:
     def decode(self, frame: bytes) -> Packet:
         """The packet of one complete frame.
 
-        Raises
-        ------
-        WireError
-            Start, escapes, length, CRC or stop byte wrong, or no room for a command.
+        Raises WireError: start, escapes, length, CRC or stop byte wrong, or no room for a command.
         """
         if len(frame) < self.min_frame_bytes or frame[0] != START or frame[-1] != STOP:
             raise WireError(f"not a frame: {frame.hex(' ')}")
@@ -237,12 +232,7 @@ class PacketLine:
     """
 
     def __init__(
-        self,
-        machine: Machine,
-        port: Port,
-        name: str,
-        framing: Framing,
-        on_packet: Callable[[Packet, float], None],
+        self, machine: Machine, port: Port, name: str, framing: Framing, on_packet: Callable[[Packet, float], None]
     ) -> None:
         self.port = name
         self.last_written_s = -1e9

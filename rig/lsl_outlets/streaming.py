@@ -49,10 +49,7 @@ def refuse_locking(folder: Path) -> None:
 class Tail:
     """One journal, read from its start on. It takes no lock, and writes nothing, not even the time of access.
 
-    Raises
-    ------
-    OSError
-        It is gone, or cannot be read.
+    Raises OSError: it is gone, or cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -135,11 +132,8 @@ class Journals:
 PULSE_CHANNELS = (("pulse_width", "µs"), ("current", "mA"), ("index", "1"))
 
 
-class NoLibraryError(RigError):
-    """LSL is not installed."""
-
-    code = "no-library"
-    title = "LSL is not installed"
+class NoLibraryError(RigError, code="no-library", title="LSL is not installed"):
+    """It names what to install."""
 
 
 def library() -> Any:

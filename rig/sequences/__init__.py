@@ -54,13 +54,7 @@ def library() -> dict[str, Sequence]:
 
 
 def find(sequence_id: str) -> Sequence:
-    """The sequence of that id.
-
-    Raises
-    ------
-    PlanError
-        There is no sequence of that id; the message lists the known ones.
-    """
+    """The sequence of that id. Raises PlanError: there is no sequence of that id; the message lists the known ones."""
     try:
         return library()[sequence_id]
     except KeyError:
@@ -68,13 +62,7 @@ def find(sequence_id: str) -> Sequence:
 
 
 def settings_of(sequence_id: str, settings: dict[str, Any]) -> SequenceSettings:
-    """Checked settings of a sequence.
-
-    Raises
-    ------
-    PlanError
-        Names the first wrong setting and what is expected.
-    """
+    """Checked settings of a sequence. Raises PlanError: names the first wrong setting and what is expected."""
     model = find(sequence_id).Settings
     try:
         return model.model_validate(settings)

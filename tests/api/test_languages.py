@@ -18,9 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig.api import language
-from stimrig.api.language import extract, translated, words
+from stimrig.api.language import best, extract, translated
 from stimrig.api.language.translated import PERSON, of
-from stimrig.api.language.words import best
 from tests.api.conftest import STUB, Service, csrf, run_service, run_test, signed_in
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
@@ -37,7 +36,7 @@ LANGUAGES = [code for code in language.CODES if code != language.DEFAULT]
 def test_the_browsers_language_is_taken_where_there_is_one(
     accepted: str, code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(words, "CODES", ("en", "de"))  # whatever other languages somebody added
+    monkeypatch.setattr(language, "CODES", ("en", "de"))  # whatever other languages somebody added
     assert best(accepted) == code
 
 
@@ -75,7 +74,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "The fit is good.": "Die Anpassung ist gut.",
     }.items():
         made.add(message, translation)
-    monkeypatch.setattr(words, "catalogue", lambda _code: made)
+    monkeypatch.setattr(language, "catalogue", lambda _code: made)
     monkeypatch.setattr(MODULE, "catalogue", lambda _code: made)
     forget()
     yield
@@ -88,7 +87,7 @@ MODULE: Any = importlib.import_module("stimrig.api.language.translated")
 
 
 def forget() -> None:
-    for cached in (words.translations, *vars(MODULE).values()):
+    for cached in (language.translations, *vars(MODULE).values()):
         if hasattr(cached, "cache_clear"):
             cached.cache_clear()
 
@@ -155,7 +154,7 @@ def test_every_message_has_its_translation(code: str) -> None:
 @pytest.mark.parametrize("code", LANGUAGES)
 def test_translations_keep_the_places(code: str) -> None:
     wrong = []
-    for entry in words.catalogue(code):
+    for entry in language.catalogue(code):
         if not entry.id:
             continue
         wanted = {place for form in forms_of(entry.id) for place in PLACE.findall(form)}
@@ -166,14 +165,14 @@ def test_translations_keep_the_places(code: str) -> None:
 
 
 def test_a_catalogue_is_one_file_and_ships() -> None:
-    assert {path.stem for path in words.HERE.glob("*.po")} | {"en"} == set(language.CODES)
+    assert {path.stem for path in language.HERE.glob("*.po")} | {"en"} == set(language.CODES)
     assert '"*.po"' in (Path(__file__).parents[2] / "pyproject.toml").read_text()
 
 
 @pytest.mark.parametrize("code", ["xq", "pt_BR", "../de", "--renew"])
 def test_no_catalogue_is_begun_for_what_is_no_language(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert extract.main([code]) == 2
-    assert "no language" in capsys.readouterr().err and words.CODES == language.CODES
+    assert "no language" in capsys.readouterr().err and not (language.HERE / f"{code}.po").exists()
 
 
 # ---- sentences that other parts put together: whole, and with all their values ---------------------------------------
@@ -185,7 +184,7 @@ NAMED = re.compile(r"%\((\w+)\)s")
 def test_each_message_is_recognised_as_itself(code: str) -> None:
     wrong, seen = [], set()
     with language.using(code):
-        for entry in words.catalogue(code):
+        for entry in language.catalogue(code):
             shape = NAMED.sub("%", str(entry.id))
             if isinstance(entry.id, str) and entry.id and entry.string and shape not in seen:
                 seen.add(shape)
@@ -256,21 +255,21 @@ def test_a_text_of_many_half_sentences_is_given_up(code: str) -> None:
 @pytest.mark.parametrize("code", LANGUAGES)
 def test_renewing_a_catalogue_loses_nothing(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / f"{code}.po"
-    shutil.copy(words.HERE / path.name, path)
-    before = {str(entry.id): entry.string for entry in words.catalogue(code)}
-    head = words.catalogue(code).header_comment
-    for module in (words, extract):
+    shutil.copy(language.HERE / path.name, path)
+    before = {str(entry.id): entry.string for entry in language.catalogue(code)}
+    head = language.catalogue(code).header_comment
+    for module in (language, extract):
         monkeypatch.setattr(module, "HERE", tmp_path)
     monkeypatch.setattr(extract, "CODES", (language.DEFAULT, code))
-    words.catalogue.cache_clear()
+    language.catalogue.cache_clear()
     try:
         extract.main([])
-        words.catalogue.cache_clear()
-        after = words.catalogue(code)
+        language.catalogue.cache_clear()
+        after = language.catalogue(code)
         assert {str(entry.id): entry.string for entry in after if entry.id and entry.string}.items() <= before.items()
         assert after.header_comment == head and sum(1 for entry in after if entry.string) > 500
     finally:
-        words.catalogue.cache_clear()
+        language.catalogue.cache_clear()
 
 
 HOSTILE = [
@@ -336,11 +335,9 @@ def made_up() -> Iterator[None]:
         if message:
             one = f"⟦{message}⟧" if isinstance(message, str) else tuple(f"⟦{form}⟧" for form in message)
             made.add(message, one)
-    names = ("words", "translated")
-    modules = [importlib.import_module(f"stimrig.api.language.{name}") for name in names]
-    pages = [importlib.import_module(name) for name in ("stimrig.api.language", "stimrig.api.web.pages.rig_view")]
+    names = ("language", "language.translated", "web.pages.rig_view")
     with pytest.MonkeyPatch.context() as patch:
-        for module in [*modules, *pages]:
+        for module in [importlib.import_module(f"stimrig.api.{name}") for name in names]:
             patch.setattr(module, "CODES", ("en", MADE_UP), raising=False)
             patch.setattr(module, "catalogue", lambda _code: made, raising=False)
         forget()

@@ -174,13 +174,7 @@ def settings_of(data: Path | None) -> Settings:
 
 
 def open_store(settings: Settings) -> closing[Store]:
-    """The database, let go at the end of a `with` statement.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
+    """The database, let go at the end of a `with` statement. Raises InputError: there is none."""
     place = settings.data_dir / "stimrig.db"
     if settings.database_url is None and not place.is_file():
         raise InputError(f"{place}: there is no database. Give the data folder with --data.")
@@ -197,13 +191,7 @@ def stored(settings: Settings) -> list[AuditEntry]:
 
 
 def read_export(path: Path) -> list[AuditEntry]:
-    """An exported trail.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or a line is no entry.
-    """
+    """An exported trail. Raises InputError: the file cannot be read, or a line is no entry."""
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

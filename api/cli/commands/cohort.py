@@ -204,13 +204,7 @@ def figures(
 
 
 def need_extra() -> None:
-    """Refuse without the extra.
-
-    Raises
-    ------
-    InputError
-        A package is missing.
-    """
+    """Refuse without the extra. Raises InputError: a package is missing."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"needs `pip install stimrig[cohort]` ({', '.join(missing)} is missing)")

@@ -37,13 +37,13 @@ def compare(
     """
     from stimrig.api.web.pages.report_file import comparison_html
     from stimrig.api.workers.curves import curves, thinned
-    from stimrig.api.workers.json_values import clean
+    from stimrig.identify.json_text import json_value
 
     model = load_model(model_json)
     record = load_record(data, columns)
     found = identify.compare(model, record).to_dict()
     if html is not None:
-        drawn = clean(curves(model, record))
+        drawn = json_value(curves(model, record))
         write(html, comparison_html(model.to_dict(), drawn, short(data), comparison=thinned(found)))
     if as_json:
         say_json(found)

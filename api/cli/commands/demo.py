@@ -68,10 +68,7 @@ def play(services: Services, token: str, tell: Callable[..., None]) -> dict[str,
 def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
     """A person approves; the controller fetches the model, and a second time hears that nothing changed.
 
-    Raises
-    ------
-    CommandError
-        The controller did not get the approved model, or no 304.
+    Raises CommandError: the controller did not get the approved model, or no 304.
     """
     client.approve(model_id, "demo")
     with Client(client.url, client.issue_token("controller", ["read-model"])) as controller:

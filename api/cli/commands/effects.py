@@ -45,10 +45,7 @@ def effects(
 def _own_text(path: Path, wanted: str | None, name: str) -> str:
     """The text of an effect's file.
 
-    Raises
-    ------
-    InputError
-        The model has no such free effect, or the name is none or taken.
+    Raises InputError: the model has no such free effect, or the name is none or taken.
     """
     from stimrig.identify.effects import known_form, own_file, registry
 

@@ -62,13 +62,7 @@ def improve(
     say(*[f"written to     {path}" for path in (output, html) if path is not None])
 
 
-def report(
-    record: Any,
-    found: dict[str, Any],
-    models: Sequence[Any],
-    name: str,
-    held: Any | None = None,
-) -> str:
+def report(record: Any, found: dict[str, Any], models: Sequence[Any], name: str, held: Any | None = None) -> str:
     """The report: what was found, what each effect is, what is left before and after."""
     import numpy as np
 

@@ -52,10 +52,7 @@ def serve(
 def attachable(settings: Settings, emulate: str) -> Status:
     """The state of the rig that runs already.
 
-    Raises
-    ------
-    InputError
-        A rig to be started was named, too, or none listens at the socket.
+    Raises InputError: a rig to be started was named, too, or none listens at the socket.
     """
     from stimrig.api.clock import Clock
     from stimrig.api.errors import ApiError

@@ -109,10 +109,7 @@ def test(
 def check_output(output: Path | None) -> None:
     """See that the recording can be written: a folder that is not there would be found after the test.
 
-    Raises
-    ------
-    InputError
-        It cannot.
+    Raises InputError: it cannot.
     """
     if output is None:
         return
@@ -145,10 +142,7 @@ def how(
 ) -> dict[str, Any]:
     """What the service is asked for beside the participant.
 
-    Raises
-    ------
-    InputError
-        An option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
+    Raises InputError: an option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
     """
     asked = given(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time, anyway=anyway or None)
     if not adaptive:
@@ -164,13 +158,7 @@ def how(
 
 
 def target_of(text: str) -> dict[str, float]:
-    """A target as it is typed: one number for both curves, or two.
-
-    Raises
-    ------
-    InputError
-        It is none.
-    """
+    """A target as it is typed: one number for both curves, or two. Raises InputError: it is none."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

@@ -55,13 +55,7 @@ async def approve(request: Request, context: Ctx, who: Approver, row: Version, r
 
 @router.post("/reject")
 async def reject(context: Ctx, who: Approver, model_id: str, reason: Reason = "") -> Response:
-    """Keep a version from the controller.
-
-    Raises
-    ------
-    ApiError
-        422: no reason was given.
-    """
+    """Keep a version from the controller. Raises ApiError: 422 no reason was given."""
     if not reason.strip():
         detail = "Go back and say in a few words why; it is kept in the audit trail. Nothing was decided."
         raise ApiError(422, "reason-missing", "A rejection needs a reason", detail)
@@ -96,10 +90,7 @@ async def _question(
 def read_tracking(sent: FormData) -> Limits:
     """The limits that were typed; the usual ones where the form has no such field.
 
-    Raises
-    ------
-    ApiError
-        422: what was typed is no percentage from 0 to 60.
+    Raises ApiError: 422 what was typed is no percentage from 0 to 60.
     """
     found: dict[str, float] = {}
     for name in Limits().to_dict():

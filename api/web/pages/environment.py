@@ -14,7 +14,6 @@ from jinja2.runtime import Context
 
 from stimrig.api import clinical_words, effect_words, language
 from stimrig.api.charts.figure import PAGE_CONFIG
-from stimrig.api.language import words
 from stimrig.api.models.stored_model import followed
 from stimrig.rig.messages import LABEL_TITLES
 
@@ -54,7 +53,7 @@ def in_words(value: Any) -> str:
 
 
 texts: Any = environment  # the extension adds the method
-texts.install_gettext_callables(words.gettext, words.plural, newstyle=True)
+texts.install_gettext_callables(language.gettext, language.plural, newstyle=True)
 
 
 def in_its_language(words: Callable[..., Any]) -> Callable[..., Any]:

@@ -149,10 +149,7 @@ def angle_fields(status: Status | None) -> list[dict[str, str]]:
 def read_pose(text: str, status: Status | None) -> float:
     """The angle that a goniometer shows, rad, from its text in degrees.
 
-    Raises
-    ------
-    ValueError
-        No plain number, or no angle that this rig takes; one line for people.
+    Raises ValueError: no plain number, or no angle that this rig takes; one line for people.
     """
     angle_rad = math.radians(typed.signed(text))
     rigs = status.angle.range_rad if status else None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api import language
@@ -18,6 +18,7 @@ from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.pages import next_view, starting, trend_view, typed
 from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import criticism, participants
 from stimrig.api.workers.jobs import FIT_TOGETHER, Job
 
@@ -162,12 +163,7 @@ async def cancel_diagnosis(context: Ctx, _who: Tester, model_id: str) -> Respons
 
 @router.post("/models/{model_id}/effects")
 async def add_effect(
-    context: Ctx,
-    who: Tester,
-    row: Version,
-    effect: Annotated[str, Form()] = "",
-    force: Annotated[str, Form()] = "",
-    reason: Annotated[str, Form()] = "",
+    context: Ctx, who: Tester, row: Version, effect: Text = "", force: Text = "", reason: Text = ""
 ) -> Response:
     """Add one effect."""
     body = typed.checked(EffectsIn, effects=[effect], reason=reason[:500], force=bool(force))

@@ -154,10 +154,7 @@ def _lost(context: Context, voids: str) -> list[str]:
 def asked_test(sent: FormData, code: str) -> TestIn:
     """The test that a person asks for; one that stops itself is asked about whether or not its target is in reach.
 
-    Raises
-    ------
-    ApiError
-        422: what was typed is no target, or no label.
+    Raises ApiError: 422 what was typed is no target, or no label.
     """
     asked: dict[str, Any] = {name: str(sent.get(name) or "").strip() or None for name in LABEL_TITLES}
     if sent.get("plan") == "adaptive":

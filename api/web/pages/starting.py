@@ -56,10 +56,7 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
 async def ask(context: Context, who: Principal, body: TestIn, back: str = "") -> str:
     """Ask a person whether this test is to be started; the address of the question.
 
-    Raises
-    ------
-    ApiError
-        409: a test runs, or a calibration is wanted first; what the rig refuses.
+    Raises ApiError: 409 a test runs, or a calibration is wanted first; what the rig refuses.
     """
     row = await asyncio.to_thread(participants.find, context, body.participant)
     refuse_archived(row)

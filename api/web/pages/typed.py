@@ -37,13 +37,7 @@ HINTS = {
 
 
 def number(text: str) -> float:
-    """What a person means by what was typed.
-
-    Raises
-    ------
-    ValueError
-        One line for people, with what was typed.
-    """
+    """What a person means by what was typed. Raises ValueError: one line for people, with what was typed."""
     found = PLAIN.fullmatch(text.strip())
     if found is None:
         given = f"{text.strip()[:40]!r} is not a plain number" if text.strip() else "nothing was typed"

@@ -41,10 +41,7 @@ def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any]) ->
 def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
     """How the calibration goes: what was asked for, and the participant's own current and torque where it was not.
 
-    Raises
-    ------
-    ApiError
-        422: neither the request nor the participant says one of them.
+    Raises ApiError: 422 neither the request nor the participant says one of them.
     """
     asked = body.model_dump()
     for name in ("current_ma", "max_torque_nm"):
@@ -57,10 +54,7 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
 def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
     """Refuse what was decided on another calibration, or, but with `any_train`, without knowing of the last train.
 
-    Raises
-    ------
-    ApiError
-        409: it is another one, or another train was sent or is on its way.
+    Raises ApiError: 409 it is another one, or another train was sent or is on its way.
     """
     sent = seen.sent.get()
     if not sent:
@@ -94,13 +88,7 @@ async def _waiting(context: Context, code: str) -> messages.Calibrated | None:
 
 
 async def standing(context: Context, code: str) -> dict[str, Any]:
-    """Where the participant's calibration stands.
-
-    Raises
-    ------
-    ApiError
-        404: none is open for this participant.
-    """
+    """Where the participant's calibration stands. Raises ApiError: 404 none is open for this participant."""
     status: messages.Status = await context.rig.fresh_status()
     found = status.calibration
     if found is None or found.participant != code:
@@ -146,10 +134,8 @@ def _begun(session: Session, calibration_id: str) -> seen.Seen | None:
 async def sound(context: Context, code: str) -> dict[str, Any]:
     """Where the calibration stands, as long as it may go on.
 
-    Raises
-    ------
-    ApiError
-        404: none is open for this participant; 409: the participant's limits were changed since it was begun.
+    Raises ApiError: 404 none is open for this participant; 409 the participant's limits were changed since it was
+    begun.
     """
     found = await standing(context, code)
     if found["outdated"]:

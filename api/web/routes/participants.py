@@ -67,11 +67,8 @@ def change_profile(
 ) -> tuple[Participant, Seen]:
     """New limits for a participant: those that are asked for, the rest stays; and the place in the trail.
 
-    Raises
-    ------
-    ApiError
-        404 no such participant; 422 beyond what the rig takes, or the first ones are not whole; 409 changed meanwhile,
-        or the calibration would be lost, and that was not allowed.
+    Raises ApiError: 404 no such participant; 422 beyond what the rig takes, or the first ones are not whole; 409
+    changed meanwhile, or the calibration would be lost, and that was not allowed.
     """
     with context.store.write() as session:
         row = within(session, code)
@@ -205,11 +202,8 @@ def site_in(body: MuscleIn) -> Site:
 def change_site(context: Context, code: str, body: MuscleIn, by: str, voids: bool = False) -> Participant:
     """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
-    Raises
-    ------
-    ApiError
-        404 no such participant; 409 a test or calibration of it is under way, or the calibration would be lost and
-        that was not allowed.
+    Raises ApiError: 404 no such participant; 409 a test or calibration of it is under way, or the calibration would be
+    lost and that was not allowed.
     """
     refuse_busy(context, code)
     now = context.clock.utc()

@@ -64,13 +64,7 @@ async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> F
 
 
 def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
-    """A recording and its file.
-
-    Raises
-    ------
-    ApiError
-        404 no such recording; 410 its file is gone.
-    """
+    """A recording and its file. Raises ApiError: 404 no such recording; 410 its file is gone."""
     row = context.store.get(Recording, recording_id)
     require_found(row, "recording", recording_id, "A test's document names its recording.")
     path = Path(row.path)
@@ -118,10 +112,8 @@ async def take_in(
 
     Where `columns` are mapped, what is kept is the record as a CSV file of ours, with the SHA-256 of what was sent.
 
-    Raises
-    ------
-    ApiError
-        422: it cannot be read or fitted; 409: it is another participant's than `of` says. Nothing is kept of it.
+    Raises ApiError: 422 it cannot be read or fitted; 409 it is another participant's than `of` says. Nothing is kept of
+    it.
     """
     whole = await asyncio.to_thread(_write, context, data, ".csv" if columns else _suffix(data))
     part = uploads.part_of(whole)

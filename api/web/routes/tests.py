@@ -118,10 +118,7 @@ async def live(socket: WebSocket, test_id: str) -> None:
 def _admit(socket: WebSocket, context: Context) -> Principal:
     """Who may watch; a live view of a running test holds the session's lock off.
 
-    Raises
-    ------
-    ApiError
-        401: no valid token or session, or it is locked; 403: without the scope, or from another site's page.
+    Raises ApiError: 401 no valid token or session, or it is locked; 403 without the scope, or from another site's page.
     """
     principal = context.auth.identify(socket, bound=True)
     refuse_outside(context.versions, principal, "WS", socket.url.path)
