@@ -47,7 +47,6 @@ DOORS: dict[str, tuple[int, str]] = {
     "api/models/carried_structure.py": (1, "no table: names of effects in the database"),
     "bench/diagnosis.py": (1, "no table: the default of an option"),
     "bench/goals.py": (1, "a made-up record for a bench: segments of ours"),
-    "bench/misfits.py": (1, "no table: the default of an option"),
     "bench/hidden_on_the_wire.py": (2, "a made-up record for a bench: segments of ours"),
     "bench/pictures.py": (2, "a made-up record for a bench: segments of ours"),
     "hardware_sim/hidden_records.py": (4, "a made-up record for a bench: segments of ours"),
