@@ -35,10 +35,7 @@ DOORS: dict[str, tuple[int, str]] = {
     "identify/records/join.py": (3, "test_a_joined_record"),
     "api/record_files.py": (2, "test_a_recording"),
     "api/web/routes/trend.py": (2, "test_a_trend"),
-    "api/web/routes/recordings.py": (
-        4,
-        "names the kind of what a worker wrote, and of files as they came",
-    ),
+    "api/web/routes/recordings.py": (4, "names the kind of what a worker wrote, and of files as they came"),
     "api/web/pages/widths_view.py": (1, "names the kind of what api/models/inverted.py wrote"),
     "api/cohort/bids.py": (3, "test_an_export"),
     "api/models/inverted.py": (1, ONLY_NUMBERS),
