@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.harness.processes import CLINIC_WATCH, ROOT, Bench, control, default_plan
+from tests.harness.processes import CLINIC_WATCH, ROOT, Bench, default_plan
 
 FITTER = """
 import sys, time
@@ -106,7 +106,7 @@ def _session(bench: Bench, client: Any, minutes: float, every_minutes: float, pl
                     live += 1
                     oldest_ms = max(oldest_ms, 1e3 * event["torque_age_s"])
             time.sleep(0.5)
-    felt = len(control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"])
+    felt = len(bench.felt())
     figures = _figures(tests, felt)
     status = client.status()
     return figures | {
