@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import os
 import random
 import signal
@@ -242,7 +241,7 @@ def look(folders: dict[str, Path], centre_url: str, bucket: Path) -> Seen:
     seen.files_at_rigs, seen.files_at_centre = len(named), len(kept)
     seen.lost_files = len(named - set(kept))
     seen.doubled += sum(count - 1 for count in kept.values()) + len(set(kept) - named)
-    seen.wrong_hashes += sum(_digest(path) != path.name for path in files)
+    seen.wrong_hashes += sum(sha256(path.read_bytes()) != path.name for path in files)
     return seen
 
 
@@ -255,8 +254,3 @@ def _gaps(items: Iterable[dict[str, Any]]) -> int:
         count += (item["seq"], item["previous"]) != (seq + 1, before)
         last[item["chain"]] = (item["seq"], item["hash"])
     return count
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -123,29 +123,18 @@ def sign_in(page: Any, url: str, password: str) -> None:
 
 
 @contextmanager
-def emulated_rig(
-    *emulator: str, busy: int = 0, fit: bool = False, speed: float = 1.0, **started: Any
-) -> Iterator[tuple[Any, Any]]:
-    """An emulator with a rig on it, and its client; so many busy processes beside, and one that fits a recording."""
+def emulated_rig(*emulator: str, busy: int = 0, speed: float = 1.0) -> Iterator[tuple[Any, Any]]:
+    """An emulator with a rig on it, and its client; so many busy processes beside."""
     from tests.harness.processes import Bench, busy_process
-    from tests.harness.soak import fitting_one
 
     with TemporaryDirectory(prefix="rig-bench-") as folder, ExitStack() as stack:
         bench = Bench(Path(folder), *emulator, speed=speed)
         stack.callback(bench.close)
-        client = bench.start_rig(**started)
+        client = bench.start_rig()
         client.ask("subscribe")
-        stack.enter_context(fitting_one(bench, client, fit))
         for _ in range(busy):
             stack.enter_context(busy_process())
         yield bench, client
-
-
-def beside(made: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    """With what may run beside a rig."""
-    made.add_argument("--fit", action="store_true", help="fit a recording again and again in another process")
-    made.add_argument("--busy", type=int, default=0, help="CPU-bound processes beside the rig")
-    return made
 
 
 def reveal(seed: int, *more: str) -> dict[str, Any]:

@@ -186,7 +186,9 @@ def figures(kind: str, rows: list[dict[str, Any]]) -> dict[str, str]:
             if some:
                 which = " and ".join(strengths)
                 told[f"named first, {which}"] = share([_first(r) for r in some])
-                told[f"named first or in its group, {which}"] = share([_grouped(r) for r in some])
+                told[f"named first or in its group, {which}"] = share(
+                    [not {*r["truth"]}.isdisjoint(r["group"]) for r in some]
+                )
                 told[f"verdict 'effect missing', {which}"] = share([r["verdict"] == "effect_missing" for r in some])
         told |= _calibration(rows)
         gone = [_removed(r) for r in rows if _first(r) and r["before"] > 1.2 * r["noise"] and _foreseeable(r)]
@@ -211,7 +213,8 @@ def figures(kind: str, rows: list[dict[str, Any]]) -> dict[str, str]:
         )
         told[f"an effect named above {SURE:g}"] = share(sure)
         for effect in sorted({r["effect"] for r in rows}) if kind == "outside" else []:
-            said = Counter(_said(r) for r in rows if r["effect"] == effect)
+            own = [r for r in rows if r["effect"] == effect]
+            said = Counter(r["named"][0] if r["verdict"] == "effect_missing" else r["verdict"] for r in own)
             told[f"  {effect}"] = ", ".join(f"{what} {count}" for what, count in said.most_common())
     elif kind == "two":
         told["both named"] = share([set(r["truth"]) <= set(r["named"]) for r in rows])
@@ -220,10 +223,6 @@ def figures(kind: str, rows: list[dict[str, Any]]) -> dict[str, str]:
     cpu = [r["cpu_seconds"] for r in rows]
     told["processor seconds a record"] = f"median {np.median(cpu):.1f}, largest {max(cpu):.1f}"
     return told
-
-
-def _said(row: dict[str, Any]) -> str:
-    return row["named"][0] if row["verdict"] == "effect_missing" else row["verdict"]
 
 
 def _over_noise(rows: list[dict[str, Any]]) -> dict[str, str]:
@@ -242,10 +241,6 @@ def _over_noise(rows: list[dict[str, Any]]) -> dict[str, str]:
 
 def _first(row: dict[str, Any]) -> bool:
     return row["named"][:1] == row["truth"][:1]
-
-
-def _grouped(row: dict[str, Any]) -> bool:
-    return bool(set(row["truth"]) & set(row["group"]))
 
 
 def _foreseeable(row: dict[str, Any]) -> bool:
@@ -276,11 +271,6 @@ def _confusions(rows: list[dict[str, Any]]) -> dict[str, str]:
     return {f"  {truth} named {named}": str(count) for (truth, named), count in wrong.most_common()}
 
 
-def _sealed(row: dict[str, Any]) -> dict[str, Any]:
-    """A row of the set `kept`, without what would tell what is in the set."""
-    return row | {"effect": "kept", "truth": [], "formulation": []}
-
-
 def _recorders(text: str) -> list[str]:
     from stimrig.hardware_sim.recorders import KINDS
 
@@ -309,7 +299,7 @@ def run(arguments: list[str] | None = None) -> None:
         ]
         rows = [row for row in in_processes(one, asked) if row is not None]
         if kind == "kept":
-            rows = [_sealed(row) for row in rows]
+            rows = [row | {"effect": "kept", "truth": [], "formulation": []} for row in rows]  # not what is hidden
         print(f"{kind}, seeds {settings.seeds.start} to {settings.seeds.stop - 1}, {len(rows)} records")
         if rows:
             tell(kind, rows)

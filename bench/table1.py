@@ -255,12 +255,7 @@ def natural_frequency() -> list[str]:
 
 
 def iterations() -> list[str]:
-    lines = [
-        "## One iteration or more",
-        "",
-        "Two-stage, noise 0.10 N·m, 40 Hz: clean ramp / unseen.",
-        "",
-    ]
+    lines = ["## One iteration or more", "", "Two-stage, noise 0.10 N·m, 40 Hz: clean ramp / unseen.", ""]
     found: dict[object, dict[str, float]] = {n: fits(0.10, "two-stage", iterations=n) for n in (0, 1, 2, 4)}
     found["maximum-likelihood (joint)"] = fits(0.10, "maximum-likelihood")
     cells = [[label, f"{scores['clean']:.2f}", f"{scores['unseen']:.2f}"] for label, scores in found.items()]

@@ -19,7 +19,7 @@ from scipy.signal import savgol_filter
 
 from stimrig.hardware_sim.arm.laws import Floats
 from stimrig.hardware_sim.arm.motion import Begin, Motion, Quintic, lasting_s
-from stimrig.hardware_sim.arm.movers import Mover, make_mover
+from stimrig.hardware_sim.arm.movers import make_mover
 from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, levels, make_design, staircase
 from stimrig.hardware_sim.hidden.scenario import rng_of
@@ -194,16 +194,12 @@ def _moved(asked: Asked, moves: Moves, parts: Parts) -> Floats:
     angle = np.empty(_fine(parts).size)
     for k in range(angle.size):
         time_s = k / SIMULATION_HZ
-        motion = _advanced(mover, time_s, motion)
+        motion = mover.advance(time_s, lambda _angle_rad, _velocity_rad_s: 0.0) if mover else motion
         while coming and coming[0][0] <= time_s:
             _, mode, settings = coming.pop(0)
             mover = make_mover(mode, Begin(time_s, motion, seeds[len(coming)]), settings)
         angle[k] = motion.angle_rad
     return angle
-
-
-def _advanced(mover: Mover | None, time_s: float, motion: Motion) -> Motion:
-    return mover.advance(time_s, lambda _angle_rad, _velocity_rad_s: 0.0) if mover else motion
 
 
 KINDS: dict[str, Callable[[Asked], ArmDesign]] = {

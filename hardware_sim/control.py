@@ -46,7 +46,7 @@ class Control:
         self._commands: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
             "state": lambda _request: state(),
             "pulses": self._pulses,
-            "faults": self._faults,
+            "faults": lambda _: {"faults": devices.faults.describe(), "active": devices.faults.active()},
             "fault": self._fault,
             "arm": self._arm,
         }
@@ -80,9 +80,6 @@ class Control:
         for pulse in pulses:
             pulse["monotonic_s"] = self._clock.monotonic_s(pulse["time_s"])
         return {"pulses": pulses}
-
-    def _faults(self, _request: dict[str, Any]) -> dict[str, Any]:
-        return {"faults": self._devices.faults.describe(), "active": self._devices.faults.active()}
 
     def _fault(self, request: dict[str, Any]) -> dict[str, Any]:
         name, on, for_s = request.pop("name", ""), request.pop("on", True), request.pop("for_s", None)

@@ -137,9 +137,7 @@ def test_a_name_with_spaces_is_repeated_as_one_word() -> None:
     ],
     ids=["nothing", "what nobody imports", "what another imports", "their package", "the checker"],
 )
-def test_types_are_checked_again_where_an_answer_may_differ(
-    content: dict[str, str], settings: str, changed: set[str]
-) -> None:
+def test_types_are_checked_again_where_an_answer_may_differ(content: dict[str, str], settings: str, changed: set[str]):
     modules, imported = dict.fromkeys(("a", "a.top", "a.low", "a.alone"), "old"), {"a.top": {"a.low"}}
     before, now = keys(modules, imported, ""), keys(modules | content, imported, settings)
     assert {name for name in modules if now[name] != before[name]} == changed

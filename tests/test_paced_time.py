@@ -174,11 +174,7 @@ def test_a_test_on_the_wire_its_children_and_their_waits_live_in_it():
 @pytest.mark.wire
 @pytest.mark.parametrize(
     "waits",
-    [
-        lambda: time.sleep(0.05),
-        lambda: threading.Event().wait(0.05),
-        lambda: select.select([], [], [], 0.05),
-    ],
+    [lambda: time.sleep(0.05), lambda: threading.Event().wait(0.05), lambda: select.select([], [], [], 0.05)],
     ids=["sleep", "event", "select"],
 )
 def test_nothing_ends_before_its_paced_time(waits: Callable[[], object]):

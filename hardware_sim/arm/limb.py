@@ -99,16 +99,13 @@ class Limb:
             self._step_to(begin_s + step * span_s / steps)
 
     def _step_to(self, time_s: float) -> None:
-        self.motion = self._mover.advance(time_s, self._acceleration_rad_s2)
+        self.motion = self._mover.advance(time_s, lambda x, v: self._net_nm(x, v) / self._inertia_kg_m2)
         angle_rad, velocity_rad_s, _ = self.motion
         self._memory = self._tissue.passive.step(self._memory, angle_rad, time_s - self._time_s)
         if self._tell_joint is not None:
             self._tell_joint(angle_rad, velocity_rad_s)
         self._isometric_nm = self._muscle.torque_nm(time_s)
         self._time_s = time_s
-
-    def _acceleration_rad_s2(self, angle_rad: float, velocity_rad_s: float) -> float:
-        return self._net_nm(angle_rad, velocity_rad_s) / self._inertia_kg_m2
 
     def _laws_at(self, angle_rad: float, velocity_rad_s: float) -> tuple[Any, Any]:
         """Share of active torque, and the torque of what is passive, N·m."""

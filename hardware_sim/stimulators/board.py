@@ -47,14 +47,10 @@ class Electrodes:
         self._muscle = muscle
         self._raise_sync = raise_sync
 
-    def closed_circuit(self, output: tuple[int, int]) -> bool:
-        """Whether current can flow at this (connector, channel)."""
-        return self.attached and not self.cut and output == self.output
-
     def fire(self, time_s: float, points: Sequence[Point], output: tuple[int, int], source: str) -> bool:
         """One pulse of this shape; True if it flowed through the muscle."""
         width_us, current_ma, balanced = phase(points)
-        flows = self.closed_circuit(output) and width_us > 0
+        flows = self.attached and not self.cut and output == self.output and width_us > 0
         self.log.append(FiredPulse(time_s, width_us, current_ma, flows, balanced, source))
         if not balanced:
             self.unbalanced_pulses += 1

@@ -50,9 +50,7 @@ def status_heard(service: Service) -> m.Status:
     return service.run(context.rig.fresh_status())
 
 
-def test_start_shows_who_and_how_much_and_plays_nothing(
-    tab: httpx.Client, client: httpx.Client, service: Service
-) -> None:
+def test_start_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, client: httpx.Client, service: Service):
     client.put("/v1/participants/P017/muscle", json={"side": "right", "muscle": "triceps brachii"})
     page = tab.get(ask(tab)).text
     assert "Start the pre-session test of P017?" in page and "P017 is not calibrated" in page
@@ -142,9 +140,7 @@ def test_a_rig_set_up_anew_meanwhile_is_asked_about_again(
     assert service.rig.starts == 0 and service.context.runner.current is None
 
 
-def test_a_rig_that_asks_for_a_calibration_offers_that_first(
-    tab: httpx.Client, client: httpx.Client, service: Service
-) -> None:
+def test_a_rig_that_asks_for_a_calibration_offers_that_first(tab: httpx.Client, client: httpx.Client, service: Service):
     model = run_test(client, "P017")["model_id"]
     client.get(f"/v1/models/{model}/diagnosis")
     starts = service.rig.starts
@@ -168,9 +164,7 @@ def test_a_calibration_of_yesterday_starts_nothing(tab: httpx.Client, client: ht
     assert tab.post(f"{PAGE}/tests", data=fields(tab)).status_code == 409
 
 
-def test_the_next_experiment_is_asked_about_the_same_way(
-    tab: httpx.Client, client: httpx.Client, service: Service
-) -> None:
+def test_the_next_experiment_is_asked_about_the_same_way(tab: httpx.Client, client: httpx.Client, service: Service):
     model = run_test(client, "P017")["model_id"]
     client.get(f"/v1/models/{model}/diagnosis")
     page = tab.get(f"/models/{model}").text

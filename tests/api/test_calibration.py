@@ -20,9 +20,7 @@ from tests.api.test_profiles import mark_all
 WHERE = "/v1/participants/P017/calibration"
 
 
-def test_steps_and_marks_become_the_profile_of_the_day(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_steps_and_marks_become_the_profile_of_the_day(client: httpx.Client, service: Service, participant: str):
     assert client.get(WHERE).status_code == 404
     opened = client.post(WHERE, json={"current_ma": 18, "step_us": 10})
     assert opened.status_code == 201 and opened.json()["pulse_width_us"] == 0 and not opened.json()["playing"]
@@ -121,9 +119,7 @@ def up(client: httpx.Client) -> httpx.Response:
     return client.post(f"{WHERE}/step", json={"direction": "up"})
 
 
-def test_lowered_limits_end_an_open_calibration_and_stay(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_lowered_limits_end_an_open_calibration_and_stay(client: httpx.Client, service: Service, participant: str):
     for asked in ({"current_ma": 19.5}, {"max_torque_nm": 29}, {"max_pulse_width_us": 290}):
         client.post(WHERE, json={"current_ma": 19})
         assert up(client).status_code == 202 and client.put(PROFILE, json=asked).status_code == 200
@@ -150,9 +146,7 @@ def test_lowered_limits_end_an_open_calibration_and_stay(
     assert anew.status_code == 201 and not anew.json()["outdated"] and up(client).status_code == 202
 
 
-def test_what_changes_no_limit_leaves_the_calibration_open(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_what_changes_no_limit_leaves_the_calibration_open(client: httpx.Client, service: Service, participant: str):
     client.post("/v1/participants", json={"code": "P018"})
     client.post(WHERE)
     assert client.put(PROFILE, json={"current_ma": 20}).status_code == 200
@@ -303,9 +297,7 @@ def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(service: S
 
 
 @pytest.mark.parametrize("stale", ["before the marks", "other"])
-def test_a_page_that_is_out_of_date_finishes_nothing(
-    client: httpx.Client, service: Service, tab: Any, stale: str
-) -> None:
+def test_a_page_that_is_out_of_date_finishes_nothing(client: httpx.Client, service: Service, tab: Any, stale: str):
     browser, fields = tab
     for threshold in ("sensory", "motor", "comfort"):
         client.post(f"{WHERE}/mark", json={"threshold": threshold})

@@ -412,9 +412,7 @@ def test_reports_have_them_and_pages_of_other_models_do_not(client: httpx.Client
 
 @pytest.mark.browser
 @pytest.mark.parametrize(("language", "scheme"), [("en", "dark"), ("de", "light")])
-def test_the_page_is_examined(
-    browser: Any, service: Service, models: tuple[str, str], language: str, scheme: str
-) -> None:
+def test_the_page_is_examined(browser: Any, service: Service, models: tuple[str, str], language: str, scheme: str):
     for page in open_tab(browser, service, color_scheme=scheme):
         page.context.add_cookies([{"name": "stimrig_language", "value": language, "url": service.url}])
         page.set_viewport_size(LAPTOP)

@@ -9,7 +9,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -229,10 +229,7 @@ def test_unforeseen_error_is_one_line_and_a_log(
 ) -> None:
     from stimrig import identify
 
-    def broken(*_: Any, **__: Any) -> None:
-        raise ZeroDivisionError("odd")
-
-    monkeypatch.setattr(identify, "fit", broken, raising=False)
+    monkeypatch.setattr(identify, "fit", Mock(side_effect=ZeroDivisionError("odd")), raising=False)
     code, out, err = run(capsys, "fit", str(record))
     assert code == 1 and out == "" and err.count("\n") == 1
     log = Path(err.rsplit("(log: ", 1)[1].rstrip(")\n"))
@@ -315,9 +312,7 @@ def test_a_file_twice_or_none_is_refused(parts: list[Path], capsys: pytest.Captu
     assert run(capsys, "fit")[0] == 2
 
 
-def test_a_copy_or_a_link_is_no_second_recording(
-    parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_copy_or_a_link_is_no_second_recording(parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     copy, link = tmp_path / "copy.csv", tmp_path / "link.csv"
     copy.write_bytes(parts[0].read_bytes())
     link.symlink_to(parts[0])
@@ -326,9 +321,7 @@ def test_a_copy_or_a_link_is_no_second_recording(
         assert code == 2 and "measured in another" in err and again.name in err, err
 
 
-def test_what_cannot_be_joined_names_its_file(
-    parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_joined_names_its_file(parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     short = tmp_path / "short.csv"
     short.write_text("\n".join(parts[0].read_text().splitlines()[:6]))
     code, _, err = run(capsys, "fit", parts[0], short)
@@ -362,9 +355,7 @@ def test_words_and_json_say_what_is_no_longer_needed(
     assert json.loads(out.read_text())["extra"]["carried"]["offered"] == "plain"
 
 
-def test_options_of_another_structure_are_one_line(
-    files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_of_another_structure_are_one_line(files: tuple[Path, Path], capsys: pytest.CaptureFixture[str]):
     model, data = files
     assert main.run(["fit", str(data), "--carry", str(model), "--effects", "fatigue"]) == 2
     err = capsys.readouterr().err

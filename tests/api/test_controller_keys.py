@@ -136,9 +136,7 @@ def test_what_is_anothers_is_refused_as_what_is_not_there(key: httpx.Client, don
     assert refused(answers[0]) == refused(answers[1]) and "P2" not in answers[0].text
 
 
-def test_a_busy_rig_tells_nothing_of_another_participant(
-    shared: Service, key: httpx.Client, admin: httpx.Client
-) -> None:
+def test_a_busy_rig_tells_nothing_of_another_participant(shared: Service, key: httpx.Client, admin: httpx.Client):
     shared.rig.speed = 1.0
     begun = admin.post("/v1/tests", json={"participant": "P2"})
     assert begun.status_code == 202
@@ -331,9 +329,7 @@ def test_it_signs_nobody_in_on_the_page(shared: Service, admin: httpx.Client) ->
         ({"name": "<b>"}, "name"),
     ],
 )
-def test_a_plan_is_never_wider_than_the_participants_limits(
-    admin: httpx.Client, changed: dict[str, str], words: str
-) -> None:
+def test_a_plan_is_never_wider_than_the_participants_limits(admin: httpx.Client, changed: dict[str, str], words: str):
     answer = admin.post("/participants/P1/keys", data={**PLAN, **changed}, headers=HTML)
     assert answer.status_code == 422 and words in html.unescape(answer.text)
 

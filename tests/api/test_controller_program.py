@@ -76,9 +76,7 @@ def ended(run: subprocess.Popen[str]) -> tuple[int, str]:
     return run.returncode, said
 
 
-def test_the_trial_has_the_rate_of_its_widths_and_the_code_is_escaped(
-    program: Path, service: Service, tmp_path: Path
-) -> None:
+def test_the_trial_has_the_rate_of_its_widths_and_the_code_is_escaped(program: Path, service: Service, tmp_path: Path):
     assert ended(begun(program, service, tmp_path, ODD_CODE)) == (0, "")
     paths, sent = [path for path, _ in service.heard], dict(service.heard)["POST /v1/tests"]
     assert paths[0] == "GET /v1/participants/P%201%2F..%2FP2%3Fx/model"
@@ -119,9 +117,7 @@ def test_what_goes_wrong_is_said_and_only_its_own_trial_is_stopped(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_whoever_interrupts_it_stops_the_trial(
-    program: Path, service: Service, tmp_path: Path, number: signal.Signals
-) -> None:
+def test_whoever_interrupts_it_stops_the_trial(program: Path, service: Service, tmp_path: Path, number: signal.Signals):
     service.answers["GET /T1"] = (200, BEGUN)
     run = begun(program, service, tmp_path)
     assert service.polled.wait(60)

@@ -92,9 +92,7 @@ def test_live_torque_comes_while_it_is_measured(served: tuple[Service, str], tmp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_whoever_interrupts_the_live_example_stops_its_trial(
-    served: tuple[Service, str], number: signal.Signals
-) -> None:
+def test_whoever_interrupts_the_live_example_stops_its_trial(served: tuple[Service, str], number: signal.Signals):
     service, _ = served
     service.rig.speed = 0.2
     words = [sys.executable, "examples/live_torque.py", "--url", service.url, "--participant", "P017"]

@@ -7,6 +7,7 @@ import logging
 import re
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -111,10 +112,7 @@ def test_open_door_fails(tmp_path: Path) -> None:
 
 
 def test_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(_: Settings) -> None:
-        raise RuntimeError("no such thing")
-
-    monkeypatch.setattr(doctor, "check_clock", broken)
+    monkeypatch.setattr(doctor, "check_clock", Mock(side_effect=RuntimeError("no such thing")))
     assert "no such thing" in finding("clock", data_dir=tmp_path).says
 
 

@@ -114,9 +114,7 @@ def test_an_action_on_any_tab_keeps_all_of_them_open(service: Service, clock: Se
         assert locked(http) and locked(other)
 
 
-def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(
-    service: Service, clock: SetClock
-) -> None:
+def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(service: Service, clock: SetClock):
     with signed_in(service) as http:
         clock.ahead_s = 900.0
         assert http.post("/v1/participants", json={"code": "L9"}).status_code == 401

@@ -23,15 +23,10 @@ service = own_service(speed=10.0)
 def ready(service: Service, client: httpx.Client, participant: str) -> str:
     """A participant with a range, at a rig with a sensor; the joint is still at 65°."""
     service.rig.arm.way = still(math.radians(65))
-    seen_soon(client)
+    soon(lambda: client.get("/v1/rig").json()["angle"]["present"], 20)
     answer = client.put(f"/v1/participants/{participant}/profile", json={"angle_range_rad": RANGE})
     assert answer.status_code == 200, answer.text
     return participant
-
-
-def seen_soon(client: httpx.Client) -> None:
-    """Until the service has asked the rig again."""
-    soon(lambda: client.get("/v1/rig").json()["angle"]["present"], 20)
 
 
 def begin(client: httpx.Client, code: str, kind: str, **more: Any) -> httpx.Response:
@@ -159,9 +154,7 @@ def test_a_person_may_say_enough(service: Service, client: httpx.Client, ready: 
     assert wait_done(client, begun)["joint"]["ended"] == "enough"
 
 
-def test_held_angles_come_one_after_the_other_and_are_remembered(
-    service: Service, client: httpx.Client, ready: str
-) -> None:
+def test_held_angles_come_one_after_the_other_and_are_remembered(service: Service, client: httpx.Client, ready: str):
     listed = client.get(f"/v1/participants/{ready}/joint").json()
     angles = [row["angle_rad"] for row in listed["targets"]]
     assert len(angles) == 5 and listed["next_rad"] == angles[0]

@@ -54,9 +54,7 @@ def sigmoid(middle_us: float, steep_us: float, top_nm: float) -> dict[str, list[
 
 @given(middle=st.floats(40, 400), steep=st.floats(5, 80), top=st.floats(0.5, 40), width=st.floats(30, 150))
 @settings(max_examples=60, deadline=None)
-def test_the_three_tests_cost_at_most_what_the_papers_costs(
-    middle: float, steep: float, top: float, width: float
-) -> None:
+def test_the_three_tests_cost_at_most_what_the_papers_costs(middle: float, steep: float, top: float, width: float):
     """Whatever the muscle and the range; recounted here from every pulse."""
     curve = curve_of(sigmoid(middle, steep, top), 300.0, None)
     found = layout((0.2, 0.2 + math.radians(width)), curve, 300.0, PAPER_US, RATE_HZ)
@@ -206,8 +204,7 @@ def test_a_cell_is_seen_after_its_time_and_not_before() -> None:
 
 
 @pytest.mark.parametrize(
-    "odd",
-    [(math.nan, 1.0, 0.4), (0.01, math.nan, 0.4), (0.01, 1.0, math.inf), (-5.0, 1.0, 0.4), (9.0, 1.0, 0.4)],
+    "odd", [(math.nan, 1.0, 0.4), (0.01, math.nan, 0.4), (0.01, 1.0, math.inf), (-5.0, 1.0, 0.4), (9.0, 1.0, 0.4)]
 )
 def test_no_number_a_gap_or_a_step_back_counts_for_nothing(odd: Sample) -> None:
     found = Coverage(grid(RANGE_RAD, 0.2))

@@ -33,9 +33,7 @@ LANGUAGES = [code for code in language.CODES if code != language.DEFAULT]
         ("fr", "en"), ("", "en"), ("*", "en"), ("de;q=0", "en"), ("de;q=x", "en"), ("q" * 5000, "en"),
     ],
 )  # fmt: skip
-def test_the_browsers_language_is_taken_where_there_is_one(
-    accepted: str, code: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_browsers_language_is_taken_where_there_is_one(accepted: str, code: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(language, "CODES", ("en", "de"))  # whatever other languages somebody added
     assert best(accepted) == code
 

@@ -137,9 +137,7 @@ def test_torque_now_is_now_or_blank(tab: Any, service: Service) -> None:
     torque.get_by_text("0.43 N·m").wait_for()
 
 
-def test_a_silent_load_cell_leaves_a_way_back_on_pages_of_each_kind(
-    tab: Any, service: Service, done: dict[str, Any]
-) -> None:
+def test_a_silent_load_cell_leaves_a_way_back_on_pages_of_each_kind(tab: Any, service: Service, done: dict[str, Any]):
     for address in every_page(service, done)[::3]:  # they share the bar, as the first test here sees
         tab.goto(address)
         says(tab, "No stimulation ready")

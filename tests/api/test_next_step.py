@@ -118,9 +118,7 @@ def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Ser
     assert shown(service)[0] == "calibrate may"
 
 
-def test_of_two_versions_of_a_test_the_offered_one_is_next(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_of_two_versions_of_a_test_the_offered_one_is_next(client: httpx.Client, service: Service, participant: str):
     plain = run_test(client, participant)["model_id"]
     carried = client.post(f"/v1/models/{plain}/effects", json={"effects": ["fatigue"]}).json()["id"]
     for offered, expected in (("plain", plain), ("carried", carried)):
@@ -144,12 +142,6 @@ def test_the_start_in_the_line_sets_what_was_typed(client: httpx.Client, pages: 
     """It is a button of the limits' form: one click sets them and asks."""
     run_test(client, participant)
     seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
-    form = {
-        "csrf": csrf(pages),
-        "seen": seen,
-        "current_ma": "19",
-        "max_pulse_width_us": "300",
-        "max_torque_nm": "30",
-    }
+    form = {"csrf": csrf(pages), "seen": seen, "current_ma": "19", "max_pulse_width_us": "300", "max_torque_nm": "30"}
     page = pages.get(pages.post("/participants/P017/tests", data=form).headers["location"]).text
     assert "19 mA" in page and "Start now" in page

@@ -191,9 +191,7 @@ def test_a_test_that_was_taken_up_during_the_fit_is_left_to_who_did(tmp_path: Pa
     store.close()
 
 
-def test_an_end_that_was_never_told_is_found_by_asking(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_an_end_that_was_never_told_is_found_by_asking(client: httpx.Client, service: Service, participant: str):
     service.rig.loses_ends = True
     ended = run_test(client, participant)
     assert ended["recording_id"] == f"R-{ended['id']}" and ended["state"] == "completed" and ended["model_id"]
@@ -204,9 +202,7 @@ def test_an_end_that_was_never_told_is_found_by_asking(
     assert len(ends) == 2, "each end is written down once"
 
 
-def test_a_failing_listener_costs_nobody_else_the_news(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_a_failing_listener_costs_nobody_else_the_news(client: httpx.Client, service: Service, participant: str):
     """The first events come while the start is under way: a link that broke there made the start a 503."""
     rig, told = service.context.rig, []
 

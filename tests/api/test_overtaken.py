@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -233,9 +234,7 @@ def test_a_rearm_that_a_stop_overtakes_is_not_done(service: Service, client: htt
 # ---- a site, another's recording, a result that could not be stored -------------------------------------------------
 
 
-def test_a_model_belongs_to_its_site_and_so_do_its_keys(
-    service: Service, client: httpx.Client, participant: str
-) -> None:
+def test_a_model_belongs_to_its_site_and_so_do_its_keys(service: Service, client: httpx.Client, participant: str):
     at = f"/v1/participants/{participant}"
     for site in (
         {"side": "left", "muscle": "biceps brachii"},
@@ -286,11 +285,7 @@ def test_a_calibration_that_could_not_be_stored_is_stored_by_finishing_again(
     client.post(at, json={})
     mark_all(client)
     store = calibration._store
-
-    def busy(*_arguments: Any) -> Any:
-        raise OperationalError("database is locked", None, Exception())
-
-    monkeypatch.setattr(calibration, "_store", busy)
+    monkeypatch.setattr(calibration, "_store", Mock(side_effect=OperationalError("is locked", None, Exception())))
     version = client.get(at).headers["etag"]
     assert client.post(f"{at}/finish", headers={"If-Match": version}).status_code == 503
     monkeypatch.setattr(calibration, "_store", store)

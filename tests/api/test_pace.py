@@ -126,9 +126,7 @@ def sign_in(service: Service, name: str, password: str, address: str) -> int:
         return http.post("/v1/sessions", json={"name": name, "password": password}).status_code
 
 
-def test_the_owner_signs_in_and_approves_whatever_others_try(
-    service: Service, client: httpx.Client, participant: str
-) -> None:
+def test_the_owner_signs_in_and_approves_whatever_others_try(service: Service, client: httpx.Client, participant: str):
     clock = standing_still(service)
     client.post("/v1/users", json={"name": "Ada", "password": PASSWORD})
     model = run_test(client, participant)["model_url"]

@@ -72,17 +72,14 @@ def posts() -> list[str]:
     return sorted(found, key=lambda path: ("calibration" not in path, path.endswith("discard"), path))
 
 
-def filled(path: str, known: dict[str, str]) -> str:
-    return re.sub(r"\{(\w+)[^}]*\}", lambda match: known.get(match[1], "none"), path)
-
-
 def test_an_odd_form_is_a_problem_in_words(service: Service, known: dict[str, str]) -> None:
     """With an administrator's token, so that no form is out of date before its fields are looked at."""
     fields = [dict.fromkeys(NAMES, value) for value in ODD]
     assert len(NAMES) > 50
     failed, tried = [], 0
     with service.client(TOKEN, headers=HTML) as client:
-        for path in (filled(each, known) for each in posts()):
+        for each in posts():
+            path = re.sub(r"\{(\w+)[^}]*\}", lambda match: known.get(match[1], "none"), each)
             sent = [client.post(path, content=body, headers={"content-type": kind}) for kind, body in BODIES]
             sent += [client.post(path, data=each) for each in fields]
             tried += len(sent)
@@ -96,9 +93,7 @@ def test_an_odd_form_is_a_problem_in_words(service: Service, known: dict[str, st
 
 
 @pytest.mark.parametrize("effect", [None, "", "No Effect", "../x", "x" * 65])
-def test_an_effect_that_is_none_is_told_in_one_sentence(
-    service: Service, known: dict[str, str], effect: str | None
-) -> None:
+def test_an_effect_that_is_none_is_told_in_one_sentence(service: Service, known: dict[str, str], effect: str | None):
     token = service.token(f"tester-{effect}"[:20].replace("/", "-"), "run-test", "read-model")
     with service.client(token, headers=HTML) as client:
         data = {} if effect is None else {"effect": effect}

@@ -126,9 +126,7 @@ def test_the_first_page_asks_as_much_of_the_database_for_many_as_for_few(service
     assert len(http.get("/v1/participants", params={"q": "Z"}).json()) == 500
 
 
-def test_the_page_of_an_archived_participant_offers_the_way_out_and_no_test(
-    pages: httpx.Client, http: httpx.Client
-) -> None:
+def test_the_page_of_an_archived_participant_offers_the_way_out_and_no_test(pages: httpx.Client, http: httpx.Client):
     make(http, "A3")
     http.post("/v1/participants/A3/archive")
     page = pages.get("/participants/A3").text

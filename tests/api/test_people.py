@@ -334,9 +334,7 @@ def test_stop_says_so_when_the_rig_is_gone(client: httpx.Client, service: Servic
     assert answer.status_code == 503 and "emergency switch" in answer.json()["detail"]
 
 
-def test_stopped_test_keeps_its_recording_and_makes_no_model(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_stopped_test_keeps_its_recording_and_makes_no_model(client: httpx.Client, service: Service, participant: str):
     service.rig.speed = 0.5
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     client.post("/v1/stop", json={"reason": "pain"})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -155,9 +156,7 @@ def test_upload_of_a_table_whose_columns_are_named(client: httpx.Client, service
     assert [path.suffix for path in (service.data / "recordings").rglob("upload-*")] == [".csv"]
 
 
-def test_upload_of_a_table_with_a_wrong_name_is_one_line(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_upload_of_a_table_with_a_wrong_name_is_one_line(client: httpx.Client, service: Service, participant: str):
     where = f"/v1/participants/{participant}/recordings"
     answer = client.post(where, content=GOOD_HEADER + "0,0,0,rest\n" * 9, params={"map": "torque_nm=Kraft:Nm"})
     detail = problem(answer, 422)["detail"]
@@ -178,12 +177,7 @@ def test_page_shows_a_problem_in_words(shared_client: httpx.Client) -> None:
     assert answer.status_code == 404 and "There is no model" in answer.text and "<h1>" in answer.text
 
 
-def test_unforeseen_error_is_a_problem_too(
-    client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(*_: object) -> None:
-        raise RuntimeError("secret detail")
-
-    monkeypatch.setattr(service.context.versions, "get", broken)
+def test_unforeseen_error_is_a_problem_too(client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(service.context.versions, "get", Mock(side_effect=RuntimeError("secret detail")))
     found = problem(client.get("/v1/models/M1"), 500)
     assert "secret detail" not in str(found)

@@ -67,9 +67,7 @@ NO_NUMBERS = [
 ]  # fmt: skip
 
 
-def test_what_is_no_number_is_refused_everywhere(
-    client: httpx.Client, service: Service, tight: dict[str, float]
-) -> None:
+def test_what_is_no_number_is_refused_everywhere(client: httpx.Client, service: Service, tight: dict[str, float]):
     def refused(method: str, path: str, body: str) -> None:
         answer = client.request(method, path, content=body, headers={"content-type": "application/json"})
         assert problem(answer, 422)["errors"], (path, body)
@@ -92,9 +90,7 @@ def test_what_is_no_number_is_refused_everywhere(
 
 
 @pytest.mark.parametrize(("name", "least"), [("current_ma", 0.5), ("max_pulse_width_us", 1), ("max_torque_nm", 0.1)])
-def test_a_limit_begins_where_a_stimulator_does(
-    client: httpx.Client, tight: dict[str, float], name: str, least: float
-) -> None:
+def test_a_limit_begins_where_a_stimulator_does(client: httpx.Client, tight: dict[str, float], name: str, least: float):
     refused = problem(client.put(f"{P}/profile", json={name: least * 0.99}), 422)
     assert refused["detail"] == f"{name}: Input should be greater than or equal to {least:g}"
     assert limits(client) == tight

@@ -38,9 +38,7 @@ def unmet(name: str, document: dict[str, Any]) -> list[str]:
 
 
 @pytest.mark.parametrize("verb", ["fit", "predict", "compare", "diagnose", "improve", "invert", "effects", "doctor"])
-def test_a_verbs_json_holds_to_its_schema(
-    verb: str, record: Path, model: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_verbs_json_holds_to_its_schema(verb: str, record: Path, model: Path, capsys: pytest.CaptureFixture[str]):
     reference = record.with_name("reference.csv")
     reference.write_text("time_s,torque_nm\n0,0\n1,2\n2,0\n")
     given = {

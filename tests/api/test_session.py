@@ -40,9 +40,7 @@ def test_whole_path_to_the_controller(client: httpx.Client, service: Service, pa
     assert other.status_code == 200
 
 
-def test_newer_model_does_not_replace_the_approved_one_and_rejection_withdraws(
-    client: httpx.Client, participant: str
-) -> None:
+def test_newer_model_does_not_replace_the_approved_one_and_rejection_withdraws(client: httpx.Client, participant: str):
     first = run_test(client, participant)
     client.post(f"{first['model_url']}/approve")
     second = run_test(client, participant)
@@ -72,9 +70,7 @@ def test_effect_makes_a_new_version_with_lineage(client: httpx.Client, participa
     assert client.get(f"/v1/models/{parent}").json()["effects"] == []
 
 
-def test_live_channel_tells_history_frames_and_the_end(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_live_channel_tells_history_frames_and_the_end(client: httpx.Client, service: Service, participant: str):
     service.rig.speed = 1.0
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] >= 0.5, 20)
@@ -109,9 +105,7 @@ def come_to_rest(pool: Any) -> None:
     soon(lambda: not (pool.queue or any(worker.call for worker in pool.workers)), 60)
 
 
-def test_comparison_and_diagnosis_are_made_once_and_kept(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_comparison_and_diagnosis_are_made_once_and_kept(client: httpx.Client, service: Service, participant: str):
     model = run_test(client, participant)["model_url"]
     diagnosis = client.get(f"{model}/diagnosis").json()  # begun with the test's end: nothing else is made after it
     assert diagnosis["verdict"] == "effect_missing"
@@ -148,9 +142,7 @@ def test_preview_plays_nothing(client: httpx.Client, service: Service, participa
     assert service.rig.starts == 0
 
 
-def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(client: httpx.Client, service: Service, participant: str):
     document = run_test(client, participant)
     client.post(f"{document['model_url']}/approve", json={"reason": "looks right"})
     trail = client.get("/v1/audit").json()

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -268,17 +269,11 @@ def test_what_an_ended_service_had_begun_to_take_in_is_settled_at_the_start(tmp_
     assert not list(parts.iterdir())
 
 
-def test_a_row_that_is_not_written_leaves_no_file(
-    tmp_path: Path, short_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_that_is_not_written_leaves_no_file(tmp_path: Path, short_dir: Path, monkeypatch: pytest.MonkeyPatch):
     for service in run_service(tmp_path, short_dir, STUB):
         with service.client() as client:
             client.post("/v1/participants", json={"code": "P017"})
-
-            def full(*_: object, **__: object) -> None:
-                raise OSError("disk full")
-
-            monkeypatch.setattr("stimrig.api.web.routes.recordings.audit.write", full)
+            monkeypatch.setattr("stimrig.api.web.routes.recordings.audit.write", Mock(side_effect=OSError("disk full")))
             assert client.post("/v1/participants/P017/recordings", content=b"a,b\n").status_code == 500
             monkeypatch.undo()
         assert not list((tmp_path / "recordings").rglob("upload-*"))

@@ -186,9 +186,7 @@ def test_a_key_before_the_rig_plays_keeps_the_test_from_beginning(
 
 
 @pytest.mark.parametrize("body", ["null", "[]", "{}", "<p>", '{"state": "ready", "connected": true, "age_s": 9.0}'])
-def test_nothing_that_a_service_says_of_its_rig_keeps_a_key_from_stopping(
-    monkeypatch: pytest.MonkeyPatch, body: str
-) -> None:
+def test_nothing_that_a_service_says_of_its_rig_keeps_a_key_from_stopping(monkeypatch: pytest.MonkeyPatch, body: str):
     posted: list[str] = []
 
     def answer(request: httpx.Request) -> httpx.Response:
@@ -222,22 +220,9 @@ def test_no_rig_at_the_socket_is_one_line(tmp_path: Path, capsys: pytest.Capture
 
 
 @pytest.mark.slow
-def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(
-    short_dir: Path, tmp_path: Path, terminal: Terminal
-) -> None:
+def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(short_dir: Path, tmp_path: Path, terminal: Terminal):
     socket = short_dir / f"attached-{time.time_ns()}.sock"
-    command = [
-        sys.executable,
-        "-m",
-        "stimrig",
-        "serve",
-        "--rig-socket",
-        str(socket),
-        "--port",
-        "0",
-        "--data",
-        "data",
-    ]
+    command = [sys.executable, "-m", "stimrig", "serve", "--rig-socket", str(socket), "--port", "0", "--data", "data"]
     environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": str(ROOT)}
     with RigThread(socket, tmp_path / "data" / "recordings", speed=1.0) as thread:
         served = subprocess.Popen(

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from urllib.parse import urlsplit
 
 import httpx
@@ -55,11 +56,6 @@ def press(service: Service, right: str, **more: Any) -> httpx.Response:
     """From a page that is open, by a browser that holds nothing else."""
     with service.client(token=None, headers=HTML, follow_redirects=True, **more) as browser:
         return browser.post("/v1/stop", data={"right": right, "reason": "stop pressed on the page"})
-
-
-def stops_noted(client: httpx.Client) -> list[dict[str, Any]]:
-    """The stops in the audit trail."""
-    return [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "stop"]
 
 
 def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) -> None:
@@ -141,7 +137,8 @@ def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
     answer = press(service, right, cookies=dict(browser.cookies))
     assert answer.status_code == 200 and CONFIRMED in answer.text
     assert service.rig.stopped_by == "Ada"
-    (entry,) = soon(lambda: stops_noted(client))  # it may come after the answer
+    stops = lambda: [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "stop"]  # noqa: E731
+    (entry,) = soon(stops)  # it may come after the answer
     assert (entry["who"], entry["subject"]) == ("Ada", test_id)
 
 
@@ -149,13 +146,9 @@ def test_a_stop_waits_for_no_database(service: Service, participant: str, monkey
     right = right_on(person(service).get("/").text)
     running(service, participant)
     store = service.context.store
-
-    def gone(*_: Any) -> Any:
-        raise OperationalError("SELECT", {}, Exception("disk I/O error"))
-
     with store.write():  # another writer does not let go
-        monkeypatch.setattr(store, "get", gone)
-        monkeypatch.setattr(store, "all", gone)
+        monkeypatch.setattr(store, "get", Mock(side_effect=OperationalError("SELECT", {}, Exception("disk I/O error"))))
+        monkeypatch.setattr(store, "all", Mock(side_effect=OperationalError("SELECT", {}, Exception("disk I/O error"))))
         answer = press(service, right, cookies={cookie_name(service): "old"})
         assert answer.status_code == 200 and CONFIRMED in answer.text
     monkeypatch.undo()

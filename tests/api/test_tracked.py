@@ -104,9 +104,7 @@ def test_a_tracked_version_foretells_a_trial(client: httpx.Client, approved: str
 # ---- within what a person allowed -------------------------------------------------------------------------------
 
 
-def test_beyond_a_limit_the_last_version_within_stays_and_asks(
-    service: Service, client: httpx.Client, approved: str
-) -> None:
+def test_beyond_a_limit_the_last_version_within_stays_and_asks(service: Service, client: httpx.Client, approved: str):
     """Which words for which limit: below."""
     client.post(f"/v1/models/{approved}/approve", json={"tracking": {"time_scale_percent": 5.0}})
     play(client)
@@ -123,9 +121,7 @@ def test_beyond_a_limit_the_last_version_within_stays_and_asks(
     assert row["outcome"] == "followed" and words in row["ask"] and client.get(TRACKING).json()["ask"] == row["ask"]
 
 
-def test_beyond_it_at_the_first_trial_the_approved_model_asks(
-    service: Service, client: httpx.Client, approved: str
-) -> None:
+def test_beyond_it_at_the_first_trial_the_approved_model_asks(service: Service, client: httpx.Client, approved: str):
     say(service, values={"gain": 1.5})
     play(client)
     document = tracked(client).json()
@@ -237,10 +233,7 @@ def test_a_trial_begun_under_an_older_approval_moves_nothing(client: httpx.Clien
 
 @pytest.mark.parametrize(
     ("wanted", "words"),
-    [
-        ({"reason": "the model holds for 40 pulses"}, "40 pulses"),
-        ({"die": True}, "while it did the track"),
-    ],
+    [({"reason": "the model holds for 40 pulses"}, "40 pulses"), ({"die": True}, "while it did the track")],
 )
 def test_a_trial_that_cannot_be_followed_is_noted_and_nothing_is_lost(
     service: Service, client: httpx.Client, approved: str, wanted: Any, words: str

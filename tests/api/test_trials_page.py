@@ -86,9 +86,7 @@ def test_limits_are_shown_as_they_were_typed() -> None:
     assert "does not follow" in tracking_words(nothing, 80.0)
 
 
-def test_the_card_tells_the_trials_without_scripts_and_in_german(
-    service: Service, client: httpx.Client, approved: str
-) -> None:
+def test_the_card_tells_the_trials_without_scripts_and_in_german(service: Service, client: httpx.Client, approved: str):
     assert "Number of the trial" not in client.get(PAGE).text, "only where there is something"
     for _ in range(3):
         play(client)
@@ -144,9 +142,7 @@ def test_a_person_sets_the_limits_with_the_approval(pages: httpx.Client, client:
 
 
 @pytest.mark.browser
-def test_the_card_is_renewed_while_trials_are_played(
-    service: Service, client: httpx.Client, approved: str, tab: Any
-) -> None:
+def test_the_card_is_renewed_while_trials_are_played(service: Service, client: httpx.Client, approved: str, tab: Any):
     tab.goto(service.url + PAGE)
     tab.evaluate("window.same = true")
     for number in (1, 2):

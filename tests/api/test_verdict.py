@@ -90,9 +90,7 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
 
 
 @pytest.mark.slow
-def test_level_held_out_torque_has_no_percent(
-    tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_level_held_out_torque_has_no_percent(tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]):
     data = record_csv(tmp_path / "level.csv", follows=True, level=True)
     printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
     assert f"held out       {stored_model.UNDEFINED}, rms" in printed
@@ -178,9 +176,7 @@ def test_the_api_wants_a_reason_for_a_model_that_is_not_usable(
     assert client.post(f"/v1/models/{model}/approve").json()["served"], "nor does a usable one"
 
 
-def test_undo_brings_no_model_into_use_that_is_not_usable(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_undo_brings_no_model_into_use_that_is_not_usable(client: httpx.Client, service: Service, participant: str):
     poor = make_poor(service, run_test(client, participant)["model_id"])
     better = client.post(f"/v1/models/{poor}/effects", json={"effects": ["fatigue"]}).json()["id"]
     client.post(f"/v1/models/{better}/approve")
@@ -317,9 +313,7 @@ WORDS = [
 ]
 
 
-def test_warnings_are_told_on_every_page_and_in_the_terminal(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_warnings_are_told_on_every_page_and_in_the_terminal(client: httpx.Client, service: Service, participant: str):
     sound = run_test(client, participant)
     service.rig.warnings = WORDS
     doubtful = run_test(client, participant)

@@ -6,6 +6,7 @@ import asyncio
 import re
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -83,9 +84,7 @@ def test_a_withdrawal_that_the_rig_does_not_take_is_repeated_and_stops_meanwhile
 
 
 @pytest.mark.parametrize("same_text", [True, False])
-def test_a_token_that_came_back_starts_tests(
-    service: Service, client: httpx.Client, participant: str, same_text: bool
-) -> None:
+def test_a_token_that_came_back_starts_tests(service: Service, client: httpx.Client, participant: str, same_text: bool):
     """Its revocation stays in the trail, newer than what was read of the participant."""
     text, auth = service.token("lab", "run-test", "read-live"), service.context.auth
     (known,) = [row for row in service.context.store.all(Token) if row.name == "lab"]
@@ -264,14 +263,10 @@ def test_a_trial_that_plays_ends_with(
     """With the day of its key, its right, or what another service does to the participant."""
     playing(service, client, participant)
     context = service.context
-
-    def gone(_: object) -> list[Any]:
-        raise OSError("the disk is gone")
-
     if how == "its day":
         context.runner.clock = Tomorrow(context.clock)
     elif how.startswith("its right"):
-        monkeypatch.setattr(context.runner, "overtaking", gone)
+        monkeypatch.setattr(context.runner, "overtaking", Mock(side_effect=OSError("the disk is gone")))
         context.runner.current.until_utc = "2026-01-01T00:00:00.000Z"
     else:
         with context.store.write() as session:

@@ -36,9 +36,7 @@ def make_slow(service: Service, progress: float = 0.5) -> Path:
 # ---- long work ----------------------------------------------------------------------------------------------
 
 
-def test_new_test_ends_the_diagnosis_in_the_background(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
+def test_new_test_ends_the_diagnosis_in_the_background(client: httpx.Client, service: Service, participant: str):
     make_slow(service)
     model = run_test(client, participant)["model_id"]
     analyses = service.context.analyses

@@ -82,9 +82,7 @@ def test_foretold_torque_is_the_muscles(client: httpx.Client, served: tuple[Serv
     assert client.post("/v1/models/none/prediction", json={"pulse_width_us": [1]}).status_code == 404
 
 
-def test_the_participants_limit_holds_and_what_is_beyond_is_named(
-    client: httpx.Client, served: tuple[Service, str]
-) -> None:
+def test_the_participants_limit_holds_and_what_is_beyond_is_named(client: httpx.Client, served: tuple[Service, str]):
     wanted = [0.0] * 20 + [50.0] * 80
     ask = f"/v1/models/{served[1]}/widths"
     found = client.post(ask, json={"reference_torque_nm": wanted, "max_pulse_width_us": 400.0}).json()

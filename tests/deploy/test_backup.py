@@ -217,9 +217,7 @@ def test_one_folder_for_both(machine: Machine, tmp_path: Path) -> None:
     assert (tmp_path / "var" / "recordings" / "20260101T080000Z_t1.h5").read_bytes() == b"first" * 1000
 
 
-def test_no_room_is_told_before_anything_is_written(
-    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_room_is_told_before_anything_is_written(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     usage = type("Usage", (), {"free": 1000})
     monkeypatch.setattr(backup.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(backup.BackupError, match="0 MB free"):
@@ -245,9 +243,7 @@ def test_the_command_line(machine: Machine, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("latch", [b"", b"\xff", b"[]", b"{}", b"3", b"[" * 100_000])
-def test_a_latch_that_cannot_be_read_is_no_hindrance_and_is_told(
-    machine: Machine, tmp_path: Path, latch: bytes
-) -> None:
+def test_a_latch_that_cannot_be_read_is_no_hindrance_and_is_told(machine: Machine, tmp_path: Path, latch: bytes):
     (machine.rig / "latch.json").write_bytes(latch)
     made = backup.make(machine.rig, machine.api, tmp_path / "backups")
     rig, api = tmp_path / "new" / "rig", tmp_path / "new" / "api"

@@ -32,10 +32,7 @@ def unit(name: str) -> dict[str, list[str]]:
 RIG, API = unit("stimrig-rig.service"), unit("stimrig-api.service")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [f"stimrig-{name}.service" for name in ("rig", "api", "backup", "outbox", "centre")],
-)
+@pytest.mark.parametrize("name", [f"stimrig-{name}.service" for name in ("rig", "api", "backup", "outbox", "centre")])
 def test_no_service_has_more_rights_than_it_needs(name: str) -> None:
     settings = unit(name)
     assert settings["User"] != ["root"]

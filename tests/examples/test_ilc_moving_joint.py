@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -202,20 +203,14 @@ def test_a_trial_that_did_not_end_well_or_has_no_angle_halts_the_controller(
 def test_a_movement_that_does_not_start_stops_the_trial(ilc: ModuleType) -> None:
     client, stops = Answers(recording()), []
     client.stop = lambda: stops.append("stop")  # pyright: ignore[reportAttributeAccessIssue]
-
-    def missing() -> None:
-        raise FileNotFoundError("robot")
-
     with pytest.raises(ilc.HaltedError, match="did not start: robot"):
-        service(ilc, client, missing).play_moving(np.full(SIZE, 90.0))
+        service(ilc, client, Mock(side_effect=FileNotFoundError("robot"))).play_moving(np.full(SIZE, 90.0))
     assert stops == ["stop"]
 
 
 @pytest.mark.parametrize(("text", "says"), [(None, "not found"), ("x\n", "could not convert"), ("1 2\n", "one angle"),
                                             ("90\n", "in rad"), ("nan\n", "in rad")])  # fmt: skip
-def test_a_file_that_is_no_movement_is_told_in_a_line(
-    ilc: ModuleType, tmp_path: Path, text: str | None, says: str
-) -> None:
+def test_a_file_that_is_no_movement_is_told_in_a_line(ilc: ModuleType, tmp_path: Path, text: str | None, says: str):
     path = tmp_path / "angles.csv"
     if text is not None:
         path.write_text(text)

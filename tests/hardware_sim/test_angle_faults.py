@@ -109,9 +109,7 @@ SHOWN: list[tuple[str, float, dict[str, Any], Callable[[Rows, Row], Any]]] = [
 @pytest.mark.parametrize(
     ("name", "seconds", "settings", "shows"), SHOWN, ids=[f"{name} {more}" for name, _, more, _ in SHOWN]
 )
-def test_it_shows(
-    bench: Bench, name: str, seconds: float, settings: dict[str, Any], shows: Callable[[Rows, Row], Any]
-) -> None:
+def test_it_shows(bench: Bench, name: str, seconds: float, settings: dict[str, Any], shows: Callable[[Rows, Row], Any]):
     last = bench.rows(0.1)[-1]
     rows = bench.broken(f"angle_{name}", seconds, **settings)
     assert shows(rows, last), rows[:20]

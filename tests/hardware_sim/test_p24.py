@@ -60,12 +60,7 @@ def test_a_pulse_reaches_the_muscle_at_receipt_and_is_acked_when_it_has_ended(re
 
 @pytest.mark.parametrize(
     "shape",
-    [
-        [(250, 20.0)],
-        [(250, 20.0), (100, 0.0), (249, -20.0)],
-        [(250, 20.0), (100, 0.0), (250, -19.5)],
-        [(250, -20.0)],
-    ],
+    [[(250, 20.0)], [(250, 20.0), (100, 0.0), (249, -20.0)], [(250, 20.0), (100, 0.0), (250, -19.5)], [(250, -20.0)]],
 )
 def test_an_unbalanced_shape_is_counted(ready: Bench, shape: list[tuple[int, float]]) -> None:
     ready.ask(LL_CONFIG, config(*shape))
@@ -102,9 +97,7 @@ def test_a_pulse_behind_a_stop_is_not_fired(ready: Bench) -> None:
         (config(*biphasic(250, 20), execute=False), OK),
     ],
 )
-def test_parameters_out_of_range_and_a_config_without_execute_fire_nothing(
-    ready: Bench, data: bytes, result: int
-) -> None:
+def test_parameters_out_of_range_and_a_config_without_execute_fire_nothing(ready: Bench, data: bytes, result: int):
     assert ready.ask(LL_CONFIG, data).data[0] == result
     assert (ready.muscle.pulses, ready.electrodes.log) == ([], [])
 

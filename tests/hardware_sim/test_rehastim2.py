@@ -155,9 +155,7 @@ class TestSinglePulse:
         assert connected.muscle.pulses[0][1:] == given
 
     @pytest.mark.parametrize("asked", [(0, 20), (19, 20), (501, 20), (65535, 20), (250, 127), (250, 255), (300, 1)])
-    def test_beyond_the_limits_and_without_current_there_is_no_pulse(
-        self, connected: Host, asked: tuple[int, int]
-    ) -> None:
+    def test_beyond_the_limits_and_without_current_there_is_no_pulse(self, connected: Host, asked: tuple[int, int]):
         assert connected.result(SINGLE, pulse(*asked)) == (OK if asked[1] == 1 else PARAMETER)
         assert connected.result(SINGLE, pulse(250, 20)[1:]) == PARAMETER
         assert connected.result(SINGLE, pulse(250, 20, mode=8)) == PARAMETER

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from stimrig.hardware_sim import load_cells, stimulators
 from stimrig.rig import archive
-from tests.harness.processes import Bench, RigClient, control, kill_hard, short_plan
+from tests.harness.processes import Bench, RigClient, kill_hard, short_plan
 
 SAME_CLOCK_S = 2e-4
 """Two processes read the same clock; between the device's doing and its answer is at least this."""
@@ -35,14 +34,9 @@ def options(stimulator: str, cell: str, transport: str) -> list[str]:
     return ["--stimulator", stimulator, "--load-cell", transport, *CELLS[cell], "--noise-seed", "7"]
 
 
-def felt(bench: Bench) -> list[dict[str, Any]]:
-    """Every pulse that the emulated electrodes felt."""
-    return control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
-
-
 def felt_after(bench: Bench, time_s: float) -> int:
     """How many pulses the emulated electrodes felt after a monotonic time."""
-    return sum(pulse["monotonic_s"] > time_s for pulse in felt(bench))
+    return sum(pulse["monotonic_s"] > time_s for pulse in bench.felt())
 
 
 def check_all(bench: Bench) -> dict[str, float]:
@@ -67,7 +61,7 @@ def plays_and_records(bench: Bench, client: RigClient) -> dict[str, float]:
         status, sent = file["pulses/status"][:], file["pulses/sent_pulse_width_us"][:]
         torque_nm, time_s = file["torque/torque_nm"][:], file["torque/time_s"][:]
         ack_s = (file["pulses/acknowledged_time_s"][:] - file["pulses/written_time_s"][:])[status == 0]
-    fired = felt(bench)
+    fired = bench.felt()
     assert [p["width_us"] for p in fired] == sent[status == 0].tolist()
     assert {p["current_ma"] for p in fired} == {20.0}
     assert all(p["balanced"] for p in fired)
@@ -92,11 +86,11 @@ def plays_and_records(bench: Bench, client: RigClient) -> dict[str, float]:
 
 def holding(bench: Bench, client: RigClient, name: str) -> None:
     """A test that stimulates steadily."""
-    before = len(felt(bench))
+    before = len(bench.felt())
     reply = client.start(short_plan(name, segments=HOLD))
     assert reply["ok"], reply
     end_s = time.monotonic() + 15
-    while len(felt(bench)) < before + 20:
+    while len(bench.felt()) < before + 20:
         assert time.monotonic() < end_s, client.status()
         time.sleep(0.02)
 
@@ -113,7 +107,7 @@ def stops_when_asked(bench: Bench, client: RigClient) -> float:
     assert client.rearm("nurse")["ok"]
     assert felt_after(bench, asked_s) <= 4  # of 25 ms each
     assert felt_after(bench, answered_s + SAME_CLOCK_S) == 0
-    return 1e3 * (felt(bench)[-1]["monotonic_s"] - asked_s)
+    return 1e3 * (bench.felt()[-1]["monotonic_s"] - asked_s)
 
 
 def stops_when_unheard(bench: Bench, client: RigClient) -> float:
@@ -125,7 +119,7 @@ def stops_when_unheard(bench: Bench, client: RigClient) -> float:
     assert "not acknowledged" in event["reason"]
     # no pulse goes out before the one ahead of it is acknowledged
     assert felt_after(bench, injected["monotonic_s"]) <= 1
-    last_ms = 1e3 * (felt(bench)[-1]["monotonic_s"] - injected["monotonic_s"])
+    last_ms = 1e3 * (bench.felt()[-1]["monotonic_s"] - injected["monotonic_s"])
     bench.fault(cmd="fault", name="no_ack", on=False)
     client.wait_state("latched")
     time.sleep(0.1)
@@ -141,12 +135,12 @@ def says_nothing_when_killed(bench: Bench, client: RigClient) -> float:
     kill_hard(bench.rig)
     died_s = time.monotonic()
     time.sleep(1.5 / bench.speed)  # longer than any device's own watchdog
-    after = felt(bench)
+    after = bench.felt()
     assert felt_after(bench, died_s) <= 1  # a command may have been on its way
     again = bench.start_rig()
     assert again.status()["state"] == "uncertain"
     again.ask("subscribe")
-    assert len(felt(bench)) == len(after)
+    assert len(bench.felt()) == len(after)
     assert again.rearm("nurse")["ok"]
     assert again.start(short_plan("next"))["ok"]
     event = again.wait_finished("next")

@@ -194,6 +194,14 @@ class Bench:
         """Send one command to the emulator's control line and return its answer."""
         return control(self.emulator.ready["control"], command)
 
+    def state(self) -> dict[str, Any]:
+        """What the emulator says of itself."""
+        return self.fault(cmd="state")
+
+    def felt(self) -> list[dict[str, Any]]:
+        """Every pulse that the emulated electrodes felt."""
+        return self.fault(cmd="pulses", since=0)["pulses"]
+
     def close(self) -> None:
         """End both processes."""
         for client in self._clients:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.harness.processes import CLINIC_WATCH, ROOT, Bench, RigClient, control, default_plan
+from tests.harness.processes import CLINIC_WATCH, ROOT, Bench, default_plan
 
 FITTER = """
 import sys, time
@@ -59,24 +58,6 @@ def fitting(recordings: Path, wanted: bool) -> Iterator[list[str]]:
             print("the fitting process ended early", file=sys.stderr)
         process.kill()
         process.wait()
-
-
-@contextlib.contextmanager
-def fitting_one(bench: Bench, client: RigClient, wanted: bool) -> Iterator[list[str]]:
-    """Play the default test, then fit its recording again and again in another process, whatever is recorded beside."""
-    folder = bench.folder / "to-fit"
-    folder.mkdir()
-    if wanted:
-        assert client.start(default_plan("to-fit"))["ok"]
-        path = client.wait_finished("to-fit")["recording_path"]
-        shutil.copy(path, folder)
-    with fitting(folder, wanted) as fits:
-        end_s = time.monotonic() + 180
-        while wanted and not fits:  # the first one compiles
-            if time.monotonic() > end_s:
-                raise TimeoutError("no fit came to its end in 180 s")
-            time.sleep(0.1)
-        yield fits
 
 
 def memory_mb(pid: int) -> float:
@@ -125,7 +106,7 @@ def _session(bench: Bench, client: Any, minutes: float, every_minutes: float, pl
                     live += 1
                     oldest_ms = max(oldest_ms, 1e3 * event["torque_age_s"])
             time.sleep(0.5)
-    felt = len(control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"])
+    felt = len(bench.felt())
     figures = _figures(tests, felt)
     status = client.status()
     return figures | {

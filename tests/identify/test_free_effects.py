@@ -128,11 +128,8 @@ def test_held_out_rows_may_object_to_any_link_of_a_chain(monkeypatch: pytest.Mon
         further = {(): {"A": 1.0, "B": 0.8}, ("B",): {"C": 3.0}}.get(chain.added, {})
         return [chain.with_(model(name), error, name) for name, error in further.items()]
 
-    def objects(before: SimpleNamespace, after: SimpleNamespace) -> str | None:
-        return "no" if (before.name, after.name) == ("base", "B") else None
-
     monkeypatch.setattr(free, "_longer", longer)
-    monkeypatch.setattr(free, "vetoed", objects)
+    monkeypatch.setattr(free, "vetoed", lambda old, new: "no" if (old.name, new.name) == ("base", "B") else None)
     monkeypatch.setattr(free, "difference", lambda old, new: SimpleNamespace(gain=new - old, errors=10.0 * (new - old)))
     found = free._extended([free.Chain((model("base"),), (0.0,), ())], silent, (0.0, 0.0))
     assert [chain.added for chain in found] == [("A",)]

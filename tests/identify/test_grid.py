@@ -94,11 +94,7 @@ def test_the_curve_is_exact_however_short_a_lag_is(time_constant_s: float, dampi
     assert np.abs(at_samples - torque[skipped:]).max() < 1e-6
 
 
-@given(
-    phase=st.floats(0.0, 0.02499),
-    rate_hz=st.sampled_from([100, 200, 400, 1000, 1600]),
-    start_s=st.floats(-5, 500),
-)
+@given(phase=st.floats(0.0, 0.02499), rate_hz=st.sampled_from([100, 200, 400, 1000, 1600]), start_s=st.floats(-5, 500))
 @settings(max_examples=60, deadline=None)
 def test_the_pulses_are_found_wherever_the_record_starts(phase: float, rate_hz: int, start_s: float) -> None:
     widths_us = schedule(1)
@@ -116,10 +112,7 @@ def test_the_pulses_are_found_wherever_the_record_starts(phase: float, rate_hz: 
 @settings(max_examples=30, deadline=None)
 def test_transition_is_the_solution_of_the_equation(time_constant_s: float, damping: float) -> None:
     phi, gamma = transition(time_constant_s, damping, 0.025)
-
-    def slope(_t: float, x: np.ndarray) -> list[float]:
-        return [x[1], (2.0 - x[0] - 2 * damping * time_constant_s * x[1]) / time_constant_s**2]
-
+    slope = lambda _t, x: [x[1], (2.0 - x[0] - 2 * damping * time_constant_s * x[1]) / time_constant_s**2]  # noqa: E731
     solved = solve_ivp(slope, (0, 0.025), [1.5, -3.0], rtol=1e-10, atol=1e-12).y[:, -1]
     np.testing.assert_allclose(phi @ [1.5, -3.0] + gamma * 2.0, solved, rtol=1e-6, atol=1e-6)
 

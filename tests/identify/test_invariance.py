@@ -20,14 +20,7 @@ from stimrig.identify.records.record import Pulses
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 
-HIDDEN = (
-    "",
-    "fatigue",
-    "asymmetric_relaxation",
-    "electromechanical_delay",
-    "output_saturation",
-    "threshold_drift",
-)
+HIDDEN = ("", "fatigue", "asymmetric_relaxation", "electromechanical_delay", "output_saturation", "threshold_drift")
 SEED, RATE_HZ = 11, 100
 WIDTHS_US = np.linspace(0.0, hidden_muscles.TOP_US, 31)
 

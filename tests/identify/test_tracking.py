@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -102,18 +102,14 @@ def test_where_nothing_changes_no_trial_moves_the_model_by_more_than_its_band(mo
     assert {step.outcome for step in steps} <= {Outcome.FOLLOWED, Outcome.LITTLE}
 
 
-def bump(size_nm: float, at_s: float, width_s: float) -> Callable[[int, np.ndarray], np.ndarray]:
-    """A torque of its own in the fourth trial."""
-    return lambda trial, time_s: (trial == 3) * size_nm * np.exp(-0.5 * ((time_s - at_s) / width_s) ** 2)
-
-
 @pytest.mark.parametrize(
     ("size_nm", "at_s", "width_s"), [(4.0, 5.0, 0.15), (-2.5, 8.0, 0.3), (1.5, 6.0, 1.2), (3, 4, 2)]
 )
 def test_a_spasm_or_an_effort_moves_nothing_by_more_than_its_band(
     model: Model, size_nm: float, at_s: float, width_s: float
 ) -> None:
-    steps = followed(model, session(Changing(PATIENT, added=bump(size_nm, at_s, width_s)), 6))
+    bump = lambda trial, time_s: (trial == 3) * size_nm * np.exp(-0.5 * ((time_s - at_s) / width_s) ** 2)  # noqa: E731
+    steps = followed(model, session(Changing(PATIENT, added=bump), 6))
     assert np.all(moves(steps) < 1.0)
     stretches = steps[3].seen.disturbed
     assert steps[3].outcome is Outcome.ODD or any(begin <= at_s <= end for begin, end in stretches)

@@ -39,9 +39,7 @@ def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters
         effects=forms,
         noise=SimpleNamespace(band=band, at_bound=False),
         parameters_of=parameters_of,
-        problem=SimpleNamespace(
-            setup=SimpleNamespace(fitted=np.ones(4000, bool), grid=SimpleNamespace(step_s=0.025)),
-        ),
+        problem=SimpleNamespace(setup=SimpleNamespace(fitted=np.ones(4000, bool), grid=SimpleNamespace(step_s=0.025))),
     )
 
 
@@ -236,11 +234,7 @@ RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any
         [("width_1", 16.6), ("decay_2", 16.6)],
         [("width_1", 16.5), ("decay_2", 16.5)],
     ),
-    "a tremor takes most of the power": (
-        trembling,
-        [(0.0435**0.5, 60.1)],
-        [(0.0425**0.5, 60.1), (0.0435**0.5, 60.0)],
-    ),
+    "a tremor takes most of the power": (trembling, [(0.0435**0.5, 60.1)], [(0.0425**0.5, 60.1), (0.0435**0.5, 60.0)]),
 }
 """By what is meant: how it is made, values at which something else is missing, and values at which nothing else is."""
 

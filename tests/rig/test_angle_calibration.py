@@ -253,10 +253,7 @@ def angled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Angled:
     return lambda **changes: AngledRig(tmp_path, monkeypatch, angle_sensor=SETTINGS, **changes)
 
 
-HELD = {
-    "kind": "held",
-    "angle": AnglePlan(range_rad=(0.2, 2.0), target_rad=math.radians(60)),
-}
+HELD = {"kind": "held", "angle": AnglePlan(range_rad=(0.2, 2.0), target_rad=math.radians(60))}
 
 
 def test_poses_are_told_kept_and_stand_in_the_journal(angled: Angled, tmp_path: Path):

@@ -302,11 +302,7 @@ def test_fine_is_fine_wherever() -> None:
 
 def test_marks_of_a_smaller_current_are_not_used() -> None:
     assert stepped(last=known(current_ma=19.5)).status().last_us == {}
-    assert stepped(last=known(current_ma=20)).status().last_us == {
-        "sensory": 60,
-        "motor": 100,
-        "comfort": 300,
-    }
+    assert stepped(last=known(current_ma=20)).status().last_us == {"sensory": 60, "motor": 100, "comfort": 300}
     assert stepped(last=known(current_ma=19.5)).next_width_us(UP) == 25
 
 

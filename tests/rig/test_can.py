@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -411,10 +412,7 @@ def test_a_port_that_is_no_serial_line_is_left_as_it_is(machine: Adapters):
 def test_a_cell_whose_start_frames_are_not_sent_is_refused_and_not_lost_as_well(
     machine: Adapters, monkeypatch: pytest.MonkeyPatch
 ):
-    def refuse(*_: object) -> None:
-        raise DeviceError("not sent")
-
-    monkeypatch.setattr(CanBus, "send", refuse)
+    monkeypatch.setattr(CanBus, "send", Mock(side_effect=DeviceError("not sent")))
     with pytest.raises(DeviceError, match="not sent"):
         cell_of(machine, {"interface": "virtual", "channel": "deaf"}, start_frames=["000#0100"])
     assert not can_bus._open

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -157,12 +158,9 @@ def test_a_folder_of_an_older_version_is_in_doubt_and_a_fresh_one_is_not(tmp_pat
 def test_a_disk_that_refuses_leaves_no_older_time_and_raises_nothing(
     left: Path, monkeypatch: pytest.MonkeyPatch, refuses: str
 ):
-    def refuse(*_: object) -> None:
-        raise OSError(30, "Read-only file system")
-
     kept = Kept(left)
     for name in {"replace", refuses}:
-        monkeypatch.setattr(Files, name, refuse)
+        monkeypatch.setattr(Files, name, Mock(side_effect=OSError(30, "Read-only file system")))
     kept.pulse_at(1000.0)
     assert kept.rest.last_pulse_s == 1000.0
     assert (left / "last-pulse.json").exists() is (refuses == "remove")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 
 import pytest
@@ -22,29 +23,25 @@ STEPS = {
 }
 
 
+def after(phase: Phase, steps: list[str], *states: str) -> Phase:
+    """What it is after those of the steps that may be taken; it is in one of the states all the time."""
+    for step in steps:
+        with contextlib.suppress(RigError):
+            phase = STEPS[step](phase)
+        assert phase.state in states
+    return phase
+
+
 @given(st.lists(st.sampled_from(sorted(STEPS)), max_size=30))
 def test_after_a_fault_nothing_starts_without_a_person(steps: list[str]):
-    phase = Phase().connected().start("a", "P").armed().halted("the fault")
-    for step in steps:
-        try:
-            phase = STEPS[step](phase)
-        except RigError:
-            continue
-        assert phase.state in ("stopping", "sealing", "latched")
+    halted = Phase().connected().start("a", "P").armed().halted("the fault")
     with pytest.raises(RigError):
-        phase.start("b", "P")
+        after(halted, steps, "stopping", "sealing", "latched").start("b", "P")
 
 
 @given(st.lists(st.sampled_from(sorted(STEPS)), max_size=30))
 def test_uncertain_stays_uncertain(steps: list[str]):
-    phase = Phase().connected("uncertain", "died")
-    for step in steps:
-        try:
-            phase = STEPS[step](phase)
-        except RigError:
-            continue
-        assert phase.state == "uncertain"
-    assert phase.rearm().state == "ready"
+    assert after(Phase().connected("uncertain", "died"), steps, "uncertain").rearm().state == "ready"
 
 
 ARMING = Phase("arming", "", "a", "P")

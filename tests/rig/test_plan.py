@@ -173,8 +173,7 @@ def test_the_default_is_the_papers_and_is_told_first():
     assert [segment.name for segment in told.default] == told.protocols[0].segments
     assert told.protocols[0].segments == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
     assert np.array_equal(
-        built_of("paper").pulse_width_us,
-        built_of(TestPlan.model_fields["protocol"].default).pulse_width_us,
+        built_of("paper").pulse_width_us, built_of(TestPlan.model_fields["protocol"].default).pulse_width_us
     )
 
 

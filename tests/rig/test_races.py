@@ -8,6 +8,7 @@ from collections.abc import Callable, Coroutine, Iterator
 from itertools import count
 from types import NoneType
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -167,11 +168,8 @@ def test_a_stop_at_each_moment_holds_until_a_person_undoes_it(make: Make, story:
 def test_a_stop_while_a_start_fails_holds_too(make: Make, monkeypatch: pytest.MonkeyPatch):
     """The rig is not told as ready on its way from the start that could not begin to the latch."""
 
-    def no_journal(*_: object) -> None:
-        raise JournalError("no room")
-
     def fails(live: LiveRig) -> None:
-        monkeypatch.setattr(live.rig.player.store, "begin", no_journal)
+        monkeypatch.setattr(live.rig.player.store, "begin", Mock(side_effect=JournalError("no room")))
 
     def given_up(live: LiveRig) -> bool:
         return "arming" in live.states and live.states[-1] == "ready"
@@ -334,11 +332,7 @@ def test_a_stop_is_remembered_by_the_next_process_once_it_is_answered(make: Make
 
 def test_a_bug_while_a_tests_files_are_made_leaves_a_rig_that_can_be_stopped(make: Make, monkeypatch: Any):
     live = make(disk=SimulatedDisk(World(0)), clock=None)
-
-    def fail(*_: object) -> None:
-        raise ValueError("a mistake in this program")
-
-    monkeypatch.setattr(live.rig.store, "begin", fail)
+    monkeypatch.setattr(live.rig.store, "begin", Mock(side_effect=ValueError("a mistake in this program")))
     with pytest.raises(ValueError, match="mistake"):
         live.start(live.plan("one"))
     assert live.rig.status().state == "ready"
@@ -376,13 +370,9 @@ def withdraw(live: LiveRig, test_id: str = "one", begun: bool = False) -> bool:
     return live.ask(live.rig.player.withdraw(request)).withdrawn
 
 
-def one_pulse(live: LiveRig) -> bool:
-    return bool(live.stimulator.sent)
-
-
 def test_at_each_moment_before_its_first_pulse_it_plays_none_and_does_not_latch(make: Make):
     ended = set[type]()
-    for live, task in moments(make, begin_test, one_pulse):
+    for live, task in moments(make, begin_test, lambda live: bool(live.stimulator.sent)):
         assert withdraw(live)
         live.until(task.done.is_set)
         ended.add(type(task.error))

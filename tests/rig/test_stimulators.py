@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings
@@ -155,11 +156,7 @@ def test_a_mistake_in_a_driver_is_told_at_once():
     told, line = [], Other(lambda _: bytes.fromhex("f08155815a814381d514030000000f"))
     device = p24.create(p24.Settings(device="p24", port=PORT), line)
     device.listen(lambda _: None, told.append)
-
-    def break_(_packet: object, _time_s: float) -> None:
-        raise ZeroDivisionError("a mistake")
-
-    device._line._on_packet = break_
+    device._line._on_packet = Mock(side_effect=ZeroDivisionError("a mistake"))
     asked_s = line.clock.now_s()
     with pytest.raises(DeviceError, match="internal: ZeroDivisionError: a mistake"):
         line.run(device.open())

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -157,9 +158,7 @@ def test_progress_may_be_a_function_of_ones_own(record: stimrig.Record) -> None:
 
 
 @pytest.mark.parametrize(("config", "notebook"), [({"IPKernelApp": {}}, True), ({}, False)])
-def test_a_notebook_is_known_by_its_kernel(
-    monkeypatch: pytest.MonkeyPatch, config: dict[str, object], notebook: bool
-) -> None:
+def test_a_notebook_is_known_by_its_kernel(monkeypatch: pytest.MonkeyPatch, config: dict[str, object], notebook: bool):
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: SimpleNamespace(config=config)))
     assert in_notebook() == notebook
 
@@ -210,12 +209,8 @@ def test_adding_an_effect_as_a_job_and_at_once(client: Client) -> None:
 def test_what_progress_raises_cancels_the_job(client: Client) -> None:
     model_id = client.run_test("P017")["model_id"]
     client.diagnosis(model_id)
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        client.improve(model_id, interrupted)
+        client.improve(model_id, Mock(side_effect=KeyboardInterrupt))
     assert client.job("J1")["done"], "nothing goes on behind the person's back"
 
 

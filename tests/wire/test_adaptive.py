@@ -60,10 +60,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Whole]:
         bench.start_rig().wait_state("ready")
         folder = tmp_path_factory.mktemp("service")
         app = create_app(Settings(data_dir=folder, admin_token=TOKEN, rig_socket=bench.socket, port=0))  # pyright: ignore[reportArgumentType]
-        with (
-            Server(app) as url,
-            httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S) as client,
-        ):
+        with Server(app) as url, httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S) as client:
             client.post("/v1/participants", json={"code": "P017"})
             yield Whole(client, app.state.context.runner.adaptive.adviser)
     finally:

@@ -14,7 +14,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.rig import archive
-from tests.harness.processes import Bench, RigClient, control, default_plan, made_ready
+from tests.harness.processes import Bench, RigClient, default_plan, made_ready
 
 pytestmark = [pytest.mark.wire, pytest.mark.slow]
 
@@ -27,10 +27,6 @@ STEPS = [
     {"name": "steps", "sequence": "steps", "settings": {"on_s": 2.5, "off_s": 1.0, "repeats": 1}},
 ]
 REST = [{"name": "passive", "sequence": "rest", "settings": {"duration_s": 3.0}}]
-
-
-def pulses(bench: Bench) -> int:
-    return control(bench.emulator.ready["control"], {"cmd": "state"})["pulses_received"]
 
 
 def played(bench: Bench, client: RigClient, test_id: str, **fields: Any) -> dict[str, Any]:
@@ -112,12 +108,12 @@ def at(bench: Bench, client: RigClient, degrees: float) -> None:
 def test_no_pulse_is_felt_in_a_passive_test(ready: tuple[Bench, RigClient]):
     bench, client = ready
     assert bench.fault(**MOVING)["ok"]
-    before = pulses(bench)
+    before = bench.state()["pulses_received"]
     refused = client.ask("start", plan=default_plan("wide", **{**PLAN, "kind": "passive", "segments": STEPS}))
     assert "passive test" in refused["problem"]["detail"]
     event = played(bench, client, "passive", **{**PLAN, "kind": "passive", "segments": REST})
     assert event["outcome"] == "completed", event
-    assert pulses(bench) == before
+    assert bench.state()["pulses_received"] == before
 
 
 def test_a_sensor_that_is_plugged_in_again_is_found_by_itself(ready: tuple[Bench, RigClient]):

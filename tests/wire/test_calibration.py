@@ -11,13 +11,9 @@ import pytest
 
 from stimrig.rig.control.sealing import MAY_BE_FELT
 from stimrig.rig.signals import PulseStatus
-from tests.harness.processes import Bench, RigClient, control, short_plan
+from tests.harness.processes import Bench, RigClient, short_plan
 
 pytestmark = pytest.mark.wire
-
-
-def felt(bench: Bench) -> list[dict[str, Any]]:
-    return control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
 
 
 def step(client: RigClient) -> dict[str, Any]:
@@ -34,11 +30,11 @@ def start(client: RigClient, name: str, **fields: Any) -> dict[str, Any]:
 
 def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     bench, client = shared
-    before = len(felt(bench))
+    before = len(bench.felt())
     reply = start(client, "cal", step_us=25.0, train_s=0.5, max_pulse_width_us=205.0)
     assert reply["ok"], reply
     assert reply["body"]["state"] == "calibrating"
-    assert len(felt(bench)) == before  # opening sends nothing
+    assert len(bench.felt()) == before  # opening sends nothing
     refused = client.ask("start", plan=short_plan("no"))["problem"]
     assert refused["code"] == "busy"
     assert "finish or discard" in refused["detail"]
@@ -51,7 +47,7 @@ def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
     over = client.ask("calibrate-step", direction="up")["problem"]
     assert over["code"] == "refused"
     assert "marked comfort maximum" in over["detail"]
-    pulses = [round(p["width_us"]) for p in felt(bench)[before:]]
+    pulses = [round(p["width_us"]) for p in bench.felt()[before:]]
     trains = shown["trains"]
     assert all(t["pulses"] <= 20 for t in trains), trains
     assert [width for width, _ in groupby(pulses)] == [t["pulse_width_us"] for t in trains if t["pulses"]]

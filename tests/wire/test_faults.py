@@ -13,15 +13,11 @@ import pytest
 
 from stimrig.rig import archive
 from stimrig.rig.config import EMULATOR_WATCH
-from tests.harness.processes import Bench, RigClient, control, default_plan, kill_hard, short_plan
+from tests.harness.processes import Bench, RigClient, default_plan, kill_hard, short_plan
 
 pytestmark = pytest.mark.wire
 
-FAULTS = {
-    "electrode_error": "electrode error",
-    "cell_silent": "stale",
-    "stimulator_unplugged": "stimulator",
-}
+FAULTS = {"electrode_error": "electrode error", "cell_silent": "stale", "stimulator_unplugged": "stimulator"}
 
 
 STEPS = [
@@ -34,20 +30,15 @@ def start(bench: Bench, test_id: str = "t", client: RigClient | None = None) -> 
     """A test that runs, its first pulses felt."""
     client = client or bench.start_rig()
     client.ask("subscribe")
-    before = state(bench)["pulses_received"]
+    before = bench.state()["pulses_received"]
     reply = client.start(default_plan(test_id, segments=STEPS))
     assert reply["ok"], reply
     client.wait_state("running")
     end = time.monotonic() + 10
-    while state(bench)["pulses_received"] < before + 30:
+    while bench.state()["pulses_received"] < before + 30:
         assert time.monotonic() < end, client.status()
         time.sleep(0.02)
     return client
-
-
-def state(bench: Bench) -> dict[str, Any]:
-    """What the emulator says of itself."""
-    return control(bench.emulator.ready["control"], {"cmd": "state"})
 
 
 def check_kept(event: dict[str, Any], outcome: str) -> None:
@@ -71,7 +62,7 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     event = client.wait_finished(fault, timeout_s=20)
     check_kept(event, "fault")
     assert FAULTS[fault] in event["reason"]
-    felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+    felt = bench.felt()
     # with slack for a shared machine; without acknowledgements one pulse is on its way at most
     late_s = max(p["monotonic_s"] - injected["monotonic_s"] for p in felt)
     watch_s = EMULATOR_WATCH["stale_torque_s"] if fault == "cell_silent" else 0.0
@@ -107,12 +98,12 @@ def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient])
     assert evidence["confirmed"], evidence
     assert evidence["device_state"] == "not initialised"
     assert "torque fell" in evidence["detail"] or "near rest" in evidence["detail"]
-    count = state(bench)["pulses_received"]
+    count = bench.state()["pulses_received"]
     event = client.wait_finished("t")
     check_kept(event, "stopped")
     assert "participant asks (by nurse)" in event["reason"]
     time.sleep(0.2)
-    assert state(bench)["pulses_received"] == count
+    assert bench.state()["pulses_received"] == count
     assert client.wait_state("latched")["reason"] == "participant asks (by nurse)"
     assert client.rearm("nurse")["body"]["state"] == "ready"
 
@@ -121,9 +112,9 @@ def test_a_signal_stops_stimulation_first_and_seals(bench: Bench):
     start(bench)
     assert bench.rig is not None
     assert bench.rig.stop(signal.SIGTERM) == 0
-    before = state(bench)
+    before = bench.state()
     time.sleep(0.1)
-    assert state(bench)["pulses_received"] == before["pulses_received"]
+    assert bench.state()["pulses_received"] == before["pulses_received"]
     sealed = list((bench.data / "recordings").glob("*.h5"))
     assert len(sealed) == 1
     with h5py.File(sealed[0]) as file:
@@ -138,9 +129,9 @@ def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
     assert bench.rig is not None
     kill_hard(bench.rig)
     time.sleep(0.05)
-    count = state(bench)["pulses_received"]
+    count = bench.state()["pulses_received"]
     time.sleep(0.3)
-    assert state(bench)["pulses_received"] == count  # silence is no stimulation
+    assert bench.state()["pulses_received"] == count  # silence is no stimulation
     client = bench.start_rig()
     status = client.status()
     assert status["state"] == "uncertain"
@@ -151,7 +142,7 @@ def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
         acknowledged = int(np.sum(file["pulses/status"][:] == 0))
         assert acknowledged >= count - 2  # the last ack may have been on its way
         assert np.sum(np.isfinite(file["pulses/sent_pulse_width_us"][:]) & (file["pulses/status"][:] != 1)) >= count
-    felt = control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
+    felt = bench.felt()
     felt_uc = sum(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)
     summary = event["summary"]
     most_uc = max(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)

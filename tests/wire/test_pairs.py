@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
-from tests.harness.device_pairs import HOLD, check_all, felt, options
-from tests.harness.processes import Bench, control, kill_hard, short_plan
+from tests.harness.device_pairs import HOLD, check_all, options
+from tests.harness.processes import Bench, kill_hard, short_plan
 
 pytestmark = pytest.mark.wire
 
@@ -28,22 +27,18 @@ def test_a_rehastim2_is_kept_alive_through_a_rest_and_lets_go_of_a_dead_host(mak
     rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 3.0}}
     assert client.start(short_plan("rests", segments=[rest, *HOLD[1:], rest]))["ok"]
     client.wait_state("running")
-    while len(felt(bench)) < 20:
+    while len(bench.felt()) < 20:
         time.sleep(0.02)
-    commands = state(bench)["commands"]
+    commands = bench.state()["commands"]
     assert 5 <= commands["4"] <= 12  # 3 s of rest, a keep-alive each 0.3 s
     assert bench.rig is not None
-    alive_s = state(bench)["time_s"]
+    alive_s = bench.state()["time_s"]
     kill_hard(bench.rig)
-    died_s = state(bench)["time_s"]
+    died_s = bench.state()["time_s"]
     asleep_s = [died_s]  # when the device was last seen connected, on its own clock
-    while (now := state(bench))["mode"] != "none":
+    while (now := bench.state())["mode"] != "none":
         assert now["time_s"] - died_s < 10
         asleep_s.append(now["time_s"])
         time.sleep(0.01)
     assert asleep_s[-1] - died_s <= 1.2 and now["time_s"] - alive_s >= 0.9  # a keep-alive each 0.3 s before
-    assert sum(pulse["time_s"] > died_s for pulse in felt(bench)) <= 1  # a command may have been on its way
-
-
-def state(bench: Bench) -> dict[str, Any]:
-    return control(bench.emulator.ready["control"], {"cmd": "state"})
+    assert sum(pulse["time_s"] > died_s for pulse in bench.felt()) <= 1  # a command may have been on its way

@@ -14,7 +14,7 @@ import pytest
 
 from stimrig.rig import align, archive
 from stimrig.rig.signals import PulseStatus
-from tests.harness.processes import Bench, control, short_plan
+from tests.harness.processes import Bench, short_plan
 
 pytestmark = pytest.mark.wire
 
@@ -26,11 +26,6 @@ def play(bench: Bench, plan: dict[str, Any], timeout_s: float = 90.0) -> dict[st
     reply = client.start(plan)
     assert reply["ok"], reply
     return client.wait_finished(plan["test_id"], timeout_s)
-
-
-def fired(bench: Bench) -> list[dict[str, Any]]:
-    """Every pulse that the emulated electrodes felt."""
-    return control(bench.emulator.ready["control"], {"cmd": "pulses", "since": 0})["pulses"]
 
 
 def check_recording(bench: Bench, event: dict[str, Any]) -> None:
@@ -50,7 +45,7 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
         assert np.sum(status == PulseStatus.DROPPED) == event["summary"]["dropped_pulses"]
         assert np.sum(acknowledged) >= 20
         assert np.array_equal(sent[acknowledged], np.trunc(planned[acknowledged]))
-        felt = fired(bench)
+        felt = bench.felt()
         assert [p["width_us"] for p in felt] == list(sent[acknowledged])
         assert {p["current_ma"] for p in felt} == {20.0}
         assert all(p["balanced"] for p in felt)
@@ -79,7 +74,7 @@ def test_aligned_times_are_those_of_the_muscle(make_bench: Callable[..., Bench])
     """The emulator knows when each pulse was felt; the recording's sync edges must lie there."""
     bench = make_bench("--clock-ppm", "-200", "--clock-jitter-us", "100", speed=1.0)
     event = play(bench, short_plan("align"))
-    felt_s = np.array([p["monotonic_s"] for p in fired(bench)])
+    felt_s = np.array([p["monotonic_s"] for p in bench.felt()])
     with h5py.File(event["recording_path"]) as file:
         written_s = file["pulses/written_time_s"][:]
         written_s = written_s[np.isfinite(written_s)]

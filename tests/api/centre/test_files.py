@@ -214,9 +214,7 @@ def kept(rig: httpx.Client, http: httpx.Client) -> tuple[Teller, bytes, dict[str
     return told, data, recording
 
 
-def test_a_folder_that_is_not_mounted_is_no_damage_of_its_files(
-    centre: Centre, rig: httpx.Client, http: httpx.Client
-) -> None:
+def test_a_folder_that_is_not_mounted_is_no_damage_of_its_files(centre: Centre, rig: httpx.Client, http: httpx.Client):
     _, data, recording = kept(rig, http)
     bucket, elsewhere, context = centre.data / "files", centre.data / "elsewhere", centre.context
     bucket.rename(elsewhere)

@@ -245,9 +245,7 @@ def test_recordings_are_listed_in_pages_by_key(centre: Centre, rig: httpx.Client
     assert http.get("/v1/recordings", params={"rig": "Ward 8"}).status_code == 404
 
 
-def test_a_hostile_rig_breaks_nothing_and_nothing_of_it_is_run(
-    centre: Centre, rig: httpx.Client, http: httpx.Client
-) -> None:
+def test_a_hostile_rig_breaks_nothing_and_nothing_of_it_is_run(centre: Centre, rig: httpx.Client, http: httpx.Client):
     deep: object = "x"
     for _ in range(30):
         deep = [deep]

@@ -257,9 +257,7 @@ def test_another_key_signs_nothing_that_holds(trail: Trail) -> None:
 
 
 @pytest.mark.parametrize(("at_utc", "changed"), [("2026-01-01T00:00:00Z", True), ("2026-01-03T00:00:00Z", False)])
-def test_under_a_chain_that_was_begun_anew_only_what_claims_an_older_time_was_changed(
-    at_utc: str, changed: bool
-) -> None:
+def test_under_a_chain_that_was_begun_anew_only_what_claims_an_older_time_was_changed(at_utc: str, changed: bool):
     """After a restore, later entries stand in the places of those that are missing."""
     entry = AuditEntry(seq=1, at_utc=at_utc, who="a", action="b", subject="", detail={}, previous_hash="0" * 64)
     entry.hash = entry_hash(entry.as_dict())

@@ -125,9 +125,7 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert len(said.splitlines()) == 1 and words in said and "secret" not in said, said
 
 
-def test_a_missing_extra_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_extra_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "fsspec", None)
     assert run(["centre", "--port", "0", "--data", str(tmp_path)]) == 2
     assert "pip install 'stimrig[centre]'" in capsys.readouterr().err

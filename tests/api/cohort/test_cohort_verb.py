@@ -79,9 +79,7 @@ def test_the_verb_loads_without_the_extra() -> None:
         (["--workers", "0"], "--workers"),
     ],
 )
-def test_wrong_options_are_one_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, options: list[str], named: str
-) -> None:
+def test_wrong_options_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, options: list[str], named: str):
     assert named in refused(capsys, "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet"), *options)
     assert list(tmp_path.iterdir()) == []
 

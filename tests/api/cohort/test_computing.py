@@ -169,9 +169,7 @@ def test_no_file_of_the_machine_can_be_read(computing: Computing, good: bytes, t
     assert "Seccomp:\t2" in status
 
 
-def test_the_environment_of_a_child_holds_no_key(
-    computing: Computing, good: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_environment_of_a_child_holds_no_key(computing: Computing, good: bytes, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret-of-the-bucket")
     monkeypatch.setenv("STIMRIG_TOKEN", "secret-of-the-centre")
     computing.close_process()
@@ -194,9 +192,7 @@ def test_what_a_killed_worker_left_is_taken_away(tmp_path: Path, monkeypatch: py
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_other_worker_takes_away_a_folder_that_is_being_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_other_worker_takes_away_a_folder_that_is_being_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     take_lock = fcntl.flock
 

@@ -317,9 +317,7 @@ def test_wrong_options_are_one_line(
     assert said.count("\n") == 1 and named in said
 
 
-def test_a_folder_of_something_else_is_left_alone(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_something_else_is_left_alone(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"x")
     with pytest.raises(CohortError, match="not empty"):

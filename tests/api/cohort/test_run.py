@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pyarrow.parquet as pq
 import pytest
@@ -268,14 +269,10 @@ def test_versions_are_compared_before_the_first_record(client: Client, monkeypat
         check_versions(client)
 
 
-def broken_worker(*_: object) -> dict[str, Any]:
-    raise OSError(28, "No space left on device")
-
-
 def test_a_worker_that_cannot_compute_ends_the_run(
     client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "run_parcel", broken_worker)
+    monkeypatch.setattr(run, "run_parcel", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(CutOffError, match="No space left"):
         go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
 

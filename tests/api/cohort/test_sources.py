@@ -92,9 +92,7 @@ def test_a_file_that_went_is_told_when_it_is_opened(tmp_path: Path) -> None:
         Folder(str(tmp_path)).open(entry, MOST)
 
 
-def test_a_folder_that_may_not_be_read_is_told_and_ends_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_may_not_be_read_is_told_and_ends_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "open").mkdir()
     (tmp_path / "open" / "a.h5").write_bytes(b"x")
     (tmp_path / "shut").mkdir()

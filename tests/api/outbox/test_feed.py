@@ -6,6 +6,7 @@ import json
 import random
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from sqlalchemy import inspect
@@ -96,12 +97,9 @@ def test_what_is_rolled_back_is_not_told(rig: Rig) -> None:
 
 
 def test_items_and_rows_stand_or_fall_together(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise RuntimeError("on purpose")
-
     rig.participant("P1")
     with monkeypatch.context() as patch:
-        patch.setattr(chain, "_append", broken)
+        patch.setattr(chain, "_append", Mock(side_effect=RuntimeError("on purpose")))
         with pytest.raises(RuntimeError, match="on purpose"):
             rig.participant("P2")
     assert rig.store.get(Participant, "P2") is None
@@ -119,11 +117,8 @@ def test_a_savepoint_that_is_rolled_back_is_not_told(rig: Rig) -> None:
 
 
 def test_a_row_that_cannot_be_told_keeps_nobody_from_working(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise ValueError("on purpose")
-
     with monkeypatch.context() as patch:
-        patch.setattr(feed, "_bounded", broken)
+        patch.setattr(feed, "_bounded", Mock(side_effect=ValueError("on purpose")))
         rig.participant("P1")
     assert rig.store.get(Participant, "P1") is not None and [kind for kind, _ in rig.told()] == ["begin", "audit"]
     assert sum(feed.batches(rig.store, rig.clock)) == 1, "it is found the next time"

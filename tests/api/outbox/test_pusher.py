@@ -10,7 +10,7 @@ import sqlite3
 import tracemalloc
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -429,17 +429,12 @@ def test_a_pusher_whose_database_was_replaced_ends(rig: Rig, centre: FakeCentre,
     assert len(centre.hellos) >= 2
 
 
-def test_a_database_that_fails_is_said_and_tried_again(
-    rig: Rig, centre: FakeCentre, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken() -> Any:
-        raise OperationalError("SELECT 1", {}, OSError("disk I/O error"))
-
+def test_a_database_that_fails_is_said_and_tried_again(rig: Rig, centre: FakeCentre, monkeypatch: pytest.MonkeyPatch):
     rig.participant("P1")
     pusher = rig.pusher(centre.handle)
     run(pusher, 5)
     with monkeypatch.context() as patch:
-        patch.setattr(rig.store, "read", broken)
+        patch.setattr(rig.store, "read", Mock(side_effect=OperationalError("SELECT 1", {}, OSError("disk I/O error"))))
         run(pusher, 120)
         assert state_of(rig).state == "database" and "disk I/O error" in state_of(rig).detail
     rig.session("P1")
