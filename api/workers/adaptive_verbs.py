@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
-from stimrig.api.workers.json_values import clean
+from stimrig.identify.json_text import json_value
 
 Progress = Callable[[float, str], None]
 NEW_PERSON_SHARE = 1 / 3
@@ -47,7 +47,7 @@ def outlook(
     opening = decide(None, (), asked)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
     found = reach(asked, NEW_PERSON_SHARE * max_torque_nm)
-    return clean({"opening_us": widths, "reach": asdict(found), "known": asked.earlier is not None})
+    return json_value({"opening_us": widths, "reach": asdict(found), "known": asked.earlier is not None})
 
 
 def warm() -> None:
@@ -88,7 +88,7 @@ def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = 
 def advise(progress: Progress, **news: Any) -> dict[str, Any]:
     """What to play after everything that is laid; see `Running.advise`."""
     progress(0.1, "deciding")
-    return clean(_running[0].advise(**news))
+    return json_value(_running[0].advise(**news))
 
 
 @dataclass(eq=False)

@@ -58,7 +58,7 @@ class Server:
     def publish(self, event: Event) -> None:
         """Send an event to all subscribers; may be called from any thread."""
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(lambda: self._send_all(*[to_line(event)] * 2))
+            self._loop.call_soon_threadsafe(lambda: self._send_all(line := to_line(event), line))
 
     async def start(self, rig: Rig, ask: Ask, path: Path) -> None:
         """Listen on `path` and on the stop socket; only this user and group may connect.

@@ -12,7 +12,7 @@ from stimrig.api.language import translated
 from stimrig.api.models import stored_model
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.api.workers.curves import curves
-from stimrig.api.workers.json_values import clean
+from stimrig.identify.json_text import json_value
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record, ramp
 
@@ -36,7 +36,7 @@ def made():
 def test_a_report_and_the_command_line_have_it(made):
     record, model = made
     document = model.to_dict()
-    page = comparison_html(document, clean(curves(model, record)), "a record")
+    page = comparison_html(document, json_value(curves(model, record)), "a record")
     assert "Of variance that repeats" in page
     assert "Between 2 repeats of the same pulses the torque differs by" in page
     assert any(line.startswith("repetition     Between 2 repeats") for line in model_report(document))
@@ -48,7 +48,7 @@ def test_a_model_of_an_older_version_has_none(made):
     del document["fit"]["repetition"]
     assert stored_model.repetition(document)["sentences"] == []
     assert repetition_lines(document["fit"]) == []
-    assert "not known" in comparison_html(document, clean(curves(model, record)), "a record")
+    assert "not known" in comparison_html(document, json_value(curves(model, record)), "a record")
 
 
 def test_every_sentence_is_translated():

@@ -1,5 +1,0 @@
-"""Values as JSON holds them."""
-
-from stimrig.identify.json_text import json_value as clean
-
-__all__ = ["clean"]
