@@ -33,7 +33,7 @@ class Watch(BaseModel):
 
     stale_torque_s: float = Field(0.1, gt=0, le=0.5)
     missing_ack_s: float = Field(0.1, gt=0, le=0.5)
-    late_pulse_periods: float = Field(0.2, gt=0, le=0.6)
+    late_pulse_periods: float = Field(0.15, gt=0, le=0.6)
     stuck_torque_s: float = Field(0.5, gt=0.05, le=10)
     clipped_torque_s: float = Field(3.0, gt=0.05, le=10)
     stale_disk_s: float = Field(3.0, gt=0.5, le=10)

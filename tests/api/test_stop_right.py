@@ -58,6 +58,11 @@ def press(service: Service, right: str, **more: Any) -> httpx.Response:
         return browser.post("/v1/stop", data={"right": right, "reason": "stop pressed on the page"})
 
 
+def stops_noted(client: httpx.Client) -> list[dict[str, Any]]:
+    """The stops in the audit trail."""
+    return [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "stop"]
+
+
 def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) -> None:
     csrf = csrf_of(browser)
     assert browser.post("/sign-out", data={"csrf": csrf}).status_code == 303
@@ -137,8 +142,7 @@ def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
     answer = press(service, right, cookies=dict(browser.cookies))
     assert answer.status_code == 200 and CONFIRMED in answer.text
     assert service.rig.stopped_by == "Ada"
-    stops = lambda: [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "stop"]  # noqa: E731
-    (entry,) = soon(stops)  # it may come after the answer
+    (entry,) = soon(lambda: stops_noted(client))  # it may come after the answer
     assert (entry["who"], entry["subject"]) == ("Ada", test_id)
 
 

@@ -250,7 +250,7 @@ def check_clock(_settings: Settings) -> Iterator[Finding]:
         late_ms.append(1000 * (time.perf_counter() - began) - 2)
     worst_ms = sorted(late_ms)[-3]
     fix = "end other programs on this machine; give the rig real-time priority"
-    says = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 5 ms)"
+    says = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 3.75 ms)"
     yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, fix)
 
 
