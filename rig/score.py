@@ -22,7 +22,7 @@ from stimrig.rig import plan
 from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.limits import Limit, refuse, tightened
-from stimrig.rig.messages import AHEAD, Extended, LaidSegment, SegmentPlan
+from stimrig.rig.messages import AHEAD, Extended, SegmentPlan
 from stimrig.rig.plan import Piece, PlannedTest
 from stimrig.rig.tasks import Tasks
 
@@ -100,13 +100,6 @@ class Score:
         """Name of the segment at a time on the test's clock, None outside."""
         index = int(np.floor(time_s * self.plan.pulse_rate_hz + 1e-9))
         return next((s.name for s in self.laid.segments if s.start <= index < s.end), None)
-
-    def segments(self) -> list[LaidSegment]:
-        rate_hz = self.plan.pulse_rate_hz
-        return [
-            LaidSegment(name=s.name, start_s=s.start / rate_hz, end_s=s.end / rate_hz, by=s.by)
-            for s in self.laid.segments
-        ]
 
     def pulse(self, index: int, torque_time_nms: float) -> float | None:
         """Width of the next pulse, µs; None after the last. Only the sender asks, in order.

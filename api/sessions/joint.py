@@ -229,7 +229,7 @@ class JointWatcher(Watcher):
             if not (width_us > 0.0):
                 self._since_s = None
             else:
-                self._since_s, self._last_s = self._since_s or at_s, at_s
+                self._since_s, self._last_s = at_s if self._since_s is None else self._since_s, at_s
         for row in event.angle or []:
             self._take(row)
         if told.state == "watching" and told.coverage.enough and not event.ended_by:

@@ -249,7 +249,8 @@ def sample_times(host_time_s: list[float], counter: list[int]) -> Any:
         number = np.arange(host.size, dtype=float)
     number -= number[0]
     hull: list[Any] = []
-    for point in np.column_stack([number, host])[np.r_[np.diff(host) > 0, True]]:  # the last of those that came at once
+    latest = np.r_[np.diff(host) > 0, True]  # of those that came at once
+    for point in np.column_stack([number, host])[latest].tolist():
         while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
             hull.pop()
         hull.append(point)

@@ -105,10 +105,10 @@ class Server:
         while True:
             await asyncio.sleep(LIVE_PERIOD_S)
             taken = self.rig.take_live(samples=any(self._subscribers.values()))
-            if taken is not None and self._subscribers:
-                self._send_all(*await self._live_lines.make(taken), live=True)
+            if taken is not None and self._subscribers and (lines := await self._live_lines.make(taken)):
+                self._send_all(*lines, live=True)
 
-    def _send_all(self, full: bytes = b"", plain: bytes = b"", live: bool = False) -> None:
+    def _send_all(self, full: bytes, plain: bytes, live: bool = False) -> None:
         for writer, samples in tuple(self._subscribers.items()):
             if writer.transport.is_closing():  # it left while its subscription was still being answered
                 self._subscribers.pop(writer, None)

@@ -35,7 +35,7 @@ class Taken(NamedTuple):
     fields
         Of the event, as they are.
     blocks, angles
-        Of torque and of angles, as they came.
+        Of torque and of angles, as they came; None: the rig has no angle sensor.
     done
         Pulses of which it is known what became of them.
     segments, pulse_rate_hz
@@ -46,7 +46,7 @@ class Taken(NamedTuple):
     origin_s: float
     samples: bool
     blocks: list[NDArray[Any]]
-    angles: list[NDArray[Any]]
+    angles: list[NDArray[Any]] | None
     done: list[Done]
     segments: tuple[tuple[Any, ...], ...] = ()
     pulse_rate_hz: float = 1.0
@@ -60,7 +60,7 @@ def take(
     Parameters
     ----------
     run
-        The test in progress; None when idle.
+        The test in progress; None when idle, and as long as its clock does not run.
     origin_s
         Rig time that counts as zero: the test's start, or the rig's when idle.
     samples
@@ -73,11 +73,11 @@ def take(
         return None
     fields = {"torque_age_s": max(0.0, receiver.age_s(now_s)), "lost_samples": receiver.counts.lost_samples}
     if angle is not None:
-        fields |= {"angle_rad": finite(angle.angle_rad), "velocity_rad_s": finite(angle.velocity_rad_s), "angle": []}
-    angles = [] if angle is None else _emptied(angle.live)
+        fields |= {"angle_rad": finite(angle.angle_rad), "velocity_rad_s": finite(angle.velocity_rad_s)}
+    angles = None if angle is None else _emptied(angle.live)
     if run is None:
         return Taken({**fields, **IDLE}, origin_s, samples, blocks, angles, [])
-    done = run.gate.done[run.told_pulses :] if run.pauses else []  # before its arming they are of the last test
+    done = run.gate.done[run.told_pulses :]
     run.told_pulses += len(done)
     segments = run.score.laid.segments if run.score.adaptive else ()  # they hold every pulse before
     return Taken({**fields, **_of_run(run)}, origin_s, samples, blocks, angles, done, segments, run.plan.pulse_rate_hz)
@@ -112,11 +112,8 @@ def live_event(taken: Taken) -> LiveEvent:
     found, rate_hz = np.concatenate(taken.blocks), taken.pulse_rate_hz
     bins = np.floor((found["host_time_s"] - taken.origin_s) / BIN_S)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(bins) > 0) + 1])
-    fields = dict(taken.fields)
-    if "angle" in fields:
-        fields["angle"] = _rows(taken) if taken.samples else None
     return LiveEvent(
-        **fields,
+        **taken.fields,
         time_s=np.round(bins[starts] * BIN_S, 4).tolist(),
         torque_min_nm=_finite(np.fmin.reduceat(found["torque_nm"], starts)),
         torque_max_nm=_finite(np.fmax.reduceat(found["torque_nm"], starts)),
@@ -128,6 +125,7 @@ def live_event(taken: Taken) -> LiveEvent:
         ],
         samples=_samples(found, taken.origin_s) if taken.samples else None,
         outcomes=_outcomes(taken.done, taken.origin_s) if taken.samples else None,
+        angle=_rows(taken.angles, taken.origin_s) if taken.samples and taken.angles is not None else None,
     )
 
 
@@ -178,11 +176,11 @@ def _outcomes(done: list[Done], origin_s: float) -> PulseOutcomes:
     )
 
 
-def _rows(taken: Taken) -> list[list[float | None]]:
+def _rows(angles: list[NDArray[Any]], origin_s: float) -> list[list[float | None]]:
     """Every angle since the last event."""
     rows: list[list[float | None]] = []
-    for block in taken.angles:
-        moved = (block - [taken.origin_s, 0.0, 0.0]).round(6).tolist()
+    for block in angles:
+        moved = (block - [origin_s, 0.0, 0.0]).round(6).tolist()
         rows += [[row[0], finite(row[1]), finite(row[2])] for row in moved]
     return rows
 

@@ -14,7 +14,7 @@ from stimrig.rig.config import RigConfig
 from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibrating import Calibrations
 from stimrig.rig.control.calibration import check_profile, check_range
-from stimrig.rig.control.live import Taken, finite, live_event, take
+from stimrig.rig.control.live import Taken, finite, take
 from stimrig.rig.control.memory import LatchFile, Rest, Result
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
@@ -27,7 +27,6 @@ from stimrig.rig.messages import (
     PASSIVE,
     Event,
     FinishedEvent,
-    LiveEvent,
     Reply,
     Sequences,
     StateEvent,
@@ -120,11 +119,6 @@ class Rig:
             return "the torque receiver has ended"
         return None
 
-    def live(self, samples: bool = False) -> LiveEvent | None:
-        """`take_live`, made an event here."""
-        taken = self.take_live(samples)
-        return None if taken is None else live_event(taken)
-
     def take_live(self, samples: bool = False) -> Taken | None:
         """Torque and pulses since the last call, every sample if asked for; None if there is no new torque.
 
@@ -133,9 +127,9 @@ class Rig:
         run, receiver, now_s = self.player.run, self.pair.receiver, self._clock.now_s()
         if receiver is None:
             return None
-        origin_s = run.t0_s if run and run.t0_s is not None else self._born_s
-        on_its_clock = run is None or run.t0_s is not None  # before a test's clock runs, samples have no time on it
-        return take(receiver, run, origin_s, now_s, samples and on_its_clock, self.pair.angle)
+        if run is None or run.t0_s is None:  # until a test's clock runs nothing has a time on it
+            return take(receiver, None, self._born_s, now_s, samples, self.pair.angle)
+        return take(receiver, run, run.t0_s, now_s, samples, self.pair.angle)
 
     async def open(self) -> None:
         """Seal what a crash left, then connect; a missing device is reported in the status, not raised.

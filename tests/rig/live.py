@@ -12,10 +12,21 @@ import pytest
 
 from stimrig.rig import config
 from stimrig.rig.control import pair
+from stimrig.rig.control.live import live_event
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Disk
-from stimrig.rig.messages import Direction, Event, FinishedEvent, Profile, Status, StopEvidence, TestPlan, Threshold
+from stimrig.rig.messages import (
+    Direction,
+    Event,
+    FinishedEvent,
+    LiveEvent,
+    Profile,
+    Status,
+    StopEvidence,
+    TestPlan,
+    Threshold,
+)
 from stimrig.rig.requests import CalibrateMarkRequest, CalibrateStepRequest
 from stimrig.rig.signals import Block
 from stimrig.rig.tasks import Outcome, Task, Tasks
@@ -221,6 +232,11 @@ class LiveRig:
         """Until the rig is in one of the states; gives the reason."""
         self.until(lambda: self.states[-1] in states)
         return self.rig.status().reason
+
+    def event(self, samples: bool = False) -> LiveEvent | None:
+        """The live event of what is new, made here and not in a process beside."""
+        taken = self.rig.take_live(samples)
+        return None if taken is None else live_event(taken)
 
     def wait_pulses(self, n: int) -> None:
         """Until so many more pulses were sent."""

@@ -63,7 +63,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     live.wait("running")
     live.wait_pulses(5)
     assert extend(live, 44).laid == 68
-    event = live.rig.live(samples=True)
+    event = live.event(samples=True)
     assert event is not None and event.samples is not None and event.pulse_time_s
     assert (event.laid, event.boundary_s, event.duration_s) == (68, 1.7, 60.0)
     assert [(s.name, s.by) for s in event.laid_segments] == [("rest", "plan"), *[("added", "extension")] * 2]
@@ -75,7 +75,7 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: M
     assert all(a < b for a, b in zip(told.written_time_s, told.acknowledged_time_s, strict=True) if a and b)
     assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event, "read as it was sent"
     live.machine.wait(0.1)
-    plain = live.rig.live()
+    plain = live.event()
     assert plain is not None
     assert (plain.outcomes, plain.samples) == (None, None), "only who chooses pieces needs them"
     assert live.rig.status().duration_s == 60.0
@@ -149,3 +149,23 @@ def test_the_day_must_last_as_long_as_the_bound(make: Make):
     with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
         previewed(PreviewRequest(plan=late), live.rig.table, midnight_s - 10.0, live.clock.speed)
     assert live.start(plan(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
+
+
+def test_until_a_tests_clock_runs_nothing_is_told_of_it(make: Make):
+    """Its samples have no time on it yet, and the gate still holds what became of the last test's pulses."""
+    live = make()
+    live.play("before", hold_s=0.5)
+    live.start(live.plan("one", hold_s=2.0))
+    told = []
+    while not told or told[-1].test_id is None:
+        live.machine.wait(0.002)
+        told += [event for event in [live.event(samples=True)] if event is not None]
+        assert live.clock.now_s() < 1e5
+    assert {event.test_id for event in told[:-1]} <= {None}
+    assert all(event.outcomes is None or event.outcomes.index == [] for event in told[:-1])
+    live.wait_pulses(20)
+    live.machine.wait(0.3)
+    rest = live.event(samples=True)
+    outcomes = [event.outcomes for event in (told[-1], rest) if event is not None and event.outcomes is not None]
+    index = [number for one in outcomes for number in one.index]
+    assert index == list(range(len(index))) and len(index) >= 20, "each of its own pulses, once"

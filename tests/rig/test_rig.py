@@ -30,7 +30,7 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
     status = live.rig.status()
     assert (status.test_id, status.participant, status.duration_s) == ("one", "P", 3.0)
     assert status.limits["current_ma"].hi == 100 and status.require_calibration is not None
-    assert live.rig.live() is not None
+    assert live.event() is not None
     assert live.rig.trouble() is None
     live.wait("ready")
     assert live.states == ["ready", "arming", "running", "sealing", "ready"]

@@ -19,7 +19,7 @@ from stimrig.rig.adapters import builders
 from stimrig.rig.adapters.builders import Previews
 from stimrig.rig.adapters.server import LONG_LINE_BYTES, Server
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
-from stimrig.rig.control.replies import internal_error
+from stimrig.rig.control.replies import internal_error, to_line
 from stimrig.rig.errors import BusyError
 from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.messages import Reply, StateEvent, Status, StopEvidence
@@ -56,7 +56,7 @@ def test_who_left_before_the_answer_is_told_nothing_more(tmp_path: Path, leaves:
             asked[1].set_result(READY)
             while server._tasks or (leaves and not all(w.transport.is_closing() for w in server._subscribers)):
                 await asyncio.sleep(0)
-            server._send_all(StateEvent(status=READY))
+            server._send_all(line := to_line(StateEvent(status=READY)), line)
             found = len(server._subscribers)
             writer.close()
             return found
