@@ -11,30 +11,16 @@ from typing import NamedTuple
 
 
 class Decision(NamedTuple):
-    """A request that decides.
+    """A request that decides."""
 
-    Attributes
-    ----------
-    method : str
-        Of the REST route; a page's form is posted.
-    path : str
-        Of the REST route, with names in braces; empty where only a page has it.
-    document : str
-        Whose version is sent.
-    form : str
-        Address that the page's form is posted to; empty where there is none.
-    field : str
-        The form's field with the version.
-    needed : bool
-        False: who sends none decides on what is there now, since it can only take away, or bring back what was before.
-    """
-
-    method: str
-    path: str
-    document: str
-    form: str = ""
-    field: str = "seen"
+    method: str  # of the REST route; a page's form is posted
+    path: str  # of the REST route, with names in braces; empty where only a page has it
+    document: str  # whose version is sent
+    form: str = ""  # address that the page's form is posted to; empty where there is none
+    field: str = "seen"  # the form's field with the version
     needed: bool = True
+    """False: who sends none decides on what is there now, since it can only take away, or bring back what was
+    before."""
 
 
 PERSON, OF_MODEL, OF_PERSON = "/v1/participants/{code}", "/models/{model_id}", "/participants/{code}"
@@ -49,8 +35,7 @@ DECISIONS = (
     Decision("POST", f"/v1{OF_MODEL}/reject", f"/v1{OF_MODEL}", f"{OF_MODEL}/reject", needed=False),
     *(Decision("PUT", f"{PERSON}/{word}", PERSON, f"{OF_PERSON}/{word}") for word in ("profile", "muscle")),
     *(Decision("POST", f"{PERSON}/{word}", PERSON, f"{OF_PERSON}/{word}")
-      for word in ("archive", "unarchive", "recordings", "calibration")),
-    Decision("POST", "", PERSON, f"{OF_PERSON}/keys"),
+      for word in ("archive", "unarchive", "recordings", "calibration", "keys")),
     Decision("POST", "/v1/tests", PERSON, f"{OF_PERSON}/tests"),
     *(Decision("POST", f"{CALIBRATION}/{path}", CALIBRATION, f"{OF_PERSON}/calibration/{form}", "calibration")
       for path, form in (("step", "step/{direction}"), ("mark", "mark/{threshold}"), ("finish", "finish"))),

@@ -60,13 +60,8 @@ def within(effect: str) -> str:
 
 
 def effects_words(effects: Iterable[str]) -> str:
-    """Titles, one after the other; each effect may have its form (`fatigue:fitness`)."""
-    return ", ".join(_form_words(effect) for effect in effects)
-
-
-def _form_words(effect: str) -> str:
-    identity, _colon, form = effect.partition(":")
-    return f"{within(identity)} ({form.replace('_', ' ')})" if form else within(identity)
+    """Titles, one after the other; of an effect's form (`fatigue:fitness`) people are told nothing."""
+    return ", ".join(within(effect.partition(":")[0]) for effect in effects)
 
 
 def without_unit(parameter: str) -> str:

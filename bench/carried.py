@@ -20,7 +20,7 @@ from typing import Any
 from bench.common import in_processes, keep, parser, table
 from stimrig import identify
 from stimrig.hardware_sim.hidden.scenario import Scenario
-from stimrig.identify.caution import caution
+from stimrig.identify.conclusion import caution
 from stimrig.identify.diagnosis import side_by_side
 from tests.harness.carried_sessions import SESSIONS, muscle, session
 

@@ -1,7 +1,8 @@
-"""`python -m bench.clinician_day`: clicks and seconds from arriving to an approved model, and where things stand.
+"""`python -m bench.clinician_day`: clicks and seconds from signing in to an approved model, and where things stand.
 
 `stimrig serve` with the emulated rig at the speed of the world, Debian's chromium, a person who reads nothing. A click
-is a press of a button, a link or a key; a field that is typed into counts as one. The person is signed in. Four days:
+is a press of a button, a link or a key; a field that is typed into counts as one. `calibration_keys` are the trains,
+marks and the end of a calibration: as many as the person's answers need; `clicks_without_them` are the rest. Four days:
 a new and a known participant, without an effect (patient `paper`) and with one (`--hidden` of `EFFECT_SEED`). On the
 second day of the participant with an effect the structure of the first day carries over.
 """
@@ -41,7 +42,7 @@ class Day:
     @contextmanager
     def doing(self, part: str) -> Iterator[None]:
         """A part of the day."""
-        self.part, begun_s = part, time.monotonic()
+        self.part, begun_s = part, time.monotonic()  # a calibration's keys are counted apart
         self.clicks.setdefault(part, 0)
         yield
         self.seconds[part] = round(self.seconds.get(part, 0.0) + time.monotonic() - begun_s, 1)
@@ -49,30 +50,42 @@ class Day:
     def click(self, target: Locator) -> None:
         """Press it once it is there."""
         target.click(timeout=LONG_MS)
-        self.clicks[self.part] += 1
+        self.clicks[self.part] = self.clicks.get(self.part, 0) + 1
 
     def key(self, name: str) -> None:
         """Press a key."""
         self.page.keyboard.press(name)
-        self.clicks[self.part] += 1
+        self.clicks[self.part] = self.clicks.get(self.part, 0) + 1
 
     def type(self, label: str, text: str) -> None:
         """Type into a field."""
         self.page.get_by_label(label, exact=True).first.fill(text)
-        self.clicks[self.part] += 1
+        self.clicks[self.part] = self.clicks.get(self.part, 0) + 1
 
     def document(self) -> dict[str, Any]:
         """Counts and times; the time in which the test plays is apart."""
         waited = self.seconds.get("test plays", 0.0)
-        total = {"clicks": sum(self.clicks.values()), "seconds": round(sum(self.seconds.values()), 1)}
+        keys, clicks = self.clicks.get("calibration keys", 0), sum(self.clicks.values())
+        total = {
+            "clicks": clicks,
+            "calibration_keys": keys,
+            "clicks_without_them": clicks - keys,
+            "seconds": round(sum(self.seconds.values()), 1),
+        }
         return {**total, "seconds_without_the_test": round(total["seconds"] - waited, 1),
-                "by_part": {part: [self.clicks[part], self.seconds[part]] for part in self.clicks}}  # fmt: skip
+                "by_part": {part: [self.clicks[part], self.seconds.get(part)] for part in self.clicks}}  # fmt: skip
 
 
 def live(day: Day, url: str, code: str, new: bool) -> dict[str, Any]:
-    """From the list of participants to an approved model."""
+    """From the door to an approved model."""
     page = day.page
+    page.context.clear_cookies()
     page.goto(f"{url}/")
+    with day.doing("sign in"):
+        day.type("Name", "Ada")
+        day.type("Password", PASSWORD)
+        day.click(page.get_by_role("button", name="Sign in", exact=True))
+        page.get_by_role("heading", name="Participants").wait_for()
     with day.doing("open"):
         if new:
             day.type("Code", code)
@@ -110,10 +123,11 @@ def live(day: Day, url: str, code: str, new: bool) -> dict[str, Any]:
 def calibrate(day: Day, code: str, answers: dict[str, float]) -> int:
     """By keys, answers at once, from the participant's page; how many trains it took."""
     page = day.page
-    if not (begin := page.locator(".next a", has_text="alibrat")).count():
-        begin = page.get_by_role("link", name="Calibrate", exact=True)
-    day.click(begin.first)
-    day.click(page.get_by_role("button", name="Begin the calibration"))
+    if not (begin := page.locator(".next button", has_text="Begin the calibration")).count():  # it holds for today
+        day.click(page.get_by_role("link", name="Calibrate", exact=True))
+        begin = page.get_by_role("button", name="Begin the calibration")
+    day.click(begin)
+    day.part = "calibration keys"
     trains = 0
     for number, wanted_us in enumerate(answers.values(), start=1):
         while True:

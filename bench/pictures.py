@@ -22,7 +22,7 @@ from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.fitting import fit
 from stimrig.identify.records.join import write_joined
-from tests.api.browser import CHROMIUM, PASSWORD
+from tests.api.browser import CHROMIUM, PASSWORD, chart
 
 IMAGES = ROOT / "docs" / "img"
 WIDTH, HEIGHT, MARGIN, COLOURS = 1366, 768, 14, 128
@@ -84,11 +84,11 @@ def photograph(page: Page, url: str, model: str) -> None:
     """The model's first screen, then the missing effect and where the error sits."""
     page.goto(f"{url}/models/{model}")
     page.wait_for_selector(".why-head")
-    page.wait_for_selector("#torque .js-plotly-plot .main-svg")
+    chart(page, "overview")
     page.wait_for_timeout(1500)
     keep("page", page.screenshot())
     page.evaluate("for (const name of ['.effect', '#error']) document.querySelector(name).open = true")
-    page.wait_for_selector("#error .js-plotly-plot .main-svg")
+    chart(page, "residual")
     page.wait_for_timeout(1500)
     keep("why", cut(page, ".effect", "#error"))
 
@@ -98,7 +98,7 @@ def photograph_joint(page: Page, url: str, model: str) -> None:
     page.goto(f"{url}/models/{model}")
     page.evaluate("document.querySelector('#joint').open = true")
     for name in ("joint_g", "joint_h"):
-        page.wait_for_selector(f"[data-figure={name}] .main-svg")
+        chart(page, name)
     page.wait_for_timeout(1500)
     keep("joint", cut(page, "#joint", "#joint"))
 

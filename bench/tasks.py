@@ -113,7 +113,7 @@ def emulated(effect: str | None, seed: int) -> Task:
     return Task(effect or "nothing hidden", as_record(made), scale=made["truth"]["noise"]["sd_nm"])
 
 
-def thinned(made: dict[str, Any]) -> dict[str, Any]:
+def rounded(made: dict[str, Any]) -> dict[str, Any]:
     """One sample a pulse of a generated record."""
     each = round((len(made["time_s"]) - 1) / float(made["time_s"][-1] - made["time_s"][0]) / RATE_HZ)
     rows = {name: made[name][::each] for name in ("time_s", "pulse_width_us", "torque_nm", "segment")}
@@ -122,13 +122,13 @@ def thinned(made: dict[str, Any]) -> dict[str, Any]:
 
 def of_physics(seed: int) -> Task:
     """A muscle of other physics, with white noise alone."""
-    made = thinned(record_of_physics("physics", seed, disturbed=()))
+    made = rounded(record_of_physics("physics", seed, disturbed=()))
     return Task(f"physics: {made['truth']['kind']}", as_record(made), scale=made["truth"]["noise_sd_nm"])
 
 
 def of_bouts(seed: int) -> Task:
     """A record as arms give them: its last ramp, in errors of the mean of the other ramps."""
-    made = thinned(record_of_bouts(seed))
+    made = rounded(record_of_bouts(seed))
     rows, repetition = repeated(made)
     off = float(np.sqrt(np.mean((made["torque_nm"][rows] - repetition) ** 2)))
     return Task("as of an arm", as_record(made), unit="× repetition", scale=off)

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from stimrig.identify.diagnosis import diagnose as diagnose
     from stimrig.identify.diagnosis import next_experiment as next_experiment
     from stimrig.identify.diagnosis.carrying import carry as carry
+    from stimrig.identify.diagnosis.improvement import diagnose_and_improve as diagnose_and_improve
+    from stimrig.identify.diagnosis.improvement import explain as explain
     from stimrig.identify.diagnosis.improvement import improve as improve
     from stimrig.identify.errors import BadModel as BadModel
     from stimrig.identify.errors import BadRecord as BadRecord
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from stimrig.identify.results import Carried as Carried
     from stimrig.identify.results import Comparison as Comparison
     from stimrig.identify.results import Diagnosis as Diagnosis
+    from stimrig.identify.results import Explanation as Explanation
     from stimrig.identify.results import Improvement as Improvement
     from stimrig.identify.simulation.predict import predict as predict
 
@@ -37,14 +40,14 @@ _PLACES = {
         "criticism": ("compare",),
         "diagnosis": ("diagnose", "next_experiment"),
         "diagnosis.carrying": ("carry",),
-        "diagnosis.improvement": ("improve",),
+        "diagnosis.improvement": ("diagnose_and_improve", "explain", "improve"),
         "errors": ("BadModel", "BadRecord", "BadRequest", "Cancelled", "IdentifyError", "NotIdentifiable"),
         "experiments": ("Experiment",),
         "fitting": ("fit",),
         "model": ("Model",),
         "records": ("read",),
         "records.record": ("Record",),
-        "results": ("Carried", "Comparison", "Diagnosis", "Improvement"),
+        "results": ("Carried", "Comparison", "Diagnosis", "Explanation", "Improvement"),
         "simulation.predict": ("predict",),
     }.items()
     for name in names

@@ -133,7 +133,7 @@ def _fit_effects(
     steps = count(1)
 
     def tell(effect: str) -> None:
-        progress(min(next(steps), len(wanted)) / (len(wanted) + 2), f"fitting {effect.replace('_', ' ')}")
+        progress(min(next(steps), len(wanted)) / (len(wanted) + 2), f"fitting {find_effect(effect).name.lower()}")
 
     base = add_effects(base, wanted, raw, tell)
     if "knots" not in options and (renewed := renewed_curve(base)) is not base:

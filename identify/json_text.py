@@ -38,19 +38,8 @@ class NotJson(BadJson):
 def parse(text: str | bytes, *, deepest: int = DEEPEST, finite: bool = True) -> Any:
     """Parse a JSON text.
 
-    Parameters
-    ----------
-    text : str or bytes
-        Bytes are UTF-8.
-    deepest : int
-        Largest number of brackets within one another.
-    finite : bool
-        Whether NaN, Infinity and numbers too large for a float are refused.
-
-    Raises
-    ------
-    BadJson
-        With the line, where it is known.
+    `text`: bytes are UTF-8; `deepest`: largest number of brackets within one another; `finite`: whether NaN, Infinity
+    and numbers too large for a float are refused. Raises BadJson: with the line, where it is known.
     """
     if isinstance(text, bytes):
         try:

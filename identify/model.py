@@ -169,7 +169,7 @@ class Model(Summarised):
         if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
             message = f"schema version {version or 'missing'}, this software reads {SCHEMA_VERSION}"
             raise BadModel(message, place="schema_version", fix="Fit the record again with this version.")
-        model_schema.MODEL(data, "")
+        model_schema.check_model(data)
         try:
             model = _from_dict(data)
             with np.errstate(all="ignore"):
@@ -295,9 +295,9 @@ def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
         if effect.band or form.fixed:  # estimated outside the fit, without bounds
             lower, upper = 1e-6 if p.scale == "log" else -model_schema.PLAUSIBLE, model_schema.PLAUSIBLE
         slack = 1e-6 * (upper - lower) if np.isfinite(upper - lower) else 0.0
-        wanted[p.name] = model_schema.number(lower - slack, upper + slack)
+        wanted[p.name] = {"type": "number", "minimum": lower - slack, "maximum": upper + slack}
     given = {name: model_schema.parameter_value(value) for name, value in entry["parameters"].items()}
-    model_schema.fields(wanted)(given, place)
+    model_schema.check(given, {"type": "object", "properties": wanted, "x-needed": list(wanted)}, place)
 
 
 def _covariance(data: dict[str, Any] | None) -> Covariance | None:

@@ -250,10 +250,7 @@ STEPS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0), (1.0, -1.
 def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
     """The most likely correlation and slow share of a residual, by a pattern search from the given start.
 
-    Returns
-    -------
-    ar1, share, sd, log_likelihood : float
-        `sd` is the total standard deviation, slow and white together.
+    ar1, share, sd and log_likelihood; `sd` is the total standard deviation, slow and white together.
     """
     total = np.sum(stop - start)
     # a = log(1 - ar1), from log(SHORTEST) (long memory) to 0 (none).

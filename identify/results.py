@@ -7,21 +7,27 @@ Rows of tables are dicts with the keys of the schema. `to_dict()` gives JSON val
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from stimrig.identify.caution import caution
+from stimrig.identify.conclusion import Conclusion, conclude, why_ended
+from stimrig.identify.healing import healed_places, place_words
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
-from stimrig.identify.summary import Sheet, Summarised, both_words, estimate, fit_words, probability, quantity, torque
+from stimrig.identify.summary import (
+    Sheet,
+    Summarised,
+    both_words,
+    certainty,
+    estimate,
+    fit_words,
+    probability,
+    quantity,
+    torque,
+)
 from stimrig.identify.yardstick import repetition_words
 
 Row = Mapping[str, Any]
-VERDICTS = {
-    "effect_missing": "an effect is missing",
-    "nothing_missing": "nothing is missing",
-    "unexplained_structure": "an error is left that no effect in the library explains",
-}
 CORRELATED_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
 MOST_PARAMETERS = 3
 """Parameters of an effect that a summary shows."""
@@ -63,7 +69,7 @@ class Comparison(Result):
     """Worst places first: `segment`, `start_s`, `end_s`, `pulse_width_us`, `direction`, `share_of_excess`,
     `mean_error_nm`, `text`."""
     series: Row
-    """Values for plots, at most 4000 points: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`,
+    """Values for plots, at most 2400 points: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`,
     `residual_nm`, `pulse_width_us`, `segment`, `noise_band_nm`."""
     left_out: str  # how much was not counted, and why; empty if everything was counted
     plain: tuple[str, ...]  # sentences for people
@@ -74,8 +80,8 @@ class Comparison(Result):
         ]
         rows = [
             ("all rows", _figures(vars(self))),
-            ("fitted rows", _figures(self.fitted)),
-            ("held out", "no rows of `validate`" if self.held_out is None else _figures(self.held_out)),
+            ("fitted pulses", _figures(self.fitted)),
+            ("held out", "no part `validate`" if self.held_out is None else _figures(self.held_out)),
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
             ("repetition", repetition_words(vars(self))),
             ("residual", f"not noise: correlated with {', '.join(alarms)}" if alarms else "looks like noise"),
@@ -95,7 +101,7 @@ class Diagnosis(Result):
     base: Row
     """The model of the examined structure: `fit_percent`, `rms_nm`, `ceiling_percent`, the same with `held_out_`, and
     `held_out_by`, which says how the held-out values were found."""
-    verdict: str  # a key of `VERDICTS`
+    verdict: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
     probability: float  # of the verdict, 0 to 1
     missing: tuple[Row, ...]
     """Effects, most probable first: `effect`, `name`, `probability`, errors before and after, `confused_with`,
@@ -105,20 +111,31 @@ class Diagnosis(Result):
     """Free effects, which describe what no effect of the library explains: `effect`, `name`, `form`, `equation`,
     `parameters`, `enters`, `driven_by`, `words`, `left_out`, and the picture: `driver`, `at`, `axis`, `lines`, each
     with `value`, `lower` and `upper`."""
+    add: tuple[str, ...]  # what `improve` adds, in its order: effects of the library, then free ones
     deciding_experiment: Row | None
     """Where structure is left, the test that teaches most about it: as `next_experiment_plan`, with `expected_fall`,
     the share by which the model's own standard error should fall; else None."""
     where: tuple[Row, ...]  # where the error is, as in `Comparison`
     with_all: Row  # the model with all of `missing`: the keys of `base`, and `noise_sd_nm`
+    residual_check: bool | None  # whether the model's residual passes as in its `quality`; None if anything is named
     explained: float  # share, 0 to 1, of the explainable log-likelihood that the effects explain
     structure_left: float  # log-likelihood by which the residuals at work and at rest still differ
     unseen: Row | None
-    """Error of the last model on held-out rows, `rms_nm`, and the error that noise and its uncertainty allow,
-    `allowed_nm`, both of means over pulse intervals; None if there are too few held-out rows."""
+    """Error of the last model on held-out pulses, `rms_nm`, and the error that noise and its uncertainty allow,
+    `allowed_nm`, both of means over pulse intervals; None if there are too few held-out pulses."""
     candidates: tuple[Sequence[Row], ...]
     """Effects tried in each round, best first: `effect`, `form`, `log_evidence_gain`, `rms_nm`, `forms`."""
     notes: tuple[str, ...]  # further reasons for the verdict
     plain: tuple[str, ...]  # sentences for people
+
+    @property
+    def conclusion(self) -> Conclusion:
+        """The verdict and the advice in words."""
+        return conclude(vars(self))
+
+    def to_dict(self) -> dict[str, Any]:
+        """All fields, and `conclusion`."""
+        return super().to_dict() | {"conclusion": asdict(self.conclusion)}
 
     def _sheet(self) -> Sheet:
         slow = quantity(self.slow_noise.get("sd_nm"), "N·m")
@@ -134,13 +151,14 @@ class Diagnosis(Result):
         told = [row for row in self.missing if row["confused_with"]]
         rows += [("next test", row["next_experiment"]) for row in told[:1]]
         rows += [("next test", str(self.deciding_experiment["text"]))] if self.deciding_experiment else []
+        said = self.conclusion
         # If nothing is missing, the places of the largest noise do not matter.
-        places = () if self.verdict == "nothing_missing" else self.where[:FEW]
+        places = () if said.kind == "nothing" else self.where[:FEW]
         rows += _listed("error in", [row["text"] for row in places])
-        rows += [("note", text) for text in (*self.notes, caution(vars(self))) if text]
-        verdict = VERDICTS.get(self.verdict, self.verdict)
-        named = "".join(f", {row['effect']}" for row in self.missing)
-        return Sheet(f"Diagnosis: {verdict}{named} (probability {probability(self.probability)})", tuple(rows))
+        rows += [("note", text) for text in self.notes] + [("", said.words), ("next", said.advice)]
+        named = ", ".join(str(row["effect"]) for row in self.missing)
+        title = f"{said.title}: {named}" if named else said.title
+        return Sheet(f"Diagnosis: {title}{certainty(vars(self))}", tuple(rows))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -163,14 +181,52 @@ class Improvement(Result):
         rows += [
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
             ("repetition", repetition_words(self.steps[-1])),
-            ("at first", VERDICTS.get(self.verdict, self.verdict)),
         ]
         rows += _listed("refused", [f"{row['effect']}: {row['reason']}" for row in self.refused[:FEW]])
         if len(self.refused) > FEW:
             rows.append(("", f"and {len(self.refused) - FEW} more effects"))
         added = ", ".join(str(step["added"]) for step in self.steps[1:]) or "no effect"
         before, after = (torque(step, "held_out_rms_nm") for step in (self.steps[0], self.steps[-1]))
-        return Sheet(f"Improvement: {added} added, held-out rms from {before} to {after}", tuple(rows))
+        return Sheet(f"Improvement: {added} added, held-out error from {before} to {after}", tuple(rows))
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Explanation(Result):
+    """Where a model fails, what is missing, how the error falls with it, and why that ends."""
+
+    diagnosis: Diagnosis  # of the first model
+    improvement: Improvement
+    left: Diagnosis  # of the last model
+    before: Comparison  # of the first model with the record
+    after: Comparison  # of the last model
+
+    def to_dict(self) -> dict[str, Any]:
+        """The keys of `explain --json`: no models, and no series for plots."""
+        improvement = self.improvement.to_dict()
+        del improvement["models"]
+        before, after = self.before.to_dict(), self.after.to_dict()
+        places = healed_places(before, after)
+        for comparison in (before, after):
+            del comparison["series"]
+        return {
+            "diagnosis": self.diagnosis.to_dict(),
+            "improvement": improvement,
+            "left": self.left.to_dict(),
+            "ended": why_ended(vars(self.left)),
+            "places": places,
+            "before": before,
+            "after": after,
+        }
+
+    def _sheet(self) -> Sheet:
+        rows = [("at first", self.diagnosis.conclusion.title)]
+        rows += [
+            ("failed in", f"{place['text']}: {place_words(place)}")
+            for place in healed_places(self.before.to_dict(), self.after.to_dict())
+        ]
+        improved = self.improvement._sheet()
+        rows += [*improved.rows, ("ended", why_ended(vars(self.left)))]
+        return Sheet(f"Explanation: {improved.title.partition(': ')[2]}", tuple(rows))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -238,7 +294,7 @@ def _shares(rows: Sequence[Row]) -> str:
 
 def _read_row(row: Row) -> str:
     text = (
-        f"probability {probability(row['probability'])}, rms from {torque(row, 'rms_before_nm')} to "
+        f"probability {probability(row['probability'])}, error from {torque(row, 'rms_before_nm')} to "
         f"{torque(row, 'rms_after_nm')}, held out from {torque(row, 'held_out_rms_before_nm')} to "
         f"{torque(row, 'held_out_rms_after_nm')}"
     )

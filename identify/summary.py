@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
+from stimrig.identify.conclusion import LIKELY, SURE, conclude
 from stimrig.identify.errors import BadRequest
 
 Plotter = Callable[[Any, Any], Any]
@@ -17,8 +18,6 @@ _plotters: list[Plotter] = []
 """At most one; `identify` itself draws nothing and imports no plotting library."""
 
 NONE = "–"
-SURE, LIKELY = 0.9, 0.6
-"""Probabilities above which the words are "very probably" and "probably"."""
 LONGEST = 300
 """Largest number of characters of a line."""
 
@@ -138,12 +137,12 @@ def fit_words(figures: Mapping[str, Any], prefix: str = "") -> str:
     """How well a model fits: fit, the best fit that the noise allows, and error."""
     allowed = figures.get(f"{prefix}ceiling_percent")
     most = "" if allowed is None else f" (the noise allows {quantity(allowed, '%')})"
-    return f"fit {quantity(figures.get(f'{prefix}fit_percent'), '%')}{most}, rms {torque(figures, f'{prefix}rms_nm')}"
+    return f"fit {quantity(figures.get(f'{prefix}fit_percent'), '%')}{most}, error {torque(figures, f'{prefix}rms_nm')}"
 
 
 def both_words(figures: Mapping[str, Any]) -> str:
-    """The same for fitted rows and held-out rows, in one line."""
-    held_out = f"{quantity(figures.get('held_out_fit_percent'), '%')}, rms {torque(figures, 'held_out_rms_nm')}"
+    """The same for fitted rows and held-out pulses, in one line."""
+    held_out = f"fit {quantity(figures.get('held_out_fit_percent'), '%')}, error {torque(figures, 'held_out_rms_nm')}"
     return f"{fit_words(figures)}; {held_out_label(figures)} {held_out}"
 
 
@@ -160,6 +159,13 @@ def sure(value: float) -> str:
 def torque(figures: Mapping[str, Any], key: str) -> str:
     """A torque from a dict, with its unit."""
     return quantity(figures.get(key), "N·m")
+
+
+def certainty(found: Mapping[str, Any]) -> str:
+    """The probability of a verdict, behind its title; empty where none is sure or each effect has its own."""
+    if conclude(found).kind == "unsure" or len(found.get("missing") or []) > 1:
+        return ""
+    return f" (probability {probability(found['probability'])})"
 
 
 def probability(value: float) -> str:

@@ -52,10 +52,7 @@ class Notifier:
     def alive(self, trouble: str | None) -> None:
         """Feed the watchdog if all is well; else report what is wrong, and let the watchdog expire.
 
-        Parameters
-        ----------
-        trouble
-            What `Rig.trouble` found; None: nothing.
+        `trouble`: what `Rig.trouble` found; None: nothing.
         """
         if trouble is None:
             if self._complained:

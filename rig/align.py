@@ -30,25 +30,14 @@ BELIEVED_RATES = 0.25, 4.0
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How the times were obtained.
+    """How the times were obtained."""
 
-    Attributes
-    ----------
-    method
-        Of a load cell: sync or regression; of an angle sensor: see `stimrig.rig.align_angle`.
-    error_ms
-        Standard error of the offset, ms; NaN if there were too few samples to estimate it. Of an angle sensor it
-        contains that of the torque, through which it was obtained.
-    delay_ms
-        Median time from a sample's aligned time to its arrival at the host, ms.
-    rate_ppm
-        How much slower (+) the cell's clock runs than the host's.
-    """
-
-    method: Method
+    method: Method  # of a load cell: sync or regression; of an angle sensor: see `stimrig.rig.align_angle`
     error_ms: float
-    delay_ms: float
-    rate_ppm: float
+    """Standard error of the offset, ms; NaN if there were too few samples to estimate it. Of an angle sensor it
+    contains that of the torque, through which it was obtained."""
+    delay_ms: float  # median time from a sample's aligned time to its arrival at the host, ms
+    rate_ppm: float  # how much slower (+) the cell's clock runs than the host's
 
 
 @dataclass(frozen=True, slots=True)

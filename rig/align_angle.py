@@ -51,12 +51,7 @@ class LiveSlope:
     def add(self, number: Numbers, value: Array) -> Array:
         """Slope per second at each of these samples, shape (n,); NaN where too few came before it.
 
-        Parameters
-        ----------
-        number
-            Of the samples, rising, shape (n,); gaps may be in it.
-        value
-            Shape (n,).
+        `number`: of the samples, rising, shape (n,); gaps may be in it. `value`: shape (n,).
         """
         numbers, values = np.concatenate([self._number, number]), np.concatenate([self._value, value])
         behind = number[:, None] - numbers[None, :]
@@ -74,14 +69,7 @@ class LiveSlope:
 def centred(angle_rad: Array, number: Numbers, rate_hz: float) -> Array:
     """Velocity at each sample, rad/s, shape (n,).
 
-    Parameters
-    ----------
-    angle_rad
-        Finite, shape (n,).
-    number
-        Of the samples, rising, shape (n,).
-    rate_hz
-        Samples per second.
+    `angle_rad`: finite, shape (n,); `number`: of the samples, rising, shape (n,); `rate_hz`: samples per second.
     """
     if not len(number):
         return np.empty(0)
@@ -125,24 +113,12 @@ LEAST_ORDERED = 20
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """The torque samples as they came, their aligned times and the error of these.
+    """The torque samples as they came, their aligned times and the error of these."""
 
-    Attributes
-    ----------
-    samples
-        Dtype `SAMPLE`, shape (N,).
-    time_s
-        Test's clock, shape (N,).
-    t0_s
-        Start of the test's clock on the rig's, s.
-    error_ms
-        Of `time_s`.
-    """
-
-    samples: NDArray[Any]
-    time_s: Array
-    t0_s: float
-    error_ms: float
+    samples: NDArray[Any]  # dtype `SAMPLE`, shape (N,)
+    time_s: Array  # test's clock, shape (N,)
+    t0_s: float  # start of the test's clock on the rig's, s
+    error_ms: float  # of `time_s`
 
 
 def beside(
@@ -266,14 +242,8 @@ def read_angles(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Datasets by path and the attributes of their group; both empty without a sensor.
 
-    Parameters
-    ----------
-    header
-        The journal's; its `angle` is missing without a sensor, and where both copies of the header are lost.
-    torque
-        The test's torque samples, aligned.
-    end_s
-        End of the recording on the test's clock, s.
+    `header`: the journal's; its `angle` is missing without a sensor, and where both copies of the header are lost.
+    `torque`: the test's torque samples, aligned. `end_s`: end of the recording on the test's clock, s.
     """
     blocks = [np.frombuffer(payload, ANGLE_SAMPLE) for kind, payload in contents.blocks if kind == Kind.ANGLE]
     told = header.get("angle") or {}

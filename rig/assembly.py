@@ -21,9 +21,9 @@ from stimrig.rig import align, align_angle, journal
 from stimrig.rig.align_angle import Reference
 from stimrig.rig.clock import utc_text
 from stimrig.rig.errors import RecordingError
-from stimrig.rig.journal import JournalContents, Kind, LaidBlock, Segment
+from stimrig.rig.journal import JournalContents, Kind, LaidBlock
 from stimrig.rig.messages import Labels
-from stimrig.rig.signals import SAMPLE, PulseStatus
+from stimrig.rig.signals import SAMPLE, PulseStatus, Segment
 
 FORMAT = "stimrig-recording"
 FORMAT_VERSION = 1
@@ -51,17 +51,8 @@ class Recording:
 def assemble(contents: JournalContents, outcome: str = "fault", reason: str = "") -> Recording:
     """Make a recording from a journal, complete, partial or damaged.
 
-    Parameters
-    ----------
-    contents
-        What `journal.read` could read.
-    outcome, reason
-        Used if the journal does not say how the test ended.
-
-    Raises
-    ------
-    RecordingError
-        There is nothing to seal, or the content is not valid.
+    `contents`: what `journal.read` could read; `outcome`, `reason`: used if the journal does not say how the test
+    ended. Raises RecordingError: there is nothing to seal, or the content is not valid.
     """
     try:
         return _assembled(contents, outcome, reason)

@@ -94,17 +94,8 @@ PSEUDO_TERMINALS = Path("/dev/pts")
 def load(path: Path, **overrides: Any) -> RigConfig:
     """Read a rig file.
 
-    Parameters
-    ----------
-    path
-        The TOML file; a relative DBC path in it is relative to the file's folder.
-    overrides
-        Values that override the file's: `data_dir`, `socket`.
-
-    Raises
-    ------
-    ConfigError
-        One line with file, key and how to correct it.
+    `path`: the TOML file; a relative DBC path in it is relative to the file's folder. `overrides`: values that override
+    the file's: `data_dir`, `socket`. Raises ConfigError: one line with file, key and how to correct it.
     """
     try:
         content = tomllib.loads(path.read_text("utf-8"))
@@ -123,7 +114,13 @@ def load(path: Path, **overrides: Any) -> RigConfig:
     return check(content, str(path), **overrides)
 
 
-EMULATOR_WATCH = {"stale_torque_s": 0.5, "missing_ack_s": 0.5, "clipped_torque_s": 10.0, "stale_angle_s": 0.5}
+EMULATOR_WATCH = {
+    "stale_torque_s": 0.5,
+    "missing_ack_s": 0.5,
+    "clipped_torque_s": 10.0,
+    "stale_angle_s": 0.5,
+    "unmoved_torque_s": 3600.0,
+}
 """No person is connected to an emulator, and it shares its processors with other programs. A pause of 0.1 s would stop
 a real rig, but must not end a demo. A hidden saturated amplifier is there to be diagnosed, and stays saturated for up
 to 6 s of the default ramp."""

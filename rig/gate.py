@@ -108,10 +108,7 @@ class Gate:
     async def open(self, journal: Journal, table: dict[str, Limit], halted: Callable[[], bool]) -> None:
         """Arm the device for one test. It stays shut if the test is `halted` by the time that the device answers.
 
-        Raises
-        ------
-        DeviceError, JournalError
-            The gate stays shut.
+        Raises DeviceError, JournalError: the gate stays shut.
         """
         journal.append_json(Kind.EVENT, {"event": "arm", "time_s": self._clock.now_s()})
         await self._stimulator.arm()

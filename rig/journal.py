@@ -17,13 +17,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig.errors import JournalError, RecordingError
 from stimrig.rig.machine import Log
+from stimrig.rig.signals import Segment
 
 MAGIC = b"STIMRIG\x01"
 _BLOCK = struct.Struct("<4sBxHII")
@@ -63,18 +64,6 @@ class Kind(IntEnum):
     SPACER = 11
     LAID = 12
     ANGLE = 13
-
-
-LaidBy = Literal["plan", "extension", "wait", "end"]
-
-
-class Segment(NamedTuple):
-    """A segment as indices of its pulses, end exclusive, and who laid it."""
-
-    name: str
-    start: int
-    end: int
-    by: LaidBy
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 from stimrig.rig.errors import RefusedError
-from stimrig.rig.messages import PASSIVE, Bound, Profile, TestPlan
+from stimrig.rig.messages import PASSIVE, PULSE_RATES_HZ, Bound, Profile, TestPlan
 from stimrig.rig.signals import Pulse
 
 
@@ -51,7 +51,7 @@ HARD_LIMITS: dict[str, Limit] = {
             "own rule: charge_per_phase_uc × 40 Hz",
         ),
         Limit(
-            "pulse_rate_hz", 1.0, 60.0, "Hz",
+            "pulse_rate_hz", *PULSE_RATES_HZ, "Hz",
             "at 40 Hz the contraction is fused; a higher rate only tires the muscle",
             "paper, section II (40 Hz); clinical FES 20-50 Hz",
         ),
@@ -169,6 +169,10 @@ class Refusal:
         if math.isfinite(self.value):
             above = self.value > row.hi
             by = f", over by {self.value - row.hi:g}" if above else f", under by {row.lo - self.value:g}"
+        if math.isinf(row.lo):
+            return f"{row.name} {self.value:g} {row.unit} is not at most {row.hi:g} ({row.owner}{by}): {row.reason}"
+        if math.isinf(row.hi):
+            return f"{row.name} {self.value:g} {row.unit} is not at least {row.lo:g} ({row.owner}{by}): {row.reason}"
         return (
             f"{row.name} {self.value:g} {row.unit} is outside {row.lo:g} … {row.hi:g} ({row.owner}{by}): {row.reason}"
         )

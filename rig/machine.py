@@ -23,17 +23,8 @@ class Port(Protocol):
     def open(self, on_bytes: Callable[[bytes, float], None], on_lost: Told) -> None:
         """Open it and begin to read; blocks for a moment.
 
-        Parameters
-        ----------
-        on_bytes
-            Called with what was read, and when (rig clock, s).
-        on_lost
-            Called once if the port is gone.
-
-        Raises
-        ------
-        DeviceError
-            It cannot be opened; names the port and says how to correct it.
+        `on_bytes`: called with what was read, and when (rig clock, s); `on_lost`: called once if the port is gone.
+        Raises DeviceError: it cannot be opened; names the port and says how to correct it.
         """
         ...
 
@@ -60,28 +51,16 @@ class Frame(NamedTuple):
 
 
 class Listener(NamedTuple):
-    """Who wants the frames of one identifier.
-
-    Attributes
-    ----------
-    is_extended
-        Whether the identifier has 29 bits: the one of 11 bits that has the same number is another one.
-    decode
-        Pure; makes a block of frames. Its arguments: the frames, and how many damaged and error frames came with them.
-    take
-        Gets each block, in the tasks' own thread.
-    lost
-        Called once with the reason when the bus is gone.
-    gather_s
-        Real seconds for which frames are gathered after the first one.
-    """
+    """Who wants the frames of one identifier."""
 
     frame_id: int
-    is_extended: bool
+    is_extended: bool  # whether the identifier has 29 bits: the one of 11 bits that has the same number is another one
     decode: Callable[[Sequence[Frame], int, int], Any]
-    take: Callable[[Any], None]
-    lost: Told
-    gather_s: float
+    """Pure; makes a block of frames. Its arguments: the frames, and how many damaged and error frames came with
+    them."""
+    take: Callable[[Any], None]  # gets each block, in the tasks' own thread
+    lost: Told  # called once with the reason when the bus is gone
+    gather_s: float  # real seconds for which frames are gathered after the first one
 
 
 class Bus(Protocol):

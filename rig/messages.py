@@ -39,6 +39,10 @@ AHEAD = 2
 client is late."""
 
 
+PULSE_RATES_HZ = (1.0, 60.0)
+"""Least and most that any rig plays (`stimrig.rig.limits` says why)."""
+
+
 def stop_socket(path: Path) -> Path:
     """Path of the stop socket of a rig that listens at `path`."""
     return path.with_name(f"{path.name}.stop")
@@ -295,7 +299,9 @@ class Status(Message):
     segment: str | None = None
     elapsed_s: float = 0.0
     duration_s: float = 0.0
-    stimulator: dict[str, Any] = Field(default_factory=dict, description="device, id, firmware, port")
+    stimulator: dict[str, Any] = Field(
+        default_factory=dict, description="device, id, firmware, port, shortest_us (no narrower pulse is sent)"
+    )
     load_cell: dict[str, Any] = Field(default_factory=dict, description="device, measured sample rate, bus")
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: there was none")
     torque_nm: float | None = None

@@ -68,10 +68,7 @@ class Phase:
     def start(self, test_id: str, participant: str) -> Phase:
         """A person asks for a test.
 
-        Raises
-        ------
-        BusyError, LatchedError, UncertainError, DeviceError
-            Naming the holder or the reason.
+        Raises BusyError, LatchedError, UncertainError, DeviceError: naming the holder or the reason.
         """
         self.may_start()
         return Phase("arming", "", test_id, participant)

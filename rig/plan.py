@@ -29,7 +29,7 @@ from stimrig.rig.messages import (
     Sequences,
     TestPlan,
 )
-from stimrig.rig.signals import Pulse
+from stimrig.rig.signals import Pulse, Segment
 
 USUAL_RATE_HZ = 40.0
 MAX_SEGMENTS = 200
@@ -51,33 +51,16 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True)
-class PlannedSegment:
-    """A segment as indices of its pulses, end exclusive."""
-
-    name: str
-    start: int
-    end: int
-
-
-@dataclass(frozen=True, slots=True)
 class PlannedTest:
-    """A test ready to be played.
-
-    Attributes
-    ----------
-    pulse_width_us
-        Width for each pulse, µs, shape (P,); pulse i is due i / pulse_rate_hz after the start.
-    pieces
-        Its segments, built; of an adaptive test those of its fixed plan, of which only the first is certain.
-    longest_s
-        The longest that the test may take, s: its length, or the bound of an adaptive test.
-    """
+    """A test ready to be played."""
 
     plan: TestPlan
     pulse_width_us: NDArray[np.float64]
-    segments: tuple[PlannedSegment, ...]
+    """Width for each pulse, µs, shape (P,); pulse i is due i / pulse_rate_hz after the start."""
+    segments: tuple[Segment, ...]
     pieces: tuple[Piece, ...]
-    longest_s: float
+    """Its segments, built; of an adaptive test those of its fixed plan, of which only the first is certain."""
+    longest_s: float  # the longest that the test may take, s: its length, or the bound of an adaptive test
 
     @property
     def duration_s(self) -> float:
@@ -104,19 +87,8 @@ class PlannedTest:
 def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     """Build every pulse of the plan and check it against the limits.
 
-    Parameters
-    ----------
-    plan
-        As a client sent it.
-    table
-        Limits already narrowed by the profile.
-
-    Raises
-    ------
-    PlanError
-        Unknown sequence, wrong setting, no segment, or a segment without a pulse: names the segment.
-    RefusedError
-        The plan would break a limit: names the limit, the pulse and the excess.
+    `plan`: as a client sent it; `table`: limits already narrowed by the profile. Raises PlanError: unknown sequence,
+    wrong setting, no segment, or a segment without a pulse: names the segment.
     """
     refuse(table["pulse_rate_hz"], plan.pulse_rate_hz, "plan")
     _check_angle(plan, table)
@@ -138,7 +110,7 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
         longest_s = table["duration_s"].hi
     ends = np.cumsum([len(piece.pulse_width_us) for piece in built]).tolist()
     places = zip(built, [0, *ends[:-1]], ends, strict=True)
-    segments = tuple(PlannedSegment(piece.of.name, start, end) for piece, start, end in places)
+    segments = tuple(Segment(piece.of.name, start, end, "plan") for piece, start, end in places)
     return PlannedTest(plan, widths_us, segments, built, longest_s)
 
 
@@ -158,17 +130,8 @@ def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:
 def build_pieces(chosen: Sequence[SegmentPlan], plan: TestPlan, longest: Limit, before: int = 0) -> tuple[Piece, ...]:
     """Build segments that follow `before` pulses; too long ones are refused before they are built.
 
-    Parameters
-    ----------
-    longest
-        Limit on the duration of all pulses, those before included.
-
-    Raises
-    ------
-    PlanError
-        Unknown sequence, wrong setting, or a segment without a pulse: names the segment.
-    RefusedError
-        Too long.
+    `longest`: limit on the duration of all pulses, those before included. Raises PlanError: unknown sequence, wrong
+    setting, or a segment without a pulse: names the segment.
     """
     reached = before
     for number, segment in enumerate(chosen, start=1):
@@ -206,15 +169,8 @@ def check_pieces(
 ) -> None:
     """Check pieces against the limits, as a part of the whole that they make with the pulses before them.
 
-    Parameters
-    ----------
-    before_us
-        Widths of all pulses before them, µs, shape (n,), already checked.
-
-    Raises
-    ------
-    RefusedError
-        Names the limit, the value and the excess.
+    `before_us`: widths of all pulses before them, µs, shape (n,), already checked. Raises RefusedError: names the
+    limit, the value and the excess.
     """
     current_ma, rate_hz = plan.profile.current_ma, plan.pulse_rate_hz
     added_us = np.concatenate([piece.pulse_width_us for piece in pieces])

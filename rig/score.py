@@ -17,13 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig import journal as jn
 from stimrig.rig import plan
 from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
-from stimrig.rig.journal import Journal, Kind
+from stimrig.rig.journal import Journal, Kind, LaidBlock
 from stimrig.rig.limits import Limit, refuse, tightened
 from stimrig.rig.messages import AHEAD, Extended, SegmentPlan
 from stimrig.rig.plan import Piece, PlannedTest
+from stimrig.rig.signals import LaidBy, Segment
 from stimrig.rig.tasks import Tasks
 
 MAX_EXTENSION_SEGMENTS = 8
@@ -42,7 +42,7 @@ class Layout:
 
     pulse_width_us: NDArray[np.float64]
     jumps: NDArray[np.bool_]
-    segments: tuple[jn.Segment, ...]
+    segments: tuple[Segment, ...]
 
     def __len__(self) -> int:
         return len(self.pulse_width_us)
@@ -51,9 +51,9 @@ class Layout:
         kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
         return Layout(self.pulse_width_us[:end], self.jumps[:end], tuple(kept))
 
-    def add_piece(self, piece: Piece, by: jn.LaidBy) -> Layout:
+    def add_piece(self, piece: Piece, by: LaidBy) -> Layout:
         end = len(self) + len(piece.pulse_width_us)
-        added = jn.Segment(piece.of.name, len(self), end, by)
+        added = Segment(piece.of.name, len(self), end, by)
         return Layout(
             np.concatenate([self.pulse_width_us, piece.pulse_width_us]),
             np.concatenate([self.jumps, np.full(len(piece.pulse_width_us), piece.jumps)]),
@@ -64,12 +64,8 @@ class Layout:
 class Score:
     """The pulses of one test.
 
-    Parameters
-    ----------
-    test, table
-        The checked plan, and the limits that hold for the whole test.
-    journal
-        Gets each segment of an adaptive test that is laid after the start.
+    `test`, `table`: the checked plan, and the limits that hold for the whole test; `journal`: gets each segment of an
+    adaptive test that is laid after the start.
     """
 
     def __init__(self, test: PlannedTest, table: dict[str, Limit], journal: Journal, tasks: Tasks) -> None:
@@ -104,17 +100,8 @@ class Score:
     def pulse(self, index: int, torque_time_nms: float) -> float | None:
         """Width of the next pulse, µs; None after the last. Only the sender asks, in order.
 
-        Parameters
-        ----------
-        index
-            One more than the last time.
-        torque_time_nms
-            Measured until now.
-
-        Raises
-        ------
-        JournalError
-            What was to be laid could not be written.
+        `index`: one more than the last time; `torque_time_nms`: measured until now. Raises JournalError: what was to be
+        laid could not be written.
         """
         if self.adaptive is not None:
             bound_nms = self.adaptive.max_torque_time_nms
@@ -168,12 +155,7 @@ class Score:
     def enough(self, by: str, at_once: bool) -> None:
         """End well: at the next pulse, or where the segment that plays ends. A second call may only end it sooner.
 
-        Raises
-        ------
-        PlanError
-            The test is not adaptive.
-        TooLateError, JournalError
-            It has ended; it could not be written.
+        Raises PlanError: the test is not adaptive. TooLateError, JournalError: it has ended; it could not be written.
         """
         if self.adaptive is None:
             raise PlanError("enough: this test has a fixed plan; stop it, or let it play to its end")
@@ -268,12 +250,12 @@ class Score:
             self._lay(Piece(SAFE_END, np.zeros(missing), jumps=False), "end", kept)
         self.ended_by, self._end_at = by, len(kept)
 
-    def _lay(self, piece: Piece, by: jn.LaidBy, before: Layout | None = None) -> None:
+    def _lay(self, piece: Piece, by: LaidBy, before: Layout | None = None) -> None:
         """Write a piece to the journal, then show it to the sender."""
         before = self.laid if before is None else before
         following = before.add_piece(piece, by) if len(piece.pulse_width_us) else before
-        block = jn.LaidBlock(
-            jn.Segment(piece.of.name, len(before), len(following), by),
+        block = LaidBlock(
+            Segment(piece.of.name, len(before), len(following), by),
             piece.of.sequence,
             piece.of.settings,
             self._clock.now_s(),

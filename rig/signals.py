@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,18 @@ class Pulse:
     def charge_uc(self) -> float:
         """Charge of one phase, µC."""
         return self.pulse_width_us * self.current_ma * 1e-3
+
+
+LaidBy = Literal["plan", "extension", "wait", "end"]
+
+
+class Segment(NamedTuple):
+    """A segment as indices of its pulses, end exclusive, and who laid it."""
+
+    name: str
+    start: int
+    end: int
+    by: LaidBy
 
 
 class LateError(Exception):

@@ -18,35 +18,45 @@ from stimrig import errors
 from stimrig.identify.summary import register_plotter
 
 if TYPE_CHECKING:
+    from stimrig import cohort
     from stimrig.api.charts.plot import plot
+    from stimrig.api.cli.result_files import save
     from stimrig.api.client.rest import Client
+    from stimrig.api.schemas import load as schema
     from stimrig.identify import Model, Record, compare, next_experiment, predict, read
     from stimrig.identify.effects import library as effects
-    from stimrig.progress import carry, diagnose, fit, improve
+    from stimrig.identify.tracking.trials import track
+    from stimrig.progress import carry, diagnose, explain, fit, improve
+    from stimrig.verbs import emulate, export, invert, join, recover, table1
 
 _PLACES = {
     "read": ("stimrig.identify.records", "read"),
     "Record": ("stimrig.identify.records.record", "Record"),
     "Model": ("stimrig.identify.model", "Model"),
-    "fit": ("stimrig.progress", "fit"),
-    "carry": ("stimrig.progress", "carry"),
     "predict": ("stimrig.identify.simulation.predict", "predict"),
     "compare": ("stimrig.identify.criticism", "compare"),
-    "diagnose": ("stimrig.progress", "diagnose"),
-    "improve": ("stimrig.progress", "improve"),
     "next_experiment": ("stimrig.identify.diagnosis", "next_experiment"),
+    "track": ("stimrig.identify.tracking.trials", "track"),
     "effects": ("stimrig.identify.effects", "library"),
+    "schema": ("stimrig.api.schemas", "load"),
     "plot": ("stimrig.api.charts.plot", "plot"),
+    "save": ("stimrig.api.cli.result_files", "save"),
     "Client": ("stimrig.api.client.rest", "Client"),
-}
+    **{name: ("stimrig.progress", name) for name in ("carry", "diagnose", "explain", "fit", "improve")},
+    **{name: ("stimrig.verbs", name)
+       for name in ("emulate", "export", "invert", "join", "recover", "table1")},
+}  # fmt: skip
 
 __all__ = [
-    "Client", "Model", "Record", "carry", "compare", "diagnose", "effects", "errors", "fit", "improve",
-    "next_experiment", "plot", "predict", "read",
+    "Client", "Model", "Record", "carry", "cohort", "compare", "diagnose", "effects", "emulate", "errors", "explain",
+    "export", "fit", "improve", "invert", "join", "next_experiment", "plot", "predict", "read", "recover", "save",
+    "schema", "table1", "track",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
+    if name == "cohort":
+        return import_module("stimrig.cohort")
     if name not in _PLACES:
         raise AttributeError(f"module 'stimrig' has no attribute {name!r}")
     module, attribute = _PLACES[name]

@@ -1,5 +1,23 @@
-"""`python -m stimrig`: what the console script `stimrig` runs."""
+"""`stimrig` and `python -m stimrig`: Ctrl-C ends it from its first moment on, while libraries are still loaded."""
 
-from stimrig.api.cli.main import main
+from __future__ import annotations
 
-main()
+import signal
+import sys
+
+from stimrig.api.cli.errors import leave
+
+
+def main() -> None:
+    """Run the command line."""
+    signal.signal(signal.SIGINT, leave)
+    from stimrig.api.cli.main import main as run
+
+    try:
+        run(sys.argv[1:])
+    except KeyboardInterrupt:
+        leave()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,7 +1,8 @@
-"""Every error that `stimrig` raises: those of identification, and those of the REST client."""
+"""Every error that `stimrig` raises: of identification, of the REST client, and of verbs that go on elsewhere."""
 
 from __future__ import annotations
 
+from stimrig.api.cli.errors import CommandError, InputError, LaunchError
 from stimrig.api.client.errors import (
     Conflict,
     Forbidden,
@@ -18,7 +19,7 @@ from stimrig.api.client.errors import (
 from stimrig.identify.errors import BadModel, BadRecord, BadRequest, Cancelled, IdentifyError, NotIdentifiable
 
 __all__ = [
-    "BadModel", "BadRecord", "BadRequest", "Cancelled", "Conflict", "Forbidden", "IdentifyError", "Invalid",
-    "NotCompleted", "NotFound", "NotIdentifiable", "Refused", "ServiceError", "TooManyRequests", "Unauthorized",
-    "Unavailable", "Unreachable",
+    "BadModel", "BadRecord", "BadRequest", "Cancelled", "CommandError", "Conflict", "Forbidden", "IdentifyError",
+    "InputError", "Invalid", "LaunchError", "NotCompleted", "NotFound", "NotIdentifiable", "Refused", "ServiceError",
+    "TooManyRequests", "Unauthorized", "Unavailable", "Unreachable",
 ]  # fmt: skip

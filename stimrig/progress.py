@@ -1,4 +1,4 @@
-"""`fit`, `carry`, `diagnose` and `improve` of `identify`, with a progress bar in notebooks and terminals.
+"""`fit`, `carry`, `diagnose`, `improve` and `explain` of `identify`, with a progress bar in notebooks and terminals.
 
 `progress` is True (a bar, if the work takes longer than a second), False (none), or a function of one's own that takes
 a share of 0 to 1 and a line of text. All other parameters, results and errors are those of `identify`.
@@ -25,13 +25,13 @@ def fit(
     progress: Progress = True,
     **options: Any,
 ) -> identify.Model:
-    """Fit a model to a record; see `identify.fit`. `progress`: a bar, none, or a function."""
+    """Fit a model to a record: `method`, `effects=["fatigue"]`, `fit_on=["prbs"]`; see `stimrig.identify.fit`."""
     with _telling(progress) as tell:
         return identify.fit(record, method, effects, fit_on, tell, **options)
 
 
 def carry(record: identify.Record, model: identify.Model, progress: Progress = True) -> identify.Carried:
-    """Fit the structure of an earlier model, too; see `identify.carry`. `progress`: a bar, none, or a function."""
+    """The structure of an earlier model fitted to a new record, beside the plain one; see `stimrig.identify.carry`."""
     with _telling(progress) as tell:
         return identify.carry(record, model, tell)
 
@@ -39,7 +39,7 @@ def carry(record: identify.Record, model: identify.Model, progress: Progress = T
 def diagnose(
     record: identify.Record, model: identify.Model | None = None, progress: Progress = True
 ) -> identify.Diagnosis:
-    """What is missing in a model of a record; see `identify.diagnose`. `progress`: a bar, none, or a function."""
+    """What is missing in the plain model of a record, or in a `model`; see `stimrig.identify.diagnose`."""
     with _telling(progress) as tell:
         return identify.diagnose(record, model, tell)
 
@@ -51,9 +51,17 @@ def improve(
     force: Sequence[str] = (),
     model: identify.Model | None = None,
 ) -> identify.Improvement:
-    """Add what is missing, one effect at a time; see `identify.improve`. `progress`: a bar, none, or a function."""
+    """Add what is missing, one effect at a time, while the evidence asks for it; see `stimrig.identify.improve`."""
     with _telling(progress) as tell:
         return identify.improve(record, tell, max_effects, force, model)
+
+
+def explain(
+    record: identify.Record, model: identify.Model | None = None, progress: Progress = True
+) -> identify.Explanation:
+    """The whole story: where a model fails, what is missing, how the error falls with it, why that ends."""
+    with _telling(progress) as tell:
+        return identify.explain(record, tell, model)
 
 
 @contextmanager

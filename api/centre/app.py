@@ -57,12 +57,7 @@ class CentreStrictBody(StrictBody):
 def create_app(settings: CentreSettings | None = None, clock: Clock | None = None) -> FastAPI:
     """The application.
 
-    Raises
-    ------
-    ApiError
-        The database cannot be opened.
-    SettingsError
-        The bucket is not there, or a package is missing.
+    Raises ApiError: the database cannot be opened. SettingsError: the bucket is not there, or a package is missing.
     """
     context = build(settings or CentreSettings(), clock)
     app = Service(context, title="stimrig centre", summary="What rigs have pushed.", description=DESCRIPTION)

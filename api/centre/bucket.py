@@ -30,15 +30,8 @@ class MissingError(BucketError):
 class Bucket:
     """The centre's files.
 
-    Parameters
-    ----------
-    url : str
-        A folder, ``file://…``, ``s3://bucket/prefix``, or another address that fsspec knows.
-
-    Raises
-    ------
-    SettingsError
-        fsspec or the driver is not installed, or the address cannot be read.
+    `url`: a folder, ``file://…``, ``s3://bucket/prefix``, or another address that fsspec knows. Raises SettingsError:
+    fsspec or the driver is not installed, or the address cannot be read.
     """
 
     def __init__(self, url: str) -> None:
@@ -92,12 +85,8 @@ class Bucket:
     def copy(self, sha256: str, out: IO[bytes] | None = None, seen: Callable[[int], object] | None = None) -> bool:
         """Read a file, into `out` if given; whether it is what its name says.
 
-        Raises
-        ------
-        MissingError
-            The bucket is there, and the file is not in it.
-        BucketError
-            The bucket is gone, or cannot be read.
+        Raises MissingError: the bucket is there, and the file is not in it. BucketError: the bucket is gone, or cannot
+        be read.
         """
         found = hashlib.sha256()
         try:

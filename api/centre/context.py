@@ -124,12 +124,7 @@ class Context(Parts):
 def build(settings: CentreSettings, clock: Clock | None = None) -> Context:
     """Make the parts.
 
-    Raises
-    ------
-    ApiError
-        The database cannot be opened.
-    SettingsError
-        The bucket is not there, or a package is missing.
+    Raises ApiError: the database cannot be opened. SettingsError: the bucket is not there, or a package is missing.
     """
     clock = clock or Clock()
     try:

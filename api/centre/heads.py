@@ -21,10 +21,7 @@ KIND = "audit"
 class Heads:
     """Countersigns what rigs have told of their trails; the items are kept as they came, a receipt is made of them.
 
-    Parameters
-    ----------
-    seed : bytes
-        The private key.
+    `seed`: the private key.
     """
 
     def __init__(self, store: Store, seed: bytes) -> None:

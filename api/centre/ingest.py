@@ -69,14 +69,8 @@ def checked(sent: ItemIn) -> Item:
 class Ingest:
     """Takes what rigs push.
 
-    Parameters
-    ----------
-    store : Store
-        The centre's database.
-    clock : Clock
-        Rigs' clocks are compared with it.
-    most_file_bytes : int
-        A longer file is not asked for.
+    `store`: the centre's database; `clock`: rigs' clocks are compared with it; `most_file_bytes`: a longer file is not
+    asked for.
     """
 
     def __init__(self, store: Store, clock: Clock, most_file_bytes: int) -> None:

@@ -176,7 +176,7 @@ async def participant(request: Request, context: Ctx, _who: ModelReader, code: s
     panels = [trend_charts.panel(name, told) for name in trend_charts.order(told) if name in known]
     return page(
         request, "participant.html", code=code, people=people, sessions=found, before=before,
-        more=f"{more[0]}~{more[1]}" if more else None, panels=panels,
+        more=f"{more[0]}~{more[1]}" if more else None, panels=panels, told=trend_charts.sessions_told(told),
         count=sum(one["sessions"] for one in people), recordings=sum(one["recordings"] for one in people),
     )  # fmt: skip
 

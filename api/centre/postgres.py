@@ -37,12 +37,7 @@ def programs() -> Path:
 class Cluster:
     """A cluster in a folder, made at its first start.
 
-    Parameters
-    ----------
-    folder : Path
-        Where it lies.
-    port : int
-        Where it listens, on 127.0.0.1 only.
+    `folder`: where it lies; `port`: where it listens, on 127.0.0.1 only.
     """
 
     SETTINGS: tuple[str, ...] = ()

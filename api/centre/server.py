@@ -37,10 +37,7 @@ def main() -> int:
 def prepared(settings: CentreSettings) -> tuple[FastAPI, socket.socket]:
     """The application, and the address it will answer at.
 
-    Raises
-    ------
-    ApiError, SettingsError, OSError
-        One line each: what is wrong, and the fix.
+    Raises ApiError, SettingsError, OSError: one line each: what is wrong, and the fix.
     """
     server.raise_file_limit()
     os.umask(os.umask(0o077) | 0o077)  # what the centre writes is for its user only

@@ -9,6 +9,7 @@ from stimrig.api.charts.figure import INK, MEASURED, MODEL, TOOLBAR_PX, axis, bo
 from stimrig.api.charts.model_charts import segment_marks
 from stimrig.api.language import _, localised, plain
 from stimrig.api.models import explanation
+from stimrig.identify.yardstick import floor_nm
 
 MARK, MARK_LINE, FLOOR = role("worst-band"), role("worst"), role("limit")
 EDGES = ("lower", "upper")
@@ -53,11 +54,7 @@ def residual(
     shapes.append(box(time_s[0], time_s[-1], fig.NOISE, -noise_nm, noise_nm, yref="y"))
     for place in places:
         shapes.append(box(place["start_s"], place["end_s"], MARK))
-        labels.append({
-            "xref": "x", "yref": "paper", "x": (place["start_s"] + place["end_s"]) / 2, "y": 0.985, "yanchor": "top",
-            "text": f"<b>{place['number']}</b>", "showarrow": False, "font": {"size": 12, "color": role("on-worst")},
-            "bgcolor": MARK_LINE, "borderpad": 3, "name": "place",
-        })  # fmt: skip
+        labels.append(number_place(place))
     words = _("measured − model")
     said = fig.hover(words, fig.RESIDUAL + fig.BESIDE, fig.name_segments(time_s, segments))
     return fig.figure(
@@ -69,11 +66,20 @@ def residual(
     )  # fmt: skip
 
 
+def number_place(place: dict[str, Any]) -> dict[str, Any]:
+    """The number of a place, at its top."""
+    return {
+        "xref": "x", "yref": "paper", "x": (place["start_s"] + place["end_s"]) / 2, "y": 0.985, "yanchor": "top",
+        "text": f"<b>{place['number']}</b>", "showarrow": False, "font": {"size": 12, "color": role("on-worst")},
+        "bgcolor": role("good") if place.get("healed") else MARK_LINE, "borderpad": 3, "name": "place",
+    }  # fmt: skip
+
+
 def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, Any]:
     """What is left without an effect, and what adding it explains of that."""
     seen, expected = (fig.hover(words, fig.RESIDUAL) for words in (_("seen"), _("expected")))
     data = [
-        line(time_s, found["seen_nm"], _("seen: left without it"), MEASURED, 1.8, **seen),
+        line(time_s, found["seen_nm"], _("seen: left without it"), MEASURED, 3.2, **seen),
         line(time_s, found["expected_nm"], _("expected: what it explains"), MODEL, 1.8, **expected),
     ]
     x = axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **fig.AT_TIME)
@@ -102,22 +108,27 @@ def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
     sizes = [13 if row["current"] else 8 for row in rows]
     data = []
     for key, words, colour, symbol in (
-        ("rms_nm", _("rows used to fit"), MEASURED, "circle"),
-        ("held_out_rms_nm", _("rows not used to fit"), MODEL, "diamond"),
+        ("rms_nm", _("fitted pulses"), MEASURED, "circle"),
+        ("held_out_rms_nm", _("held-out pulses"), MODEL, "diamond"),
     ):
         values, marker = [row[key] for row in rows], {"size": sizes, "symbol": symbol, "color": colour}
         if key == "rms_nm" or any(value is not None for value in values):
             said = fig.hover(words, "%{y:.3f} N·m")
             data.append(line(names, values, words, colour, 2.2, mode="lines+markers", marker=marker, **said))
     shapes, labels = [], []
-    if noise := next((row["noise_sd_nm"] for row in reversed(rows) if row.get("noise_sd_nm")), None):
-        shapes.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": noise, "y1": noise,
-                       "line": {"color": FLOOR, "width": 1.6, "dash": "dash"}})  # fmt: skip
-        words = _("noise %(size)s N·m", size=localised(f"{noise:.3f}"))
-        labels.append({"xref": "paper", "x": 0, "y": noise, "text": words, "showarrow": False,
-                       "yanchor": "bottom", "xanchor": "left", "name": "noise", "font": {"color": FLOOR}})  # fmt: skip
+    repeats = rows[-1].get("repetition") or {}
+    between = _("scatter at rest") if repeats.get("found_by") == "estimate" else _("between repeats")
+    floors = ((rows[-1].get("noise_sd_nm"), "noise", _("noise"), "left"),
+              (floor_nm(repeats), "repetition", between, "right"))  # fmt: skip
+    for level_nm, name, words, side in floors:
+        if level_nm:
+            shapes.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": level_nm, "y1": level_nm,
+                           "line": {"color": FLOOR, "width": 1.6, "dash": "dash"}})  # fmt: skip
+            labels.append({"xref": "paper", "x": 0 if side == "left" else 1, "y": level_nm, "showarrow": False,
+                           "text": f"{words} {localised(f'{level_nm:.3f}')} N·m", "yanchor": "bottom",
+                           "xanchor": side, "name": name, "font": {"color": FLOOR}})  # fmt: skip
     x = axis("", type="category", range=[-0.4, len(rows) - 0.6])
     if sum(map(len, names)) > NAMED_LETTERS:  # they would be cut off; the table below names each number
         x |= {"tickvals": names, "ticktext": [f"{number}." for number in range(1, len(rows) + 1)]}
-    y = axis(_("Error, rms (N·m)"), rangemode="tozero")
+    y = axis(_("Error (N·m)"), rangemode="tozero")
     return fig.figure(data, height=320, shapes=shapes, annotations=labels, xaxis=x, yaxis=y)

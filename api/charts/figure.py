@@ -47,8 +47,15 @@ def in_light(part: Any) -> Any:
 
 
 def paint_light(picture: str) -> str:
-    """A still with the light colours in it; its words are left alone."""
-    return PAINTED.sub(lambda found: f'{found[1]}="{LIGHT[found[2]]}"', picture)
+    """A still with the light colours in it; its words are left alone. SVG 1.1 has a colour and its opacity apart."""
+    return PAINTED.sub(lambda found: _painted(found[1], LIGHT[found[2]]), picture)
+
+
+def _painted(attribute: str, colour: str) -> str:
+    if not colour.startswith("rgba("):
+        return f'{attribute}="{colour}"'
+    red, green, blue, opacity = colour.removeprefix("rgba(").rstrip(")").split(",")
+    return f'{attribute}="rgb({red},{green},{blue})" {attribute}-opacity="{opacity}"'
 
 
 # ---- what every chart may do ------------------------------------------------------------------------------------

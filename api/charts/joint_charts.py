@@ -30,15 +30,19 @@ class Way:
     high: float
     colour: str
     width: float
+    symbol: str
 
 
 WAYS = (
-    Way("still", -STILL_RAD_S, STILL_RAD_S, role("series-6"), 1.8),
-    Way("flexion", STILL_RAD_S, FAST_RAD_S, role("series-1"), 1.4),
-    Way("flexion", FAST_RAD_S, math.inf, role("series-3"), 2.6),
-    Way("extension", -FAST_RAD_S, -STILL_RAD_S, role("series-2"), 1.4),
-    Way("extension", -math.inf, -FAST_RAD_S, role("series-4"), 2.6),
+    Way("still", -STILL_RAD_S, STILL_RAD_S, role("series-6"), 1.8, "circle"),
+    Way("flexion", STILL_RAD_S, FAST_RAD_S, role("series-1"), 1.4, "triangle-up"),
+    Way("flexion", FAST_RAD_S, math.inf, role("series-3"), 2.6, "triangle-up"),
+    Way("extension", -FAST_RAD_S, -STILL_RAD_S, role("series-2"), 1.4, "triangle-down"),
+    Way("extension", -math.inf, -FAST_RAD_S, role("series-4"), 2.6, "triangle-down"),
 )
+"""Told apart by more than their colours: up is bending, and the thick line is the quick one."""
+EVERY = 6
+"""So many angles from one marker of a line to the next."""
 
 
 def joint_figures(document: dict[str, Any]) -> dict[str, Any]:
@@ -91,7 +95,10 @@ def _figure(joint: dict[str, Any], name: str, unit: str, value: str, title: str)
             dotted.append(line(angle_deg, y, "", way.colour, 1.2, **dots))
         words = _words(way, joint["velocity_rad_s"][column])
         solid = [at if there else None for at, there in zip(y, seen, strict=True)]
-        lines.append(line(angle_deg, solid, words, way.colour, way.width, **fig.hover_halves(words, value, halves)))
+        sizes = [0 if row % EVERY else 7 for row in range(len(angle_deg))]
+        marked: dict[str, Any] = {"mode": "lines+markers", "marker": {"symbol": way.symbol, "size": sizes}}
+        marked |= fig.hover_halves(words, value, halves)
+        lines.append(line(angle_deg, solid, words, way.colour, way.width, **marked))
     if dotted:  # an entry of the legend, without a line
         dots = {"line": {"dash": "dot"}, **fig.QUIET}
         lines.append(line(angle_deg[:1], [None], _("dotted: not seen"), role("mark"), 1.2, **dots))

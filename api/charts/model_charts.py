@@ -61,10 +61,9 @@ def measurement(
 
 
 def overview(large: dict[str, Any]) -> dict[str, Any]:
-    """Torque and residual of the large chart, low enough for the first screen; its lines are sent once.
+    """Torque and residual of the large chart, low enough for the first screen.
 
-    `lines_of` names the figure whose lines are drawn. The pulse width is said under the pointer, and not drawn:
-    `only_said`.
+    The pulse width is said under the pointer, and not drawn.
     """
     layout = {name: value for name, value in large["layout"].items() if name not in ("yaxis", "yaxis2")}
     labels = [{**label, "yanchor": "middle", "y": 0.36, "font": {**label["font"], "size": 11}}
@@ -79,7 +78,9 @@ def overview(large: dict[str, Any]) -> dict[str, Any]:
         "yaxis2": axis(_("Residual (N·m)"), domain=[0.0, 0.29], nticks=4),
         "yaxis3": {"visible": False, "domain": [0.0, 0.29], "overlaying": "y2"},
     }
-    return {"lines_of": LARGE, "only_said": "y3", "layout": layout}
+    only_said = [{**line, "line": {**line["line"], "width": 0}} if line.get("yaxis") == "y3" else line
+                 for line in large["data"]]  # fmt: skip
+    return {"data": only_said, "layout": layout}
 
 
 def measured_lines(curves: dict[str, Any], series: dict[str, Any] | None) -> list[dict[str, Any]]:
@@ -113,7 +114,7 @@ def broken_at_pauses(curves: dict[str, Any]) -> dict[str, Any]:
     pauses = [place + 1 for place, step_s in enumerate(steps_s) if step_s > max(PAUSE * usual_s, PAUSE_S)]
     if not pauses:
         return curves
-    lines = ("torque_nm", "predicted_torque_nm", "pulse_width_us")
+    lines = [name for name in ("torque_nm", "predicted_torque_nm", "pulse_width_us") if name in curves]
     broken: dict[str, list[Any]] = {name: list(curves[name]) for name in ("time_s", *lines)}
     for place in reversed(pauses):
         broken["time_s"].insert(place, (time_s[place - 1] + time_s[place]) / 2)
@@ -230,10 +231,7 @@ def ramp_points(document: dict[str, Any], curves: dict[str, Any]) -> dict[str, d
     A partial residual plot: the curve's own value plus what the measurement has more than the free run, at the pulse
     width in force one mean lag of the linear part earlier. Where both directions lie on the curve, one is enough.
 
-    Returns
-    -------
-    dict
-        ``rising`` and ``falling``: ``pulse_width_us``, µs, and ``torque_nm``, N·m; absent where the recording has none.
+    ``rising`` and ``falling``: ``pulse_width_us``, µs, and ``torque_nm``, N·m; absent where the recording has none.
     """
     time_s, width_us = curves["time_s"], curves["pulse_width_us"]
     if len(time_s) < 3:

@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from stimrig.api.charts import diagnosis_charts, model_charts
 from stimrig.api.charts.figure import CHART_CONFIG, in_light
 from stimrig.api.models import explanation
-from stimrig.api.workers.curves import curves, runs, thinned
+from stimrig.api.workers.curves import curves, rounded, runs
 from stimrig.identify import BadRequest, Comparison, Diagnosis, Improvement, Model, Record, compare
 
 BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]
@@ -76,7 +76,7 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
     if isinstance(what, Comparison):
         found = what.to_dict()
         segments = runs(found["series"]["segment"], found["series"]["time_s"])
-        residual = diagnosis_charts.residual(thinned(found), segments, diagnosis_charts.places_of(found))
+        residual = diagnosis_charts.residual(rounded(found), segments, diagnosis_charts.places_of(found))
         return LocalFigure(in_light(residual))
     if isinstance(what, Improvement):
         rows = explanation.step_versions({**what.to_dict(), "models": []})
@@ -93,7 +93,7 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
 def _model(model: Model, record: Record) -> dict[str, Any]:
     """Measurement and model with the residual and the pulse widths; the recruitment curve beside them."""
     document, drawn = model.to_dict(), curves(model, record)
-    series = thinned(compare(model, record).to_dict())["series"]
+    series = rounded(compare(model, record).to_dict())["series"]
     figure = model_charts.measurement(drawn, model.fit.get("noise_sd_nm"), series)
     curve = model_charts.recruitment(document, drawn)
     figure["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in curve["data"]]

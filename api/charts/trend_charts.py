@@ -5,14 +5,14 @@ They are SVG in the page's own colours: a dozen of them are there at once, and t
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 from markupsafe import Markup, escape
 
 from stimrig.api import language
-from stimrig.api.charts.svg import plain, ticks
+from stimrig.api.charts.strokes import plain, ticks
 from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.language import _, lazy
 from stimrig.api.models import changes
@@ -32,10 +32,7 @@ Point = dict[str, Any]
 def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """The pictures: each `title`, `unit`, `latest` (in words), `svg`.
 
-    Parameters
-    ----------
-    sessions : sequence of dict
-        As `Session.page_document` gives them, the oldest first.
+    `sessions`: as `Session.page_document` gives them, the oldest first.
     """
     return [panel(name, sessions) for name in order(sessions)]
 
@@ -62,6 +59,19 @@ def panel(figure: str, sessions: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def sessions_told(sessions: Sequence[dict[str, Any]]) -> list[list[Any]]:
+    """For the script that says what is under the pointer, for each session: where, when, what else, and its page.
+
+    All pictures have the same sessions in the same places; its value there stands in each picture (`data-words`).
+    """
+    plane = Plane([{"at_s": unix_of(one["at_utc"]), "value": None} for one in sessions], False) if sessions else None
+    return [
+        [round(plane.x(unix_of(one["at_utc"])), 1), language.when(one["at_utc"]), tip(one),
+         one.get("href") or f"/models/{one['model_id']}"]
+        for one in sessions if plane
+    ]  # fmt: skip
+
+
 def point(session: dict[str, Any], figure: str, name: Name) -> Point:
     """A session's value in the unit that is shown, and what is said of it."""
     found = session["figures"].get(figure) or {"value": None, "uncertainty": None}
@@ -77,18 +87,14 @@ def point(session: dict[str, Any], figure: str, name: Name) -> Point:
         "approved": session["approved"],
         "noted": bool(session["notes"]),
         "words": words,
-        "tip": tip(session, f"{name.words} {words}", found.get("where") or ""),
-        "href": session.get("href") or f"/models/{session['model_id']}",
+        "tip": "\n".join(filter(None, (f"{name.words} {words}", found.get("where")))),
     }
 
 
-def tip(session: dict[str, Any], words: str, where: str = "") -> str:
-    """What stands beside the pointer, line by line."""
-    lines = [language.when(session["at_utc"]), words, *([where] if where else [])]
-    if session["approved"]:
-        lines.append(_("approved by %(name)s", name=session["approved_by"]))
-    else:
-        lines.append(_("not approved"))
+def tip(session: dict[str, Any]) -> str:
+    """What is said of a session below its value, line by line."""
+    by = session["approved_by"]
+    lines = [_("approved by %(name)s", name=by) if session["approved"] else _("not approved")]
     lines += [f"{note['by']}: {note['text'][:120]}" for note in session["notes"][:4]]
     return "\n".join(lines)
 
@@ -117,7 +123,8 @@ class Plane:
     def svg(self, label: str) -> Markup:
         """The picture."""
         parts = [*self.frame(), *self.dates(), *self.bands(), *self.lines(), *self.marks(), *self.columns()]
-        head = f'<svg class="trend" viewBox="0 0 {WIDE:g} {self.tall:g}" role="img" aria-label="{escape(label)}">'
+        size = f'viewBox="0 0 {WIDE:g} {self.tall:g}" role="img" aria-label="{escape(label)}"'
+        head = f'<svg class="trend" {size} data-words="{escape(json.dumps(self.tips()))}">'
         return Markup(head + "".join(parts) + "</svg>")
 
     def frame(self) -> list[str]:
@@ -165,7 +172,7 @@ class Plane:
 
     def bands(self) -> list[str]:
         """The uncertainty as a band along each line, and as a bar at each point."""
-        parts = []
+        parts, bars = [], ""
         for run in self.runs():
             known = [one for one in run if one["half"] is not None]
             edge = [(self.x(one["at_s"]), self.y(one["value"] + one["half"])) for one in known]
@@ -174,8 +181,8 @@ class Plane:
                 parts.append(f'<path class="band" d="M{"L".join(f"{x:.1f} {y:.1f}" for x, y in edge)}Z"/>')
             for one in known:
                 top, foot = self.y(one["value"] + one["half"]), self.y(one["value"] - one["half"])
-                parts.append(f'<path class="bar" d="M{self.x(one["at_s"]):.1f} {top:.1f}V{foot:.1f}"/>')
-        return parts
+                bars += f"M{self.x(one['at_s']):.1f} {top:.1f}V{foot:.1f}"
+        return [*parts, f'<path class="bar" d="{bars}"/>'] if bars else parts
 
     def lines(self) -> list[str]:
         """The lines."""
@@ -184,26 +191,24 @@ class Plane:
 
     def marks(self) -> list[str]:
         """A dot for each session, hollow where nothing is approved; a flag where something is noted."""
-        parts = []
+        ways = {"flag": "", "dot": "", "hole": ""}
         for one in self.points:
             x = self.x(one["at_s"])
             if one["noted"]:
-                parts.append(f'<path class="flag" d="M{x - 4:.1f} 1h8l-4 7Z"/>')
-            if one["value"] is not None:
-                kind = "dot" if one["approved"] else "dot hollow"
-                parts.append(f'<circle class="{kind}" cx="{x:.1f}" cy="{self.y(one["value"]):.1f}" r="3.6"/>')
-        return parts
+                ways["flag"] += f"M{x - 4:.1f} 1h8l-4 7Z"
+            if one["value"] is not None:  # a line of no length with round ends
+                dot = f"M{x:.1f} {self.y(one['value']):.1f}h0"
+                ways["dot"] += dot
+                ways["hole"] += "" if one["approved"] else dot
+        return [f'<path class="{name}" d="{way}"/>' for name, way in ways.items() if way]
+
+    def tips(self) -> list[str]:
+        """What is said of each session's value."""
+        return [one["tip"] for one in self.points]
 
     def columns(self) -> list[str]:
-        """What the pointer meets: a column for each session, as wide as the way to its neighbours."""
-        at = [self.x(one["at_s"]) for one in self.points]
-        edges = [LEFT, *((a + b) / 2 for a, b in pairwise(at)), WIDE - RIGHT]
-        return [
-            f'<rect class="column" x="{left:.1f}" y="0" width="{max(right - left, 0.5):.1f}" '
-            f'height="{TALL - BOTTOM:g}" data-session="{number}" data-href="{escape(one["href"])}" '
-            f'data-tip="{escape(one["tip"])}"/>'
-            for number, (one, left, right) in enumerate(zip(self.points, edges[:-1], edges[1:], strict=True))
-        ]
+        """The mark of the session under the pointer, which a script moves."""
+        return [f'<rect class="column" y="0" width="8" height="{TALL - BOTTOM:g}"/>']
 
 
 def span(points: Sequence[Point]) -> tuple[float, float]:
@@ -213,6 +218,8 @@ def span(points: Sequence[Point]) -> tuple[float, float]:
         return 0.0, 1.0
     low, high = min(values), max(values)
     room = max(high - low, LEAST_SPAN * max(abs(low), abs(high))) or 1.0
+    if len(values) == 1:  # no other value that its band could dwarf
+        room = max([room, *(one["half"] for one in points if one["half"] is not None)])
     halves = [(one["value"] - one["half"], one["value"] + one["half"]) for one in points if one["half"] is not None]
     foot = max(min((down for down, _up in halves), default=low), low - room)
     top = min(max((up for _down, up in halves), default=high), high + room)
@@ -237,12 +244,8 @@ TRIAL_FIGURES: dict[str, tuple[Any, str, float]] = {
 def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[dict[str, Any]]:
     """The pictures: each `title`, `unit`, `latest` (in words), `svg`.
 
-    Parameters
-    ----------
-    trials : sequence of mapping
-        As `api.models.tracked.trial_document` gives them, the oldest first.
-    bounds : Bounds
-        What a person allowed, drawn as lines.
+    `trials`: as `api.models.tracked.trial_document` gives them, the oldest first; `bounds`: what a person allowed,
+    drawn as lines.
     """
     referred = any(trial["error_percent"] is not None for trial in trials)
     return [_trial_panel(trials, name, bounds) for name in TRIAL_FIGURES if referred or name != "error_percent"]
@@ -316,6 +319,10 @@ class TrialPlane(Plane):
         middle = (LEFT + WIDE - RIGHT) / 2
         name = escape(_("Number of the trial"))
         return [*marks, f'<text class="x" x="{middle:g}" y="{TALL + 11:g}" text-anchor="middle">{name}</text>']
+
+    def tips(self) -> list[str]:
+        """None: each column says it."""
+        return []
 
     def columns(self) -> list[str]:
         """What the pointer meets, told by the browser itself: the card is renewed while somebody points at it."""

@@ -13,6 +13,7 @@ from stimrig.api.cli.terminal import load_record
 from stimrig.api.client.errors import NotFound
 from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
+from stimrig.api.structure import held_by
 from stimrig.identify.records.join import LEAST_SAMPLES, samples_between
 from stimrig.identify.records.record import Source
 
@@ -42,7 +43,8 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
         fix = "Give the rig's own recordings (HDF5), each by itself."
         raise InputError(f"{data[0]} does not say with what current it was made. {fix}")
     with progress_bar() as progress:
-        experiment = identify.next_experiment(identify.diagnose(record, None, progress))
+        explained = identify.explain(record, progress)
+    experiment = identify.next_experiment(explained.diagnosis) or identify.next_experiment(explained.left)
     if experiment is None:
         raise InputError(f"{data[0]}: no experiment is asked for: nothing is left to decide. Leave out --decide.")
     segments = [dict(segment) for segment in experiment.segments]
@@ -88,9 +90,11 @@ def check_participant(client: Client, code: str, recorded_ma: float | None) -> N
 
 
 def diagnosed(data: Sequence[Path], recording: bytes) -> dict[str, Any]:
-    """What is missing by the recordings and a new one together."""
+    """What is missing by the recordings and a new one together; in `left`, once that is added."""
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         new = Path(folder) / "recording.h5"
         new.write_bytes(recording)
-        found = identify.diagnose(load_record([*data, new]), None, progress).to_dict()
-    return {"structure": [], **found}
+        record = load_record([*data, new])
+        explained = identify.explain(record, progress)
+    held = held_by(explained.improvement.models[-1], record)
+    return {"structure": [], **explained.diagnosis.to_dict(), "left": {"structure": held, **explained.left.to_dict()}}

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import os
+
+INTERRUPTED = 130
+
+
+def leave(*_: object) -> None:
+    """End at once after Ctrl-C: nothing is begun yet, or nobody heard of it in time."""
+    os.write(2, b"stimrig: interrupted\n")
+    os._exit(INTERRUPTED)
+
 
 class CommandError(Exception):
     """A verb cannot go on; its words go to the person.
 
-    Parameters
-    ----------
-    message : str
-        One line: the place, what is wrong, what to do.
-    exit_code : int
-        1: something failed. 2: the input was at fault.
+    `message`: one line: the place, what is wrong, what to do; `exit_code`: 1: something failed. 2: the input was at
+    fault.
     """
 
     def __init__(self, message: str, exit_code: int = 1) -> None:

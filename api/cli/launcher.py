@@ -30,13 +30,7 @@ LASTED_S = 300.0
 
 
 class Streams:
-    """Starts `stimrig.rig.lsl_outlets`, and again when it dies; waits for nothing.
-
-    Parameters
-    ----------
-    child
-        How it is started.
-    """
+    """Starts `stimrig.rig.lsl_outlets`, and again when it dies; waits for nothing. `child`: how it is started."""
 
     def __init__(self, child: Child) -> None:
         self.child = child

@@ -10,8 +10,10 @@ import gc
 import importlib
 import os
 import pkgutil
+import signal
 import sys
 import tempfile
+import threading
 import traceback
 from pathlib import Path
 from typing import Annotated
@@ -20,12 +22,17 @@ import typer
 from typer.exceptions import TyperException
 
 from stimrig.api.cli import commands
-from stimrig.api.cli.errors import CommandError
+from stimrig.api.cli.errors import INTERRUPTED, CommandError, leave
 from stimrig.api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.version import software_version
 from stimrig.identify.errors import IdentifyError
 
+COMPUTES = {"compare", "diagnose", "explain", "export", "fit", "improve", "invert", "predict", "table1"}
+"""Verbs that only compute: they hold no device, and Ctrl-C may end them whatever they are in."""
+GRACE_S = 0.7
+"""For what is to be tidied up after Ctrl-C."""
+interrupted = threading.Event()
 VERBS = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
 INPUT_AT_FAULT = (Unreachable, Unauthorized, Forbidden, NotFound, Invalid)
 """Errors of a service that stand for a wrong address, a wrong token or a request that cannot be used."""
@@ -98,7 +105,12 @@ def main(arguments: list[str] | None = None) -> None:
     # The libraries make half a million objects that all stay: to go through them again and again, and once more at the
     # end, takes longer than a fit.
     gc.set_threshold(50_000)
+    computes = COMPUTES.intersection(sys.argv[1:2] if arguments is None else arguments[:1])
+    signal.signal(signal.SIGINT, _interrupt if computes else signal.default_int_handler)
     code = run(arguments)
+    signal.signal(signal.SIGINT, leave)
+    if computes and code == INTERRUPTED:  # Python itself would end by the signal, where it went through an exec
+        os._exit(code)
     gc.freeze()
     sys.exit(code)
 
@@ -107,22 +119,38 @@ def run(arguments: list[str] | None = None) -> int:
     """Run a verb; its exit code."""
     # Matrices of a fit are small: a second BLAS thread only waits for the first, and on a busy machine for long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    verb = next((word for word in (arguments if arguments is not None else sys.argv[1:]) if word[:1] != "-"), "")
+    given = arguments if arguments is not None else sys.argv[1:]
+    verb = next((word for word in given if word[:1] != "-"), "")
     try:
         code = (build(verb) if verb in VERBS else _overview())(arguments, standalone_mode=False)
         sys.stdout.flush()
+        if code == INTERRUPTED:  # typer has caught it
+            raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):
         print("stimrig: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the reader has gone; nothing to say to nobody
         return 0
     except Exception as error:
-        return _one_line(verb, error)
+        if interrupted.is_set():  # a library made another error of it
+            print("stimrig: interrupted", file=sys.stderr)
+            return INTERRUPTED
+        return _one_line(verb, given, error)
 
 
-def _one_line(verb: str, error: Exception) -> int:
+def _interrupt(*_: object) -> None:
+    """Ctrl-C: an exception, and the end of the process where it is not heard: a library may call us from its C code,
+    which drops exceptions, or compute for seconds before it looks."""
+    interrupted.set()
+    late = threading.Timer(GRACE_S, leave)
+    late.daemon = True
+    late.start()
+    raise KeyboardInterrupt
+
+
+def _one_line(verb: str, given: list[str], error: Exception) -> int:
     """The error's line, and the exit code it stands for."""
     name = f"stimrig {verb}" if verb in VERBS else "stimrig"
     if isinstance(error, TyperException):
@@ -133,7 +161,7 @@ def _one_line(verb: str, error: Exception) -> int:
         print(f"{name}: {flat(message)} (see {name} --help)", file=sys.stderr)
         return 2
     if isinstance(error, CommandError | IdentifyError | ApiError | SettingsError):
-        print(f"{name}: {flat(str(error))}", file=sys.stderr)
+        print(f"{name}: {flat(_naming(given, error))}", file=sys.stderr)
         return error.exit_code if isinstance(error, CommandError) else 2
     if isinstance(error, ServiceError):
         print(f"{name}: {flat(str(error))}", file=sys.stderr)
@@ -142,6 +170,13 @@ def _one_line(verb: str, error: Exception) -> int:
     log.write_text("".join(traceback.format_exception(error)))
     print(f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", file=sys.stderr)
     return 1
+
+
+def _naming(given: list[str], error: Exception) -> str:
+    """What went wrong, with the files of the command line where it is of what they hold and names none of them."""
+    files = [word for word in given if word[:1] != "-" and Path(word).is_file()]
+    about = isinstance(error, IdentifyError) and not error.place and files
+    return f"{', '.join(files)}: {error}" if about else str(error)
 
 
 def flat(text: str) -> str:

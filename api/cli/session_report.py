@@ -120,7 +120,7 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any] | None) -> list[
         f"dose           {dose}",
         f"torque         {summary.get('samples')} samples at {number(summary.get('sample_rate_hz'), 1)} Hz, "
         f"lost {summary.get('lost_samples')}, peak {number(summary.get('torque_peak_nm'))} N·m",
-        f"pulses         {summary.get('pulses')}, dropped {summary.get('dropped_pulses')}; lateness median "
+        f"pulses         {summary.get('pulses')}, dropped {summary.get('dropped_pulses')}; written late by median "
         f"{number(late.get('median'), 3)}, p99 {number(late.get('p99'), 3)}, max {number(late.get('max'), 3)} ms",
         f"clocks         aligned by {aligned.get('method')}, error {number(aligned.get('error_ms'), 4)} ms",
         *(f"in doubt       {words}" for words in summary.get("warnings") or []),

@@ -30,14 +30,8 @@ DOUBT = "THE STOP IS NOT CONFIRMED. Use the stimulator's own emergency switch no
 class StopKey(keys.StopKey):
     """Listens for a key as long as it is open; does nothing where standard input is no terminal.
 
-    Parameters
-    ----------
-    stop : callable
-        Stops, and says in words what came of it.
-    tell : callable
-        Gets the words.
-    descriptor : int, optional
-        Another file descriptor than standard input's.
+    `stop`: stops, and says in words what came of it; `tell`: gets the words; `descriptor`: another file descriptor than
+    standard input's.
     """
 
     def __init__(self, stop: Callable[[], str], tell: Callable[[str], object], descriptor: int | None = None) -> None:

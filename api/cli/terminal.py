@@ -14,6 +14,7 @@ import typer
 
 from stimrig import identify
 from stimrig.api.cli.errors import InputError
+from stimrig.api.whole_file import whole_path
 
 LARGEST_MODEL_BYTES = 32 * 2**20
 
@@ -41,6 +42,8 @@ ColumnMap = Annotated[
         show_default=False,
     ),
 ]
+Html = Annotated[Path | None, typer.Option(help="write a report with charts here")]
+LastModel = Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json, or MODEL.mat")]
 ModelFile = Annotated[
     Path, typer.Argument(help="MODEL.json of `stimrig fit -o`", metavar="MODEL.json", show_default=False)
 ]
@@ -66,8 +69,11 @@ def names(text: str | None) -> tuple[str, ...]:
     return tuple(part.strip() for part in (text or "").split(",") if part.strip())
 
 
-def load_model(path: Path) -> Any:
-    """A model from its file. Raises InputError: the file cannot be read, or holds no model."""
+def load_model(path: Path, usage: str = "") -> Any:
+    """A model from its file; `usage`: of a verb that takes it before a recording.
+
+    Raises InputError: the file cannot be read, or holds no model.
+    """
     if path.suffix.lower() == ".mat":
         raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
     try:
@@ -76,18 +82,18 @@ def load_model(path: Path) -> Any:
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
     except identify.IdentifyError as error:
+        with contextlib.suppress(identify.IdentifyError):
+            identify.read(path)
+            fix = f"The model comes first: stimrig {usage}." if usage else "Give a file written by `stimrig fit -o`."
+            raise InputError(f"{path}: this is a recording, not a model. {fix}") from error
         raise InputError(f"{path}: {error}") from error
 
 
 def load_record(data: Sequence[Path], columns: list[str] | None = None, effects: Sequence[str] = ()) -> Any:
     """A record from its file, or from several as one; what was assumed goes to standard error.
 
-    Raises
-    ------
-    InputError
-        A file is named twice.
-    IdentifyError
-        One cannot be read, they do not go together, or one lacks what one of the `effects` needs.
+    Raises InputError: a file is named twice. IdentifyError: one cannot be read, they do not go together, or one lacks
+    what one of the `effects` needs.
     """
     from stimrig.api import record_files
 
@@ -135,10 +141,10 @@ def load_held(path: Path | None, data: Sequence[Path], columns: list[str] | None
         raise InputError(f"{path}: {error}") from error
 
 
-def write(path: Path, text: str) -> None:
+def write(path: Path, content: str | bytes) -> None:
     """Write a file. Raises InputError: it cannot be written."""
-    with writing(path):
-        path.write_text(text, "utf-8")
+    with writing(path) as place:
+        place.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def write_model(path: Path, model: Any) -> None:
@@ -146,25 +152,26 @@ def write_model(path: Path, model: Any) -> None:
 
     Raises InputError: it cannot be written.
     """
-    if path.suffix.lower() != ".mat":
-        write(path, model.to_json())
-        return
-    write_mat(path, model.to_dict())
+    from stimrig.api.cli.result_files import write_model
+
+    with writing(path) as place:
+        write_model(place, model)
 
 
 def write_mat(path: Path, variables: dict[str, Any]) -> None:
     """Write variables as a MAT file. Raises InputError: it cannot be written."""
     from stimrig.identify import plain_mat
 
-    with writing(path):
-        plain_mat.write(path, variables)
+    with writing(path) as place:
+        plain_mat.write(place, variables)
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Around the writing of a file: one line where it cannot be written. Raises InputError: it cannot."""
+def writing(path: Path) -> Iterator[Path]:
+    """A place to write a file at, which is whole or as it was; one line where it cannot. Raises InputError."""
     try:
-        yield
+        with whole_path(path) as place:
+            yield place
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
 
@@ -243,11 +250,11 @@ def model_report(document: dict[str, Any]) -> list[str]:
     lines = [
         f"model          {document['model_id']}  ({document['method']}, effects: {effects})",
         f"fit            {percent(fit['fit_percent'])}  (the noise allows {number(fit['ceiling_percent'])} %), "
-        f"rms {number(fit['rms_nm'], 4)} N·m, noise {number(fit['noise_sd_nm'], 4)} N·m",
+        f"error {number(fit['rms_nm'], 4)} N·m, noise {number(fit['noise_sd_nm'], 4)} N·m",
         "held out       nothing"
         if fit["held_out_rms_nm"] is None
-        else f"held out       {in_turn}{percent(fit['held_out_fit_percent'])}, "
-        f"rms {number(fit['held_out_rms_nm'], 4)} N·m",
+        else f"held out       {in_turn}fit {percent(fit['held_out_fit_percent'])}, "
+        f"error {number(fit['held_out_rms_nm'], 4)} N·m",
         *repetition_lines(document.get("fit") or {}),
     ]
     if dynamics["time_constant_s"] is not None:

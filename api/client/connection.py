@@ -13,12 +13,15 @@ from websockets.sync.client import connect
 from stimrig.api import decisions
 from stimrig.api.client.errors import Unreachable, refused
 
+MOST_OWN = 200
+"""Entries of one's own that are told, the newest; of older ones one is told as of another's."""
+
 
 class SendsVersions(httpx.Auth):
     """Sends with each decision the version of what it is made on: the one that was last seen, or that of now.
 
     A program that has read a participant, a model or the rig, and decides on it, is so refused (409) if that has
-    changed meanwhile. One that has not read it decides on what is there now.
+    changed meanwhile by anybody else. One that has not read it decides on what is there now.
 
     Parameters
     ----------
@@ -29,7 +32,7 @@ class SendsVersions(httpx.Auth):
     requires_response_body = False
 
     def __init__(self, headers: dict[str, str]) -> None:
-        self._headers, self.seen = headers, dict[str, str]()
+        self._headers, self.seen, self.own = headers, dict[str, str](), list[str]()
 
     def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
         """As httpx asks for it."""
@@ -43,6 +46,7 @@ class SendsVersions(httpx.Auth):
                     return  # there is nothing to decide on: that is the answer
             if tag := self.seen.get(document):
                 request.headers["if-match"] = tag
+                request.headers["trail-own"] = ", ".join(self.own[-MOST_OWN:])
                 break
         answer = yield request
         self._keep(request.url.path, answer)
@@ -72,10 +76,16 @@ class SendsVersions(httpx.Auth):
                 self.seen[path] = ""  # a controller's key reads no participant
             if "etag" in answer.headers:  # of a calibration that waits to be stored with a 404, too
                 self.seen[path] = answer.headers["etag"]
-        elif answer.is_success and (path == "/v1/stop" or decisions.find(answer.request.method, path)):
-            about = "/v1/rig" if path == "/v1/stop" else "/".join(path.split("/")[:4])
-            # what was decided on has another version now
-            self.seen = {kept: tag for kept, tag in self.seen.items() if not kept.startswith(about)}
+        elif answer.is_success and path == "/v1/stop":
+            self._forget("/v1/rig")
+        elif answer.is_success and (found := decisions.find(answer.request.method, path)):
+            decision, names = found
+            # of what the rig keeps there is another version now; the rest stays as seen, but for one's own entries
+            self._forget(decision.document.format(**names) if decision.field in decisions.OF_RIG else path)
+            self.own += [entry for entry in answer.headers.get("trail-entries", "").split(", ") if entry]
+
+    def _forget(self, about: str) -> None:
+        self.seen = {kept: tag for kept, tag in self.seen.items() if not kept.startswith(about)}
 
 
 class Connection:
@@ -124,16 +134,29 @@ class Connection:
             The answer is a problem. Its class tells the status: `NotFound`, `Conflict`, `Invalid`, …
         """
         try:
-            answer = self.http.request(method, path, **more)
+            return _accepted(self.http.request(method, path, **more))
         except (httpx.RequestError, httpx.InvalidURL) as error:
             raise self._unreachable(error) from error
-        if answer.is_success or answer.status_code == httpx.codes.NOT_MODIFIED:
-            return answer
+
+    def content(self, path: str, most_bytes: int) -> bytes:
+        """The content at a path; of a longer one no more than its beginning: a service may be anybody.
+
+        Raises
+        ------
+        Unreachable, Refused
+        """
+        content = bytearray()
         try:
-            problem = answer.json()
-        except ValueError:
-            problem = None
-        raise refused(f"{method} {answer.request.url.path}", answer.status_code, problem, answer.text)
+            with self.http.stream("GET", path) as answer:
+                if not answer.is_success:
+                    answer.read()
+                for piece in _accepted(answer).iter_bytes():
+                    content += piece
+                    if len(content) > most_bytes:
+                        break
+        except (httpx.RequestError, httpx.InvalidURL) as error:
+            raise self._unreachable(error) from error
+        return bytes(content)
 
     def get(self, path: str, **more: Any) -> Any:
         """The JSON document at a path."""
@@ -164,3 +187,14 @@ class Connection:
     def _unreachable(self, error: Exception) -> Unreachable:
         why = str(error) or type(error).__name__
         return Unreachable(self.url, "the service cannot be reached", f"{why}. Is `stimrig serve` running there?")
+
+
+def _accepted(answer: httpx.Response) -> httpx.Response:
+    """An answer that is read, if it is none of a problem. Raises Refused."""
+    if answer.is_success or answer.status_code == httpx.codes.NOT_MODIFIED:
+        return answer
+    try:
+        problem = answer.json()
+    except ValueError:
+        problem = None
+    raise refused(f"{answer.request.method} {answer.request.url.path}", answer.status_code, problem, answer.text)

@@ -300,12 +300,13 @@ class Client(Connection):
         self,
         model_id: str,
         pulse_width_us: Sequence[float],
-        pulse_rate_hz: float = 40.0,
+        pulse_rate_hz: float | None = None,
         angle_rad: Sequence[float] | None = None,
     ) -> list[float]:
         """Mean torque in the period of each pulse, N·m, with all effects of the model. Nothing is played.
 
-        `angle_rad`: of the joint in each period, rad; a model that depends on it needs it.
+        `pulse_rate_hz`: by default the model's. `angle_rad`: of the joint in each period, rad; a model that depends on
+        it needs it.
         """
         body: dict[str, Any] = {"pulse_width_us": list(pulse_width_us), "pulse_rate_hz": pulse_rate_hz}
         if angle_rad is not None:

@@ -16,30 +16,35 @@ import numpy as np
 
 from stimrig.api.cohort.export import ERRORS, NoExport, Put, Who
 from stimrig.api.cohort.export_state import FOLDER, State
-from stimrig.api.cohort.parquet import STATUS, record_row, segment_at
-from stimrig.api.cohort.select import FIELDS, LABELS
+from stimrig.api.cohort.parquet import COLUMNS, STATUS, Column, record_row, segment_at
+from stimrig.api.cohort.select import LABELS
 from stimrig.api.cohort.whole_record import WholeRecord
 from stimrig.api.version import software_version
 from stimrig.identify.records.cells import cell_text
 
 Words = dict[str, dict[str, Any]]
 
-PHYSIO: Words = {
-    "time_s": {"Description": "time of the sample, test's clock, where the even rate does not give it", "Units": "s"},
-    "torque_nm": {"Description": "elbow torque, zero offset not removed; n/a: the sample was lost", "Units": "N.m"},
-    "angle_rad": {"Description": "joint angle", "Units": "rad"},
-    "velocity_rad_s": {"Description": "angular velocity of the joint", "Units": "rad/s"},
-    "sync": {"Description": "stimulator's sync line as the load cell saw it, 0 or 1"},
-}
-STIM: Words = {
-    "pulse_width_us": {
-        "Description": "width of a phase of the pulse in force, held between pulses; 0: none; n/a: outside of every "
-        "segment, or the sample was lost",
-        "Units": "us",
-    },
-    "late_s": {"Description": "by how much later than its even slot the pulse in force was felt", "Units": "s"},
-    "doubted": {"Description": "1: it is not known what was felt"},
-}
+
+def _words(table: str, *names: str, **renamed: str) -> Words:
+    """What the data dictionary says of columns, as BIDS writes it; `renamed`: by another name here."""
+    said = {column.name: column for column in COLUMNS[table]}
+    return {name: _word(said[column]) for name, column in {**dict(zip(names, names, strict=True)), **renamed}.items()}
+
+
+def _word(column: Column) -> dict[str, Any]:
+    among = "1: yes, 0: no" if column.type == "true or false" else column.range
+    says = column.meaning.replace("null", "n/a") + (f" ({among})" if among not in column.meaning else "")
+    unit = column.unit.replace("·", ".").replace("µ", "u")
+    return {"Description": says, **({"Units": unit} if unit not in ("", "1") else {})}
+
+
+PHYSIO = _words("samples", "time_s", "torque_nm", "angle_rad", "velocity_rad_s", "sync")
+STIM = _words("samples", "pulse_width_us", "late_s", "doubted")
+PULSE = {
+    "pulse_width": "sent_pulse_width_us", "planned_pulse_width": "pulse_width_us", "current": "current_ma",
+    "planned_onset": "planned_time_s", "acknowledged": "acknowledged_time_s",
+}  # fmt: skip
+"""Columns of a pulse's event, and those of the record's pulses that they are."""
 EVENTS: Words = {
     "onset": {"Description": "begin of the segment; when the pulse's command had been written to the line (of one that "
               "was not sent: when it was due). Zero is the start of the first segment, as in the continuous recordings",
@@ -51,23 +56,12 @@ EVENTS: Words = {
                    "pulse_not_sent": "a planned pulse that was dropped or refused"},
     },
     "segment": {"Description": "name of the segment; rows of `validate` are held out from fits"},
-    "pulse_index": {"Description": "index of the pulse in the test, from 0"},
-    "pulse_width": {"Description": "width of a phase as sent", "Units": "us"},
-    "planned_pulse_width": {"Description": "width of a phase as planned", "Units": "us"},
-    "current": {"Description": "current as sent", "Units": "mA"},
-    "planned_onset": {"Description": "when the pulse was due", "Units": "s"},
-    "acknowledged": {"Description": "when the stimulator's acknowledgement was read; n/a: none came", "Units": "s"},
-    "status": {"Description": "what became of the pulse: acknowledged, dropped, refused, unacknowledged, device error"},
+    **_words("pulses", pulse_index="index", **PULSE, status="status"),
 }  # fmt: skip
 SCANS: Words = {
     "filename": {"Description": "the continuous recording of torque; its stim and events files are called alike"},
-    "acq_time": {"Description": "when the recording was made (UTC); moved or n/a where days are hidden"},
-    **{name: {"Description": label.says} for name, label in LABELS.items()},
-    "outcome": {"Description": FIELDS["outcome"].says},
-    "duration_s": {"Description": "from the first sample in a segment to the last", "Units": "s"},
-    "sample_rate_hz": {"Description": "samples a second", "Units": "Hz"},
-    "record_id": {"Description": "id of the recording"},
-    "sha256": {"Description": "SHA-256 of the file that was exported"},
+    **_words("records", acq_time="begun_utc"),
+    **_words("records", *LABELS, "outcome", "duration_s", "sample_rate_hz", "record_id", "sha256"),
 }
 PARTICIPANTS: Words = {
     "participant_id": {"Description": "sub- and the label: the letters and digits of the code"},
@@ -88,6 +82,8 @@ Each recording is one test: `sub-<label>/ses-<day>/beh/sub-…_ses-…_task-<kin
 - `…_stim.tsv.gz`: the pulse width in force at each of these samples;
 - `…_events.tsv`: each pulse and each segment of the test;
 - `…_scans.tsv` of a session: when each recording was made, and how it ended.
+
+In a table `n/a` stands where nothing is known; in a continuous recording also where a sample was lost.
 
 Row k of a continuous recording was measured at StartTime + k / SamplingFrequency, on the clock of the events. `acq-` is
 the beginning of the SHA-256 of the exported file. A session is a day (UTC). `participants.tsv` says which code a label
@@ -211,11 +207,7 @@ def events(record: WholeRecord) -> list[dict[str, Any]]:
             "trial_type": "pulse" if sent else "pulse_not_sent",
             "segment": record.segments[place][0] if place >= 0 else None,
             "pulse_index": index,
-            "pulse_width": row.get("sent_pulse_width_us"),
-            "planned_pulse_width": row.get("pulse_width_us"),
-            "current": row.get("current_ma"),
-            "planned_onset": due_s,
-            "acknowledged": row.get("acknowledged_time_s"),
+            **{name: row.get(column) for name, column in PULSE.items()},
             "status": STATUS[int(status)] if status in range(len(STATUS)) else None,
         })  # fmt: skip
     return sorted(found, key=lambda event: (event["onset"], event["trial_type"] != "segment"))

@@ -18,7 +18,7 @@ SDS = 1.0
 RELATIVE = 0.01
 """Where it has none: by more than this share of its value."""
 RMS_RELATIVE = 0.02
-"""An error on held-out rows that moves by no more than this share has not changed."""
+"""An error on held-out pulses that moves by no more than this share has not changed."""
 ROWS_AT_ONCE = 100_000
 """Rows of OLD held in memory; of more, both files are read several times."""
 COLUMNS = (
@@ -35,26 +35,16 @@ Row = Mapping[str, Any]
 
 @dataclass
 class Changes:
-    """What differs between two runs.
-
-    Attributes
-    ----------
-    options : str
-        How their options differ, apart from the version of stimrig: then not only that may be the cause.
-    same : int
-        Records in both whose results do not differ by more than the tolerances.
-    rows : list of dict
-        Records that differ: `record`, `participant`, `day`, `kinds`, `why`.
-    only_old, only_new : list of str
-        Records in one of the runs only.
-    """
+    """What differs between two runs."""
 
     old: dict[str, Any]
     new: dict[str, Any]
     options: str = ""
-    same: int = 0
+    """How their options differ, apart from the version of stimrig: then not only that may be the cause."""
+    same: int = 0  # records in both whose results do not differ by more than the tolerances
     rows: list[dict[str, Any]] = field(default_factory=list)
-    only_old: list[str] = field(default_factory=list)
+    """Records that differ: `record`, `participant`, `day`, `kinds`, `why`."""
+    only_old: list[str] = field(default_factory=list)  # records in the old run only
     only_new: list[str] = field(default_factory=list)
 
     def take(self, old: Row | None, new: Row | None) -> None:
@@ -157,7 +147,7 @@ def differences(old: Row, new: Row) -> Iterator[tuple[str, str]]:
     yield from _parameters(old, new)
     before, after = old["held_out_rms_nm"], new["held_out_rms_nm"]
     if _apart(before, after, RMS_RELATIVE * max(abs(before or 0.0), abs(after or 0.0))):
-        yield "held-out error", f"held-out rms {_number(before)} → {_number(after)} N·m"
+        yield "held-out error", f"held-out error {_number(before)} → {_number(after)} N·m"
 
 
 def _errors(old: Row, new: Row) -> Iterator[tuple[str, str]]:

@@ -32,27 +32,13 @@ LOST_WORKERS = 2
 
 @dataclass(frozen=True)
 class Workers:
-    """Where the records are computed.
+    """Where the records are computed."""
 
-    Attributes
-    ----------
-    scheduler : str
-        Address of a scheduler; empty: this machine.
-    count : int
-        Processes on this machine.
-    memory_bytes : int
-        What a record may take beyond the libraries.
-    dashboard : bool
-        Whether a local scheduler shows its dashboard.
-    wait_s : float
-        How long to wait for the first worker of a scheduler.
-    """
-
-    scheduler: str = ""
-    count: int = 2
-    memory_bytes: int = 2**30
-    dashboard: bool = False
-    wait_s: float = 60.0
+    scheduler: str = ""  # address of a scheduler; empty: this machine
+    count: int = 2  # processes on this machine
+    memory_bytes: int = 2**30  # what a record may take beyond the libraries
+    dashboard: bool = False  # whether a local scheduler shows its dashboard
+    wait_s: float = 60.0  # how long to wait for the first worker of a scheduler
 
 
 def memory_of(text: str) -> int:
@@ -70,12 +56,8 @@ def memory_of(text: str) -> int:
 def connected(workers: Workers) -> Iterator[Client]:
     """A client whose workers are there and have this version; all that was started is ended.
 
-    Raises
-    ------
-    CohortError
-        No scheduler, no worker, or workers of another version.
-    CutOffError
-        The scheduler went while it was asked for something.
+    Raises CohortError: no scheduler, no worker, or workers of another version. CutOffError: the scheduler went while it
+    was asked for something.
     """
     quiet()
     with warnings.catch_warnings():

@@ -132,12 +132,7 @@ def lost(entry: Entry, task: Task, line: str) -> dict[str, Any]:
 class Computing:
     """One process that computes, for one thread of a worker.
 
-    Parameters
-    ----------
-    memory_bytes : int
-        What a record may take beyond the libraries.
-    records : int
-        After so many the process is started afresh.
+    `memory_bytes`: what a record may take beyond the libraries; `records`: after so many the process is started afresh.
     """
 
     def __init__(self, memory_bytes: int, records: int = RECORDS_A_PROCESS) -> None:

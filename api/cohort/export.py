@@ -70,19 +70,13 @@ class Days:
 
 @dataclass(frozen=True)
 class Who:
-    """Whose record it is, and how it is called.
-
-    Attributes
-    ----------
-    key : str
-        Letters and digits that no other record has: it names files.
-    """
+    """Whose record it is, and how it is called."""
 
     participant: str
     label: str
     session: str
     record_id: str
-    key: str
+    key: str  # letters and digits that no other record has: it names files
     begun_utc: str | None
 
 
@@ -127,33 +121,15 @@ class Tally:
 
 @dataclass
 class Export:
-    """One export.
+    """One export."""
 
-    Parameters
-    ----------
-    sources : sequence of Source
-        Where the records are.
-    selection : Selection
-        Which are meant.
-    state : State
-        Of the folder.
-    writer : Writer
-        The format.
-    days : Days
-        What becomes of dates.
-    columns : sequence of str
-        `--map` for tables of other tools.
-    tell : callable
-        Called with the tally after every record.
-    """
-
-    sources: Sequence[Source]
-    selection: Selection
-    state: State
-    writer: Writer
-    days: Days
-    columns: Sequence[str] = ()
-    tell: Callable[[Tally], None] = lambda _: None
+    sources: Sequence[Source]  # where the records are
+    selection: Selection  # which are meant
+    state: State  # of the folder
+    writer: Writer  # the format
+    days: Days  # what becomes of dates
+    columns: Sequence[str] = ()  # `--map` for tables of other tools
+    tell: Callable[[Tally], None] = lambda _: None  # called with the tally after every record
     tally: Tally = field(default_factory=Tally)
 
     def __post_init__(self) -> None:
@@ -163,12 +139,7 @@ class Export:
     def go(self) -> Tally:
         """Export all, and what is made of all.
 
-        Raises
-        ------
-        CohortError
-            A source is not there.
-        CutOffError
-            The disk is full, or the like; the same command goes on.
+        Raises CohortError: a source is not there. CutOffError: the disk is full, or the like; the same command goes on.
         """
         for source in self.sources:
             source.check()
@@ -178,7 +149,9 @@ class Export:
                     self._one(source, entry, Path(folder))
                     self.tell(self.tally)
             self.writer.finish(self.state, self.put)
-            self._write_errors()
+            with self.put(ERRORS) as file:
+                rows = chain([("address", "kind", "reason")], self.state.failures())
+                file.writelines(line.encode("utf-8", "replace") for line in lines(rows))
         return self.tally
 
     def _one(self, source: Source, entry: Entry, folder: Path) -> None:
@@ -266,11 +239,6 @@ class Export:
             yield file
             target.parent.mkdir(parents=True, exist_ok=True)
         self._places.append(place)
-
-    def _write_errors(self) -> None:
-        with self.put(ERRORS) as file:
-            rows = chain([("address", "kind", "reason")], self.state.failures())
-            file.writelines(line.encode("utf-8", "replace") for line in lines(rows))
 
     @contextmanager
     def _on_the_disk(self) -> Iterator[None]:

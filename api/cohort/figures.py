@@ -9,6 +9,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from stimrig.api.charts.figure import axis, in_light, layout, role, unlinked
+from stimrig.api.charts.model_charts import COLOURS
 from stimrig.api.charts.plot import LocalFigure
 from stimrig.api.cohort.statistics import PROBABLE, Statistics, wilson
 
@@ -17,7 +18,6 @@ LEAST_CASES = 5
 MOST_LINES = 20
 """Participants whose lines are drawn: those with the most sessions."""
 MOST_PANELS = 12
-COLOURS = tuple(role(f"series-{number}") for number in range(1, 7))
 DASHES = ("solid", "dash", "dot", "dashdot")
 UNITS = {"us": "µs", "nm": "N·m", "s": "s"}
 ROW_PX = 26
@@ -145,15 +145,7 @@ NOTHING = "Too few: a line needs a participant with two sessions whose participa
 
 
 def page(found: Statistics, name: str) -> str:
-    """The page.
-
-    Parameters
-    ----------
-    found : Statistics
-        From the table of results.
-    name : str
-        The file's, for the title.
-    """
+    """The page. `found`: from the table of results; `name`: the file's, for the title."""
     pictures = _Pictures()
     parts = [
         *_head(found, name),

@@ -14,9 +14,10 @@ import pyarrow.parquet as pq
 from stimrig.api.cohort.export import Put, Who
 from stimrig.api.cohort.export_state import State
 from stimrig.api.cohort.select import FIELDS, LABELS
-from stimrig.api.cohort.table import table_of
+from stimrig.api.cohort.table import TYPES, schema_of, table_of
 from stimrig.api.cohort.whole_record import WholeRecord
 from stimrig.identify.records.cells import lines
+from stimrig.identify.records.record import HELD_OUT
 
 Kind = Literal["text", "number", "integer", "true or false", "time"]
 
@@ -106,19 +107,8 @@ COLUMNS = {table: [Column(*entry) for entry in entries] for table, entries in {
 }.items()}  # fmt: skip
 
 
-def schema_of(table: str) -> Any:
-    """A table's Arrow schema; unit and meaning stand in each field's metadata."""
-
-    types = {
-        "text": pa.string(),
-        "number": pa.float64(),
-        "integer": pa.int64(),
-        "true or false": pa.bool_(),
-        "time": pa.timestamp("us", tz="UTC"),
-    }
-    return pa.schema([
-        pa.field(c.name, types[c.type], metadata={"unit": c.unit, "description": c.meaning}) for c in COLUMNS[table]
-    ])  # fmt: skip
+SCHEMAS = {table: schema_of((c.name, TYPES[c.type], c.unit, c.meaning) for c in columns)
+           for table, columns in COLUMNS.items()}  # fmt: skip
 
 
 def as_json(title: str) -> str:
@@ -138,7 +128,6 @@ def as_csv() -> str:
 
 NAME: str = "parquet"
 STATUS = ("acknowledged", "rest", "dropped", "refused", "unacknowledged", "device error")
-HELD_OUT = "validate"
 ROWS = 2000
 """Rows of `records.parquet` that are held in memory at once."""
 KEPT_NAN = ("time_s", "torque_nm")
@@ -156,7 +145,7 @@ def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
 
 def finish(state: State, put: Put) -> None:
     """`records.parquet` and the dictionary."""
-    schema = schema_of("records")
+    schema = SCHEMAS["records"]
     with put("records.parquet") as file, pq.ParquetWriter(file, schema, compression="zstd") as writer:
         rows = (row for _, _, row in state.rows())
         while batch := list(islice(rows, ROWS)):
@@ -259,7 +248,7 @@ def _numbers(column: Any, field: Any, size: int) -> pa.Array:
 
 def _table(name: str, made: dict[str, Any], columns: Mapping[str, Any], size: int) -> pa.Table:
     """A table with the columns that were made; the others are a record's numbers."""
-    schema = schema_of(name)
+    schema = SCHEMAS[name]
     numbers = {field.name: field for field in schema if field.name not in made}
     made |= {column: _numbers(columns.get(column), field, size) for column, field in numbers.items()}
     return pa.Table.from_arrays([made[field.name] for field in schema], schema=schema)

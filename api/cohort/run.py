@@ -43,12 +43,7 @@ class Sent:
 class Parcels:
     """Records on the workers of one run.
 
-    Parameters
-    ----------
-    client : Client
-        With workers.
-    task, bounds : Task, Bounds
-        What is done with each, and what it may take.
+    `client`: with workers; `task`, `bounds`: what is done with each, and what it may take.
     """
 
     def __init__(self, client: Client, task: Task, bounds: Bounds) -> None:
@@ -77,12 +72,8 @@ class Parcels:
     def receive(self) -> list[dict[str, Any]]:
         """The rows of the next parcel that comes back; none where its records were sent again.
 
-        Raises
-        ------
-        CohortError
-            A worker has another version.
-        CutOffError
-            The scheduler is gone, or a worker cannot compute at all.
+        Raises CohortError: a worker has another version. CutOffError: the scheduler is gone, or a worker cannot compute
+        at all.
         """
         future = next(self._came)
         one = self._sent.pop(future.key)
@@ -170,33 +161,15 @@ class Tally:
 
 @dataclass(eq=False)
 class Run:
-    """One run over a cohort.
+    """One run over a cohort."""
 
-    Parameters
-    ----------
-    client : Client
-        With workers.
-    sources : sequence of Source
-        Where the records are.
-    task : Task
-        What is done with each.
-    bounds : Bounds
-        What one record may take.
-    results : Results
-        Open; takes the rows.
-    tell : callable
-        Called with the tally after every row.
-    monotonic_s : callable
-        The clock.
-    """
-
-    client: Client
-    sources: Sequence[Source]
-    task: Task
-    bounds: Bounds
-    results: Results
-    tell: Tell = lambda _tally: None
-    monotonic_s: Callable[[], float] = time.monotonic
+    client: Client  # with workers
+    sources: Sequence[Source]  # where the records are
+    task: Task  # what is done with each
+    bounds: Bounds  # what one record may take
+    results: Results  # open; takes the rows
+    tell: Tell = lambda _tally: None  # called with the tally after every row
+    monotonic_s: Callable[[], float] = time.monotonic  # the clock
     tally: Tally = field(default_factory=Tally)
 
     def __post_init__(self) -> None:
@@ -207,17 +180,8 @@ class Run:
     def go(self, keep: bool = False) -> Tally:
         """Do every record that is not done; then the results are whole, but not joined yet.
 
-        Parameters
-        ----------
-        keep : bool
-            Leave the workers' computing processes for another run.
-
-        Raises
-        ------
-        CohortError
-            A source is not there, or a worker has another version.
-        CutOffError
-            The scheduler, or a worker's machine, cannot go on.
+        `keep`: leave the workers' computing processes for another run. Raises CohortError: a source is not there, or a
+        worker has another version.
         """
         counting = threading.Thread(target=self._count, daemon=True)
         counting.start()

@@ -81,15 +81,8 @@ Test = Callable[[Known], bool | None]
 class Selection:
     """Which records are meant.
 
-    Parameters
-    ----------
-    text : str
-        The expression; empty: all.
-
-    Raises
-    ------
-    CohortError
-        It is no such expression, or names a field that there is not.
+    `text`: the expression; empty: all. Raises CohortError: it is no such expression, or names a field that there is
+    not.
     """
 
     def __init__(self, text: str = "") -> None:
@@ -206,25 +199,23 @@ def _sides(node: ast.Compare) -> tuple[str, type[ast.cmpop], Any]:
     left, right, kind = node.left, node.comparators[0], type(node.ops[0])
     if isinstance(left, ast.Name) == isinstance(right, ast.Name):
         raise _bad(node, "a field is compared with a text or a number")
-    if isinstance(left, ast.Name):
-        field = _field(left)
-        if kind in (ast.In, ast.NotIn):
-            return field, kind, _several(field, right)
-        if kind not in MIRRORED:
-            raise _bad(node, "compare with ==, !=, <, <=, >, >=, in or not in")
-        return field, kind, _value(field, right, kind)
-    assert isinstance(right, ast.Name)
-    field = _field(right)
+    name, other = (left, right) if isinstance(left, ast.Name) else (right, left)
+    assert isinstance(name, ast.Name)
+    field = _field(name)
     if kind in (ast.In, ast.NotIn):
-        if FIELDS[field].type == "number":
-            raise _bad(node, f"{field} is a number, and nothing is part of it")
-        part = _literal(left)
-        if not isinstance(part, str):
-            raise _bad(left, "a text is part of a text")
-        return field, Contains if kind is ast.In else ContainsNot, part
+        return (field, kind, _several(field, other)) if name is left else _part_of(node, field, other)
     if kind not in MIRRORED:
         raise _bad(node, "compare with ==, !=, <, <=, >, >=, in or not in")
-    return field, MIRRORED[kind], _value(field, left, kind)
+    return field, kind if name is left else MIRRORED[kind], _value(field, other, kind)
+
+
+def _part_of(node: ast.Compare, field: str, given: ast.expr) -> tuple[str, type[ast.cmpop], str]:
+    if FIELDS[field].type == "number":
+        raise _bad(node, f"{field} is a number, and nothing is part of it")
+    part = _literal(given)
+    if not isinstance(part, str):
+        raise _bad(given, "a text is part of a text")
+    return field, Contains if isinstance(node.ops[0], ast.In) else ContainsNot, part
 
 
 def _field(node: ast.Name) -> str:

@@ -26,33 +26,17 @@ SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 
 @dataclass(frozen=True)
 class Entry:
-    """One record as a source lists it.
+    """One record as a source lists it."""
 
-    Attributes
-    ----------
-    address : str
-        What names it among all, and for people: a path, a URL.
-    name : str
-        Name of the file, or id at a centre.
-    key : str
-        What `open` takes.
-    bytes : int or None
-        Size, where the listing says it.
-    stamp : str
-        Changes whenever the content does: time of change, ETag, hash. Empty: not known.
-    sha256 : str
-        Of the content, where the listing says it.
-    known : dict
-        Fields (`stimrig.api.cohort.select`) that are known without reading the record.
-    """
-
-    address: str
-    name: str
-    key: str
-    bytes: int | None = None
+    address: str  # what names it among all, and for people: a path, a URL
+    name: str  # name of the file, or id at a centre
+    key: str  # what `open` takes
+    bytes: int | None = None  # size, where the listing says it
     stamp: str = ""
-    sha256: str = ""
+    """Changes whenever the content does: time of change, ETag, hash. Empty: not known."""
+    sha256: str = ""  # of the content, where the listing says it
     known: dict[str, Any] = field(default_factory=dict)
+    """Fields (`stimrig.api.cohort.select`) that are known without reading the record."""
 
 
 class SourceError(Exception):
@@ -260,34 +244,9 @@ class Centre(Source):
     def open(self, entry: Entry, most_bytes: int) -> bytes:
         try:
             with Connection(self.url, self.token) as line:
-                return _bounded(line, f"/v1/recordings/{entry.key}", most_bytes)
+                return line.content(f"/v1/recordings/{entry.key}", most_bytes)
         except ServiceError as error:
             raise SourceError(f"cannot be fetched ({_line(error, 300)})") from None
-
-
-def _bounded(line: Connection, path: str, most_bytes: int) -> bytes:
-    """An answer's bytes, no more than wanted: a centre may be anybody."""
-    import httpx
-
-    from stimrig.api.client.errors import Unreachable, refused
-
-    try:
-        with line.http.stream("GET", path) as answer:
-            if not answer.is_success:
-                answer.read()
-                try:
-                    problem = answer.json()
-                except ValueError:
-                    problem = None
-                raise refused(f"GET {path}", answer.status_code, problem, answer.text)
-            content = bytearray()
-            for piece in answer.iter_bytes():
-                content += piece
-                if len(content) > most_bytes:
-                    break
-            return bytes(content)
-    except httpx.HTTPError as error:
-        raise Unreachable(line.url, "the service cannot be reached", str(error)) from error
 
 
 def sources_of(addresses: Sequence[str], token: str = "", scheduler: str = "") -> list[Source]:

@@ -34,40 +34,23 @@ def wilson(count: int, of: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """How a parameter repeats between sessions of the same participant.
+    """How a parameter repeats between sessions of the same participant."""
 
-    Attributes
-    ----------
-    participants, sessions : int
-        With at least two sessions, and their sessions.
-    mean : float
-        Over all sessions.
-    within_sd : float
-        Standard deviation between sessions of one participant, pooled.
-    between_sd : float or None
-        Standard deviation between participants, the part that sessions don't explain; None with one participant.
-    cv_percent : float or None
-        `within_sd` of the mean, %; None where values of both signs make it mean nothing.
-    icc : float or None
-        Intraclass correlation ICC(1), one way, for single sessions of unequal numbers; None with one participant.
-    """
-
-    participants: int
-    sessions: int
-    mean: float
-    within_sd: float
+    participants: int  # with at least two sessions
+    sessions: int  # theirs
+    mean: float  # over all sessions
+    within_sd: float  # standard deviation between sessions of one participant, pooled
     between_sd: float | None
-    cv_percent: float | None
+    """Standard deviation between participants, the part that sessions don't explain; None with one participant."""
+    cv_percent: float | None  # `within_sd` of the mean, %; None where values of both signs make it mean nothing
     icc: float | None
+    """Intraclass correlation ICC(1), one way, for single sessions of unequal numbers; None with one participant."""
 
 
 def repeatability(groups: Sequence[Sequence[float]]) -> Repeatability | None:
     """By one-way analysis of variance over participants with two sessions or more; None where there is none.
 
-    Parameters
-    ----------
-    groups : sequence of sequence of float
-        Values by participant.
+    `groups`: values by participant.
     """
     several = [list(group) for group in groups if len(group) > 1]
     if not several:

@@ -6,7 +6,7 @@ It is read for the options it was made with, its rows, and which rows of many pa
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,10 @@ STEP = pa.struct([("added", pa.string()), *((name, pa.float64()) for name in OF_
 REFUSED = pa.struct([("effect", pa.string()), ("log_evidence_gain", pa.float64())])
 INSTANT = pa.timestamp("us", tz="UTC")
 
-TYPES = {"text": pa.string(), "day": pa.date32(), "number": pa.float64(), "bytes": pa.int64()}
+TYPES: dict[str, pa.DataType] = {
+    "text": pa.string(), "day": pa.date32(), "number": pa.float64(), "integer": pa.int64(), "bytes": pa.int64(),
+    "true or false": pa.bool_(), "time": INSTANT,
+}  # fmt: skip
 
 
 def _fields(*names: str) -> Iterator[tuple[str, pa.DataType, str, str]]:
@@ -71,9 +74,9 @@ COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
     ("probability", pa.float64(), "1", "of the diagnosis"),
     ("fit_percent", pa.float64(), "%", "best fit; of diagnose: the plain structure's; of improve: the last model's"),
     ("ceiling_percent", pa.float64(), "%", "best fit that the noise allows"),
-    ("rms_nm", pa.float64(), "N·m", "error on the fitted rows"),
-    ("held_out_fit_percent", pa.float64(), "%", "best fit on held-out rows"),
-    ("held_out_rms_nm", pa.float64(), "N·m", "error on held-out rows"),
+    ("rms_nm", pa.float64(), "N·m", "error on the fitted pulses"),
+    ("held_out_fit_percent", pa.float64(), "%", "best fit on held-out pulses"),
+    ("held_out_rms_nm", pa.float64(), "N·m", "error on held-out pulses"),
     ("held_out_by", pa.string(), "", "how the held-out values were found"),
     ("noise_sd_nm", pa.float64(), "N·m", "white noise of a sample, standard deviation"),
     ("reasons", TEXTS, "", "reasons of the verdict"),
@@ -88,12 +91,15 @@ COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
 
 MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
 
-SCHEMA = pa.schema(
-    [
-        pa.field(name, kind, metadata={"description": says, **({"unit": unit} if unit else {})})
-        for name, kind, unit, says in COLUMNS
-    ]
-)
+
+def schema_of(columns: Iterable[tuple[str, pa.DataType, str, str]]) -> pa.Schema:
+    """An Arrow schema; unit and meaning stand in each field's metadata."""
+    return pa.schema([
+        pa.field(name, kind, metadata={"unit": unit, "description": says}) for name, kind, unit, says in columns
+    ])  # fmt: skip
+
+
+SCHEMA = schema_of(COLUMNS)
 ROWS_A_GROUP = 5000
 ROWS_AT_ONCE = 1000
 """Rows held in memory while tables are read."""

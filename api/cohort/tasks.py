@@ -16,10 +16,7 @@ SCHEDULER_GONE = f"the scheduler is gone. {GOES_ON}"
 class CohortError(ApiError):
     """The run cannot begin: wrong input, a scheduler that is not there, results of other options.
 
-    Parameters
-    ----------
-    message : str
-        One line: the place, what is wrong, what to do.
+    `message`: one line: the place, what is wrong, what to do.
     """
 
     def __init__(self, message: str) -> None:
@@ -35,22 +32,14 @@ AUTO, METHOD = "auto", "maximum-likelihood"
 
 @dataclass(frozen=True)
 class Task:
-    """One verb with its options, the same for every record.
-
-    Attributes
-    ----------
-    select : str
-        The selection's text: a record whose listing leaves it open is judged once it has been read.
-    software : str
-        Version of stimrig that asked; a worker of another one refuses.
-    """
+    """One verb with its options, the same for every record."""
 
     verb: str
-    select: str = ""
+    select: str = ""  # the selection's text: a record whose listing leaves it open is judged once it has been read
     method: str = METHOD
     effects: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
-    software: str = ""
+    software: str = ""  # version of stimrig that asked; a worker of another one refuses
 
     def document(self) -> dict[str, Any]:
         """The options by which results may be added to results."""

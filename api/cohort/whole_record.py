@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stimrig.api.cohort.record import read
 from stimrig.api.cohort.select import Known
 from stimrig.identify.records import HDF5_MAGIC
+from stimrig.identify.records.bounds import LONGEST_PLAN
 from stimrig.identify.records.hdf5 import StrictFile
 
 TORQUE = ("counter", "host_time_s", "sync")
@@ -32,28 +33,17 @@ NO_SYNC = 255
 
 @dataclass
 class WholeRecord:
-    """One record.
-
-    Attributes
-    ----------
-    about : dict
-        Fields of `stimrig.api.cohort.select` and attributes of the recording.
-    samples : dict of ndarray, each of shape (N,)
-        All torque samples, those outside of every segment, too; a column that the record lacks is not there.
-    pulses : dict of ndarray, each of shape (P,)
-        What was planned, sent and heard of each pulse; empty for a record without a list of its pulses.
-    segments : list of (name, start_s, end_s)
-        End exclusive.
-    notes : tuple of str
-        What was assumed when it was read.
-    """
+    """One record."""
 
     sha256: str
-    about: dict[str, Any]
+    about: dict[str, Any]  # fields of `stimrig.api.cohort.select` and attributes of the recording
     samples: dict[str, NDArray[Any]]
+    """Shape (N,); all torque samples, those outside of every segment, too; a column that the record lacks is not
+    there."""
     pulses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    segments: list[tuple[str, float, float]] = field(default_factory=list)
-    notes: tuple[str, ...] = ()
+    """Shape (P,); what was planned, sent and heard of each pulse; empty for a record without a list of its pulses."""
+    segments: list[tuple[str, float, float]] = field(default_factory=list)  # end exclusive
+    notes: tuple[str, ...] = ()  # what was assumed when it was read
 
     @property
     def sample_rate_hz(self) -> float:
@@ -90,7 +80,7 @@ def _sealed(found: WholeRecord, record: Any, content: bytes, path: Path) -> None
     """Everything that the file holds; what `identify` made of it beside the samples that it took."""
     file = StrictFile(content, str(path))
     found.about |= {name: number for name in NUMBERS if np.isfinite(number := file.number(name, np.nan))}
-    found.about |= {name: text for name in TEXTS if (text := file.text(name, ""))}
+    found.about |= {name: text for name in TEXTS if (text := file.text(name, "", LONGEST_PLAN))}
     found.about |= _alignment(content)
     time_s = file.numbers("/torque/time_s")
     size = len(time_s)

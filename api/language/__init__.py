@@ -19,7 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from babel import Locale, UnknownLocaleError
+from babel import Locale, negotiate_locale
 from babel.dates import format_date
 from babel.messages.catalog import Catalog
 from babel.messages.mofile import write_mo
@@ -67,17 +67,11 @@ def best(accepted: str) -> str:
     for place, part in enumerate(accepted[:400].split(",")):
         tag, _, weight = part.partition(";q=")
         try:
-            wanted.append((-float(weight or 1.0), place, tag.strip()))
+            wanted.append((-float(weight or 1.0), place, tag.strip().lower()))
         except ValueError:
             continue
-    for weight, _, tag in sorted(wanted):
-        try:
-            code = Locale.parse(tag, sep="-").language if weight < 0 else ""
-        except (ValueError, UnknownLocaleError, TypeError):
-            continue
-        if code in CODES:
-            return code
-    return DEFAULT
+    preferred = [tag for weight, _, tag in sorted(wanted) if weight < 0]
+    return negotiate_locale(preferred, CODES, sep="-") or DEFAULT
 
 
 # ---- texts ----------------------------------------------------------------------------------------------------------

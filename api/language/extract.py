@@ -23,7 +23,8 @@ from stimrig.api.language import CODES, DEFAULT, HERE, catalogue, first
 ROOT = HERE.parents[1]
 KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}
 SENTENCES = (
-    "identify/caution.py", "identify/errors.py", "identify/criticism/*.py", "identify/diagnosis/*.py",
+    "identify/conclusion.py", "identify/healing.py",
+    "identify/errors.py", "identify/criticism/*.py", "identify/diagnosis/*.py",
     "identify/estimation/quality.py", "identify/effects/*.py", "identify/experiments/*.py", "identify/records/*.py",
     "identify/fitting.py", "identify/dynamics/grid.py", "identify/estimation/plain.py",
     "identify/estimation/candidates.py", "identify/estimation/effect_fit.py", "identify/estimation/samples.py",
@@ -75,7 +76,8 @@ VOCABULARY = (
     # how sure, how much
     "very probably", "probably", "possibly", "something", "expired", "empty", "1 place", "%(count)s places",
     # what is joined
-    "%(one)s and %(other)s", "%(one)s from %(other)s", "%(name)s (%(form)s)", " by %(who)s", "with %(effects)s",
+    "%(one)s and %(other)s", "%(one)s, then %(other)s", "“%(name)s”",
+    "%(one)s from %(other)s", "%(name)s (%(form)s)", " by %(who)s", "with %(effects)s",
     # a sentence without the figure that `stimrig.api.structure.worded` takes away; made by `format`
     "%(test)s should separate %(those)s.", "%(test)s is the best test to separate %(those)s, but it may not be enough.",
     "pulse widths of %(range)s µs", "%(range)s pulses/s",

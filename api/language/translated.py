@@ -33,6 +33,8 @@ STRONG = 12
 
 PERSON = "who"
 """The place of a person's name, which may have two words and stays as it is."""
+COUNT = "count"
+"""The place of a number: what stands there may else take in the sentence before it."""
 
 Names = tuple[str, ...]
 """Places that nothing separates."""
@@ -79,13 +81,7 @@ Value = Callable[[str, str, Pattern], str | None]
 
 
 def translated(text: object) -> str:
-    """The text in the page's language.
-
-    Returns
-    -------
-    str
-        Itself in English; in another language its translation, or marked as English where there is none.
-    """
+    """The text in the page's language: its translation, or marked as English where there is none."""
     words = str(text)
     if code() == DEFAULT or not words.strip():
         return words
@@ -195,6 +191,8 @@ def _candidates(language: str, text: str) -> tuple[Pattern, ...]:
 def _places(language: str, text: str, names: Names, pattern: Pattern, value: Value) -> dict[str, str] | None:
     """What stands at places without a word between them: the second and later ones are empty or begin with a sign."""
     if len(names) == 1:
+        if names[0] == COUNT and _END.search(text):
+            return None
         said = text if names[0] == PERSON else value(language, text, pattern)
         return None if said is None else {names[0]: said}
     for end in (len(text), *(sign.start() for sign in _SIGN.finditer(text))):

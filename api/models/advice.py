@@ -13,7 +13,8 @@ from typing import Any, Literal, NamedTuple
 from stimrig.api.language import _, lazy, localised, plain
 from stimrig.api.models.stored_model import followed
 
-Act = Literal["approve", "add", "test", "fit"]
+Act = Literal["approve", "look", "add", "improve", "test", "fit", "wait"]
+"""The first button; with "look", "fit" and "wait" there is none. "improve" adds several effects one by one."""
 
 
 class Gate(NamedTuple):
@@ -39,7 +40,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Advice:
-    """The sentence at the top of a model's page, and which button is the first one."""
+    """The sentence at the top of a model's page, and its first button."""
 
     act: Act
     words: str
@@ -77,20 +78,20 @@ GATES: dict[str, Gate] = {
         lazy("The controller would set pulse widths that were never measured: the plateau is not identified."),
     ),
     "ceiling": Gate(
-        lazy("The model follows less of the torque than the sensor's noise would allow."),
+        lazy("The fit is less than the noise would allow."),
         lazy("Usable with care: look at where the error sits first."),
         lazy("Not usable: test again with electrodes checked and the arm relaxed: the torque hardly follows."),
         lazy("The model does not follow the torque: the controller's pulses would be too wide at one time and too "
              "narrow at another."),
     ),
     "held_out": Gate(
-        lazy("The error on pulses not used for fitting is clearly larger than on the others."),
+        lazy("The error on held-out pulses is clearly larger than on the others."),
         lazy("Usable with care: look at the check in the chart first."),
         lazy("Not usable: test again with the arm held still and relaxed."),
-        lazy("On new pulses the controller would be further off than the fit says."),
+        lazy("On other pulses the controller would be further off than the fit says."),
     ),
     "gap": Gate(
-        lazy("On pulses not used for fitting the model follows less of the torque than the noise would allow."),
+        lazy("The fit on held-out pulses is less than the noise would allow."),
         lazy("Usable with care: look at where the error sits first."),
         lazy("Not usable: test again with the arm held still and relaxed, or add what is missing."),
         lazy("The controller works with pulses that the model has not seen: its torque there would be far off."),
@@ -124,6 +125,13 @@ GATES: dict[str, Gate] = {
 """Each check of `stimrig.identify.estimation.quality`."""
 
 
+BESIDE: dict[str, Any] = {
+    "unsure": lazy("Usable: approve it. Whether something is missing, this recording cannot tell."),
+    "unexplained": lazy("Usable: approve it. Some error is left that no effect explains."),
+}
+"""What to do with a usable model whose diagnosis is not that nothing is missing."""
+
+
 def findings(document: dict[str, Any]) -> list[Finding]:
     """The checks that failed, those that make a model not usable first; empty for models without stored checks."""
     gates = (document.get("quality") or {}).get("gates") or {}
@@ -136,37 +144,31 @@ def findings(document: dict[str, Any]) -> list[Finding]:
     ]
 
 
-def leaves_structure(found: Sequence[Finding]) -> bool:
-    """Whether the model's own check says that what it leaves over is not only noise."""
-    return any(finding.gate == "residual" for finding in found)
+def advice(
+    verdict: str, found: Sequence[Finding], missing: Sequence[str], kind: str | None = "nothing", looking: bool = False
+) -> Advice:
+    """What to do with a model: one sentence for its verdict and for what its diagnosis found.
 
-
-def advice(verdict: str, found: Sequence[Finding], missing: Sequence[str]) -> Advice:
-    """What to do with a model.
-
-    Parameters
-    ----------
-    verdict : str
-        identify's.
-    found : sequence of Finding
-        The checks that failed, the worst first.
-    missing : sequence of str
-        Names of effects that the diagnosis found likely to be missing.
+    `verdict`: identify's; `found`: the checks that failed, the worst first; `missing`: names of effects that the
+    diagnosis found likely to be missing.
     """
-    effects = _(" and ").join(plain(name) for name in missing)
+    effects = _(" and ").join(_("“%(name)s”", name=plain(name)) for name in missing)
+    add: Act = "add" if len(missing) == 1 else "improve"
     first = GATES[found[0].gate] if found else None
+    if looking and verdict in ("usable", "usable with care"):
+        return Advice("wait", _("Wait: what is missing in the model is still being looked for."))
     if verdict == "usable":
         if missing:
-            return Advice("approve", _("Usable: approve it. %(effects)s may make it better.", effects=effects))
-        return Advice("approve", _("Usable: approve it."))
+            return Advice(add, _("Usable, and better with %(effects)s: add that first.", effects=effects))
+        return Advice("approve", str(BESIDE.get(kind or "", _("Usable: approve it."))))
     if verdict == "usable with care":
         if missing:
-            return Advice("add", _("Usable with care: look at %(effects)s first, and add it.", effects=effects))
+            return Advice(add, _("Usable with care: add %(effects)s first.", effects=effects))
         look = str(first.look) if first else _("Usable with care: look at where the error sits first.")
-        return Advice("approve", look)
+        return Advice("approve" if kind in ("nothing", "unsure") else "look", look)
     if verdict == "not usable":
         if missing and all(finding.gate in ("gap", "ceiling") for finding in found if finding.severe):
-            return Advice("add", _("Not usable as it is: add %(effects)s, or test again.", effects=effects))
+            return Advice(add, _("Not usable as it is: add %(effects)s, or test again.", effects=effects))
         again = _("Not usable: test again with electrodes, fixture and load cell checked.")
         return Advice("test", str(first.test) if first else again)
     return Advice("fit", _("There is no verdict on this model: test again, or fit the recording again."))
@@ -178,7 +180,7 @@ def risks(document: dict[str, Any], found: Sequence[Finding]) -> list[str]:
     said = list(dict.fromkeys(finding.risk for finding in found))
     if fit is not None:
         error = f"{100.0 - fit:.0f}"
-        said.append(_("On pulses not used for fitting the error is %(percent)s %% of the torque.", percent=error))
+        said.append(_("On held-out pulses the error is %(percent)s %% of the torque.", percent=error))
     return said or [_("Nobody knows how far the torque will be from what the controller expects.")]
 
 
@@ -190,8 +192,8 @@ def fit_sentence(fit: dict[str, Any]) -> str:
     if found.percent <= 0.0:
         return _("%(where)s the model does not follow the torque at all.", where=found.where)
     reached = localised(f"{found.percent:.1f}")
-    follows = _("%(where)s the model follows %(reached)s %% of the torque", where=found.where, reached=reached)
+    fit_is = _("%(where)s the fit is %(reached)s %%", where=found.where, reached=reached)
     if found.ceiling_percent is None:
-        return f"{follows}."
-    limit = _("sensor noise limits this to %(ceiling)s %%", ceiling=localised(f"{found.ceiling_percent:.1f}"))
-    return f"{follows}; {limit}."
+        return f"{fit_is}."
+    limit = _("the noise allows %(ceiling)s %%", ceiling=localised(f"{found.ceiling_percent:.1f}"))
+    return f"{fit_is}; {limit}."

@@ -6,24 +6,24 @@ import asyncio
 import hashlib
 import json
 import logging
-from collections.abc import Callable
 from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
-from stimrig.api.models import stored_model
-from stimrig.api.models.carried_structure import CarriedStructure
-from stimrig.api.models.explanation import require_evidence
+from stimrig.api.models import explanation, stored_model
+from stimrig.api.models.carried_structure import CarriedStructure, OnCall
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Model, Recording
 from stimrig.api.workers.pool import Call, Pool
+from stimrig.identify.conclusion import asked_for
 
 log = logging.getLogger("stimrig.analyses")
-OnCall = Callable[[Call], None]
-OWN_DIAGNOSIS = "diagnosis of its structure"
-"""The name under which that of a version is kept whose structure is not the plain one."""
+DIAGNOSIS, OWN_DIAGNOSIS = "diagnosis", "diagnosis of its structure"
+"""The names under which those of the plain structure and of another are kept."""
+IMPROVEMENT = "improvement"
+"""What a diagnosis found by the way, kept apart: the models with the effects that it names."""
 HALF_DONE = 0.5
 """From here on a diagnosis of low priority is left to finish when somebody begins to wait for it."""
 
@@ -71,20 +71,34 @@ class Analyses:
     async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
         """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
         place, kind, given = await asyncio.to_thread(self._criticised, model)
-        return await self._kept(place, kind, given, verb="diagnosis", on_call=on_call)
+        found = await self._kept(place, kind, given, verb="diagnosis", on_call=on_call)
+        return explanation.remaining(found, model.effects, model.fit)
 
     def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
-        """With which version a diagnosis is kept, under which name, and what the worker is given for it."""
+        """With which version a diagnosis is kept, under which name, and what the worker is given for it.
+
+        A version with some of what was found missing at once has that diagnosis until all of it is added: a second
+        search from there could say something else of the same recording.
+        """
         if is_plain(model):
             # what is found of the plain structure is kept with the first version made from the recording
             own = Model.recording_id == model.recording_id
-            return self.store.first(Model, own, order=Model.created_utc), "diagnosis", {}
+            return self.store.first(Model, own, order=Model.created_utc), DIAGNOSIS, {}
+        own = self.known(model.id, OWN_DIAGNOSIS)  # what was said once is not taken back
+        parent = self.store.get(Model, model.parent_id) if model.parent_id and own is None else None
+        if parent is not None and parent.recording_id == model.recording_id:
+            above = self._criticised(parent)
+            found = self.known(above[0].id, above[1])
+            begun_with = [] if above[1] == DIAGNOSIS else above[0].effects
+            if found and asked_for(found) > set(model.effects) - set(begun_with):
+                return above
         return model, OWN_DIAGNOSIS, {"model_json": stored_model.text(model)}
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """The diagnosis if it has been made."""
         place, kind, _ = self._criticised(model)
-        return self.known(place.id, kind)
+        found = self.known(place.id, kind)
+        return found and explanation.remaining(found, model.effects, model.fit)
 
     async def diagnose_ahead(self, model: Model) -> None:
         """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
@@ -151,8 +165,12 @@ class Analyses:
         return call
 
     def _keep(self, model_id: str, kind: str, found: dict[str, Any]) -> None:
+        parts = {kind: found}
+        if IMPROVEMENT in found:
+            parts[f"{IMPROVEMENT} of {kind}"] = found.pop(IMPROVEMENT)
         with self.store.write() as session:
-            session.merge(Analysis(model_id=model_id, kind=kind, document=found, created_utc=self.clock.utc()))
+            for name, document in parts.items():
+                session.merge(Analysis(model_id=model_id, kind=name, document=document, created_utc=self.clock.utc()))
 
     async def asked(self, verb: str, on_call: OnCall | None = None, **arguments: Any) -> dict[str, Any]:
         """What a worker answers; who asked may go away meanwhile."""
@@ -193,7 +211,7 @@ class Analyses:
         free: dict[str, str] = {}
         if not force:
             diagnosis = await self.diagnosis(model, on_call)
-            require_evidence(diagnosis, model.effects, added)
+            explanation.require_evidence(diagnosis, model.effects, added)
             free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in diagnosis.get("free") or []}
         path = await asyncio.to_thread(self.path, model.recording_id)
         held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
@@ -223,14 +241,22 @@ class Analyses:
     async def improve(self, model: Model, by: str, on_call: OnCall | None = None) -> tuple[dict[str, Any], list[Model]]:
         """Effects added to the model's structure one by one while the evidence lasts, each step a version.
 
-        They descend from the model; of the plain structure, from the recording's first version if that has it, too.
+        They descend from the version whose diagnosis names them.
         """
-        path = await asyncio.to_thread(self.path, model.recording_id)
-        place, _kind, given = await asyncio.to_thread(self._criticised, model)
-        found = await self.asked("improve", on_call, data=path, **given)
-        first = place if await asyncio.to_thread(is_plain, place) else model
-        rows = await asyncio.to_thread(self._store_steps, found, first, by)
+        place, kind, given = await asyncio.to_thread(self._criticised, model)
+        await self._kept(place, kind, given, verb="diagnosis", on_call=on_call)
+        found = await asyncio.to_thread(self.known, place.id, f"{IMPROVEMENT} of {kind}")
+        if found is None:  # the diagnosis is of an older version
+            path = await asyncio.to_thread(self.path, model.recording_id)
+            found = (await self.asked("diagnosis", on_call, data=path, **given))[IMPROVEMENT]
+        rows = await asyncio.to_thread(lambda: self._store_steps(found, self._begun_from(model, place, kind), by))
         return {key: value for key, value in found.items() if key != "models"}, rows
+
+    def _begun_from(self, model: Model, place: Model, kind: str) -> Model:
+        """The version whose structure was diagnosed; that of the plain structure may be kept with another."""
+        if kind == OWN_DIAGNOSIS:
+            return place
+        return next((row for row in [place, *self.versions.ancestry(model)] if is_plain(row)), model)
 
     def _store_steps(self, found: dict[str, Any], first: Model, by: str) -> list[Model]:
         """Each step that adds something as a version; what they begin with is there already."""

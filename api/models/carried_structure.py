@@ -20,6 +20,7 @@ from stimrig.api.store.tables import Model
 from stimrig.api.structure import in_words
 from stimrig.api.workers.pool import Call, Pool
 from stimrig.api.workers.process import WORKER, Places
+from stimrig.identify.conclusion import asked_for
 
 OnCall = Callable[[Call], None]
 
@@ -133,7 +134,10 @@ def carried_context(versions: Versions, row: Model, diagnosis: dict[str, Any] | 
         return None
     carried = row.carried_from_id is not None
     earlier = versions.get(found["from_model_id"])
-    missing = None if diagnosis is None else diagnosis["missing"]
+    missing = None
+    if diagnosis is not None:  # what the diagnosis wants to be added: what it only names, it does not ask for
+        wanted = asked_for(diagnosis)
+        missing = [entry for entry in diagnosis["missing"] if entry["effect"] in wanted]
     known = [effect["effect"] for effect in found["effects"]]
     again = {entry["effect"] for entry in missing or []} & {*found["no_longer_needed"], *found["undecided"]}
     left = [effect for effect in found["effects"] if effect["effect"] not in again]

@@ -78,11 +78,8 @@ def structure_of(effects: Collection[str], figures: dict[str, Figure]) -> tuple[
 def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
     """How far a figure moved, and how sure that is; None where it cannot be said.
 
-    Returns
-    -------
-    dict
-        `figure`, `unit`, `before`, `now`, `difference` and `uncertainty` (one standard deviation of the difference) in
-        that unit; `percent` of the value before; `times`, the difference over its uncertainty; `beyond`.
+    `figure`, `unit`, `before`, `now`, `difference` and `uncertainty` (one standard deviation of the difference) in that
+    unit; `percent` of the value before; `times`, the difference over its uncertainty; `beyond`.
     """
     old, new = before.figures.get(name) or {}, now.figures.get(name) or {}
     first, second = old.get("value"), new.get("value")
@@ -92,13 +89,14 @@ def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
     found |= {"difference": second - first, "percent": 100 * (second - first) / abs(first) if first else None}
     if old.get("sd") is None or new.get("sd") is None:
         return found | {"uncertainty": None, "times": None, "beyond": False}
-    uncertainty = math.hypot(old["sd"], new["sd"], _floor(name, before.same_structure(now)).at(first))
+    floor = _floor(name, before.same_structure(now))
+    uncertainty = math.hypot(old["sd"], new["sd"], max(floor.at(first), floor.at(second)))
     times = abs(second - first) / uncertainty if uncertainty > 0 else 0.0
     return found | {"uncertainty": uncertainty, "times": times, "beyond": times > BEYOND}
 
 
 def uncertainty(name: str, figure: Figure) -> float | None:
-    """A figure's own uncertainty, in its unit, such that of two they add up to that of their difference."""
+    """A figure's own uncertainty, in its unit, such that of two alike they add up to that of their difference."""
     if figure.get("value") is None or figure.get("sd") is None:
         return None
     return math.hypot(figure["sd"], _floor(name, True).at(figure["value"]) / math.sqrt(2))
@@ -172,9 +170,9 @@ NAMES = {
     "time_constant_s": Name(lazy("Time constant"), "s", digits=3, in_percent=True),
     "damping": Name(lazy("Damping"), "1", digits=3, in_percent=True),
     "delay_s": Name(lazy("Delay"), "ms", 1e3, digits=1),
-    "follows_percent": Name(lazy("Follows"), "%", digits=1),
+    "follows_percent": Name(lazy("Fit"), "%", digits=1),
     "noise_sd_nm": Name(lazy("Noise of the torque sensor"), "N·m", digits=3),
-    "charge_uc": Name(lazy("Dose (charge)"), "mC", 1e-3, digits=2),
+    "charge_uc": Name(lazy("Dose of the day"), "mC", 1e-3, digits=2),
     "current_ma": Name(lazy("Current"), "mA", digits=1),
 }
 """In the order in which they are shown."""
@@ -201,6 +199,11 @@ def value_words(value: float | None, name: Name, unit: bool = True) -> str:
     digits = name.digits if name.digits is not None else _digits(scaled)
     text = language.localised(f"{round(scaled, digits) + 0.0:.{digits}f}".replace("-", "−"))  # + 0.0: no "−0"
     return f"{text}{UNBROKEN}{name.unit}" if unit and name.unit != "1" else text
+
+
+def dose_words(charge_uc: float | None) -> str:
+    """A dose on a page: the charge of one phase, summed over the pulses."""
+    return value_words(charge_uc, NAMES["charge_uc"])
 
 
 def uncertain_words(value: float | None, uncertainty: float | None, name: Name, sign: bool = False) -> str:
@@ -255,6 +258,8 @@ def _doubt(kind: str, before: Any, now: Any) -> str:
         return _("The current was %(before)s, now it is %(now)s: threshold and plateau are not compared.", **given)
     if kind == "effects":
         given = {name: effects_words(value) or _("none") for name, value in (("before", before), ("now", now))}
+        if given["before"] == given["now"]:
+            return _("The models describe %(now)s in different ways: only large differences are told.", **given)
         return _("The models' effects differ (%(before)s, then %(now)s): only large differences are told.", **given)
     given = {"before": str(before or "–")[:80], "now": str(now or "–")[:80]}
     if kind == "method":

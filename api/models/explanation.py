@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from stimrig.api.clinical_words import segment_words
 from stimrig.api.effect_words import effect_words, effects_words, parameter_words, within, without_unit
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _, lazy, localised, ngettext, plain
+from stimrig.api.language import _, lazy, localised, plain, translated
 from stimrig.api.structure import worded
-from stimrig.identify.caution import caution, only_open
+from stimrig.identify.conclusion import asked_for, conclude, in_order, is_likely
+from stimrig.identify.healing import HEALED
+from stimrig.identify.summary import probability, sure
 
 SPLITS: dict[str, Any] = {
     "segment": lazy("By part of the test"),
@@ -19,9 +22,8 @@ SPLITS: dict[str, Any] = {
     "time": lazy("By time since the start"),
     "frequency": lazy("By frequency"),
 }
-NOISE_LIKE = 1.3
-"""Held-out error over noise up to which what is left passes for noise."""
-SURE, LIKELY = 0.9, 0.6
+OWN_SHARE = 0.05
+"""By so much the error of a model that is fitted anew may differ."""
 LEAST_SHARE = 0.005
 """Octaves above the last one with a larger share are not shown."""
 
@@ -34,37 +36,33 @@ PARTS = {
 """Where an effect stands in the paper's Fig. 2."""
 
 
-def view(
-    diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str], leaves_structure: bool = False
-) -> dict[str, Any]:
+def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str]) -> dict[str, Any]:
     """What the section holds.
 
-    Parameters
-    ----------
-    diagnosis : dict
-        As `stimrig.api.workers.verbs.diagnosis` gives it, or identify's own.
-    comparison : dict or None
-        `identify.compare` of the model that is looked at.
-    effects : sequence of str
-        Effects that this model holds already.
-    leaves_structure : bool
-        The model's own check says that what it leaves over is not only noise: the page must not say that it is.
+    `diagnosis`: as `stimrig.api.workers.verbs.diagnosis` gives it, or identify's own; `comparison`: `identify.compare`
+    of the model that is looked at; `effects`: effects that this model holds already.
     """
     library = diagnosis.get("library") or {}
-    missing = [entry for entry in diagnosis["missing"] if entry["effect"] not in effects]
+    left = _without(diagnosis, effects)
+    missing, free = in_order({**diagnosis, **left}), left["free"]
+    wanted = asked_for(diagnosis)
+    asked = [entry for entry in [*missing, *free] if entry["effect"] in wanted]
     places = (comparison or {}).get("where") or diagnosis.get("where") or []
     experiment = diagnosis.get("experiment")
     if experiment and experiment["effect"] in effects:
         experiment = None
+    said = conclude({**diagnosis, "missing": missing})
     return {
-        **headline(diagnosis, missing, comparison, effects, places, leaves_structure),
-        "missing": [card(entry, library) for entry in missing],
-        "free": [free_card(entry, library) for entry in diagnosis.get("free") or [] if entry["effect"] not in effects],
-        "likely": [name_of(entry["effect"], library) for entry in missing if likely(entry)],
+        "kind": said.kind,
+        "title": translated(said.title),
+        "words": translated(said.words) + _mostly_here(places if said.kind == "unexplained" else []),
+        "advice": translated(said.advice),
+        "missing": [card(entry, library, diagnosis.get("base") or {}) for entry in missing],
+        "free": [free_card(entry, library) for entry in free],
+        "to_add": [entry["effect"] for entry in asked],
+        "likely": [name_of(entry["effect"], library) for entry in asked if is_likely(entry)],
         "structure": effects_words(diagnosis.get("structure") or []) or _("plain"),
-        "present": [{"id": effect, "name": name_of(effect, library)} for effect in effects],
         "places": [place(entry, number) for number, entry in enumerate(places, start=1)],
-        "splits": splits(comparison),
         "tests": ((comparison or {}).get("tests") or {}).get("tests") or [],
         "experiment": experiment and tidy_experiment(experiment, library),
         "others": others(diagnosis, effects, library),
@@ -73,70 +71,38 @@ def view(
     }
 
 
-def headline(
-    diagnosis: dict[str, Any],
-    missing: list[dict[str, Any]],
-    comparison: dict[str, Any] | None,
-    effects: Sequence[str],
-    places: Sequence[dict[str, Any]],
-    leaves_structure: bool = False,
-) -> dict[str, str]:
-    """The verdict on this model: kind, title, sentence."""
-    if diagnosis["verdict"] == "unexplained_structure":
-        kind, title = "unexplained", _("The error has structure that no effect of the library explains")
-        words = _("The error depends on what the muscle does, so it is not measurement noise.")
-        if places:
-            words += " " + _("It sits mostly here: %(place)s.", place=place(places[0], 1)["words"])
-    elif missing:
-        names = _(" and ").join(plain(entry.get("name") or entry["effect"]) for entry in missing)
-        kind, title = "missing", _missing(missing)
-        words = _("The recording gives evidence for: %(names)s.", names=names)
-    else:
-        kind, title, words = _nothing(diagnosis, comparison, effects, leaves_structure)
-    return {"kind": kind, "title": title, "words": words + _beside(comparison)}
+def remaining(diagnosis: dict[str, Any], effects: Sequence[str], fit: Mapping[str, Any]) -> dict[str, Any]:
+    """The diagnosis of a version that holds some of the effects that it names: what is still missing there.
+
+    `fit`: that version's statistics.
+    """
+    asked = asked_for(diagnosis)
+    added = asked & set(effects)
+    if not added:
+        return diagnosis
+    base = diagnosis.get("base") or {}
+    found = {
+        **diagnosis,
+        **_without(diagnosis, added),
+        "add": [effect for effect in diagnosis.get("add", sorted(asked)) if effect not in added],
+        "base": {**base, **{key: fit[key] for key in base if key in fit}},
+    }
+    said, structure = conclude(found), [*(diagnosis.get("structure") or []), *sorted(added)]
+    told = {"conclusion": asdict(said), "plain": [f"{said.title}. {said.words}", said.advice]}
+    return {**found, "structure": structure, **told}
 
 
-def _missing(missing: list[dict[str, Any]]) -> str:
-    """How many effects are missing, and how sure that is. Beside a likely one, what is only possible does not count."""
-    if sure := sum(map(likely, missing)):
-        return ngettext("An effect is missing in this model", "%(num)s effects are missing in this model", sure)
-    return ngettext(
-        "An effect is possibly missing in this model", "%(num)s effects are possibly missing in this model",
-        len(missing),
-    )  # fmt: skip
+def _without(diagnosis: dict[str, Any], held: Collection[str]) -> dict[str, list[dict[str, Any]]]:
+    """The effects that a diagnosis names, `missing` and `free`, but for those that a model holds."""
+    return {
+        key: [entry for entry in diagnosis.get(key) or [] if entry["effect"] not in held] for key in ("missing", "free")
+    }
 
 
-def _nothing(
-    diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: Sequence[str], leaves_structure: bool
-) -> tuple[str, str, str]:
-    """The verdict where no effect is asked for: nothing is missing, or the recording cannot tell."""
-    untold = _("This recording cannot tell whether something is missing")
-    if best := only_open(diagnosis):
-        name = plain(name_of(best["effect"], diagnosis.get("library") or {}))
-        return "unsure", untold, _("%(name)s explains too little to be named, and too much to be excluded. A longer "
-                                   "test can decide.", name=name)  # fmt: skip
-    if caution(diagnosis):
-        return "unsure", untold, _("Its error is larger than the noise, and no effect of the library has "
-                                   "enough evidence. A longer test may show what is missing.")  # fmt: skip
-    if leaves_structure or noisy(comparison or {}):
-        title = _("No effect of the library has enough evidence in this recording")
-        if effects:
-            title = _("No more effect of the library has enough evidence in this recording")
-        return "unsure", title, _("Some error is left, but the evidence for each effect of the library is too weak.")
-    title = _("Nothing more is missing: what is left is noise") if effects else _(
-        "Nothing is missing: what is left is noise")  # fmt: skip
-    return "nothing", title, _("No effect of the library explains more than noise would.")
-
-
-def _beside(comparison: dict[str, Any] | None) -> str:
-    """The error in parts of the noise, as a sentence with a space before it; empty where it is not known."""
-    times = times_noise(comparison)
-    if times is None:
+def _mostly_here(places: Sequence[dict[str, Any]]) -> str:
+    if not places:
         return ""
-    many = localised(f"{times:.1f}")
-    if comparison and comparison.get("held_out"):
-        return " " + _("On pulses not used for fitting its error is %(times)s times the noise.", times=many)
-    return " " + _("Its error is %(times)s times the noise.", times=many)
+    return " " + _("It sits mostly here: %(place)s.", place=place(places[0], 1)["words"])
 
 
 def times_noise(comparison: dict[str, Any] | None) -> float | None:
@@ -157,17 +123,21 @@ def _in_a_sentence(effect: str, library: dict[str, Any]) -> str:
     return plain(known.lower()) if known else within(effect)
 
 
-def card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
-    """One effect that is missing."""
+def card(entry: Mapping[str, Any], library: dict[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
+    """One effect that is missing. `base`: this model's errors; an effect found beside another begins at other ones."""
     known = library.get(entry["effect"]) or {}
-    rows = ((_("pulses used for fitting"), ""), (_("pulses not used for fitting"), "held_out_"))
+    rows = ((_("fitted pulses"), ""), (_("held-out pulses"), "held_out_"))
     errors = [
-        (label, entry.get(f"{prefix}rms_before_nm"), entry.get(f"{prefix}rms_after_nm")) for label, prefix in rows
+        (label, before_nm, entry.get(f"{prefix}rms_after_nm"))
+        for label, prefix in rows
+        if (before_nm := entry.get(f"{prefix}rms_before_nm")) is not None
+        and _is_own(before_nm, base.get(f"{prefix}rms_nm"))
     ]
     return {
         **entry,
         "id": entry["effect"],
         "name": entry.get("name") or name_of(entry["effect"], library),
+        "objection": entry.get("objection"),
         "sure_words": how_sure(entry.get("probability")),
         "plain": entry.get("plain") or known.get("plain") or "",
         "signature": known.get("signature") or "",
@@ -176,16 +146,24 @@ def card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
         "part": PARTS.get(known.get("part") or ""),
         "next_experiment": worded(entry.get("next_experiment") or ""),
         "rivals": [_in_a_sentence(rival, library) for rival in entry.get("confused_with") or []],
-        "errors": [error for error in errors if error[1] is not None],
-        "most_nm": max([value for _, *pair in errors for value in pair if value is not None], default=1.0),
-        "parameters": _labelled(entry.get("parameters") or {}, known),
+        "errors": errors,
+        "parameters": _labelled(entry.get("parameters") or {}, known, entry.get("form")),
     }  # fmt: skip
+
+
+def _is_own(before_nm: float, own_nm: float | None) -> bool:
+    """Whether an error is that of the model that is looked at: fitted together anew it may be a little another."""
+    return own_nm is None or abs(before_nm - own_nm) <= OWN_SHARE * own_nm
 
 
 def free_card(entry: dict[str, Any], library: dict[str, Any]) -> dict[str, Any]:
     """One free effect: what it does, and its picture."""
     known = library.get(entry["effect"]) or {}
-    more = {"id": entry["effect"], "parameters": _labelled(entry["parameters"], known), "source": known.get("source")}
+    more = {
+        "id": entry["effect"],
+        "parameters": _labelled(entry["parameters"], known, entry.get("form")),
+        "source": known.get("source"),
+    }
     return {**entry, **more}
 
 
@@ -193,32 +171,27 @@ def held_free(document: dict[str, Any]) -> list[dict[str, Any]]:
     """The free effects that a model holds, as `free_card` gives what a diagnosis found."""
     return [
         {"id": one["id"], "name": effect_words(one["id"]), "equation": one.get("equation") or "", **one["shape"],
-         "axis": one["shape"]["effect"], "left_out": "", "parameters": _labelled(one["parameters"], {})}
+         "axis": one["shape"]["effect"], "left_out": "", "parameters": _labelled(one["parameters"], {}, None)}
         for one in document.get("effects") or [] if one.get("shape")
     ]  # fmt: skip
 
 
-def likely(entry: dict[str, Any]) -> bool:
-    """Whether an effect is more than possibly missing: only such a one is advised to be added."""
-    probability = entry.get("probability")
-    return probability is None or probability > LIKELY
-
-
-def how_sure(probability: float | None) -> str:
+def how_sure(chance: float | None) -> str:
     """A probability that an effect is missing, in words and as a number."""
-    if probability is None:
+    if chance is None:
         return ""
-    percent = "> 99 %" if probability > 0.99 else f"{100 * probability:.0f} %"
-    if probability > SURE:
-        return _("very probably missing · %(percent)s", percent=percent)
-    if probability > LIKELY:
-        return _("probably missing · %(percent)s", percent=percent)
-    return _("possibly missing · %(percent)s", percent=percent)
+    words = {
+        "very probably": _("very probably missing · %(percent)s", percent=probability(chance)),
+        "probably": _("probably missing · %(percent)s", percent=probability(chance)),
+        "possibly": _("possibly missing · %(percent)s", percent=probability(chance)),
+    }
+    return words[sure(chance)]
 
 
-def _labelled(parameters: dict[str, Any], known: dict[str, Any]) -> dict[str, Any]:
-    """Each parameter with what it is, and its name without the unit, as the equation has it."""
-    about = {one["name"]: one.get("about") or "" for form in known.get("forms") or [] for one in form["parameters"]}
+def _labelled(parameters: dict[str, Any], known: dict[str, Any], own: str | None) -> dict[str, Any]:
+    """Each parameter with what it is in its `own` form, and its name without the unit, as the equation has it."""
+    forms = sorted(known.get("forms") or [], key=lambda form: form.get("name") == own)
+    about = {one["name"]: one.get("about") or "" for form in forms for one in form["parameters"]}
     return {
         name: {**value, "label": plain(about.get(name, "")) or parameter_words(name), "symbol": without_unit(name)}
         for name, value in parameters.items()
@@ -299,7 +272,7 @@ def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str,
 
 VERSION = (
     "id", "rms_nm", "held_out_rms_nm", "noise_sd_nm", "fit_percent", "held_out_fit_percent", "decision", "served",
-    "created_utc",
+    "decision_reason", "created_utc", "added_effect", "effects", "repetition", "reason",
 )  # fmt: skip
 """What is shown of a version."""
 
@@ -325,14 +298,13 @@ def step_versions(found: dict[str, Any]) -> list[dict[str, Any]]:
         {"id": str(number), "added_effect": step["added"], "noise_sd_nm": found["noise_sd_nm"], "served": False, **step}
         for number, step in enumerate(found["steps"])
     ]
-    shown = versions(steps, "")
-    return [{**row, "reason": step.get("reason", "")} for row, step in zip(shown, steps, strict=True)]
+    return versions(steps, "")
 
 
 def noisy(comparison: dict[str, Any]) -> bool:
     """Whether more is left than noise would leave."""
     times = times_noise(comparison)
-    return times is not None and times > NOISE_LIKE
+    return times is not None and times > HEALED
 
 
 # ---- effects that the recording does not ask for --------------------------------------------------------------------

@@ -30,6 +30,8 @@ COLUMNS = (
 
 POOR = ("not usable", "unknown")
 """The verdicts with which an approval needs a reason."""
+AT_ONCE = 16
+"""Decisions that are read from the database at a time, the newest first."""
 WORDS, LETTERS, DIFFERENT = 3, 10, 5
 """So many different words, so many letters, so many different letters; "ok", "asdf" and "......" have fewer."""
 WHAT_TO_WRITE = (
@@ -141,7 +143,8 @@ class Versions:
         """
         wanted = (Model.participant == participant, Model.created_utc >= since_utc)
         query = select(Model).options(defer(Model.document)).where(*wanted)
-        decided = select(Approval).where(Approval.participant == participant).order_by(Approval.id)
+        of_these = Approval.model_id.in_(select(Model.id).where(*wanted))
+        decided = select(Approval).where(of_these).order_by(Approval.id)
         with self.store.read() as session:
             rows = list(session.scalars(query.order_by(Model.created_utc.desc())))
             newest = {decision.model_id: decision for decision in session.scalars(decided)}
@@ -156,13 +159,18 @@ class Versions:
 
     def lineage(self, model: Model) -> list[Model]:
         """The versions from the first one of the recording to this one, then its newest descendants."""
+        path = self.ancestry(model)
+        children = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc)
+        while below := [row for row in children if row.parent_id == path[-1].id]:
+            path.append(below[-1])
+        return path
+
+    def ancestry(self, model: Model) -> list[Model]:
+        """The versions from the first one of the recording to this one."""
         rows = {row.id: row for row in self.store.all(Model, Model.recording_id == model.recording_id)}
         path = [model]
         while path[0].parent_id in rows:
             path.insert(0, rows[str(path[0].parent_id)])
-        children = sorted(rows.values(), key=lambda row: row.created_utc)
-        while below := [row for row in children if row.parent_id == path[-1].id]:
-            path.append(below[-1])
         return path
 
     def undo(self, model_id: str, by: str, reason: str) -> Model:
@@ -175,8 +183,10 @@ class Versions:
         row = self.get(model_id)
         if row.parent_id is None:
             detail = f"{model_id} is the first version. Reject it instead."
+            if (decision := self.decision(model_id)) is not None and not decision.approved:
+                detail = f"{model_id} is the first version, and it is rejected. Approve it anew to use it all the same."
             raise ApiError(409, "nothing-to-undo", "There is no version before this one", detail)
-        words = f"undone: {reason}" if reason else "undone"
+        words = ": ".join(part for part in (stored_model.UNDONE, reason) if part)
         parent = self.get(row.parent_id)
         with self.store.write() as session:
             seen.check(session, seen.decisions(row.participant))
@@ -285,7 +295,9 @@ class Versions:
         with self.store.read() as session:
             of = session.scalars(select(Participant).where(Participant.code.in_(participants)))
             sites = {row.code: site_of(row) for row in of}
-            for decision in session.scalars(query):
+            for decision in session.scalars(query.execution_options(yield_per=AT_ONCE)):
+                if len(newest) == len(sites):
+                    break  # years of decisions are not read for today's
                 if not decision.approved:
                     rejected.add(decision.model_id)
                 elif decision.model_id not in rejected and kept(decision.site) == sites[decision.participant]:

@@ -84,10 +84,7 @@ def quality(document: dict[str, Any]) -> dict[str, Any]:
     Older models are read so: a verdict of a former vocabulary by its place in today's; without words, the first reason;
     whatever is stored, no better than its gates; "unknown" where there is no verdict.
 
-    Returns
-    -------
-    dict
-        ``verdict`` (usable, usable with care, not usable, unknown), ``words`` (a sentence), ``reasons`` (a list).
+    ``verdict`` (usable, usable with care, not usable, unknown), ``words`` (a sentence), ``reasons`` (a list).
     """
     stored = document.get("quality") or {}
     gates = stored.get("gates") or {}
@@ -117,18 +114,29 @@ class Followed:
     percent: float | None
     ceiling_percent: float | None
     where: str
+    held_out: bool = True
 
 
 def followed(fit: Mapping[str, Any]) -> Followed:
     """The figure of a model's `fit`: of pulses not used for fitting where there are any."""
     if fit.get("held_out_fit_percent") is None:
         where = _("On the pulses that it was fitted to")
-        return Followed(fit.get("fit_percent"), fit.get("ceiling_percent"), where)
+        return Followed(fit.get("fit_percent"), fit.get("ceiling_percent"), where, held_out=False)
     if fit.get("held_out_by") == "cross-validation":
         where = _("On parts of the recording that were left out in turn")
     else:
-        where = _("On pulses not used for fitting")
+        where = _("On held-out pulses (not used for fitting)")
     return Followed(fit["held_out_fit_percent"], fit.get("held_out_ceiling_percent"), where)
+
+
+UNDONE = "undone"
+"""How the reason begins of a rejection that was an undo."""
+
+
+def was_undone(version: Mapping[str, Any]) -> bool:
+    """Whether the decision on a version is an undo."""
+    reason = version.get("decision_reason") or ""
+    return version.get("decision") == "rejected" and reason.partition(":")[0] == UNDONE
 
 
 # ---- curve and dynamics -------------------------------------------------------------------------------------------

@@ -93,12 +93,8 @@ def _store(
 async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs: Sequence[str] = ()) -> Recording:
     """Recordings as one, itself a recording (`origin` joined), to which all else applies.
 
-    Parameters
-    ----------
-    parts : sequence of str
-        Their ids; where all begins are known the order is that of time.
-    needs : sequence of str
-        Columns that each of them must have, such as `angle_rad`; one that a part lacks is left out of the whole.
+    `parts`: their ids; where all begins are known the order is that of time. `needs`: columns that each of them must
+    have, such as `angle_rad`; one that a part lacks is left out of the whole.
     """
     paths = [await asyncio.to_thread(analyses.path, part) for part in parts]
     settings = analyses.settings
@@ -125,6 +121,14 @@ def _one_site(session: Session, parts: list[str]) -> Site | None:
     return sites[0]
 
 
+def warnings(session: Session, recording_id: str) -> list[str]:
+    """What was found doubtful about a recording, in sentences: by the rig, or when its first model was made."""
+    recording = session.get(Recording, recording_id)
+    test = session.get(Test, recording.test_id) if recording is not None and recording.test_id else None
+    found = test.summary.get("warnings") if test is not None else recording and recording.warnings
+    return list(found or [])
+
+
 def _store_joined(analyses: Analyses, kept: Path, digest: str, participant: str, parts: list[str]) -> Recording:
     now, identity = analyses.clock.utc(), kept.stem
     row = Recording(id=identity, participant=participant, path=str(kept), file_sha256=digest, origin="joined")
@@ -132,6 +136,7 @@ def _store_joined(analyses: Analyses, kept: Path, digest: str, participant: str,
     with uploads.taken_in(kept), analyses.store.write() as session:
         site = _one_site(session, parts)
         row.site = None if site is None else list(site)
+        row.warnings = list(dict.fromkeys(text for part in parts for text in warnings(session, part))) or None
         session.add(row)
         session.flush()
         audit.write(session, now, "service", "join recordings", identity, parts=parts, sha256=digest)

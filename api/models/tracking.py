@@ -24,26 +24,12 @@ Bounds = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Limits:
-    """Each in percent, 0 to 60; 0: this stays as approved.
+    """Each in percent, 0 to 60; 0: this stays as approved. Raises ApiError: 422: outside of that."""
 
-    Parameters
-    ----------
-    gain_percent : float
-        Of the approved gain, either way.
-    threshold_percent : float
-        Of the approved curve's threshold, the pulse width at which it has gone 5 % of its way to the plateau.
-    time_scale_percent : float
-        Of the approved model's time scale, either way.
-
-    Raises
-    ------
-    ApiError
-        422: outside of that.
-    """
-
-    gain_percent: float = USUAL_PERCENT
+    gain_percent: float = USUAL_PERCENT  # of the approved gain, either way
     threshold_percent: float = USUAL_PERCENT
-    time_scale_percent: float = USUAL_PERCENT
+    """Of the approved curve's threshold, the pulse width at which it has gone 5 % of its way to the plateau."""
+    time_scale_percent: float = USUAL_PERCENT  # of the approved model's time scale, either way
 
     def __post_init__(self) -> None:
         given = self.to_dict()
@@ -63,10 +49,7 @@ class Limits:
     def bounds(self, threshold_us: float | None) -> Bounds:
         """What the quantities may be.
 
-        Parameters
-        ----------
-        threshold_us : float or None
-            The approved curve's threshold, µs; without one the threshold is not tracked.
+        `threshold_us`: the approved curve's threshold, µs; without one the threshold is not tracked.
         """
         gain, time_scale = self.gain_percent / 100.0, self.time_scale_percent / 100.0
         shift_us = self.threshold_percent / 100.0 * max(threshold_us or 0.0, 0.0)
@@ -86,14 +69,8 @@ def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
 
     The bounds are for what is expected, not for its band.
 
-    Parameters
-    ----------
-    number : int
-        Of the trial.
-    step : mapping
-        `identify.tracking.Step.to_dict()`.
-    bounds : Bounds
-        Beyond these a person is asked (`Limits.alarms`).
+    `number`: of the trial; `step`: `identify.tracking.Step.to_dict()`; `bounds`: beyond these a person is asked
+    (`Limits.alarms`).
     """
     words = _outcome_sentence(number, step) or _beyond(number, step["coming"], bounds)
     return f"{words} {NEW_TEST}" if words else None
@@ -192,12 +169,8 @@ NARROW = {"gain": 0.05, "threshold_shift_us": 5.0, "time_scale": 0.1}
 def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
     """What has changed by the newest trial that the model learnt from; only what its bands are sure of.
 
-    Parameters
-    ----------
-    trials : sequence of mapping
-        As `stimrig.api.models.tracked.trial_document` gives them, the oldest first.
-    since_utc : str
-        When the approved model's recording was made.
+    `trials`: as `stimrig.api.models.tracked.trial_document` gives them, the oldest first; `since_utc`: when the
+    approved model's recording was made.
     """
     known = [trial for trial in trials if trial["now"] and trial["distance"] is not None]
     if not known:

@@ -16,6 +16,7 @@ from sqlalchemy import Row, select
 
 from stimrig.api.clock import Clock, local_day
 from stimrig.api.errors import ApiError
+from stimrig.api.language import _
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.models.stored_model import followed
@@ -87,7 +88,12 @@ class Session:
         found = followed(self.model.fit)
         one = {"value": found.percent, "sd": None, "uncertainty": None, "unit": "%", "where": found.where}
         kept = {name: figure for name, figure in document["figures"].items() if not name.endswith("fit_percent")}
-        return {**document, "figures": {**kept, "follows_percent": one}}
+        kept["charge_uc"]["where"] = _(
+            "charge of one phase, over all pulses of all %(count)s tests of that day, stopped ones, too",
+            count=len(self.test_ids),
+        )
+        at = {"at_utc": self.model.created_utc}  # as the participant's page and the model's own name the model
+        return {**document, **at, "figures": {**kept, "follows_percent": one}}
 
 
 class Trend:
@@ -133,7 +139,10 @@ class Trend:
         groups: dict[str, list[Row[Any]]] = {}
         for row in models:
             groups.setdefault(_key(row), []).append(row)
-        found = [_session(key, rows, tests, newest) for key, rows in groups.items()]
+        days: dict[str, list[Row[Any]]] = {}
+        for test in tests:
+            days.setdefault(local_day(test.requested_utc), []).append(test)
+        found = [_session(key, rows, days.get(key, []), newest) for key, rows in groups.items()]
         found.sort(key=lambda one: one.at_utc)
         _attach(notes, found)
         return found, {row.id: row for row in models}
@@ -205,7 +214,7 @@ def _key(row: Any) -> str:
     return local_day(row.recorded_utc) if row.origin in ("rig", "joined") else row.recording_id
 
 
-def _session(key: str, rows: list[Row[Any]], tests: Sequence[Row[Any]], decided: dict[str, Approval]) -> Session:
+def _session(key: str, rows: list[Row[Any]], here: Sequence[Row[Any]], decided: dict[str, Approval]) -> Session:
     approvals = [decided[row.id] for row in rows if row.id in decided and decided[row.id].approved]
     approval = max(approvals, key=lambda one: one.id, default=None)
     rejected = {row.id for row in rows if row.id in decided and not decided[row.id].approved}
@@ -213,7 +222,6 @@ def _session(key: str, rows: list[Row[Any]], tests: Sequence[Row[Any]], decided:
     model = max(left, key=lambda row: (row.recorded_utc, row.created_utc))
     if approval is not None:
         model = next(row for row in rows if row.id == approval.model_id)
-    here = [test for test in tests if local_day(test.requested_utc) == key]
     own = [test for test in here if test.id == model.test_id] or here  # a joined recording is of all its tests
     charges = [test.charge_uc for test in here if test.charge_uc is not None]
     return Session(

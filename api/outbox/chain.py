@@ -41,25 +41,13 @@ class Head:
 
 @dataclass(frozen=True)
 class Telling:
-    """What an item says, before it has its place in the chain.
+    """What an item says, before it has its place in the chain."""
 
-    Attributes
-    ----------
-    kind, key : str
-        What it tells of, and the id of the row.
-    body : dict
-        What it tells.
-    file : str or None
-        SHA-256 of the file that belongs to it.
-    file_bytes : int or None
-        The file's length; None with a file: the file is not to be found at the moment.
-    """
-
-    kind: str
-    key: str
-    body: dict[str, Any]
-    file: str | None = None
-    file_bytes: int | None = None
+    kind: str  # what it tells of
+    key: str  # the id of the row
+    body: dict[str, Any]  # what it tells
+    file: str | None = None  # SHA-256 of the file that belongs to it
+    file_bytes: int | None = None  # the file's length; None with a file: the file is not to be found at the moment
 
 
 def item_hash(fields: dict[str, Any]) -> str:

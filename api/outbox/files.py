@@ -11,7 +11,7 @@ from pathlib import Path
 from sqlalchemy import select
 
 from stimrig.api.outbox.link import Link
-from stimrig.api.outbox.messages import LackingOut, PieceOut, RefusedError, UnreachableError, WrongAnswerError
+from stimrig.api.outbox.messages import LackingOut, RefusedError, UnreachableError, WrongAnswerError
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Model, OutboxItem, Recording, Tracked
 from stimrig.api.whole_file import sha256_of
@@ -51,11 +51,8 @@ class Source:
 class Files:
     """Finds what is to be sent, and remembers what is damaged.
 
-    Attributes
-    ----------
-    damaged : dict
-        SHA-256 of each file that is missing or has another content, with what was seen of it: it is looked through
-        again only once that changes.
+    `damaged`: SHA-256 of each file that is missing or has another content, with what was seen of it: it is looked
+    through again only once that changes.
     """
 
     def __init__(self, store: Store) -> None:
@@ -146,12 +143,8 @@ def _signature(path: Path) -> Signature | None:
 class Sending:
     """Sends a centre the files that it lacks.
 
-    Attributes
-    ----------
-    queue : deque of LackingOut
-        What it lacked when it was last asked, without what is damaged here.
-    asked : bool
-        Whether it was asked since something new was told.
+    `queue`: what it lacked when it was last asked, without what is damaged here; `asked`: whether it was asked since
+    something new was told.
     """
 
     def __init__(self, link: Link, files: Files) -> None:
@@ -202,9 +195,6 @@ class Sending:
             self.files.doubt(wanted.sha256)  # it may have been cut here
             raise
         self._other_offset = False
-        self._took(wanted, source, length, given)
-
-    def _took(self, wanted: LackingOut, source: Source, length: int, given: PieceOut) -> None:
         if given.whole and given.have_bytes == source.size:
             self.queue.popleft()
         elif given.whole or given.have_bytes != wanted.have_bytes + length or length == 0:

@@ -45,12 +45,7 @@ class NoCookies(CookieJar):
 class Link:
     """Asks a centre.
 
-    Parameters
-    ----------
-    url, key : str
-        Where it answers, and the rig's key there.
-    transport : httpx.BaseTransport, optional
-        Another way to it, for tests.
+    `url`, `key`: where it answers, and the rig's key there; `transport`: another way to it, for tests.
     """
 
     def __init__(self, url: str, key: str, clock: Clock, transport: httpx.BaseTransport | None = None) -> None:

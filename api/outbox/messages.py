@@ -125,13 +125,7 @@ class PieceOut(_Out):
 
 
 class PushError(Exception):
-    """Something was not told: one line for people.
-
-    Attributes
-    ----------
-    state : str
-        What it is called in the status (`api.outbox.status`).
-    """
+    """Something was not told: one line for people. `state`: what it is called in the status (`api.outbox.status`)."""
 
     state = "refused"
 
@@ -156,15 +150,7 @@ class BucketError(PushError, state="bucket-failed"):
 
 
 class RefusedError(PushError):
-    """The centre refused what was sent.
-
-    Parameters
-    ----------
-    code : str
-        Id of the problem, as `out-of-order`.
-    said : dict
-        The problem's members.
-    """
+    """The centre refused what was sent. `code`: id of the problem, as `out-of-order`; `said`: the problem's members."""
 
     def __init__(self, words: str, code: str, said: dict[str, object]) -> None:
         super().__init__(words)

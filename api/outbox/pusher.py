@@ -67,12 +67,7 @@ class Backoff:
 class Pusher:
     """Tells a centre what the outbox holds.
 
-    Parameters
-    ----------
-    sleep : callable
-        Waits so many seconds.
-    chance : random.Random, optional
-        Spreads the waits after failures.
+    `sleep`: waits so many seconds; `chance`: spreads the waits after failures.
     """
 
     def __init__(
@@ -110,7 +105,9 @@ class Pusher:
         busy = False
         try:
             if self.clock.monotonic_s() >= self._database_s:
-                busy = self._put_in_missing()
+                if self._missing is not None and next(self._missing, None) is None:
+                    self._missing = None
+                busy = self._missing is not None
                 busy = self._push() or busy
                 self._database_words = ""
             if self._told is None or self.clock.monotonic_s() >= self._told[0] + POLL_S:
@@ -133,11 +130,6 @@ class Pusher:
         now_s = self.clock.monotonic_s()
         wait_s = max(self._line_s, self._database_s) - now_s
         return min(max(wait_s, POLL_S), TOLD_S)
-
-    def _put_in_missing(self) -> bool:
-        if self._missing is not None and next(self._missing, None) is None:
-            self._missing = None
-        return self._missing is not None
 
     # ---- the line ----------------------------------------------------------------------------------------------
 
@@ -316,10 +308,7 @@ def _text(value: object) -> str | None:
 class Collecting:
     """Asks a centre for its receipts, and keeps them: a file for each centre and key, so that none are mixed up.
 
-    Attributes
-    ----------
-    asked : bool
-        Whether it was asked since something new was told.
+    `asked`: whether it was asked since something new was told.
     """
 
     def __init__(self, store: Store, settings: Settings, link: Link) -> None:

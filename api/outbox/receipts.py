@@ -28,31 +28,20 @@ Text = Annotated[str, StringConstraints(max_length=200)]
 
 
 class Receipt(BaseModel):
-    """A head of the trail as it was noted: an entry's number and hash, and when.
-
-    Attributes
-    ----------
-    noted_utc : str
-        When the centre received it, or it was written down.
-    at_utc : str
-        The entry's own time.
-    rig, chain, item
-        As whose, and with which item of the outbox it was told.
-    key, signature : str
-        The centre's Ed25519 key and its signature of all the rest; empty where a rig noted its head by itself.
-    """
+    """A head of the trail as it was noted: an entry's number and hash, and when."""
 
     model_config = ConfigDict(strict=True, frozen=True)
 
     seq: Annotated[int, Field(ge=0, le=2**53)]
     hash: Hex
-    noted_utc: Text
-    at_utc: Text = ""
-    rig: Text = ""
+    noted_utc: Text  # when the centre received it, or it was written down
+    at_utc: Text = ""  # the entry's own time
+    rig: Text = ""  # as whose it was told
     chain: Text = ""
-    item: Annotated[int, Field(ge=0, le=2**53)] = 0
+    item: Annotated[int, Field(ge=0, le=2**53)] = 0  # of the outbox, with which it was told
     key: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{64})?$")] = ""
-    signature: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{128})?$")] = ""
+    """The centre's Ed25519 key; empty, as its signature, where a rig noted its head by itself."""
+    signature: Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{128})?$")] = ""  # of all the rest
 
     @property
     def signed(self) -> bytes:
@@ -74,22 +63,12 @@ class Receipt(BaseModel):
 
 @dataclass(frozen=True)
 class Standing:
-    """How the trail stands against what was noted of it.
+    """How the trail stands against what was noted of it."""
 
-    Attributes
-    ----------
-    first_broken : int or None
-        The first entry that does not hold, or that differs from the one noted.
-    missing_since : int or None
-        The first entry that was noted and is gone, as after the restore of a backup.
-    differs, missing : Receipt or None
-        What was noted of them.
-    """
-
-    first_broken: int | None
-    missing_since: int | None
-    differs: Receipt | None
-    missing: Receipt | None
+    first_broken: int | None  # the first entry that does not hold, or that differs from the one noted
+    missing_since: int | None  # the first entry that was noted and is gone, as after the restore of a backup
+    differs: Receipt | None  # what was noted of the first
+    missing: Receipt | None  # and of the second
 
 
 def standing(entries: Sequence[AuditEntry], noted: Sequence[Receipt]) -> Standing:

@@ -40,41 +40,19 @@ GOOD = ("starting", "current", "sending")
 
 @dataclass(frozen=True)
 class Status:
-    """How it goes.
+    """How it goes."""
 
-    Attributes
-    ----------
-    state : str
-        One of `WORDS`.
-    detail : str
-        What was wrong at last, on one line; empty: nothing.
-    centre : str
-        Its address.
-    good_until_utc : str
-        Nothing written until then: the process that writes this does not run.
-    last_contact_utc : str or None
-        When the centre last answered as it should.
-    chain : str or None
-        Of what `seq` is about.
-    seq : int
-        The newest item that the centre has, as far as known.
-    items_waiting, files_waiting : int
-        What the centre lacks; files as far as it has told which.
-    damaged : list of str
-        SHA-256 of files that are missing or damaged, the first ones.
-    """
-
-    state: str
-    detail: str
-    centre: str
+    state: str  # one of `WORDS`
+    detail: str  # what was wrong at last, on one line; empty: nothing
+    centre: str  # its address
     at_utc: str
-    good_until_utc: str
-    last_contact_utc: str | None = None
-    chain: str | None = None
-    seq: int = 0
-    items_waiting: int = 0
-    files_waiting: int = 0
-    damaged: tuple[str, ...] = ()
+    good_until_utc: str  # nothing written until then: the process that writes this does not run
+    last_contact_utc: str | None = None  # when the centre last answered as it should
+    chain: str | None = None  # of what `seq` is about
+    seq: int = 0  # the newest item that the centre has, as far as known
+    items_waiting: int = 0  # what the centre lacks
+    files_waiting: int = 0  # the same, as far as it has told which
+    damaged: tuple[str, ...] = ()  # SHA-256 of files that are missing or damaged, the first ones
     damaged_count: int = 0
 
     def since_contact_s(self, now_unix_s: float) -> float | None:

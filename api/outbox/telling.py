@@ -31,12 +31,8 @@ log = logging.getLogger("stimrig.outbox")
 class Telling:
     """Tells a centre of the newest chain.
 
-    Attributes
-    ----------
-    at : Position or None
-        Where the centre stands; None: it has to be asked.
-    reached : tuple
-        Chain and number of the newest item that the centre is known to have.
+    `at`: where the centre stands; None: it has to be asked. `reached`: chain and number of the newest item that the
+    centre is known to have.
     """
 
     def __init__(self, store: Store, clock: Clock, link: Link, about: Callable[[], dict[str, Any]]) -> None:

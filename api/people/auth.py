@@ -56,39 +56,18 @@ ROLES = {
 
 @dataclass(frozen=True)
 class Principal:
-    """Who is asking.
+    """Who is asking."""
 
-    Parameters
-    ----------
-    name : str
-        The token's name; goes into the audit trail.
-    scopes : frozenset of str
-        What the token may do; ``administer`` includes everything.
-    csrf : str or None
-        The session's CSRF token; None for a bearer token.
-    session_hash : str or None
-        The session of a person with a password; None for tokens, which have none to ask for again.
-    page_session : PageSession or None
-        The browser's session, however it was opened; None for a bearer token.
-    locked : bool
-        Whether that session waits to be unlocked: then it may press stop, and nothing else.
-    participant : str or None
-        The only one that a controller's key opens; None for everybody else.
-    plan : dict or None
-        What trials that key may play.
-    token_hash : str
-        The token's.
-    """
-
-    name: str
-    scopes: frozenset[str]
-    csrf: str | None = None
+    name: str  # the token's name; goes into the audit trail
+    scopes: frozenset[str]  # what the token may do; ``administer`` includes everything
+    csrf: str | None = None  # the session's CSRF token; None for a bearer token
     session_hash: str | None = None
-    page_session: PageSession | None = None
-    locked: bool = False
-    participant: str | None = None
-    plan: dict[str, Any] | None = None
-    token_hash: str = ""
+    """The session of a person with a password; None for tokens, which have none to ask for again."""
+    page_session: PageSession | None = None  # the browser's session, however it was opened; None for a bearer token
+    locked: bool = False  # whether that session waits to be unlocked: then it may press stop, and nothing else
+    participant: str | None = None  # the only one that a controller's key opens; None for everybody else
+    plan: dict[str, Any] | None = None  # what trials that key may play
+    token_hash: str = ""  # the token's
 
     def may(self, scope: Scope) -> bool:
         """Whether the scope is held."""
@@ -268,14 +247,8 @@ class Auth:
     def cookie(self, cookie: str, *, forgive_age: bool = False, forgive_lock: bool = False) -> Principal:
         """The holder of a page session.
 
-        Parameters
-        ----------
-        cookie : str
-            Its text.
-        forgive_age : bool
-            A session that ran out, or that is locked, still presses stop.
-        forgive_lock : bool
-            One that is locked may be unlocked, or ended.
+        `cookie`: its text; `forgive_age`: a session that ran out, or that is locked, still presses stop;
+        `forgive_lock`: one that is locked may be unlocked, or ended.
         """
         row = self.store.get(PageSession, digest(cookie))
         if row is None or (row.expires_unix_s <= self.clock.unix_s() and not forgive_age):
@@ -388,14 +361,8 @@ class IdleLock:
     of actions are kept in memory and written down now and then, so that no page waits for the disk; a lock holds over a
     restart.
 
-    Parameters
-    ----------
-    store : Store
-        Holds the sessions.
-    clock : Clock
-        Idle times are measured on it.
-    after_min : float
-        A session locks after so many minutes without an action; 0: never by itself.
+    `store`: holds the sessions. `clock`: idle times are measured on it. `after_min`: a session locks after so many
+    minutes without an action; 0: never by itself.
     """
 
     def __init__(self, store: Store, clock: Clock, after_min: float) -> None:

@@ -37,14 +37,7 @@ class Count:
 class Pace:
     """Wrong tries by key.
 
-    Parameters
-    ----------
-    clock : Clock
-        Waits are measured on it.
-    free : int
-        So many tries cost nothing.
-    most_keys : int
-        So many keys are told apart.
+    `clock`: waits are measured on it; `free`: so many tries cost nothing; `most_keys`: so many keys are told apart.
     """
 
     def __init__(self, clock: Clock, free: int = FREE_TRIES, most_keys: int = MOST_KEYS) -> None:

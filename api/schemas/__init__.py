@@ -1,22 +1,27 @@
 """JSON Schemas of MODEL.json and of what each verb's `--json` prints, one file each; `$id` ends in its version.
 
+That of MODEL.json stands in `identify`, which reads models by it.
 A reader that knows 1.0 can read every 1.x: what comes is added, and nothing changes its meaning.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
-FOLDER = Path(__file__).parent
-NAMES = tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
+from stimrig.identify import model_schema
+
+FILES = {"model": model_schema.FILE} | {path.stem: path for path in Path(__file__).parent.glob("*.json")}
+NAMES = tuple(sorted(FILES))
 OF_VERB = {
     "fit": "model",
     "predict": "prediction",
     "compare": "comparison",
     "diagnose": "diagnosis",
     "improve": "improvement",
+    "explain": "explanation",
     "invert": "inversion",
 }
 """The schema of a verb's `--json`, where it bears another name than the verb."""
@@ -24,16 +29,39 @@ OF_VERB = {
 
 def load(name: str) -> dict[str, Any]:
     """A schema by its name, or by the verb that prints it. Raises KeyError where there is none."""
-    name = OF_VERB.get(name, name)
-    if name not in NAMES:
-        raise KeyError(name)
-    return json.loads((FOLDER / f"{name}.json").read_text("utf-8"))
+    return json.loads(FILES[OF_VERB.get(name, name)].read_text("utf-8"))
 
 
-def component(name: str) -> dict[str, Any]:
-    """A schema as a component of the OpenAPI document: references lead to its place there."""
-    text = json.dumps({key: value for key, value in load(name).items() if key not in ("$schema", "$id")})
-    return json.loads(text.replace('"#/$defs/', f'"#/components/schemas/{component_name(name)}/$defs/'))
+def components(name: str) -> dict[str, Any]:
+    """A schema and what it refers to as components of the OpenAPI document, where generators of clients look for them.
+
+    Of values that differ by case or signs alone no names are made: the list of them becomes a plain text.
+    """
+    own, whole = component_name(name), load(name)
+    text = json.dumps({key: value for key, value in whole.items() if key not in ("$schema", "$id")})
+    made = json.loads(
+        re.sub(r'"#/\$defs/(\w+)"', lambda found: f'"#/components/schemas/{own}{_title(found[1])}"', text)
+    )
+    parts = made.pop("$defs", {})
+    found = {own: made, **{own + _title(part): schema for part, schema in parts.items()}}
+    _leave_alike(found)
+    return found
+
+
+def _leave_alike(node: Any) -> None:
+    if isinstance(node, list):
+        for value in node:
+            _leave_alike(value)
+    elif isinstance(node, dict):
+        _leave_alike(list(node.values()))
+        listed = node.get("enum")
+        if isinstance(listed, list) and len({str(value).lower() for value in listed}) < len(listed):
+            del node["enum"]
+            node["type"] = "string"
+
+
+def _title(name: str) -> str:
+    return name.title().replace("_", "")
 
 
 def component_name(name: str) -> str:

@@ -44,13 +44,7 @@ PIECE_S = 2.0
 
 
 class AdaptiveTests(Watched):
-    """All of them.
-
-    Parameters
-    ----------
-    adviser : Adviser
-        Says what a test can reach, and what to play next.
-    """
+    """All of them. `adviser`: says what a test can reach, and what to play next."""
 
     names, part = (ADAPTIVE,), "adaptive"
     ends: ClassVar[Mapping[str, str]] = {"torque_time": "torque-time", "plan": "fixed-rest"}
@@ -66,13 +60,15 @@ class AdaptiveTests(Watched):
     async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:
         """The plan with its bounds and its fixed plan.
 
-        Raises
-        ------
-        ApiError
-            422: the target cannot be reached, and nobody said that the test is to be played anyway; what the rig
-            refuses. 500: the worker died.
+        Raises ApiError: 422: the target cannot be reached, and nobody said that the test is to be played anyway; what
+        the rig refuses. 500: the worker died.
         """
-        bounds = bounds_of(body, plan)
+        given_s, given_nm_s = body.max_duration_s, body.max_torque_time_nm_s
+        bounds = AdaptivePlan(
+            max_duration_s=DURATION_S if given_s is None else given_s,
+            max_torque_time_nms=AT_STOPPING_TORQUE_S * plan.stopping_torque_nm if given_nm_s is None else given_nm_s,
+            patience_s=PATIENCE_S,
+        )
         how = {
             "target": body.target.model_dump(),
             "playable_s": bounds.max_duration_s - SAFE_END_S, "max_torque_time_nm_s": bounds.max_torque_time_nms,
@@ -166,32 +162,13 @@ class AdaptiveTests(Watched):
         }
 
 
-def bounds_of(body: TestIn, plan: TestPlan) -> AdaptivePlan:
-    """Longest duration and largest torque-time of the whole test."""
-    given_s, given_nm_s = body.max_duration_s, body.max_torque_time_nm_s
-    return AdaptivePlan(
-        max_duration_s=DURATION_S if given_s is None else given_s,
-        max_torque_time_nms=AT_STOPPING_TORQUE_S * plan.stopping_torque_nm if given_nm_s is None else given_nm_s,
-        patience_s=PATIENCE_S,
-    )
-
-
 def fixed_plan(
     opening_us: Sequence[float], default: dict[str, Any], rate_hz: float, bounds: AdaptivePlan
 ) -> list[SegmentPlan]:
     """The opening, then the default test in short pieces, as many as the bounds leave room for.
 
-    Parameters
-    ----------
-    opening_us
-        The opening's widths, one for each pulse, µs.
-    default
-        The rig's preview of the default test.
-
-    Raises
-    ------
-    ApiError
-        422: there is no room for the opening.
+    `opening_us`: the opening's widths, one for each pulse, µs; `default`: the rig's preview of the default test. Raises
+    ApiError: 422: there is no room for the opening.
     """
     opening = [*opening_us, *[0.0] * round(TAIL_S * rate_hz)]
     room = round((bounds.max_duration_s - SAFE_END_S) * rate_hz) - len(opening)

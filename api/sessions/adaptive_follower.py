@@ -92,14 +92,8 @@ class Told:
 class Follower(Watcher):
     """One test from its first sample to its end.
 
-    Parameters
-    ----------
-    plan : TestPlan
-        Each of its segments holds its widths.
-    how : dict
-        For the adviser: target, bounds, largest width, pulse rate, the participant's models.
-    reach : dict
-        What was said of the target before the test.
+    `plan`: each of its segments holds its widths; `how`: for the adviser: target, bounds, largest width, pulse rate,
+    the participant's models; `reach`: what was said of the target before the test.
     """
 
     watches, left = "choosing", "fixed"

@@ -7,7 +7,7 @@ import json
 import secrets
 from typing import Annotated, Any
 
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, StringConstraints
 from sqlalchemy import select
 
 from stimrig.api.decisions import MODEL_TAG
@@ -41,6 +41,12 @@ class PlanIn(Body):
     trials: Annotated[int, Field(ge=1, le=MOST_TRIALS, description="that are played")]
 
 
+class KeyFor(PlanIn):
+    """A key's name and plan."""
+
+    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,60}$")]
+
+
 def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
     """The plan, as it is kept with the key. Raises ApiError: 422 wider than the participant's limits."""
     for name in ("current_ma", "max_pulse_width_us"):
@@ -49,7 +55,7 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
             unit = LIMITS[name].unit
             detail = f"{LIMITS[name].words}: {asked:g} {unit} is above the limit of today, {own or 0:g} {unit}."
             raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
-    return {**plan.model_dump(), "site": site_of(participant)}
+    return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
 
 
 async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: TestIn) -> Test:
@@ -202,6 +208,11 @@ def keys_of(auth: Auth, participant: str) -> list[dict[str, Any]]:
         of_participant = select(Token).where(Token.participant == participant, today)
         rows = list(session.scalars(of_participant.order_by(Token.created_utc.desc())))
     return [{"id": row.hash[:16], "state": _key_state(auth, row), **row.as_dict()} for row in rows]
+
+
+def has_key(auth: Auth, participant: str) -> bool:
+    """Whether a controller has a key to a participant that opens something now."""
+    return any(row["state"] == "valid" for row in keys_of(auth, participant))
 
 
 def _key_state(auth: Auth, row: Token) -> str:

@@ -158,10 +158,7 @@ class JointTests(Watched):
     async def overview(self, plan: messages.TestPlan, preview_s: float) -> dict[str, Any]:
         """What is open of today's guided tests, and what they cost beside the paper's test.
 
-        Parameters
-        ----------
-        plan : TestPlan
-            Any plan of the participant, with its limits.
+        `plan`: any plan of the participant, with its limits.
         """
         range_rad = plan.profile.angle_range_rad
         assert range_rad is not None

@@ -54,17 +54,11 @@ Segment = dict[str, Any]
 
 @dataclass(frozen=True)
 class Curve:
-    """Steady torque over pulse width, rising: a model's, or a stand-in whose torque at the widest pulse is 1.
-
-    Parameters
-    ----------
-    known : bool
-        Whether it is a model's, in N·m.
-    """
+    """Steady torque over pulse width, rising: a model's, or a stand-in whose torque at the widest pulse is 1."""
 
     pulse_width_us: tuple[float, ...]
     torque_nm: tuple[float, ...]
-    known: bool
+    known: bool  # whether it is a model's, in N·m
 
     def torque(self, width_us: float) -> float:
         """Steady torque at a width; 0 without a pulse, level beyond the ends."""
@@ -91,14 +85,8 @@ class Curve:
 def curve_of(table: Mapping[str, Sequence[float]] | None, largest_us: float, motor_us: float | None) -> Curve:
     """The approved model's recruitment curve; where there is none, a straight line from the motor threshold on.
 
-    Parameters
-    ----------
-    table : dict or None
-        `pulse_width_us` and `torque_nm`.
-    largest_us : float
-        The widest pulse of the tests, µs.
-    motor_us : float or None
-        What the calibration found, µs.
+    `table`: `pulse_width_us` and `torque_nm`; `largest_us`: the widest pulse of the tests, µs; `motor_us`: what the
+    calibration found, µs.
     """
     if table is not None and _rises(table, largest_us):
         return Curve(tuple(table["pulse_width_us"]), tuple(max(0.0, t) for t in table["torque_nm"]), True)
@@ -199,26 +187,15 @@ def widths_of(segments: Sequence[Segment]) -> list[float]:
 
 @dataclass(frozen=True)
 class Layout:
-    """The guided tests of a participant.
+    """The guided tests of a participant."""
 
-    Parameters
-    ----------
-    targets_rad : list of float
-        Angles to hold.
-    held, moving : list of dict
-        Segments of one held test, and of the moving one.
-    doses : dict
-        Expected torque-time: of the paper's test, one held test, all of them, the moving one, and all together; N·m·s,
-        with a stand-in curve only good for being compared.
-    known : bool
-        Whether the doses are N·m·s.
-    """
-
-    targets_rad: list[float]
-    held: list[Segment]
+    targets_rad: list[float]  # angles to hold
+    held: list[Segment]  # of one held test
     moving: list[Segment]
     doses: dict[str, float]
-    known: bool
+    """Expected torque-time: of the paper's test, one held test, all of them, the moving one, and all together; N·m·s,
+    with a stand-in curve only good for being compared."""
+    known: bool  # whether the doses are N·m·s
 
     @property
     def share(self) -> float:
@@ -232,14 +209,8 @@ def layout(
 ) -> Layout:  # fmt: skip
     """Share out `PLANNED_SHARE` of the paper's torque-time among the held tests and the moving one.
 
-    Parameters
-    ----------
-    range_rad : sequence of float
-        The participant's lowest and highest angle, rad.
-    paper_us : sequence of float
-        Every width of the paper's test with these limits, µs.
-    moving_s : float
-        The longest moving test without its safe end, s.
+    `range_rad`: the participant's lowest and highest angle, rad; `paper_us`: every width of the paper's test with these
+    limits, µs; `moving_s`: the longest moving test without its safe end, s.
     """
     angles, paper = targets(range_rad), torque_time(paper_us, rate_hz, curve)
     one = torque_time(widths_of(held(curve, largest_us, LONGEST_STAIR_S, rate_hz)), rate_hz, curve)
@@ -275,17 +246,10 @@ class Grid:
 
     A cell is seen once the joint was in it for long enough. Nearly still is not asked for, nor fast at the ends of the
     range, where a movement turns round.
-
-    Parameters
-    ----------
-    angle_rad : tuple of float
-        Edges of the A columns, rad, rising; angles beyond belong to the outer columns.
-    seen_s : float
-        Time in a cell after which it is seen, s.
     """
 
-    angle_rad: tuple[float, ...]
-    seen_s: float
+    angle_rad: tuple[float, ...]  # edges of the A columns, rad, rising; angles beyond belong to the outer columns
+    seen_s: float  # time in a cell after which it is seen, s
 
     @property
     def columns(self) -> int:
@@ -384,28 +348,6 @@ class Coverage:
 
     def _cells(self) -> Iterable[tuple[int, int]]:
         return ((row, column) for row in range(len(ROWS)) for column in range(self.grid.columns))
-
-
-def covered(
-    cells: Grid, time_s: Sequence[float], angle_rad: Sequence[float], velocity_rad_s: Sequence[float],
-    counts: Sequence[bool] | None = None,
-) -> Coverage:  # fmt: skip
-    """What a whole record shows.
-
-    Parameters
-    ----------
-    cells : Grid
-        The cells.
-    time_s, angle_rad, velocity_rad_s : sequence of float, shape (N,)
-        The samples, s, rad, rad/s.
-    counts : sequence of bool, shape (N,), optional
-        Which of them count; None: all.
-    """
-    found = Coverage(cells)
-    flags = [True] * len(time_s) if counts is None else counts
-    for sample in zip(time_s, angle_rad, velocity_rad_s, flags, strict=True):
-        found.add(*sample)
-    return found
 
 
 def _order(row: int) -> tuple[bool, int]:

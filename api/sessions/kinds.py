@@ -16,6 +16,7 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient, samples_of
 from stimrig.api.store.tables import Test
+from stimrig.api.workers.pool import Tasks
 from stimrig.rig.messages import AnglePlan, FinishedEvent, LiveEvent, TestPlan
 
 SERVICE = "stimrig"
@@ -25,48 +26,13 @@ AT_STOPPING_TORQUE_S = 12.0
 Tell = Callable[[dict[str, Any]], None]
 
 
-class Tasks:
-    """Work in the background; an error in it is logged."""
-
-    def __init__(self, log: logging.Logger) -> None:
-        self._log = log
-        self._running: set[asyncio.Task[None]] = set()
-
-    def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Do it beside what waits."""
-        task = asyncio.create_task(work)
-        self._running.add(task)
-        task.add_done_callback(self._ended)
-        return task
-
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._running.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._log.error("what went on in the background has failed", exc_info=error)
-
-    async def close(self) -> None:
-        """End all of it."""
-        running = list(self._running)
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
-
-
 @dataclass(frozen=True)
 class Planned:
-    """A plan, and what else is known of it before it is played.
-
-    Parameters
-    ----------
-    kept : dict
-        What is kept beside the plan; nothing of a plain test.
-    how : dict or None
-        Of an adaptive test: what the adviser is asked with.
-    """
+    """A plan, and what else is known of it before it is played."""
 
     plan: TestPlan
-    kept: dict[str, Any] = field(default_factory=dict)
-    how: dict[str, Any] | None = None
+    kept: dict[str, Any] = field(default_factory=dict)  # what is kept beside the plan; nothing of a plain test
+    how: dict[str, Any] | None = None  # of an adaptive test: what the adviser is asked with
 
 
 class Kind:
@@ -154,14 +120,8 @@ class Kinds:
 class Watcher:
     """A test from its first sample to its end. Whatever goes wrong in watching leaves it to its plan, told.
 
-    Parameters
-    ----------
-    plan : TestPlan
-        As the rig plays it.
-    told : object
-        What is known of the test, for pages and its document; has `state`, `problem` and `ended`.
-    tell : callable
-        Called whenever there is something new for pages.
+    `plan`: as the rig plays it. `told`: what is known of the test, for pages and its document; has `state`, `problem`
+    and `ended`. `tell`: called whenever there is something new for pages.
     """
 
     watches, left = "watching", "alone"
@@ -220,10 +180,7 @@ class Watcher:
 class Watched(Kind):
     """A kind whose running test this service watches, sample by sample; at most one runs.
 
-    Parameters
-    ----------
-    tell : callable
-        Called with a message for the live channel.
+    `tell`: called with a message for the live channel.
     """
 
     ends: ClassVar[Mapping[str, str]] = {}

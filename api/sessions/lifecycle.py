@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store, audit
 from stimrig.api.store.holds import Holds, Turn
 from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
-from stimrig.api.workers.pool import Call, Pool
+from stimrig.api.workers.pool import Call, Pool, Tasks
 from stimrig.rig.messages import LABEL_TITLES, FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
@@ -38,10 +38,7 @@ class LeftError(Exception):
 class Lifecycle:
     """Takes over what a test leaves behind.
 
-    Parameters
-    ----------
-    on_progress : callable
-        Called with a test's id whenever its identification has got further.
+    `on_progress`: called with a test's id whenever its identification has got further.
     """
 
     def __init__(
@@ -53,10 +50,15 @@ class Lifecycle:
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
         self.kinds, self.follower = kinds, follower
         self.calls: dict[str, Call] = {}
-        self._ahead: set[asyncio.Task[None]] = set()
+        self._ahead = Tasks(log)
 
-    def document(self, row: Test, position: tuple[float, float, str | None] | None) -> dict[str, Any]:
-        """A test as clients see it: what became of it so far; while it runs also where it is, as the rig tells it."""
+    def document(
+        self, row: Test, position: tuple[float, float, str | None] | None, fits: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """A test as clients see it: what became of it so far; while it runs also where it is, as the rig tells it.
+
+        `fits`: documents of models by their ids, where many tests are told of at once.
+        """
         planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
         running = row.state in ("requested", "running")
         lasted_s = row.summary.get("duration_s", 0.0)
@@ -64,7 +66,8 @@ class Lifecycle:
         elapsed_s, duration_s, segment = there
         call, rig = self.calls.get(row.id), self.rig.status
         sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
-        model = self.versions.get(row.model_id) if row.model_id else None
+        if fits is None and row.model_id:
+            fits = {row.model_id: self.versions.document(self.versions.get(row.model_id))}
         return {
             **{name: getattr(row, name) for name in ROW},
             "state": "sealing" if sealing else row.state,
@@ -82,7 +85,7 @@ class Lifecycle:
             "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
             "summary": {name: value for name, value in row.summary.items() if name not in self.kinds.parts},
             **self.kinds.documents(row),
-            "fit": self.versions.document(model) if model else None,
+            "fit": (fits or {}).get(row.model_id or ""),
         }
 
     def update(self, test_id: str, **fields: Any) -> Test:
@@ -162,9 +165,7 @@ class Lifecycle:
         if last_sample_unix_s is not None:
             summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)
-        ahead = asyncio.create_task(self.analyses.diagnose_ahead(model))
-        self._ahead.add(ahead)
-        ahead.add_done_callback(self._ahead.discard)
+        self._ahead.begin(self.analyses.diagnose_ahead(model))
 
     async def _first_version(
         self, row: Test, recording: Recording, parent: str | None, take: Callable[[Call], None], how: dict[str, Any]
@@ -206,10 +207,8 @@ class Lifecycle:
 
     def warnings(self, recording_id: str) -> list[str]:
         """What was found doubtful about a recording, in sentences: by the rig, or when its first model was made."""
-        recording = self.store.get(Recording, recording_id)
-        row = self.store.get(Test, recording.test_id) if recording is not None and recording.test_id else None
-        found = row.summary.get("warnings") if row is not None else recording and recording.warnings
-        return list(found or [])
+        with self.store.read() as session:
+            return together.warnings(session, recording_id)
 
     async def missed_end(self, test_id: str, why: str) -> FinishedEvent:
         """The end of a test as the rig remembers it, or as its recording tells."""
@@ -239,12 +238,7 @@ class Follower:
 
     Who began a test follows it to its end; when that service is dead, another one of the same rig does.
 
-    Parameters
-    ----------
-    holds : Holds
-        Says which services live.
-    rig : str
-        What the services of this rig call it.
+    `holds`: says which services live; `rig`: what the services of this rig call it.
     """
 
     def __init__(self, store: Store, holds: Holds, rig: str) -> None:

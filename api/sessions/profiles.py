@@ -53,17 +53,10 @@ def calibration(profile: Profile, now_utc: str) -> Literal["none", "valid", "exp
 
 
 def changed(profile: Profile, asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    """The profile with some limits changed, and what that voids.
+    """The profile with some limits changed, and why the calibration does not hold with it: empty where nothing is lost.
 
     What a calibration found stays where no limit is wider than it was; it goes where one is, and where the comfort
     maximum falls below the motor threshold.
-
-    Returns
-    -------
-    profile : dict
-        The new one.
-    voids : str
-        Why the calibration does not hold with it; empty where nothing is lost.
     """
     new = {**profile, **asked}
     if RANGE in asked and asked[RANGE] is None:
@@ -122,14 +115,8 @@ def takes(name: str, limits: Mapping[str, Bound]) -> str:
 def outside(asked: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
     """Which of the limits that are asked for this rig would refuse, by name, in words.
 
-    Parameters
-    ----------
-    asked
-        The ones that change.
-    profile
-        The participant's, with the others.
-    limits
-        As the rig tells them; where it has not, the widest of any rig.
+    `asked`: the ones that change. `profile`: the participant's, with the others. `limits`: as the rig tells them; where
+    it has not, the widest of any rig.
     """
     found = {}
     for name in [name for name in LIMITS if name in asked]:

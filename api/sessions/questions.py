@@ -35,37 +35,17 @@ class Row:
 
 @dataclass
 class Question:
-    """What is shown, and what is done when a person says yes.
+    """What is shown, and what is done when a person says yes."""
 
-    Parameters
-    ----------
-    participant : str
-        Whom it is about; also its place among the addresses.
-    title, button : str
-        The question, and what the button says that means yes.
-    action : callable
-        Does it; gives the address that it leads to.
-    rows : list of Row
-        What it is bound to, in words.
-    warnings : list of str
-        What deserves a second look.
-    stimulates : bool
-        Whether current flows on yes.
-    back : str
-        Where no leads to; the participant where nothing is said.
-    at_deg : tuple of float, optional
-        The joint must be between these angles when yes is said.
-    """
-
-    participant: str
-    title: str
-    button: str
-    action: Callable[[], Awaitable[str]]
-    rows: list[Row] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    stimulates: bool = False
-    back: str = ""
-    at_deg: tuple[float, float] | None = None
+    participant: str  # whom it is about; also its place among the addresses
+    title: str  # the question
+    button: str  # what the button says that means yes
+    action: Callable[[], Awaitable[str]]  # does it; gives the address that it leads to
+    rows: list[Row] = field(default_factory=list)  # what it is bound to, in words
+    warnings: list[str] = field(default_factory=list)  # what deserves a second look
+    stimulates: bool = False  # whether current flows on yes
+    back: str = ""  # where no leads to; the participant where nothing is said
+    at_deg: tuple[float, float] | None = None  # the joint must be between these angles when yes is said
     asker: tuple[str, str | None] = ("", None)
     seen: seen.Seen | None = None
     asked_s: float = 0.0

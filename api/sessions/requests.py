@@ -24,9 +24,10 @@ from stimrig.api.models.tracking import USUAL_PERCENT, Limits
 from stimrig.api.people import accounts
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
-from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, Labels, Profile
+from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, PULSE_RATES_HZ, Labels, Profile
 
 LONGEST_NOTE = 500
+RateHz = Annotated[FiniteFloat, Field(ge=PULSE_RATES_HZ[0], le=PULSE_RATES_HZ[1], description="pulses a second, Hz")]
 Side = Literal["left", "right"]
 NoteKind = Literal["electrodes", "side", "posture", "medication", "spasm", "other"]
 
@@ -192,7 +193,7 @@ class TestIn(Labels, Body):
         default=None,
         description="a whole test by its id in `GET /v1/sequences`; None: the default. Not together with segments",
     )
-    pulse_rate_hz: Annotated[FiniteFloat, Field(ge=1, le=100)] = 40.0
+    pulse_rate_hz: RateHz = 40.0
     max_pulse_width_us: FiniteFloat | None = Field(
         default=None, ge=LIMITS["max_pulse_width_us"].least, description="for this test alone, if tighter, µs"
     )
@@ -241,7 +242,11 @@ class TestIn(Labels, Body):
 
     @model_validator(mode="after")
     def _check_kind(self) -> TestIn:
-        sent = {name for name in self.model_fields_set if getattr(self, name) is not None}
+        # Clients that generators make send every default, too.
+        default = {
+            name: field.get_default(call_default_factory=True) for name, field in type(self).model_fields.items()
+        }
+        sent = {name for name in self.model_fields_set if getattr(self, name) not in (None, default[name])}
         others = set().union(*OWN_FIELDS.values()) - OWN_FIELDS.get(self.kind, set())
         planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING)
         if "reference_torque_nm" in sent & others:

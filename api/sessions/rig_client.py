@@ -36,12 +36,8 @@ _events: TypeAdapter[AnyEvent] = TypeAdapter(messages.Event)
 class RigClient:
     """One lasting connection to the rig, and the newest state with its age.
 
-    Parameters
-    ----------
-    path : Path or None
-        The rig's socket; None: there is no rig, every request is refused with the reason.
-    clock : Clock
-        Ages are measured on it.
+    `path`: the rig's socket; None: there is no rig, every request is refused with the reason. `clock`: ages are
+    measured on it.
     """
 
     def __init__(self, path: Path | None, clock: Clock) -> None:

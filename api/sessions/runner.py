@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 import secrets
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.joint import JointTests
-from stimrig.api.sessions.kinds import Kind, Kinds, Planned, Tasks
+from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Follower, Lifecycle
 from stimrig.api.sessions.live import Hub
 from stimrig.api.sessions.playing import Current, Playing, busy, other_than, refuse_archived, rests_of, right_ended
@@ -31,7 +31,7 @@ from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.tables import Participant, Test, Token
-from stimrig.api.workers.pool import Adviser, Pool
+from stimrig.api.workers.pool import Adviser, Pool, Tasks
 from stimrig.rig import messages, requests
 
 log = logging.getLogger("stimrig.trials")
@@ -449,9 +449,17 @@ class Runner(Playing):
         elif (document := read.result()) is not None:
             self.hub.send({"type": "test", "test": document})
 
-    def document(self, row: Test) -> dict[str, Any]:
-        """A test as clients see it."""
-        return self.lifecycle.document(row, self.hub.position(row.id))
+    def document(self, row: Test, fits: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """A test as clients see it; `fits` as `Lifecycle.document` takes them."""
+        return self.lifecycle.document(row, self.hub.position(row.id), fits)
+
+    def documents(
+        self, participant: str, models: list[dict[str, Any]], limit: int | None = None
+    ) -> list[dict[str, Any]]:
+        """A participant's tests, newest first; `models`: documents of all of the participant's, read at once."""
+        fits, own = {model["id"]: model for model in models}, Test.participant == participant
+        rows = self.lifecycle.store.all(Test, own, order=Test.requested_utc.desc(), limit=limit)
+        return [self.document(row, fits) for row in rows]
 
     async def close(self) -> None:
         """Leave what runs to the next start of the service."""

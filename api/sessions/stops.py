@@ -23,22 +23,14 @@ KEPT = 200
 
 @dataclass(frozen=True)
 class StopResult:
-    """One press of the button on a page, and its answer.
-
-    Parameters
-    ----------
-    right : str or None
-        The page's right to stop: the page with the answer carries it on.
-    answer : StopEvidence or ApiError
-        The rig's evidence, or why the stop is not confirmed.
-    """
+    """One press of the button on a page, and its answer."""
 
     by: str
     reason: str
     at_utc: str
     test_id: str | None
-    right: str | None
-    answer: StopEvidence | ApiError
+    right: str | None  # the page's right to stop: the page with the answer carries it on
+    answer: StopEvidence | ApiError  # the rig's evidence, or why the stop is not confirmed
 
 
 class StopLog:
@@ -79,12 +71,8 @@ LONGEST = 1000
 class StopRights:
     """Gives rights to stop and knows them again.
 
-    Parameters
-    ----------
-    key : bytes
-        The service's own; a restart keeps it, so that the pages that are open stay good.
-    clock : Clock
-        Their age is measured on it.
+    `key`: the service's own; a restart keeps it, so that the pages that are open stay good. `clock`: their age is
+    measured on it.
     """
 
     def __init__(self, key: bytes, clock: Clock) -> None:

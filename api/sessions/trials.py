@@ -16,12 +16,12 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.models.places import differ, place_of
 from stimrig.api.models.tracked import TrackedVersions, Trial
-from stimrig.api.sessions.kinds import Kind, Tasks
+from stimrig.api.sessions.kinds import Kind
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
-from stimrig.api.workers.pool import Adviser
+from stimrig.api.workers.pool import Adviser, Tasks
 
 log = logging.getLogger("stimrig.tracking")
 SEQUENCE = "sequence"
@@ -34,13 +34,7 @@ ELSEWHERE = "It was played at another side, muscle or current than the approved 
 
 
 class Trials(Kind):
-    """Follows what controllers play; nothing is identified from it.
-
-    Parameters
-    ----------
-    tracker : Adviser
-        A worker that does nothing else.
-    """
+    """Follows what controllers play; nothing is identified from it. `tracker`: a worker that does nothing else."""
 
     names, fitted = (SEQUENCE,), False
 
@@ -102,13 +96,7 @@ class Trials(Kind):
             log.warning("a trial is still being followed; the version before it is served")
 
     async def follow(self, test_id: str, last_sample_unix_s: float | None = None) -> Tracked | None:
-        """Follow a trial that has ended; one that is noted already moves nothing.
-
-        Returns
-        -------
-        Tracked or None
-            What was written down; None where there was nothing to follow.
-        """
+        """Follow a trial that has ended: what was written down, None where it is noted already and moves nothing."""
         with self.ending():
             async with self._turn:
                 trial = await asyncio.to_thread(self.tracked.open_trial, test_id)

@@ -37,6 +37,8 @@ def write(session: Session, at_utc: str, who: str, action: str, subject: str, **
     }
     session.add(AuditEntry(**fields, hash=entry_hash(fields)))
     session.flush()
+    if (written := seen.written.get()) is not None:
+        written.append(fields["seq"])
 
 
 def first_broken(entries: list[AuditEntry]) -> int | None:

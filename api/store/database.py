@@ -28,15 +28,7 @@ from stimrig.api.store.seen import About, Seen, check, newest
 class Store:
     """The database, opened and its tables made.
 
-    Parameters
-    ----------
-    url : str
-        SQLAlchemy URL.
-
-    Raises
-    ------
-    ApiError
-        The URL cannot be read or the database not opened.
+    `url`: SQLAlchemy URL. Raises ApiError: the URL cannot be read or the database not opened.
     """
 
     def __init__(self, url: str) -> None:
@@ -144,12 +136,7 @@ KEEPALIVES = {"keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count
 def open_engine(url: URL) -> Engine:
     """An engine for SQLite or PostgreSQL.
 
-    Raises
-    ------
-    ArgumentError
-        Another kind of database.
-    ImportError
-        The driver is not installed.
+    Raises ArgumentError: another kind of database. ImportError: the driver is not installed.
     """
     kind = url.get_backend_name()
     if kind == "sqlite":

@@ -177,15 +177,7 @@ class HeldError(OSError):
 class ServiceLock:
     """What this service holds.
 
-    Parameters
-    ----------
-    settings : Settings
-        Data folder and database.
-
-    Raises
-    ------
-    HeldError
-        Another service holds one of them.
+    `settings`: data folder and database. Raises HeldError: another service holds one of them.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -267,12 +259,8 @@ SECRET_BYTES = 32
 def shared_secret(store: Store, name: str, before: Path | None = None) -> bytes:
     """A secret that all services share, so that a page of one is good at another: read, or drawn once.
 
-    Parameters
-    ----------
-    name : str
-        What it is for.
-    before : Path, optional
-        The file in which an older version kept it: pages that are open stay good over the upgrade.
+    `name`: what it is for; `before`: the file in which an older version kept it: pages that are open stay good over the
+    upgrade.
     """
     with store.write() as session:
         row = session.get(Secret, name)

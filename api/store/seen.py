@@ -37,21 +37,11 @@ MOST_TOLD = 20
 
 @dataclass(frozen=True)
 class Seen:
-    """A place in the trail, and the day: approvals and calibrations end with it.
+    """A place in the trail, and the day: approvals and calibrations end with it."""
 
-    Parameters
-    ----------
-    entry : int
-        Number of the newest entry at that time; 0: there was none.
-    mark : str
-        Begin of that entry's hash: a database that was restored has another one.
-    day : str
-        As 2026-11-26, where the service stands.
-    """
-
-    entry: int
-    mark: str
-    day: str
+    entry: int  # number of the newest entry at that time; 0: there was none
+    mark: str  # begin of that entry's hash: a database that was restored has another one
+    day: str  # as 2026-11-26, where the service stands
 
     def __str__(self) -> str:
         return f"{self.entry}.{self.mark}.{self.day}"
@@ -66,9 +56,14 @@ def mark_of(document: str) -> str:
     return hashlib.sha256(document.encode()).hexdigest()[:8]
 
 
+def written_as_version(text: str) -> re.Match[str] | None:
+    """The parts of a version of any document; None: nobody was shown this."""
+    return re.fullmatch(rf"{ENTRY}\.{MARK}\.(\d{{4}}-\d\d-\d\d)(?:\.{MARK})?", text, re.ASCII)
+
+
 def read(text: str, *marks: str) -> Seen | None:
     """What was sent back, with one of these documents' marks, or the empty one of a page; None where it is none."""
-    found = re.fullmatch(rf"{ENTRY}\.{MARK}\.(\d{{4}}-\d\d-\d\d)(?:\.{MARK})?", text, re.ASCII)
+    found = written_as_version(text)
     if found is None or (found[4] or "") not in marks:
         return None
     return Seen(int(found[1]), found[2], found[3])
@@ -82,6 +77,11 @@ looked: ContextVar[Seen | None] = ContextVar("looked", default=None)
 """The place when this request began to read what it shows: a page's forms carry it, and a question is bound to it."""
 sent: ContextVar[str] = ContextVar("sent", default="")
 """The same as it came: of what the rig keeps, and of models, the version is another one."""
+
+written: ContextVar[list[int] | None] = ContextVar("written", default=None)
+"""Numbers of the entries that this request has written: its answer tells them, as `Trail-Entries`."""
+own: ContextVar[tuple[str, frozenset[int]]] = ContextVar("own", default=("", frozenset()))
+"""Who decides, and which entries they say they have written since (`Trail-Own`)."""
 
 
 def participant(code: str) -> About:
@@ -160,8 +160,11 @@ def check(session: Session, *about: About) -> None:
         return
     refuse_another_day(seen)
     if not known(session, seen):
-        raise another_trail(seen)
-    if changed := since(session, seen, *about):
+        detail = "This page was shown by another database than the one of now. Nothing was done. Load the page again."
+        raise ChangedError([], seen, detail)  # a backup was restored, or it is of another service
+    who, entries = own.get()  # what one has decided oneself meanwhile is no news; another's entry always is
+    changed = [entry for entry in since(session, seen, *about) if entry.who != who or entry.seq not in entries]
+    if changed:
         raise ChangedError([change(session, seen, entry) for entry in changed[-MOST_TOLD:]], seen)
 
 
@@ -186,16 +189,11 @@ def entry_document(entry: AuditEntry) -> dict[str, Any]:
 class ChangedError(ApiError):
     """What a decision rests on has changed since it was shown.
 
-    Parameters
-    ----------
-    changes : list of dict
-        `seen` and `now`, each an entry of the trail or None.
-    seen : Seen or None
-        What was sent.
+    `changes`: `seen` and `now`, each an entry of the trail or None; `seen`: what was sent.
     """
 
     def __init__(self, changes: list[dict[str, Any]], seen: Seen | None, detail: str = "") -> None:
-        if changes:
+        if changes and not detail:
             last = changes[-1]["now"]
             detail = (
                 f"{last['who']}: {last['action']} {last['subject']}, {last['at_utc']}. Nothing was done. "
@@ -214,12 +212,6 @@ def another_document(document: str) -> ChangedError:
     """What was sent is the version of something else, or of nothing."""
     detail = f"This is no version of {document}. Send the ETag with which you last saw it. Nothing was done."
     return ChangedError([], None, detail)
-
-
-def another_trail(seen: Seen) -> ChangedError:
-    """What was sent was seen before a backup was restored, or at another service."""
-    detail = "This page was shown by another database than the one of now. Nothing was done. Load the page again."
-    return ChangedError([], seen, detail)
 
 
 def refuse_another_day(seen: Seen) -> None:

@@ -84,8 +84,11 @@ def create_app(
 
 @cache
 def _routes() -> Sequence[BaseRoute]:
-    """All routes, made once a process: FastAPI examines every endpoint anew for each application it is included in."""
-    whole = APIRouter()
+    """All routes, made once a process: FastAPI examines every endpoint anew for each application it is included in.
+
+    A client that is made of the document has a function of each endpoint's name.
+    """
+    whole = APIRouter(generate_unique_id_function=lambda route: route.name)
     for router in routers(routes, pages):
         whole.include_router(router)
     return whole.routes

@@ -52,12 +52,7 @@ T = TypeVar("T")
 class Parts:
     """What a rig's service and a centre both have: a database, people who sign in, work that nobody asks for.
 
-    Parameters
-    ----------
-    settings : ServerSettings
-        Session hours, idle lock, first administrator.
-    store : Store
-        Opened.
+    `settings`: session hours, idle lock, first administrator; `store`: opened.
     """
 
     forgiven: ClassVar[tuple[type[Exception], ...]] = (SQLAlchemyError, OSError)
@@ -105,12 +100,7 @@ class Parts:
 class Context(Parts):
     """Everything a route of the service may need.
 
-    Parameters
-    ----------
-    worker : tuple of str
-        How to start a worker process.
-    lock : ServiceLock
-        Held; let go at the end.
+    `worker`: how to start a worker process. `lock`: held; let go at the end.
     """
 
     def __init__(self, settings: Settings, clock: Clock, worker: tuple[str, ...], lock: ServiceLock) -> None:
@@ -171,12 +161,7 @@ def build(
 ) -> Context:
     """Make the parts; `lock` is held already, or taken now.
 
-    Raises
-    ------
-    ApiError
-        The database cannot be opened.
-    HeldError
-        Another service holds the data folder or the database.
+    Raises ApiError: the database cannot be opened. HeldError: another service holds the data folder or the database.
     """
     lock = lock or ServiceLock(settings)
     try:

@@ -33,6 +33,7 @@ from stimrig.api.people.auth import Principal, Scope, outside
 from stimrig.api.sessions.controllers import unapproved
 from stimrig.api.sessions.requests import PARTICIPANT_CODE, StopIn
 from stimrig.api.store import seen
+from stimrig.api.store.audit import storable
 from stimrig.api.store.tables import Model, Participant, Recording, Test
 from stimrig.api.web.middleware import PARSED, SAFE_METHODS, STOP, entity_tags, wants_html
 
@@ -119,6 +120,7 @@ OPEN = [
     for method, path, table in (
         ("POST", STOP, None),
         ("POST", "/v1/tests", None),
+        ("GET", "/v1/sequences", None),
         ("GET", "/v1/participants/([^/]+)/(?:model|tracking)", str),
         ("POST", "/v1/models/([^/]+)/prediction", Model),
         ("POST", "/v1/models/([^/]+)/widths", Model),
@@ -127,7 +129,8 @@ OPEN = [
         ("GET", "/v1/recordings/([^/]+)(?:/csv)?", Recording),
     )
 ]
-"""Method, path, and the table in whose row the participant stands; str: the path names it; None: the body does.
+"""Method, path, and the table in whose row the participant stands; str: the path names it; None: the body does, or
+nothing.
 
 Of the models it is the approved one, and what was tracked from it under the approval that holds."""
 
@@ -201,29 +204,35 @@ MOST_TAGS = 20
 async def note_version(request: Request) -> None:
     """Note what the request was decided on, for `stimrig.api.store.seen.check`.
 
-    Raises ApiError: 428 it does not say; 409 another day has begun since, or what it says is no version.
+    Raises ApiError: 428 it does not say, or nothing that is a version; 409 that is one of another document or day.
     """
     found = decisions.find(request.method, request.url.path)
     if found is None:
         return
     decision, names = found
     document = decision.document.format(**{**await _names(request, decision), **names})
+    if decision.path == "/v1/tests" and (own := request.state.who.participant) is not None:
+        document = f"/v1/participants/{own}/model"  # a controller's key reads no participant
     text, marks = await _sent(request, decision, seen.mark_of(document))
     if decision.field == "latch" and not request.app.state.context.rig.latch_known:
         raise old_rig()
     if not decision.needed and request.url.path.startswith("/v1/") and "if-match" not in request.headers:
         return
     seen.today.set(lambda: local_day(request.app.state.context.clock.utc()))
-    if not re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII):
-        raise version_missing(document, decision)
+    by_tag = decision.path == "/v1/tests" and re.fullmatch(rf"[0-9a-f]{{{MODEL_TAG}}}", text)
+    outside = decision.field in OF_RIG or by_tag  # of what the rig keeps, and of models: the trail has no such place
+    if not (re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII) if outside else seen.written_as_version(text)):
+        raise version_missing(document)
     seen.sent.set(text)
-    place = seen.read(text, *marks)
-    if decision.field in OF_RIG or (decision.path == "/v1/tests" and len(text) == MODEL_TAG):
+    if outside:
         return
+    place = seen.read(text, *marks)
     if place is None:
         raise seen.another_document(document)
     seen.refuse_another_day(place)
     seen.shown.set(place)
+    numbers = re.findall(r"\d{1,9}", ",".join(request.headers.getlist("trail-own")), re.ASCII)
+    seen.own.set((storable(request.state.who.name), frozenset(map(int, numbers))))
 
 
 async def _names(request: Request, decision: Decision) -> dict[str, str]:
@@ -246,7 +255,7 @@ async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, t
     if fields:
         tags = [tag.strip('"') for field in fields for tag in entity_tags(field)][:MOST_TAGS]
         places = {place.entry: tag for tag in tags if (place := seen.read(tag, mark))}
-        return (places[max(places)] if places else tags[0]), (mark,)
+        return places[max(places)] if places else max(tags, key=lambda tag: bool(seen.written_as_version(tag))), (mark,)
     if "form" not in request.headers.get("content-type", ""):
         return "", (mark,)
     return str((await request.form()).get(decision.field) or ""), ("", mark)
@@ -258,12 +267,11 @@ def old_rig() -> ApiError:
     return ApiError(409, "rig-outdated", "The rig's program is older than this service", detail)
 
 
-def version_missing(document: str, decision: Decision) -> ApiError:
-    """428: nobody says what this was decided on (RFC 6585, section 3)."""
-    trial = f" (a controller's key: of GET {document}/model)" if decision.path == "/v1/tests" else ""
+def version_missing(document: str) -> ApiError:
+    """428: nobody says what this was decided on (RFC 6585, section 3), or not so that it can be read."""
     detail = (
-        f"Send the ETag of GET {document}{trial} as If-Match, as you last saw it. On a page: load it again and repeat "
-        "what you did. Nothing was done."
+        f"Send the ETag of GET {document} as If-Match, as you last saw it. On a page: load it again and repeat what "
+        "you did. Nothing was done."
     )
     return ApiError(428, "seen-missing", "Say what this was decided on", detail)
 

@@ -19,6 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from stimrig.api import language
 from stimrig.api.clock import asked_s
 from stimrig.api.errors import ApiError
+from stimrig.api.store import seen
 from stimrig.identify.json_text import BadJson, NotJson, parse
 
 log = logging.getLogger("stimrig.look_again")
@@ -30,10 +31,7 @@ STOP, PREVIEW, UPLOAD = "/v1/stop", "/v1/preview", "/recordings"
 class HttpMiddleware:
     """ASGI middleware for HTTP; what is none passes by. `serve` is what each of them does.
 
-    Parameters
-    ----------
-    context : Context, optional
-        The application's parts, for those that need them.
+    `context`: the application's parts, for those that need them.
     """
 
     def __init__(self, app: ASGIApp, context: Any = None) -> None:
@@ -86,9 +84,14 @@ class Headers(HttpMiddleware):
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As the base class."""
 
+        entries: list[int] = []
+        seen.written.set(entries)
+
         async def send_more(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = datastructures.MutableHeaders(scope=message)
+                if entries:
+                    headers["Trail-Entries"] = ", ".join(map(str, entries))
                 page = headers.get("content-type", "").startswith("text/html")
                 for name, value in (PAGE if page else DATA).items():
                     headers.setdefault(name, value)

@@ -10,6 +10,8 @@ from stimrig.api import schemas
 from stimrig.api.decisions import DECISIONS
 from stimrig.api.web.middleware import REFUSALS
 from stimrig.api.web.responses.base import Problem
+from stimrig.api.web.responses.models import TrackedOut
+from stimrig.api.web.responses.rig import LiveOut
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 EMBEDDED = ("model", "effects")
@@ -27,8 +29,9 @@ operation names, as it was last read, in `If-Match`. A controller's key, which r
 model's. Without: 428. Changed since: 409, with what was there, what is there now, who changed it and when.
 
 Live signals come over a WebSocket, `/v1/tests/{id}/live`, with the same token: JSON messages with a `type`, which is
-`history` (all curves so far, once), `live` (about 20 a second), `state` (the rig), `link` (is the rig there) or `test`
-(the test's document). It closes once the test is done.
+`history` (all curves so far, once), `live` (about 20 a second, see `LiveOut`), `state` (the rig), `link` (is the
+rig there), `test` (the test's document), `joint`, `adaptive` or `problem` (docs/api.md says what each holds). It closes
+once the test is done.
 
 The same facts as JSON Schemas: `GET /v1/schemas`.
 """
@@ -66,12 +69,15 @@ def describe(app: FastAPI) -> None:
 
 def _complete(document: dict[str, Any]) -> None:
     components = document["components"]["schemas"]
-    own = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
-    components.update(own.pop("$defs", {}) | {"Problem": own})
+    for model in (Problem, LiveOut, TrackedOut):
+        own = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        components.update(own.pop("$defs", {}) | {model.__name__: own})
     components["JsonValue"] = {"description": "any JSON value: what it holds depends on its key"}
     for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own words; ours are a Problem
         components.pop(name, None)
-    components.update({schemas.component_name(name): schemas.component(name) for name in EMBEDDED})
+    for name in EMBEDDED:
+        components.update(schemas.components(name))
+    components["ModelJson"]["properties"]["tracking"] = {"$ref": "#/components/schemas/TrackedOut"}
     _tell_of_decisions(document)
     for methods in document["paths"].values():
         for operation in methods.values():

@@ -12,6 +12,7 @@ from fastapi.responses import JSONResponse, Response
 from sqlalchemy.exc import DataError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from stimrig.api.errors import ApiError, invalid, not_answering
 from stimrig.api.store import seen
@@ -27,6 +28,9 @@ def from_validation(error: RequestValidationError) -> ApiError:
     """Fields that do not hold, each named with what would do."""
     found = []
     for item in error.errors():
+        if item["type"] == "json_invalid":
+            where = item["loc"][-1]
+            return invalid(f"The body is no JSON from character {where} on. Send one whole JSON object in UTF-8.")
         place = ".".join(str(part) for part in item.get("loc", ()) if part != "body") or "body"
         found.append({"field": place, "detail": str(item.get("msg", "")), "got": _short(item.get("input"))})
     names = "; ".join(f"{item['field']}: {item['detail']}" for item in found)
@@ -86,6 +90,11 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> Response:
         return await respond(request, _from_http(error))
+
+    @app.exception_handler(ClientDisconnect)
+    async def left(request: Request, error: ClientDisconnect) -> Response:  # noqa: ARG001
+        log.info("who asked for %s %s left before the whole of it was here", request.method, request.url.path)
+        return Response(status_code=400)
 
     @app.exception_handler(OperationalError)
     @app.exception_handler(InterfaceError)

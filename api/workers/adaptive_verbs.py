@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.api.record_files import Progress
 from stimrig.identify.json_text import json_value
 
-Progress = Callable[[float, str], None]
 NEW_PERSON_SHARE = 1 / 3
 """Of the torque that stops a test: the guess of a new person's torque at the largest width."""
 DIGITS = 4

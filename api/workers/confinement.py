@@ -66,12 +66,8 @@ def confine(
 ) -> dict[str, str]:
     """Shut this process in, for good; what could not be shut, and why.
 
-    Parameters
-    ----------
-    reads, writes : iterable of Path
-        Folders that stay open, beside those of Python and of the system's libraries.
-    memory_bytes : int
-        Addresses that it may take, those of its libraries included.
+    `reads`, `writes`: folders that stay open, beside those of Python and of the system's libraries; `memory_bytes`:
+    addresses that it may take, those of its libraries included.
     """
     for kind, most in (
         (resource.RLIMIT_AS, memory_bytes), (resource.RLIMIT_FSIZE, FILE_BYTES),

@@ -1,20 +1,18 @@
-"""What pages draw of a recording, thinned: curves beside a model's, a comparison, a sealed recording as it was made."""
+"""What pages draw of a recording, rounded: curves beside a model's, a comparison, a sealed recording as it was made."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stimrig import identify
+from stimrig.api.record_files import Progress
+from stimrig.identify.criticism import POINTS
 from stimrig.identify.json_text import json_value
 
-Progress = Callable[[float, str], None]
-POINTS = 2400
-"""Most points in a drawn curve: more than a screen has pixels."""
 BINS = 1000
 """Each bin keeps its lowest and its highest torque: no peak is lost."""
 
@@ -35,20 +33,18 @@ def page_curves(data: str, progress: Progress, model_json: str) -> dict[str, Any
 
 
 def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
-    """Measurement against model: identify's comparison, its series thinned."""
+    """Measurement against model: identify's comparison, its series rounded."""
     progress(0.1, "reading the recording")
     record = identify.read(Path(data))
     model = identify.Model.from_json(model_json)
     progress(0.4, "comparing")
-    return thinned(identify.compare(model, record).to_dict())
+    return rounded(identify.compare(model, record).to_dict())
 
 
-def thinned(found: dict[str, Any]) -> dict[str, Any]:
-    """A comparison whose series hold no more points than a screen shows, five digits each."""
+def rounded(found: dict[str, Any]) -> dict[str, Any]:
+    """A comparison whose series hold five digits each."""
     series = found.get("series") or {}
-    longest = max((len(values) for values in series.values() if isinstance(values, list)), default=0)
-    pick = slice(None, None, max(1, math.ceil(longest / POINTS)))
-    short = {key: _rounded(values[pick]) if isinstance(values, list) else values for key, values in series.items()}
+    short = {key: _rounded(values) if isinstance(values, list) else values for key, values in series.items()}
     return {**found, "series": short}
 
 
@@ -57,20 +53,24 @@ def _rounded(values: list[Any]) -> list[Any]:
 
 
 def curves(model: Any, record: Any) -> dict[str, Any]:
-    """The measured, predicted and commanded curves, thinned to what a screen shows."""
+    """The measured, predicted and commanded curves, rounded to what a screen shows."""
     predicted = np.asarray(identify.predict(model, record))
     time_s, torque_nm = np.asarray(record.time_s), np.asarray(record.torque_nm)
     step = max(1, math.ceil(len(time_s) / POINTS))
-    labels = [str(record.segment_names[index]) for index in record.segment]
     pick = slice(None, None, step)
     return {
         "time_s": time_s[pick].round(5).tolist(),
         "torque_nm": torque_nm[pick].round(5).tolist(),
         "predicted_torque_nm": predicted[pick].round(5).tolist(),
         "pulse_width_us": np.asarray(record.pulse_width_us)[pick].round(2).tolist(),
-        "segments": runs(labels, time_s),
+        "segments": segments_of(record),
         "step_response": step_response(model.to_dict()),
     }
+
+
+def segments_of(record: Any) -> list[dict[str, Any]]:
+    """The segments of a record, each with its name and times."""
+    return runs([str(record.segment_names[index]) for index in record.segment], np.asarray(record.time_s))
 
 
 def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:
@@ -84,7 +84,7 @@ def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:
 
 
 def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, list[float]]:
-    """The linear part's answer to a unit step (eq. 2 of the paper: B(q)/A(q)), thinned."""
+    """The linear part's answer to a unit step (eq. 2 of the paper: B(q)/A(q)), rounded."""
     from scipy.signal import lfilter
 
     linear, rate_hz = document["linear"], float(document["sample_rate_hz"])
@@ -97,8 +97,8 @@ def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, l
     return {"time_s": (np.arange(response.size) / rate_hz)[pick].tolist(), "response": response[pick].round(6).tolist()}
 
 
-def recorded(data: str, progress: Callable[[float, str], None]) -> dict[str, Any]:
-    """Torque over time, thinned; each change of the pulse width that was sent; None where a pulse was dropped.
+def recorded(data: str, progress: Progress) -> dict[str, Any]:
+    """Torque over time, rounded; each change of the pulse width that was sent; None where a pulse was dropped.
 
     With an angle sensor also the joint's angle, °.
     """
@@ -135,7 +135,7 @@ def _columns(path: Path) -> dict[str, Any]:
 
 
 def _angle(held: dict[str, Any]) -> dict[str, Any]:
-    """The joint's angle, °, thinned; nothing where it was not recorded."""
+    """The joint's angle, °, rounded; nothing where it was not recorded."""
     if not set(held) >= set(ANGLES) or not held[ANGLES[0]].size:
         return {}
     time_s, angle_rad = (held[name] for name in ANGLES)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from stimrig.api.errors import ApiError, require_found
-from stimrig.api.workers.pool import Call, Pool
+from stimrig.api.workers.pool import Call, Pool, Tasks
 
 log = logging.getLogger("stimrig.jobs")
 FIT_TOGETHER = "fit-recordings"
@@ -21,19 +21,11 @@ KEPT = 200
 
 @dataclass
 class Job:
-    """One piece of long work.
-
-    Parameters
-    ----------
-    kind : str
-        diagnosis, add-effects, improve or fit-recordings.
-    subject : str
-        The model's id; of fit-recordings the participant's code.
-    """
+    """One piece of long work."""
 
     id: str
-    kind: str
-    subject: str
+    kind: str  # diagnosis, add-effects, improve or fit-recordings
+    subject: str  # the model's id; of fit-recordings the participant's code
     by: str
     state: str = "running"
     call: Call | None = None
@@ -71,7 +63,7 @@ class Jobs:
         self.pool = pool
         self.all: dict[str, Job] = {}
         self._numbers = itertools.count(1)
-        self._running: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks(log)
 
     def start(self, kind: str, subject: str, by: str, work: Callable[[Job], Awaitable[str]]) -> Job:
         """Begin; `work` gives the address of the result. A second start of what runs already gives the first one."""
@@ -82,9 +74,7 @@ class Jobs:
         self.all[job.id] = job
         for old in [known.id for known in self.all.values() if known.state != "running"][: -KEPT or None]:
             del self.all[old]
-        running = asyncio.create_task(self._follow(job, work))
-        self._running.add(running)
-        running.add_done_callback(self._running.discard)
+        self._tasks.begin(self._follow(job, work))
         return job
 
     async def _follow(self, job: Job, work: Callable[[Job], Awaitable[str]]) -> None:
@@ -110,6 +100,4 @@ class Jobs:
             self.pool.cancel(job.call)
 
     async def close(self) -> None:
-        for running in list(self._running):
-            running.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+        await self._tasks.close()

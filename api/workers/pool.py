@@ -7,7 +7,7 @@ import itertools
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from stimrig.api.errors import ApiError
@@ -17,19 +17,40 @@ from stimrig.api.workers.process import WORKER, Call, Places, Worker, cancelled
 log = logging.getLogger("stimrig.fitting")
 
 
+class Tasks:
+    """Work in the background; an error in it is logged."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._running: set[asyncio.Task[None]] = set()
+
+    def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Do it beside what waits."""
+        task = asyncio.create_task(work)
+        self._running.add(task)
+        task.add_done_callback(self._ended)
+        return task
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._running.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._log.error("what went on in the background has failed", exc_info=error)
+
+    async def close(self) -> None:
+        """End all of it."""
+        running = list(self._running)
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+
+
 class Pool:
     """A few workers and a queue; the fit after a test goes before everything else.
 
     One worker more, of low priority, does what nobody waits for yet; a new test ends what it does.
 
-    Parameters
-    ----------
-    workers : int
-        How many processes.
-    command : tuple of str
-        How to start one; tests put another in its place.
-    places : Places
-        The folders that they may reach.
+    `workers`: how many processes. `command`: how to start one; tests put another in its place. `places`: the folders
+    that they may reach.
     """
 
     def __init__(self, workers: int = 2, command: tuple[str, ...] = WORKER, places: Places | None = None) -> None:
@@ -41,7 +62,7 @@ class Pool:
         self.failed_count = 0
         self.busy_s = 0.0
         self._numbers = itertools.count(1)
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Tasks(log)
 
     def submit(
         self,
@@ -98,9 +119,7 @@ class Pool:
                 self.queue.remove(call)
                 worker.call = call
                 call.state, call.started_s = "running", time.monotonic()
-                task = asyncio.create_task(self._work(worker, call))
-                self._tasks.add(task)
-                task.add_done_callback(self._tasks.discard)
+                self._tasks.begin(self._work(worker, call))
 
     def _next_for(self, worker: Worker) -> Call | None:
         """The next call for a worker; the first of several is kept free for the fit after a test."""
@@ -134,9 +153,7 @@ class Pool:
 
     async def close(self) -> None:
         self.queue.clear()
-        for task in list(self._tasks):
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.close()
         await asyncio.gather(*(worker.close() for worker in self.workers))
 
 
@@ -146,12 +163,7 @@ class Adviser:
     It is started by the first question, so whoever asks none has no such process. For an adaptive test that is what it
     can reach: during the test it is warm.
 
-    Parameters
-    ----------
-    command : tuple of str
-        How to start the worker; tests put another in its place.
-    places : Places
-        The folders that it may reach.
+    `command`: how to start the worker; tests put another in its place. `places`: the folders that it may reach.
     """
 
     def __init__(self, command: tuple[str, ...] = WORKER, places: Places | None = None) -> None:

@@ -47,6 +47,8 @@ PROCESSOR_S = {
 }
 LONGEST_PROCESSOR_S = 1200.0
 """What a call may compute; improving a long record takes minutes on a slow machine."""
+LEAST_SHARE = 0.05
+"""Before so much is done a call has no pace."""
 WALL_FACTOR = 3.0
 """A machine that does other things, too, takes longer; then the worker is ended."""
 
@@ -62,10 +64,7 @@ def environment() -> dict[str, str]:
 class Places:
     """The folders that stay open to workers; a call that names another one makes it known.
 
-    Parameters
-    ----------
-    reads, writes : iterable of Path
-        Known from the start.
+    `reads`, `writes`: known from the start.
     """
 
     def __init__(self, reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> None:
@@ -101,6 +100,8 @@ class Call:
     state: str = "queued"
     progress: float = 0.0
     text: str = ""
+    expected_s: float = math.inf
+    """How long its pace says that it takes in all: the least that was said so far."""
     started_s: float | None = None
     result: asyncio.Future[dict[str, Any]] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
     on_progress: Callable[[Call], None] | None = None
@@ -113,10 +114,16 @@ class Call:
 
     @property
     def time_left_s(self) -> float | None:
-        """What its pace so far says, s; None before there is a pace."""
-        if self.state != "running" or self.progress < 0.05:
+        """What its pace so far says, s: never more than was said before; 0 once that is over; None before a pace."""
+        if self.state != "running" or self.expected_s == math.inf:
             return None
-        return self.elapsed_s * (1.0 - self.progress) / self.progress
+        return max(0.0, self.expected_s - self.elapsed_s)
+
+    def advance(self, progress: float, text: str) -> None:
+        """Take in how far it is."""
+        self.progress, self.text = progress, text
+        if progress >= LEAST_SHARE:
+            self.expected_s = min(self.expected_s, self.elapsed_s / progress)
 
     def document(self) -> dict[str, Any]:
         """What a client sees of it."""
@@ -203,7 +210,7 @@ class Worker:
                 raise call_error(call.verb, message["error"])
             if not math.isfinite(fraction := float(message["progress"])):
                 raise ValueError(fraction)
-            call.progress, call.text = fraction, str(message["text"])
+            call.advance(fraction, str(message["text"]))
             if call.on_progress is not None:
                 call.on_progress(call)
         return None

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
-from stimrig.api.record_files import begun
+from stimrig.api.record_files import Progress, begun
 from stimrig.identify.json_text import json_value
 
-Progress = Callable[[float, str], None]
 MOST_MISSED = 50
 SETTLED_S = 0.2
 """So long the torque must have been measured at rest for its offset to be known."""

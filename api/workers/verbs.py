@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
-from stimrig.api.record_files import export_csv, find_recording, joined, plain_csv
+from stimrig.api.record_files import Progress, export_csv, find_recording, joined, plain_csv
 from stimrig.api.structure import held_by
 from stimrig.api.workers import adaptive_verbs, tracking_verbs
 from stimrig.api.workers.curves import comparison, page_curves, recorded
 from stimrig.identify.json_text import json_value
 
-Progress = Callable[[float, str], None]
 SIGNATURE_POINTS = 900
 """Points of a signature's curve: it is drawn small."""
 
@@ -79,20 +78,30 @@ def diagnosis(
 
 
 def diagnosed(record: Any, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
-    """The same of a record that was read."""
-    from stimrig.identify import effects
-
+    """The same of a record that was read; `improvement` holds the models that come of it."""
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
-    found = identify.diagnose(record, model, lambda share, text="": progress(0.8 * share, text)).to_dict()
-    found["structure"] = structure
+    return finding_of(record, *identify.diagnose_and_improve(record, progress, model), structure)
+
+
+def finding_of(record: Any, diagnosis: Any, improvement: Any, structure: Sequence[str]) -> dict[str, Any]:
+    """A diagnosis as it is kept, with the improvement that was found by the way."""
+    found = with_experiment(record, diagnosis, structure)
+    found["signatures"] = signatures(record, improvement)
+    found["improvement"] = {**improvement.to_dict(), "structure": list(structure)}
+    return json_value(found)
+
+
+def with_experiment(record: Any, diagnosis: Any, structure: Sequence[str]) -> dict[str, Any]:
+    """A diagnosis with what the library says of its effects, and the experiment that comes next."""
+    from stimrig.identify import effects
+
+    found = {**diagnosis.to_dict(), "structure": list(structure)}
     found["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(found)}
-    progress(0.82, "what each effect would explain")
-    found["signatures"] = signatures(record, [entry["effect"] for entry in found["missing"]], structure)
     planned = experiment(found["missing"], found["deciding_experiment"])
     # A list of widths is one of pulses: at another rate it would be another test, and could not be joined.
     found["experiment"] = planned and {**planned, "pulse_rate_hz": record.pulse_rate_hz}
-    return json_value(found)
+    return found
 
 
 def mentioned(found: dict[str, Any]) -> set[str]:
@@ -102,26 +111,17 @@ def mentioned(found: dict[str, Any]) -> set[str]:
     return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
 
 
-def signatures(record: Any, effects: Sequence[str], structure: Sequence[str] = ()) -> dict[str, Any]:
+def signatures(record: Any, improvement: Any) -> dict[str, Any]:
     """What each effect explains of what the model before it leaves: seen beside expected.
 
     ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
-    The first model is the structure criticised. An effect whose model cannot be fitted alone has none.
     """
     pick = slice(None, None, max(1, -(-record.time_s.size // SIGNATURE_POINTS)))
     found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
-    held = list(structure)
-    before = np.asarray(identify.predict(identify.fit(record, effects=held), record))
-    for effect in effects:
-        held.append(effect)
-        try:
-            after = np.asarray(identify.predict(identify.fit(record, effects=held), record))
-        except identify.IdentifyError:
-            held.pop()
-            continue
-        seen = record.torque_nm - before
-        found[effect] = {"seen_nm": smooth(record, seen)[pick].round(4), "expected_nm": (after - before)[pick].round(4)}
-        before = after
+    torques = [np.asarray(identify.predict(model, record)) for model in improvement.models]
+    for step, before, after in zip(improvement.steps[1:], torques, torques[1:], strict=False):
+        seen, expected = smooth(record, record.torque_nm - before), after - before
+        found[step["added"]] = {"seen_nm": seen[pick].round(4), "expected_nm": expected[pick].round(4)}
     return found
 
 
@@ -140,19 +140,11 @@ def experiment(missing: Sequence[dict[str, Any]], further: dict[str, Any] | None
     return found and {**found.to_dict(), "effect": next(iter(found.rivals), "")}
 
 
-def improve(data: str, progress: Progress, force: Sequence[str] = (), model_json: str | None = None) -> dict[str, Any]:
-    """Effects added to a model's structure one by one while the evidence lasts, each step with its model."""
-    record = identify.read(Path(data))
-    model = None if model_json is None else identify.Model.from_json(model_json)
-    structure = held_by(model, record)
-    return {**identify.improve(record, progress, force=tuple(force), model=model).to_dict(), "structure": structure}
-
-
 def forecast(
     progress: Progress,
     model_json: str,
     pulse_width_us: list[float],
-    pulse_rate_hz: float = 40.0,
+    pulse_rate_hz: float | None = None,
     angle_rad: list[float] | None = None,
 ) -> dict[str, Any]:
     """Mean torque that the pulses give in each pulse's period, N·m, effects included, after one second of rest.
@@ -163,9 +155,10 @@ def forecast(
 
     progress(0.1, "predicting")
     model = identify.Model.from_json(model_json)
-    motion = None if angle_rad is None else Motion.of(np.asarray(angle_rad, float), pulse_rate_hz)
-    torque = above_rest(model, np.asarray(pulse_width_us, float), pulse_rate_hz, motion)
-    return {"torque_nm": torque.round(6).tolist()}
+    rate_hz = pulse_rate_hz or model.pulse_rate_hz
+    motion = None if angle_rad is None else Motion.of(np.asarray(angle_rad, float), rate_hz)
+    torque = above_rest(model, np.asarray(pulse_width_us, float), rate_hz, motion)
+    return {"pulse_rate_hz": rate_hz, "torque_nm": torque.round(6).tolist()}
 
 
 def invert(
@@ -179,6 +172,7 @@ def invert(
     largest_us: float | None = None,
     rise_us: float | None = None,
     whole: bool = True,
+    shortest_us: float = 0.0,
 ) -> dict[str, Any]:
     """The pulse widths whose predicted torque follows a reference best, and where it cannot be reached and why.
 
@@ -195,7 +189,7 @@ def invert(
         reference = read_reference(table.encode(), "the upload", rate_hz)
     else:
         reference = Reference.of(reference_torque_nm, time_s, angle_rad=angle_rad, pulse_rate_hz=rate_hz)
-    found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole)
+    found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole, shortest_us=shortest_us)
     return json_value(found.to_dict())
 
 
@@ -228,7 +222,7 @@ def _warm_record() -> Any:
 
 
 OWN = (
-    fit, carry, comparison, figures, diagnosis, improve, effects, warm, forecast, invert, export_csv, plain_csv,
+    fit, carry, comparison, figures, diagnosis, effects, warm, forecast, invert, export_csv, plain_csv,
     find_recording, recorded,
 )  # fmt: skip
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {

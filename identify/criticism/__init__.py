@@ -26,7 +26,7 @@ from stimrig.identify.results import Comparison
 from stimrig.identify.simulation.predict import same_data
 from stimrig.identify.yardstick import repetition_sentences
 
-POINTS = 4000
+POINTS = 2400
 """Largest number of points of a plotted series."""
 TOLD_S = 5e-3
 """Pulses at least this late are reported: a fifth of an interval, more than the jitter of a healthy computer."""
@@ -49,7 +49,7 @@ def compare(model: Model, record: Record) -> Comparison:
     Returns
     -------
     Comparison
-        Fit statistics of all rows, of fitted and of held-out rows; the error by segment, level, direction, time and
+        Fit statistics of all rows, of fitted and of held-out pulses; the error by segment, level, direction, time and
         frequency; tests of the residual; the places of the largest error. Doubted samples count nowhere. A record that
         is nearly all `validate` is compared as a whole: `held_out` is None, and `fitted` holds all rows.
 
@@ -150,7 +150,7 @@ def _plain(
         share = f"its fit is {UNDEFINED}"
         if np.isfinite(held_out["fit_percent"]):
             share = f"{held_out['fit_percent']:.1f} %, where the noise allows {held_out['ceiling_percent']:.1f} %"
-        lines.append(f"On rows of `validate` its error is {held_out['rms_nm']:.3g} N·m ({share}).")
+        lines.append(f"On held-out pulses its error is {held_out['rms_nm']:.3g} N·m ({share}).")
     alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     lines.append(" ".join(alarms) if alarms else "The remaining error looks like noise: no correlation is significant.")
     if alarms:
@@ -165,7 +165,8 @@ def _left_out(grid: Grid) -> str:
     seconds = float(np.sum(grid.doubted[grid.count > 0])) * grid.step_s
     if not pulses and not seconds:
         return ""
-    told = "1 pulse came late or was lost" if pulses == 1 else f"{pulses} pulses came late or were lost"
+    how = "felt 5 ms late or more, or lost"
+    told = f"1 pulse was {how}" if pulses == 1 else f"{pulses} pulses were {how}"
     if not seconds:
         return f"{told}; the time of each is known, so nothing is left out."
     if not pulses:
@@ -285,10 +286,7 @@ def worst_places(
 ) -> list[dict[str, Any]]:
     """The stretches with most of the error above the noise, among some rows.
 
-    Returns
-    -------
-    list of dict
-        As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
+    As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
     """
     length = max(round(STRETCH_S * record.sample_rate_hz), 1)
     rising, pieces = direction_of(record), []

@@ -82,7 +82,7 @@ def next_experiment(about: Record | Diagnosis, rivals: Sequence[str] = ()) -> Ex
     Returns
     -------
     Experiment or None
-        None if nothing is left to be told apart.
+        None if no test can be planned from this record.
 
     Raises
     ------

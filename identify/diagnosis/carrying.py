@@ -30,7 +30,7 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     """Fit the structure of an earlier model to a new record, beside the plain structure, and offer the better one.
 
     An effect stays if the record asks for it: its log evidence, beside the other effects that stay, reaches the margin
-    of a first effect, and it does not raise the error on held-out rows (the criteria of `diagnose` and `improve`).
+    of a first effect, and it does not raise the error on held-out pulses (the criteria of `diagnose` and `improve`).
     Every other effect is dropped, the weakest first. If the residual of what remains has structure, something else is
     missing, and the dropped effects are undecided. Rows of `validate` are not used to fit or to choose.
 
@@ -191,7 +191,7 @@ def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted
 
 
 def rise(before: Fitted, after: Fitted) -> Reason | None:
-    """The error on held-out rows as a reason if it rises; else None."""
+    """The error on held-out pulses as a reason if it rises; else None."""
     objection = vetoed(before, after)
     return Reason("held-out-error", objection) if objection else None
 

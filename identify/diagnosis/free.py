@@ -98,7 +98,7 @@ def searched(
 
 
 def _believed(search: EffectSearch) -> list[str]:
-    """The effects that were added before the first against which held-out rows speak."""
+    """The effects that were added before the first against which held-out pulses speak."""
     return search.added[: len(helpful(search)[0]) - 1 - len(search.detected)]
 
 
@@ -116,7 +116,7 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     search : EffectSearch
         In whose last model structure is left.
     names : sequence of str
-        Of its effects the first ones, against which held-out rows do not speak.
+        Of its effects the first ones, against which held-out pulses do not speak.
     named : bool
         Whether they are named: then they stay beside free effects. A free effect describes more than a name's own form,
         so it would often do better alone where the name is right.

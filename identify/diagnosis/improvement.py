@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from stimrig.identify.diagnosis import structure_of
+from stimrig.identify.criticism import compare
+from stimrig.identify.diagnosis import diagnose, structure_of
 from stimrig.identify.diagnosis.free import searched
-from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful
+from stimrig.identify.diagnosis.result import diagnosis_of
+from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful, silent
 from stimrig.identify.diagnosis.thresholds import RISE
+from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
@@ -18,7 +21,7 @@ from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
-from stimrig.identify.results import Improvement
+from stimrig.identify.results import Diagnosis, Explanation, Improvement
 
 COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent", "repetition", "unforeseen_nm")
 
@@ -65,6 +68,51 @@ def improve(
     structure = structure_of(model)
     grid, raw = prepare(record)
     search, verdict = searched(grid, raw, progress, most=most, structure=structure)
+    return _improvement_of(search, verdict, max_effects, force)
+
+
+def explain(record: Record, progress: Progress | None = None, model: Model | None = None) -> Explanation:
+    """Compare, diagnose, improve, compare and diagnose again: how the model of a record was improved, and why.
+
+    Parameters
+    ----------
+    record, progress, model
+        As `improve` takes them.
+
+    Returns
+    -------
+    Explanation
+        The diagnoses of the first and of the last model, the improvement, and both models compared with the record.
+
+    Raises
+    ------
+    BadRequest, NotIdentifiable
+        As `improve` and `diagnose` raise them.
+    """
+    say = progress or silent
+    found, improvement = diagnose_and_improve(record, lambda share, text: say(0.6 * share, text), model)
+    first, last = improvement.models[0], improvement.models[-1]
+    left = found
+    if last is not first:  # a further search tries all forms beside what was added, as one of the last model would
+        left = diagnose(record, last, lambda share, text: say(0.6 + 0.4 * share, text))
+    before, after = (compare(one, record) for one in (first, last))
+    say(1.0, "done")
+    return Explanation(diagnosis=found, improvement=improvement, left=left, before=before, after=after)
+
+
+def diagnose_and_improve(
+    record: Record, progress: Progress | None = None, model: Model | None = None
+) -> tuple[Diagnosis, Improvement]:
+    """What `diagnose` and `improve` give, with one search. Parameters and errors are those of `improve`."""
+    structure = structure_of(model)
+    grid, raw = prepare(record)
+    search, verdict = searched(grid, raw, progress, structure=structure)
+    return diagnosis_of(search, verdict), _improvement_of(search, verdict)
+
+
+def _improvement_of(
+    search: EffectSearch, verdict: Verdict, max_effects: int | None = None, force: Sequence[str] = ()
+) -> Improvement:
     row, against = helpful(search)
     if max_effects is not None:
         row = row[: max_effects + 1]
@@ -113,9 +161,9 @@ def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str
 
 
 def _rising(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    """What is said where the error on held-out rows rises and does not speak against the effect."""
+    """What is said where the error on held-out pulses rises and does not speak against the effect."""
     rises = before["held_out_by"] == "validate" and after["held_out_rms_nm"] > RISE * before["held_out_rms_nm"]
-    return ["On held-out rows the error rises, but not by more than its standard error."] if rises else []
+    return ["On held-out pulses the error rises, but not by more than its standard error."] if rises else []
 
 
 def refused(search: EffectSearch) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The residual of a model: at work compared with at rest, and on held-out rows with what noise allows there."""
+"""The residual of a model: at work compared with at rest, and on held-out pulses with what noise allows there."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | No
 
 
 def vetoed(before: Fitted, after: Fitted) -> str | None:
-    """What held-out rows say against an effect, in words; None where they do not.
+    """What held-out pulses say against an effect, in words; None where they do not.
 
     They speak against it where the error rises, and by more than its standard error over pieces of the rows. They
     never speak for one.
@@ -149,4 +149,4 @@ def vetoed(before: Fitted, after: Fitted) -> str | None:
     if difference(old, new).errors > thresholds.VETO or not new.rms_nm > thresholds.RISE * old.rms_nm:
         return None
     errors = f"{old.rms_nm:.3g}", f"{new.rms_nm:.3g}"
-    return f"On held-out rows with fitted pulse widths the error would rise from {errors[0]} to {errors[1]} N·m."
+    return f"Held out, the error of a pulse interval's mean torque would rise from {errors[0]} to {errors[1]} N·m."

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.caution import OPEN
+from stimrig.identify.conclusion import conclude, only_open
 from stimrig.identify.criticism import worst_places
-from stimrig.identify.diagnosis.search import EffectSearch, Step, steps
+from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful, steps
 from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import find_effect
@@ -19,7 +19,7 @@ from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.plain import moves
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.uncertainty import covariance_of
-from stimrig.identify.experiments import Experiment, plan, plan_further
+from stimrig.identify.experiments import NOTHING, Experiment, plan, plan_further
 from stimrig.identify.results import Diagnosis
 from stimrig.identify.summary import probability, sure
 
@@ -34,7 +34,6 @@ STATISTICS = (
 def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     """The `Diagnosis` that a search and its verdict give."""
     record, raw = search.record, search.raw
-    base_prediction = predict_fitted(search.base)[0]
     row = steps(search)
     base = row[0].statistics
     ranked = _ranked(search, verdict)
@@ -42,35 +41,34 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     missing = [_missing(search, verdict, effect, row, covariance) for effect in ranked]
     free = [_free(search, effect, covariance) for effect in search.free]
     final = row[-1].statistics
-    residual = record.torque_nm - (
-        predict_fitted(search.last)[0] if verdict.kind == "unexplained_structure" and not free else base_prediction
-    )
-    where = worst_places(
-        record, residual, raw.noise_sd_nm, rows=~record.held_out & search.base.problem.setup.grid.counted
-    )
-    return Diagnosis(
-        noise_sd_nm=raw.noise_sd_nm,
-        slow_noise={
+    residual = record.torque_nm - predict_fitted(search.base)[0]
+    where = worst_places(record, residual, raw.noise_sd_nm, rows=search.base.problem.setup.grid.counted)
+    found: dict[str, Any] = {
+        "noise_sd_nm": raw.noise_sd_nm,
+        "slow_noise": {
             "sd_nm": search.last.noise.sd_nm * float(np.sqrt(min(search.last.noise.share, 1.0))),
             "ar1": search.last.noise.ar1,
         },
-        base={key: base[key] for key in STATISTICS},
-        verdict=verdict.kind,
-        probability=verdict.probability,
-        missing=tuple(missing),
-        free=tuple(free),
-        deciding_experiment=_plan(plan_further(record, search.last)) if _undecided(search, verdict) else None,
-        where=tuple(where),
-        with_all={key: final[key] for key in STATISTICS} | {"noise_sd_nm": final["noise_sd_nm"]},
-        explained=verdict.explained,
-        structure_left=verdict.structure,
-        unseen=None
+        "base": {key: base[key] for key in STATISTICS},
+        "verdict": verdict.kind,
+        "probability": verdict.probability,
+        "missing": tuple(missing),
+        "free": tuple(free),
+        "add": tuple(step.added for step in helpful(search)[0] if step.added),
+        "deciding_experiment": None,
+        "where": tuple(where),
+        "with_all": {key: final[key] for key in STATISTICS} | {"noise_sd_nm": final["noise_sd_nm"]},
+        "residual_check": _is_noise(search) if verdict.kind == "nothing_missing" else None,
+        "explained": verdict.explained,
+        "structure_left": verdict.structure,
+        "unseen": None
         if verdict.held_out_error is None
         else {"rms_nm": verdict.held_out_error.rms_nm, "allowed_nm": verdict.held_out_error.allowed_nm},
-        candidates=tuple([_candidate(one) for one in tried] for tried in search.rounds),
-        notes=tuple(verdict.notes),
-        plain=tuple(_plain(search, verdict, base, row[-1 - len(free)].statistics, missing, free, where)),
-    )
+        "candidates": tuple([_candidate(one) for one in tried] for tried in search.rounds),
+        "notes": tuple(verdict.notes),
+    }
+    found["deciding_experiment"] = _deciding(search, verdict, found)
+    return Diagnosis(**found, plain=tuple(_plain(search, found, row[-1 - len(free)].statistics)))
 
 
 def _ranked(search: EffectSearch, verdict: Verdict) -> list[str]:
@@ -119,6 +117,16 @@ def _plan(experiment: Experiment) -> dict[str, Any]:
     return {key: value for key, value in experiment.to_dict().items() if key != "rivals"}
 
 
+def _deciding(search: EffectSearch, verdict: Verdict, found: dict[str, Any]) -> dict[str, Any] | None:
+    """The test for what is left, or for an effect that the record neither names nor excludes."""
+    if _undecided(search, verdict):
+        return _plan(plan_further(search.record, search.last))
+    best = search.rounds[0][0] if only_open(found) else None
+    if best is None or best.effect.band or best.effect.sporadic:
+        return None
+    return _plan(plan(search.record, {best.effect.id: best.fitted, NOTHING: search.last}))
+
+
 def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
     """Whether a further test is planned for what is left; not of a joint that moves, which has tests of its own, and
     not where the curve is a guess or the muscle hardly answers: the dose would be one, too."""
@@ -126,6 +134,12 @@ def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
         return False
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)
     return still and finish("maximum-likelihood", search.last).quality["gates"]["torque"]["passed"]
+
+
+def _is_noise(search: EffectSearch) -> bool:
+    """Whether what the examined model leaves over passes for noise, as the model's own check says."""
+    model = finish("maximum-likelihood", search.base, statistics=steps(search)[0].statistics)
+    return bool(model.quality["gates"]["residual"]["passed"])
 
 
 def _free(search: EffectSearch, effect: str, covariance: np.ndarray) -> dict[str, Any]:
@@ -176,6 +190,7 @@ PARTS = {
 def _candidate(one: Candidate) -> dict[str, Any]:
     return {
         "effect": one.effect.id,
+        "name": one.effect.name,
         "form": one.form.name,
         "log_evidence_gain": one.gain,
         "rms_nm": one.fitted.rms_nm,
@@ -184,32 +199,17 @@ def _candidate(one: Candidate) -> dict[str, Any]:
     }
 
 
-def _plain(
-    search: EffectSearch,
-    verdict: Verdict,
-    base: dict[str, Any],
-    named: dict[str, Any],
-    missing: list,
-    free: list,
-    where: list,
-) -> list[str]:
-    noise = search.raw.noise_sd_nm
+def _plain(search: EffectSearch, found: dict[str, Any], named: dict[str, Any]) -> list[str]:
+    base, missing = found["base"], found["missing"]
     held = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
+    said = conclude(found)
     lines = [
         f"The model {f'with {held}' if held else 'without effects'} fits {base['fit_percent']:.1f} %; the noise of "
-        f"{noise:.3g} N·m allows {base['ceiling_percent']:.1f} % at most. On rows that were not fitted its error is "
-        f"{base['held_out_rms_nm']:.3g} N·m."
+        f"{found['noise_sd_nm']:.3g} N·m allows {base['ceiling_percent']:.1f} % at most.",
+        f"{said.title}. {said.words}",
+        *[f"Most of it is here: {place['text']}." for place in found["where"][:1] if said.kind == "unexplained"],
+        *[f"{row['words']} {row['left_out']}" for row in found["free"]],
     ]
-    if verdict.kind == "nothing_missing" and verdict.probability >= OPEN:
-        lines.append("Nothing is missing: the remaining error looks like noise, both at work and at rest.")
-    if verdict.kind == "unexplained_structure":
-        lines.append(
-            "An error is left that no effect in the library explains. It appears when the muscle works, so it is not "
-            "measurement noise."
-        )
-        if where:
-            lines.append(f"Most of it is here: {where[0]['text']}.")
-    lines += [f"{row['words']} {row['left_out']}" for row in free]
     for entry in missing:
         chance = entry["probability"]
         text = f"{entry['name']} is {sure(chance)} missing ({probability(chance)}). {entry['plain']}"
@@ -219,9 +219,9 @@ def _plain(
             others = ", ".join(find_effect(name).name.lower() for name in entry["confused_with"])
             text += f" This record cannot clearly separate it from: {others}. To decide: {entry['next_experiment']}"
         lines.append(text)
-    if missing and verdict.kind == "effect_missing":
+    if missing and found["verdict"] == "effect_missing":
         lines.append(
-            f"With {'it' if len(missing) == 1 else 'them'} the error on rows that were not fitted falls from "
+            f"With {'it' if len(missing) == 1 else 'them'} the error on held-out pulses falls from "
             f"{base['held_out_rms_nm']:.3g} to {named['held_out_rms_nm']:.3g} N·m."
         )
-    return lines + verdict.notes
+    return [*lines, *found["notes"], said.advice]

@@ -208,9 +208,13 @@ def required_errors(search: EffectSearch, candidate: Candidate) -> float:
 
 
 def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iterable[str]) -> bool:
-    """Whether an effect may only repair the form of one that is there: they resemble, or both change the dynamics."""
+    """Whether an effect may only repair the form of one that is there.
+
+    They resemble, both change the dynamics, or that one is free: it describes a cause that nobody knows.
+    """
     return any(
-        name in effect.resembles
+        find_effect(name).shape
+        or name in effect.resembles
         or effect.id in find_effect(name).resembles
         or (stage in thresholds.DYNAMIC and own.stage in thresholds.DYNAMIC)
         for name, own in before.effects
@@ -466,14 +470,14 @@ def steps(search: EffectSearch) -> list[Step]:
 
 
 def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
-    """The steps up to the first that raises the error on held-out rows, and the effects refused for that reason."""
+    """The steps up to the first that raises the error on held-out pulses, and the effects refused for that reason."""
     row = steps(search)
     for number in range(1 + len(search.detected), len(row)):
         objection = vetoed(row[number - 1].fitted, row[number].fitted)
         if objection is None:
             continue
         first = find_effect(str(row[number].added)).name
-        reason = f"It was found beside another effect, against which held-out rows speak: {first}."
+        reason = f"It was found beside another effect, against which held-out pulses speak: {first}."
         against = [{"effect": step.added, "log_evidence_gain": None, "reason": reason} for step in row[number:]]
         against[0]["reason"] = objection
         return row[:number], against

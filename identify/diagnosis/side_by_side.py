@@ -29,14 +29,8 @@ def side_by_side(work: Callable[[int], Any], count: int, processes: int = 0) -> 
 
     A task that fails in a copy, or whose copy ends early, is done again here, so that its error is raised here.
 
-    Parameters
-    ----------
-    work : callable
-        Called with the number of a task.
-    count : int
-        Of tasks, 256 at most: each number is one byte.
-    processes : int
-        Processes that share the tasks, this one included; 0 for `WORKERS`.
+    `work`: called with the number of a task. `count`: of tasks, 256 at most: each number is one byte. `processes`:
+    processes that share the tasks, this one included; 0 for `WORKERS`.
     """
     numbers, put = os.pipe()
     os.write(put, bytes(range(count)))

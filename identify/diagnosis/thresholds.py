@@ -24,8 +24,8 @@ BETTER = 1.0
 BETTER_IF_WEAK = 1.5
 """The same for a first effect that gains less log evidence than a further one must."""
 BETTER_THAN_ALIKE = 3.0
-"""The same if it resembles an effect that is there, or both change the dynamics: one effect in an inexact form looks
-like two."""
+"""The same if it resembles an effect that is there, both change the dynamics, or that one is free: one effect in an
+inexact form looks like two."""
 NO_WORSE = -1.0
 """The same for effects that cannot be foreseen: they need not predict, but they must not spoil what the muscle does."""
 EFFORT_WEIGHT = 0.92
@@ -71,11 +71,11 @@ FREE_GAIN_MARGIN = 8.0
 EXPLAINED_BY_LAWS = 0.9
 """If the effects explain this share, a better gain without a law does not count."""
 HELD_OUT_RATIO = 2.5
-"""Error on held-out rows, divided by what is allowed there, above which structure may be left."""
+"""Error on held-out pulses, divided by what is allowed there, above which structure may be left."""
 HELD_OUT_SHARE = 0.5
 """The same as a share of the plain structure's error there: a law close to the true one takes most of it, not all."""
 VETO, RISE = -1.0, 1.02
-"""Standard errors from which, and the factor by which, the error on held-out rows must rise to speak against an effect:
+"""Standard errors from which, and the factor by which, a held-out error must rise to speak against an effect:
 `improve` stops there."""
 REFUSED = 20.0
 """Log evidence from which something is there that no effect can predict, if left-out blocks refuse what explains it."""
@@ -90,9 +90,9 @@ CLOSE = 0.8
 RIVAL = 0.04
 """Probability from which an effect is named as one that this record cannot tell from the best."""
 FORM_ERROR = 0.01
-"""Error, as a share of the largest torque, that a curve of few knots may leave on held-out rows without any effect."""
+"""Error, as a share of the largest torque, that a curve of few knots may leave on held-out pulses with no effect."""
 FORM_ERROR_WITH_EFFECTS = 0.003
-"""The same if an effect is named: its law must also hold on held-out rows."""
+"""The same if an effect is named: its law must also hold on held-out pulses."""
 LEAST_HELD_OUT_ROWS = 40
 """With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""
 MOST_FREE = 2
@@ -102,4 +102,4 @@ BEAM = 2
 FIRST_FREE, FURTHER_FREE = (2.0, 0.2), (3.0, 0.2)
 """Standard errors, and share as a logarithm, by which the error on left-out blocks must fall with a free effect."""
 NAMED_BUT = 1.3
-"""Error on held-out rows, divided by what is allowed there, from which free effects are tried beside named ones."""
+"""Error on held-out pulses, divided by what is allowed there, from which free effects are tried beside named ones."""

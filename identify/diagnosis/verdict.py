@@ -25,9 +25,9 @@ class Verdict:
     explained: float  # share of the explainable log-likelihood that the effects explain
     structure: float  # log-likelihood by which the residuals at work and at rest still differ
     probability: float  # of the verdict as a whole
-    held_out_error: HeldOutError | None = None  # of the last model; None if held-out rows tell nothing
+    held_out_error: HeldOutError | None = None  # of the last model; None if held-out pulses tell nothing
     notes: list[str] = field(default_factory=list)  # reasons, for people
-    objections: dict[str, str] = field(default_factory=dict)  # by effect: what held-out rows say against it
+    objections: dict[str, str] = field(default_factory=dict)  # by effect: what held-out pulses say against it
 
 
 def shares(candidates: list[Candidate], most: float = np.inf) -> dict[str, float]:
@@ -91,7 +91,7 @@ def _efforts(parameters: dict[str, float]) -> int:
 
 
 def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
-    """Whether the error on held-out rows shows that structure is left."""
+    """Whether the error on held-out pulses shows that structure is left."""
     if after.ratio < thresholds.HELD_OUT_RATIO:
         return False
     return before is None or after.excess_nm > thresholds.HELD_OUT_SHARE * before.excess_nm
@@ -99,7 +99,7 @@ def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
 
 def _beyond(error: HeldOutError) -> str:
     return (
-        f"On held-out rows the error of the last model is {error.ratio:.1f} times what noise and its uncertainty "
+        f"On held-out pulses the error of the last model is {error.ratio:.1f} times what noise and its uncertainty "
         "allow: something is still missing."
     )
 
@@ -154,7 +154,7 @@ def judge(search: EffectSearch) -> Verdict:
         if objection := vetoed(search.chain[number], search.chain[number + 1]):
             objections[effect] = objection
             found[effect] = min(found[effect], thresholds.DOUBTED)
-            notes.append(f"The error on held-out rows rises with this effect: {find_effect(effect).name}.")
+            notes.append(f"The error on held-out pulses rises with this effect: {find_effect(effect).name}.")
     structure = left.ratio
     if last.noise.band > 0.0:
         # The narrow band itself is not structure: what counts is what remains beside it.
@@ -163,7 +163,7 @@ def judge(search: EffectSearch) -> Verdict:
     strange = readings is not None and readings.held_s > thresholds.LONGEST_HELD_S
     if effects:
         strange = strange or (explained < thresholds.LEAST_EXPLAINED and left.left)
-        lawless = any(search.free_gain > one[0].gain + thresholds.FREE_GAIN_MARGIN for one in search.rounds[:1])
+        lawless = any(search.free_gain > one[0].gain + thresholds.FREE_GAIN_MARGIN for one in search.rounds[:1] if one)
         strange = strange or (lawless and explained < thresholds.EXPLAINED_BY_LAWS)
         if find_effect(effects[0]).band:
             strange = strange or (

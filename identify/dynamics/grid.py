@@ -138,12 +138,7 @@ class Grid:
         early, that much shorter. The silence after the last pulse of a train begins as late as that pulse. The drive of
         a pulse that is later is added to the intervals in which it came.
 
-        Parameters
-        ----------
-        drive_nm : ndarray, shape (K,), (K, M) or (M, K)
-            Drive on even slots, N·m.
-        axis : int
-            Axis of the intervals.
+        `drive_nm`: shape (K,); drive on even slots, N·m. `axis`: axis of the intervals.
         """
         if self._shifts is None:
             return drive_nm
@@ -347,7 +342,7 @@ def _applied(
 
     Where samples are missing, the record's list of pulses is used, if it has one. Otherwise the stimulation in the gap
     is unknown, except between two rests with the same torque. After such a gap the state is unknown, and the intervals
-    are doubted as long as a delayed response to the gap may last; held-out rows until the muscle has forgotten it.
+    are doubted as long as a delayed response to the gap may last; held-out pulses until the muscle has forgotten it.
     """
     width = record.pulse_width_us[middle]
     late = np.zeros(width.size) if record.late_s is None else record.late_s[middle]
@@ -364,7 +359,7 @@ def _applied(
         for gap in runs(gaps):
             if not (width[gap.start - 1] or _moved(record, middle, gap)):
                 continue
-            # The initial state of held-out rows cannot be fitted: the muscle must have forgotten the gap.
+            # The initial state of held-out pulses cannot be fitted: the muscle must have forgotten the gap.
             unseen = record.held_out[middle[gap.stop]]
             reach_s = FORGOTTEN_S if unseen else LONGEST_DELAY_S
             after = slice(gap.start, gap.stop + round(reach_s / step_s))

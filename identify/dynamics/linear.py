@@ -20,21 +20,11 @@ DAMPING_BOUNDS = (0.15, 8.0)
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """T² y'' + 2 ζ T y' + y = w(t - delay): unit gain at DC (section V of the paper).
+    """T² y'' + 2 ζ T y' + y = w(t - delay): unit gain at DC (section V of the paper)."""
 
-    Parameters
-    ----------
-    time_constant_s : float
-        T, s (Tω in the paper).
-    damping : float
-        ζ, 1 is critical.
-    delay_s : float
-        Delay after the pulses, s.
-    """
-
-    time_constant_s: float
-    damping: float
-    delay_s: float = 0.0
+    time_constant_s: float  # T, s (Tω in the paper)
+    damping: float  # ζ, 1 is critical
+    delay_s: float = 0.0  # delay after the pulses, s
 
     @property
     def core(self) -> Core:
@@ -76,41 +66,32 @@ class SecondOrder:
 
     def step_response(self, time_s: np.ndarray) -> np.ndarray:
         """Response to a unit step at zero, shape of `time_s`."""
-        t = np.maximum(np.asarray(time_s, float) - self.delay_s, 0.0) / self.time_constant_s
-        zeta = self.damping
-        if abs(zeta - 1.0) < 1e-6:
-            return 1.0 - (1.0 + t) * np.exp(-t)
-        root = np.sqrt(complex(zeta * zeta - 1.0))
-        p, q = -zeta + root, -zeta - root
-        return np.real(1.0 + (q * np.exp(p * t) - p * np.exp(q * t)) / (p - q))
+        t = np.asarray(time_s, float)
+        return step_responses(np.array([astuple(self)]), t.ravel())[0].reshape(t.shape)
 
     def to_dict(self) -> dict:
         return {"kind": "second-order"} | asdict(self)
 
 
+def step_responses(dynamics: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """Responses to a unit step of many (T, ζ, delay), shape (S, len(time_s))."""
+    t = np.maximum(time_s[None, :] - dynamics[:, 2:3], 0.0) / dynamics[:, :1]
+    zeta = dynamics[:, 1:2]
+    gap = zeta * zeta - 1.0
+    root = np.sqrt(np.where(np.abs(gap) < 1e-6, 1e-6, gap).astype(complex))
+    p, q = -zeta + root, -zeta - root
+    return np.real(1.0 + (q * np.exp(p * t) - p * np.exp(q * t)) / (p - q))
+
+
 @dataclass(frozen=True)
 class Discrete:
-    """B(q)/A(q) from the drive of an interval to the mean torque of an interval, equations (1) to (3).
+    """B(q)/A(q) from the drive of an interval to the mean torque of an interval, equations (1) to (3)."""
 
-    Parameters
-    ----------
-    b : tuple of float
-        b0 … bn.
-    a : tuple of float
-        1, a1 … al.
-    delay_samples : int
-        d, in pulse intervals.
-    step_s : float
-        Pulse interval, s.
-    centre : float
-        Place of the mean within the interval, 0 to 1: 0 for one sample per pulse, near 0.5 for many.
-    """
-
-    b: tuple[float, ...]
-    a: tuple[float, ...]
-    delay_samples: int
-    step_s: float
-    centre: float = 0.0
+    b: tuple[float, ...]  # b0 … bn
+    a: tuple[float, ...]  # 1, a1 … al
+    delay_samples: int  # d, in pulse intervals
+    step_s: float  # pulse interval, s
+    centre: float = 0.0  # place of the mean within the interval, 0 to 1: 0 for one sample per pulse, near 0.5 for many
 
     @property
     def poles(self) -> np.ndarray:

@@ -75,7 +75,9 @@ def find_effect(effect_id: str) -> Effect:
     """One effect by its id. Raises BadRequest: no effect has this id."""
     effects = registry()
     if effect_id not in effects:
-        raise BadRequest(f"unknown effect {effect_id!r}", fix=f"Known: {', '.join(sorted(effects))}.")
+        known = ", ".join(sorted(effects))
+        fix = f"If it is one of your own, set {FOLDER_VARIABLE} to the folder with its file. Known: {known}."
+        raise BadRequest(f"unknown effect {effect_id!r}", fix=fix)
     return effects[effect_id]
 
 

@@ -27,38 +27,23 @@ LEAST_RANGE_RAD = 0.1
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a form.
+    """One parameter of a form."""
 
-    Parameters
-    ----------
-    name : str
-        Ends in its unit, if it has one.
-    unit : str
-        Such as µs, s, N·m; "1" for a pure number.
-    lower, upper : float
-        Bounds. They set the width of the prior, and so the evidence: choose them as physiology allows, not wider.
-    neutral : float
-        Value at which the form changes nothing, alone or together with other parameters; may be outside the bounds.
-    start : tuple of float
-        Starting values, one for each run of the fit. The parameter with most values sets the number of runs.
-    scale : str
-        "linear" or "log": the scale on which the parameter is varied and on which its prior is symmetric.
-    relative : str
-        "torque", "width" or "span": bounds, start and neutral are multiples of the record's largest torque, largest
-        pulse width or length. "level": multiples of the largest torque, counted from the sensor's zero.
-    about : str
-        One line for people.
-    """
-
-    name: str
-    unit: str
+    name: str  # ends in its unit, if it has one
+    unit: str  # such as µs, s, N·m; "1" for a pure number
     lower: float
     upper: float
+    """Bounds. They set the width of the prior, and so the evidence: choose them as physiology allows, not wider."""
     neutral: float = 0.0
+    """Value at which the form changes nothing, alone or together with other parameters; may be outside the bounds."""
     start: tuple[float, ...] = (0.0,)
+    """Starting values, one for each run of the fit. The parameter with most values sets the number of runs."""
     scale: str = "linear"
+    """The scale on which it is varied and on which its prior is symmetric: "linear" or "log"."""
     relative: str = ""
-    about: str = ""
+    """What bounds, start and neutral are multiples of. "torque", "width", "span": the record's largest torque, largest
+    pulse width or length; "level", the largest torque, counted from the sensor's zero."""
+    about: str = ""  # one line for people
 
     def on(self, scene: Scene) -> Parameter:
         """The parameter with its bounds in absolute units."""
@@ -90,62 +75,34 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a form can use of the record, at the times at which it is evaluated.
+    """What a form can use of the record, at the times at which it is evaluated."""
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (K,)
-        Times since the record's start, s.
-    pulse_width_us : ndarray, shape (K,)
-        Pulse width applied, µs.
-    step_s : float
-        Pulse interval, s.
-    scale_nm : float
-        The record's largest torque, N·m; a constant, not a parameter.
-    largest_us : float
-        Largest pulse width, µs.
-    angle_rad, velocity_rad_s : ndarray or None, shape (K,)
-        Joint angle, rad, and velocity, rad/s, if the record has them.
-    acceleration_rad_s2 : ndarray or None, shape (K,)
-        Angular acceleration, rad/s², from the velocity.
-    reference_rad : float or None
-        The model's own angle: here the curve holds as it stands, and no passive torque is counted. None: the angle at
-        the record's start.
-    angle_range_rad : tuple of float or None
-        Smallest and largest angle that the model was fitted on, rad. None: those of the record.
-    begins : ndarray of bool or None, shape (K,)
-        Where a recording begins; None: at the first time alone.
-    noise_sd_nm : float
-        White noise of a sample, N·m.
-    zero_nm : float
-        Zero of the record's torque, N·m. Only the sensor stage sees it; at other stages torque is relative to it.
-    reference_s : float
-        Time at which a drifting recruitment curve holds, s: the mean time of the partly recruited pulses.
-    fitted : ndarray of bool or None, shape (K,)
-        Where the torque is used for fitting.
-    pauses_s : ndarray or None, shape (K,)
-        For the first interval of each part: the part of the pause before it that `time_s` does not contain, s.
-    states : mapping of str to float
-        By effect id, where the slow state of an effect begins (`Form.state`), 0 to 1; 0 where there is none.
-    """
-
-    time_s: np.ndarray
-    pulse_width_us: np.ndarray
-    step_s: float
-    scale_nm: float
-    largest_us: float
+    time_s: np.ndarray  # shape (K,); times since the record's start, s
+    pulse_width_us: np.ndarray  # shape (K,); pulse width applied, µs
+    step_s: float  # pulse interval, s
+    scale_nm: float  # the record's largest torque, N·m; a constant, not a parameter
+    largest_us: float  # largest pulse width, µs
     angle_rad: np.ndarray | None = None
     velocity_rad_s: np.ndarray | None = None
-    acceleration_rad_s2: np.ndarray | None = None
+    """Shape (K,); joint angle, rad, and velocity, rad/s, if the record has them."""
+    acceleration_rad_s2: np.ndarray | None = None  # shape (K,); angular acceleration, rad/s², from the velocity
     reference_rad: float | None = None
+    """The model's own angle: here the curve holds as it stands, and no passive torque is counted. None: the angle at
+    the record's start."""
     angle_range_rad: tuple[float, float] | None = None
-    begins: np.ndarray | None = None
-    noise_sd_nm: float = 0.0
+    """Smallest and largest angle that the model was fitted on, rad. None: those of the record."""
+    begins: np.ndarray | None = None  # shape (K,); where a recording begins; None: at the first time alone
+    noise_sd_nm: float = 0.0  # white noise of a sample, N·m
     zero_nm: float = 0.0
+    """Zero of the record's torque, N·m. Only the sensor stage sees it; at other stages torque is relative to it."""
     reference_s: float = 0.0
-    fitted: np.ndarray | None = None
+    """Time at which a drifting recruitment curve holds, s: the mean time of the partly recruited pulses."""
+    fitted: np.ndarray | None = None  # shape (K,); where the torque is used for fitting
     pauses_s: np.ndarray | None = None
+    """Shape (K,); for the first interval of each part: the part of the pause before it that `time_s` does not contain,
+    s."""
     states: Mapping[str, float] = field(default_factory=dict)
+    """By effect id, where the slow state of an effect begins (`Form.state`), 0 to 1; 0 where there is none."""
 
     @property
     def rest_s(self) -> np.ndarray:
@@ -225,66 +182,41 @@ class Form:
     - "output": x is the torque; returns the torque. Each time by itself.
     - "additive": x is None; returns a torque that is added at `scene.time_s`.
     - "sensor": x is the torque, after all other stages; returns the measured torque.
-
-    Parameters
-    ----------
-    name : str
-        Short id of the form.
-    stage : str
-        One of `STAGES`.
-    equation : str
-        The equation, for people.
-    parameters : tuple of Parameter
-        The parameters; their first starting values form the first run, their second ones the second, and so on.
-    apply : callable
-        See above. At the neutral values it must return x itself, bit for bit.
-    batched : bool
-        Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row.
-    law : dict
-        For "speed": the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on that
-        scale; for "lags" the `FreeLaw`. `apply` is then not called.
-    held : dict
-        For "lags" only: what of the same has a given value.
-    propose : callable or None
-        `propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
-        there are none. `previous` holds the parameters of the form before it in a chain.
-    restarts : tuple of dict
-        Further starts that also set `base.time_constant_s` and `base.damping`, of the linear dynamics, by which the
-        model without the effect may have imitated it.
-    accept : callable or None
-        `accept(parameters, scene)`: whether the result of a fit is plausible.
-    grows : bool
-        Whether the form is the next in a chain. It is tried only while the forms before it gain.
-    fixed : bool
-        Whether its parameters are found in the samples before the fit, and the torque is corrected for it then.
-    scales : bool
-        For "output" only: whether it multiplies the torque by what does not depend on it; x may then be 1.
-    fine : bool
-        For "additive" only: whether it is averaged over each pulse interval in the fit, not taken in its middle.
-    source : str
-        Publication.
-    state : callable or None
-        For "gain" only, and for a form with a slow state between 0 (rested) and 1 that begins at `scene.states`:
-        `state(x, p, scene)`, called as a batched `apply` is, returns it after the last interval, shape (M,).
     """
 
-    name: str
-    stage: str
-    equation: str
+    name: str  # short id of the form
+    stage: str  # one of `STAGES`
+    equation: str  # the equation, for people
     parameters: tuple[Parameter, ...]
+    """The parameters; their first starting values form the first run, their second ones the second, and so on."""
     apply: Apply | None = None
+    """See above. At the neutral values it must return x itself, bit for bit."""
     batched: bool = False
+    """Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row."""
     law: Mapping[str, tuple[Lag, SpeedLaw] | FreeLaw] = field(default_factory=dict)
-    held: Mapping[FreeLaw, float] = field(default_factory=dict)
+    """For "speed": the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on that
+    scale; for "lags" the `FreeLaw`. `apply` is then not called."""
+    held: Mapping[FreeLaw, float] = field(default_factory=dict)  # for "lags" only: what of the same has a given value
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
+    """`propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
+    there are none. `previous` holds the parameters of the form before it in a chain."""
     grows: bool = False
+    """Whether the form is the next in a chain. It is tried only while the forms before it gain."""
     accept: Callable[[dict[str, float], Scene], bool] | None = None
+    """`accept(parameters, scene)`: whether the result of a fit is plausible."""
     restarts: tuple[dict[str, float], ...] = ()
+    """Further starts that also set `base.time_constant_s` and `base.damping`, of the linear dynamics, by which the
+    model without the effect may have imitated it."""
     fixed: bool = False
+    """Whether its parameters are found in the samples before the fit, and the torque is corrected for it then."""
     scales: bool = False
+    """For "output" only: whether it multiplies the torque by what does not depend on it; x may then be 1."""
     fine: bool = False
-    source: str = ""
+    """For "additive" only: whether it is averaged over each pulse interval in the fit, not taken in its middle."""
+    source: str = ""  # publication
     state: Callable[[np.ndarray, dict[str, Any], Scene], np.ndarray] | None = None
+    """For "gain" only, and for a form with a slow state between 0 (rested) and 1 that begins at `scene.states`:
+    `state(x, p, scene)`, called as a batched `apply` is, returns it after the last interval, shape (M,)."""
 
     def to_dict(self, source: str) -> dict[str, Any]:
         """As the library tells it; `source` is that of the effect."""
@@ -320,103 +252,54 @@ class Form:
 
 @dataclass(frozen=True)
 class Shape:
-    """What a free effect is found to do.
+    """What a free effect is found to do."""
 
-    Parameters
-    ----------
-    enters : str
-        "drive", "rate of rise", "rate of fall", "output" or "zero".
-    driven_by : str
-        "width", "activation", "torque", "time since" or "sum of the past".
-    words : str
-        The same in one sentence with its size.
-    driver : str
-        Name and unit of the horizontal axis.
-    at : ndarray, shape (n,)
-        Places there.
-    effect : str
-        Name and unit of the vertical axis.
-    lines : dict of str to ndarray, shape (n,)
-        The curves, by name.
-    """
-
-    enters: str
-    driven_by: str
-    words: str
-    driver: str
-    at: np.ndarray
-    effect: str
-    lines: Mapping[str, np.ndarray]
+    enters: str  # "drive", "rate of rise", "rate of fall", "output" or "zero"
+    driven_by: str  # "width", "activation", "torque", "time since" or "sum of the past"
+    words: str  # the same in one sentence with its size
+    driver: str  # name and unit of the horizontal axis
+    at: np.ndarray  # shape (n,); places there
+    effect: str  # name and unit of the vertical axis
+    lines: Mapping[str, np.ndarray]  # shape (n,); the curves, by name
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One physical effect, in one or more forms.
+    """One physical effect, in one or more forms."""
 
-    Parameters
-    ----------
-    id : str
-        Such as "fatigue"; used in files, commands and the REST API.
-    name : str
-        Name for people.
-    forms : tuple of Form
-        The published variants. The fit takes the most likely one.
-    signature : str
-        What it looks like in the residual of a model without it.
-    resembles : tuple of str
-        Ids of effects that a record often cannot separate from it.
-    separated_by : str
-        The test that separates them.
-    plain : str
-        A paragraph for clinicians.
-    source : str
-        Where the physics is described.
-    needs : tuple of str
-        Columns that the record must have; otherwise the effect is not tried.
-    predictable : bool
-        Whether it can be foreseen on another record, as what follows from the pulses can. Hum, a zero that moves,
-        efforts and tremor cannot: their mean over the fitted rows stays as a zero, their size widens the band.
-    sporadic : bool
-        Whether it comes and goes by no law, as efforts and tremor do. It can repair any error, so the evidence asks for
-        more of it; its mean does not stay either.
-    raw : bool
-        Whether it is detected in the samples, before the means over pulse intervals are taken.
-    band : bool
-        Whether it is a narrow band of noise: found in the residual's spectrum, part of the noise beside other effects.
-    detect : callable or None
-        `detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. Such
-        an effect is added before any fit. `raw` is what `stimrig.identify.estimation.samples.inspect` gives.
-    prior : float
-        Logarithm of its prior odds, relative to other effects.
-    muscle : bool
-        Whether it is of the muscle. Else it is of one record, its sensor or its person's mood: that its parameters
-        differ between two sessions says nothing of the muscle.
-    main : dict of str
-        The parameters that stand for it in the trend, first choice first, and their names for people, without units;
-        the form's first one where none of them is its own.
-    shape : callable or None
-        Of a free effect only: `shape(form, values)` is what a fit found, as a picture with its sentence. A free effect
-        describes what no other explains. It is tried last, and its name claims no physics.
-    """
-
-    id: str
-    name: str
+    id: str  # such as "fatigue"; used in files, commands and the REST API
+    name: str  # name for people
     forms: tuple[Form, ...]
-    signature: str
-    resembles: tuple[str, ...]
-    separated_by: str
-    plain: str
-    source: str = ""
-    needs: tuple[str, ...] = ()
+    """The published variants. The fit takes the most likely one."""
+    signature: str  # what it looks like in the residual of a model without it
+    resembles: tuple[str, ...]  # ids of effects that a record often cannot separate from it
+    separated_by: str  # the test that separates them
+    plain: str  # a paragraph for clinicians
+    source: str = ""  # where the physics is described
+    needs: tuple[str, ...] = ()  # columns that the record must have; otherwise the effect is not tried
     predictable: bool = True
+    """Whether it can be foreseen on another record, as what follows from the pulses can. Hum, a zero that moves,
+    efforts and tremor cannot: their mean over the fitted rows stays as a zero, their size widens the band."""
     sporadic: bool = False
-    raw: bool = False
+    """Whether it comes and goes by no law, as efforts and tremor do. It can repair any error, so the evidence asks for
+    more of it; its mean does not stay either."""
+    raw: bool = False  # whether it is detected in the samples, before the means over pulse intervals are taken
     band: bool = False
+    """Whether it is a narrow band of noise: found in the residual's spectrum, part of the noise beside other
+    effects."""
     detect: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
-    prior: float = 0.0
+    """`detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. Such an
+    effect is added before any fit. `raw` is what `stimrig.identify.estimation.samples.inspect` gives."""
+    prior: float = 0.0  # logarithm of its prior odds, relative to other effects
     muscle: bool = True
+    """Whether it is of the muscle. Else it is of one record, its sensor or its person's mood: that its parameters
+    differ between two sessions says nothing of the muscle."""
     main: dict[str, str] = field(default_factory=dict)
+    """The parameters that stand for it in the trend, first choice first, and their names for people, without units; the
+    form's first one where none of them is its own."""
     shape: Callable[[Form, Mapping[str, float]], Shape] | None = None
+    """Of a free effect only: `shape(form, values)` is what a fit found, as a picture with its sentence. A free effect
+    describes what no other explains. It is tried last, and its name claims no physics."""
 
     @property
     def stage(self) -> str:

@@ -52,27 +52,16 @@ def _follow(
     return out, rate
 
 
-def _exponential(matrix: np.ndarray) -> np.ndarray:
-    """Matrix exponential of a small matrix of norm up to about 20, by scaled Taylor series."""
-    size = matrix.shape[0]
-    scaled = matrix / 64.0
-    term, total = np.eye(size), np.eye(size)
-    for n in range(1, 13):
-        term = term @ scaled / n
-        total += term
-    for _ in range(6):
-        total = total @ total
-    return total
-
-
 def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Exact transition of z'' = ω²(x - z) - 2ζω z', where x is the cubic between the states (x, x') at both ends."""
+    from scipy.linalg import expm  # here: its import takes as long as a fit, which mostly does not need it
+
     omega = 2 * np.pi * frequency_hz * step_s
     system = np.zeros((6, 6))
     system[0, 1] = 1.0
     system[1, :3] = [-(omega**2), -2 * damping * omega, omega**2]
     system[2, 3] = system[3, 4] = system[4, 5] = 1.0
-    phi = _exponential(system)
+    phi = expm(system)
     # Time in steps: the cubic's derivatives at the start, from x0, x0', x1, x1'.
     cubic = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [-6, -4, 6, -2], [12, 6, -12, 6]], float)
     return phi[:2, :2], phi[:2, 2:] @ cubic

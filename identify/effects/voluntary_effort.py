@@ -187,8 +187,8 @@ EFFECT = Effect(
     signature="Single bumps of torque, also at rest, at times that do not depend on the stimulation.",
     resembles=("threshold_drift", "recruitment_hysteresis", "catch_like", "baseline_drift"),
     separated_by="A test without stimulation; EMG; the instruction to relax.",
-    plain="The participant helped, resisted, or had a spasm. No model of the muscle can predict this. Repeat the test "
-    "with the instruction to relax, or leave these parts out.",
+    plain="The participant helped, resisted, or had a spasm. No model can predict when this comes. Once it is in the "
+    "model, it no longer distorts what is said of the muscle; predictions of another test leave it out.",
     source="Additive torque that does not depend on the stimulation",
     predictable=False,
     sporadic=True,

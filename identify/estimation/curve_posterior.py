@@ -48,15 +48,7 @@ class Mode:
 
 
 class CurvePosterior:
-    """The posterior for given data and prior.
-
-    Parameters
-    ----------
-    prior : NearShape
-        Of the curve.
-    data : Quadratic
-        Of the record.
-    """
+    """The posterior for given data and prior. `prior`: of the curve; `data`: of the record."""
 
     def __init__(self, prior: NearShape, data: Quadratic) -> None:
         self.prior, self.data = prior, data

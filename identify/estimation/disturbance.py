@@ -29,14 +29,8 @@ LARGEST = 0.3
 def disturbed(short: Short, white_nm: float, mains_hz: float | None) -> tuple[Fitted, np.ndarray]:
     """A fit with a disturbance beside it as a solved problem, and the disturbance, N·m, shape (K,).
 
-    Parameters
-    ----------
-    short : Short
-        The fit.
-    white_nm : float
-        White noise of an interval's mean, N·m.
-    mains_hz : float or None
-        Frequency of the mains, where the samples show hum.
+    `short`: the fit; `white_nm`: white noise of an interval's mean, N·m; `mains_hz`: frequency of the mains, where the
+    samples show hum.
     """
     fitted = averaged(short, mean_of_draws=False)
     setup = fitted.problem.setup

@@ -49,10 +49,7 @@ def learn_change(models: Sequence[Model]) -> Change:
     Each standard deviation is that of the differences between successive models, with the usual change as a prior that
     counts like three differences. With fewer than two models it is the usual change.
 
-    Parameters
-    ----------
-    models : sequence of Model
-        With second-order dynamics; others are left out.
+    `models`: with second-order dynamics; others are left out.
     """
     known = [_marks(model) for model in models if isinstance(model.linear, SecondOrder)]
     known = [marks for marks in known if marks is not None]

@@ -1,4 +1,4 @@
-"""Statistics of a fit: best-fit %, error, white noise, the best fit that the noise allows, and held-out rows."""
+"""Statistics of a fit: best-fit %, error, white noise, the best fit that the noise allows, and held-out pulses."""
 
 from __future__ import annotations
 

@@ -96,24 +96,15 @@ def near_widths(grid: Grid, seen: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What a model predicts on left-out blocks.
-
-    Parameters
-    ----------
-    error_nm : ndarray, shape (K,)
-        Measured minus predicted where the block of the interval was left out, N·m; NaN where nothing can be judged.
-    block : ndarray of int, shape (K,)
-        As `blocks` gives it.
-    floor_nm : float
-        Error below which a difference does not matter: that of white noise, N·m.
-    wander_nm : float
-        Scatter of the torque at rest. A block's mean error is no fault of the model as far as its zero explains it.
-    """
+    """What a model predicts on left-out blocks."""
 
     error_nm: np.ndarray
-    block: np.ndarray
-    floor_nm: float
+    """Shape (K,); measured minus predicted where the block of the interval was left out, N·m; NaN where nothing can be
+    judged."""
+    block: np.ndarray  # shape (K,); as `blocks` gives it
+    floor_nm: float  # error below which a difference does not matter: that of white noise, N·m
     wander_nm: float = 0.0
+    """Scatter of the torque at rest. A block's mean error is no fault of the model as far as its zero explains it."""
 
     def square(self, own: np.ndarray) -> float:
         """Mean square error of some intervals of one block about their zero, N²m²."""
@@ -133,12 +124,7 @@ def leave_out(fitted: Fitted, block: np.ndarray | None = None) -> LeftOut:
 
     The noise is that of the whole fit. Rows are judged where their widths were seen in the rest of the record.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        The model.
-    block : ndarray of int, shape (K,), optional
-        The block of each interval, -1 for none; as `blocks` gives it by default.
+    `fitted`: the model. `block`: shape (K,); the block of each interval, -1 for none; as `blocks` gives it by default.
     """
     return _left_out(fitted) if block is None else _without(fitted, block)
 
@@ -217,21 +203,12 @@ def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Difference:
-    """How much better one model predicts left-out blocks than another.
-
-    Parameters
-    ----------
-    gain : float
-        Mean over rows of the logarithm of the ratio of their blocks' errors; above 0: the second model is better.
-    sd : float
-        Its standard error over blocks.
-    blocks : float
-        Number of blocks that tell something.
-    """
+    """How much better one model predicts left-out blocks than another."""
 
     gain: float
-    sd: float
-    blocks: float
+    """Mean over rows of the logarithm of the ratio of their blocks' errors; above 0: the second model is better."""
+    sd: float  # its standard error over blocks
+    blocks: float  # number of blocks that tell something
 
     @property
     def errors(self) -> float:

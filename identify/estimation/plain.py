@@ -128,7 +128,7 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
     """
     seen = grid.pulse_width_us[rows]
     if np.ptp(seen) <= 0:
-        raise NotIdentifiable("the pulse width never changes in the fitted rows", fix="Record a PRBS and a ramp.")
+        raise NotIdentifiable("the pulse width never changes in the fitted pulses", fix="Record a PRBS and a ramp.")
     if np.ptp(grid.torque_nm[rows]) <= 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
     basis = SplineBasis(np.linspace(0.0, float(np.max(grid.pulse_width_us)), PILOT_KNOTS))

@@ -16,16 +16,17 @@ from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.joint_surface import Acting, Surfaces
 from stimrig.identify.simulation.predict import refuse_rate
 from stimrig.identify.simulation.pulses import Motion, above_rest
+from stimrig.identify.yardstick import held_out_pulses
 
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
 LEAST_FIT_PERCENT = 30.0
 GOOD_GAP, LARGEST_GAP = 2.0, 8.0
-"""Percentage points of fit below the ceiling on held-out rows: above the first something is missing, above the second
+"""Percentage points of fit below the ceiling on held-out pulses: above the first something is missing, above the second
 too much."""
 WITHIN_NOISE = 1.3
 """If the error is at most this many times the noise, it passes as noise, even if the torque hardly changes."""
-OWN = "the fitted rows"
+OWN = "the fitted pulses"
 ANGLE_SLACK_RAD, VELOCITY_SLACK_RAD_S = 0.09, 0.1
 """Five degrees, and what a hand that holds still may move."""
 LARGEST_MOVE_RAD = math.radians(10)
@@ -39,12 +40,12 @@ PROBES, TAME = 60, 4.0
 
 
 def valid_for(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
-    """Pulse widths, torques and rates of the fitted rows."""
+    """Torques and rates of the fitted rows; pulse widths from the record's lowest on: below it nothing was seen."""
     widths = grid.pulse_width_us[rows]
     largest = float(np.max(widths))
     table = model.recruitment(np.linspace(0.0, largest, 101))
     return {
-        "pulse_width_us": [0.0, largest],
+        "pulse_width_us": [float(np.min(grid.record.pulse_width_us)), largest],
         "torque_nm": [float(min(table.min(), 0.0)), float(max(table.max(), 0.0))],
         "measured_torque_nm": [float(np.min(grid.torque_nm[rows])), float(np.max(grid.torque_nm[rows]))],
         "pulse_rate_hz": [model.pulse_rate_hz * 0.95, model.pulse_rate_hz * 1.05],
@@ -111,11 +112,8 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
 
     A failed check of severity "refuse" makes a model not usable; one of severity "care" makes it usable with care.
 
-    Returns
-    -------
-    dict
-        `verdict`: usable, usable with care, or not usable; `words`: one sentence with the main reason; `reasons`: the
-        texts of the failed checks, "refuse" first; `gates`: the checks by name, {"passed", "severity", "says"}.
+    `verdict`: usable, usable with care, or not usable; `words`: one sentence with the main reason; `reasons`: the texts
+    of the failed checks, "refuse" first; `gates`: the checks by name, {"passed", "severity", "says"}.
     """
     moving = depend_on_joint(str(entry["id"]) for entry in model.effects)
     gates = {
@@ -222,13 +220,13 @@ def _held_out(model: Model) -> dict[str, Any]:
     return _gate(
         error <= max(1.5 * like, NEGLIGIBLE * np.ptp(model.valid_for["torque_nm"])),
         "care",
-        f"the error on held-out rows, {error:.3g} N·m, is {error / max(fitted_error, 1e-12):.1f} times "
-        "that on fitted rows",
+        f"the error on {held_out_pulses(model.fit)}, {error:.3g} N·m, is "
+        f"{error / max(fitted_error, 1e-12):.1f} times that on fitted pulses",
     )
 
 
 def _gap(model: Model) -> dict[str, Any]:
-    """Whether the fit on held-out rows is near what the noise allows there.
+    """Whether the fit on held-out pulses is near what the noise allows there.
 
     If the torque is constant there, their error above the noise is taken as a share of the fitted torque's spread.
     """
@@ -239,7 +237,8 @@ def _gap(model: Model) -> dict[str, Any]:
     unseen = _statistic(model, "held_out_rms_nm")
     if where == OWN and np.isfinite(unseen):
         gap, error = 100.0 * (unseen - noise) * (1.0 - reached / 100.0) / max(error, 1e-300), unseen
-        says = f"on held-out rows, whose torque is constant, the error is {unseen:.3g} N·m (noise {noise:.3g} N·m)"
+        pulses = held_out_pulses(model.fit)
+        says = f"on {pulses}, whose torque is constant, the error is {unseen:.3g} N·m (noise {noise:.3g} N·m)"
     if not np.isfinite(gap):
         return _gate(True, "care", "")
     far = gap > LARGEST_GAP and not error <= WITHIN_NOISE * noise
@@ -248,8 +247,8 @@ def _gap(model: Model) -> dict[str, Any]:
 
 
 def _reach(model: Model) -> tuple[float, float, str, float]:
-    """Fit, ceiling, name of the rows and error there: of the held-out rows, unless the torque is constant there."""
-    prefix, where = "held_out_", "held-out rows"
+    """Fit, ceiling, name of the rows and error there: of the held-out pulses, unless the torque is constant there."""
+    prefix, where = "held_out_", held_out_pulses(model.fit)
     if not np.isfinite(_statistic(model, "held_out_fit_percent")):
         prefix, where = "", OWN
     names = ("fit_percent", "ceiling_percent", "rms_nm")

@@ -16,6 +16,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.estimation.rests import relaxed, scatter_at_rest
 from stimrig.identify.records.record import FORGOTTEN_S
+from stimrig.identify.yardstick import floor_nm
 
 EXACT, ESTIMATE = "exact repeats", "estimate"
 LEAST_S = 1.0
@@ -78,10 +79,11 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
         found = UNKNOWN | {"found_by": ESTIMATE}
         repeating = float(np.var(grid.torque_nm[at])) - variance
     model = float(np.mean(error_nm[at] ** 2))
-    if repeating > LEAST_SHARE * float(np.var(grid.torque_nm[at])):
+    found |= {"rms_nm": variance**0.5, "model_rms_nm": model**0.5}
+    if floor_nm(found) is not None and repeating > LEAST_SHARE * float(np.var(grid.torque_nm[at])):
         share = 1.0 - (model - variance) / repeating
         found["explained_percent"] = 100.0 * float(np.clip(share, 0.0, 1.0))
-    return found | {"seconds": at.size * grid.step_s, "rms_nm": variance**0.5, "model_rms_nm": model**0.5}
+    return found | {"seconds": at.size * grid.step_s}
 
 
 def _groups(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -34,13 +34,10 @@ def chi_square_p(statistic: float, freedom: float) -> float:
 def residual_tests(fitted: Fitted) -> dict[str, Any]:
     """Test the residual for whiteness, and for structure that the model cannot describe.
 
-    Returns
-    -------
-    dict
-        `whiteness`: correlations of the innovations over 20 lags, compared with what the fit leaves of white noise.
-        `structure`: share of the residual that six signals of missing physics explain (drift, gain drift, squared
-        output, rate, direction, onset), without what the model itself explains. Each has statistic, freedom, p_value
-        and passed. Empty if the residual is zero.
+    `whiteness`: correlations of the innovations over 20 lags, compared with what the fit leaves of white noise.
+    `structure`: share of the residual that six signals of missing physics explain (drift, gain drift, squared output,
+    rate, direction, onset), without what the model itself explains. Each has statistic, freedom, p_value and passed.
+    Empty if the residual is zero.
     """
     setup = fitted.problem.setup
     if not fitted.rms_nm > 1e-12 * setup.scale_nm:
@@ -98,12 +95,8 @@ LEAST_SHARE = 1e-9
 def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
     """Derivatives of the innovations' correlations at lags 1 to `lags` by the estimated parameters of the noise.
 
-    A parameter at its bound, or without influence, has no row.
-
-    Returns
-    -------
-    ndarray, shape (numbers, lags)
-        From the derivative of the log spectrum by each parameter: the spectrum that a wrong value leaves.
+    Shape (numbers, lags), from the derivative of the log spectrum by each parameter: the spectrum that a wrong value
+    leaves. A parameter at its bound, or without influence, has no row.
     """
     slow = noise.share > LEAST_SHARE and noise.ar1 > LEAST_SHARE
     names = []

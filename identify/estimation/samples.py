@@ -78,7 +78,7 @@ def rows_of(grid: Grid, names: Sequence[str]) -> np.ndarray:
 
 
 def fitted_rows(grid: Grid, fit_on: Sequence[str] | None) -> np.ndarray:
-    """Rows to fit: those of the named segments and the rests, which determine the baseline; never held-out rows.
+    """Rows to fit: those of the named segments and the rests, which determine the baseline; never held-out pulses.
 
     Raises BadRequest: a named segment is not in the record (with those that are), or is the held-out one.
     NotIdentifiable: fewer than eight pulse intervals are left to fit.
@@ -134,14 +134,8 @@ def white_noise(record: Record, rows: np.ndarray, torque_nm: np.ndarray) -> tupl
     At low sampling rates the torque changes from sample to sample; the estimate is then an upper bound. So it is for
     samples that are held, coarse, interpolated or smoothed, if the muscle never rests for long.
 
-    Parameters
-    ----------
-    record : Record
-        What was measured.
-    rows : ndarray of bool, shape (N,)
-        Samples that may be looked at.
-    torque_nm : ndarray, shape (N,)
-        Torque without mains hum, N·m.
+    `record`: what was measured. `rows`: shape (N,); samples that may be looked at. `torque_nm`: shape (N,); torque
+    without mains hum, N·m.
     """
     torque, width = torque_nm[rows], record.pulse_width_us[rows]
     if torque.size < 16:

@@ -19,7 +19,6 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.rests import RELAXED_S, scatter_at_rest, since_pulse
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment import Basis
 from stimrig.identify.simulation.joint_surface import POINTWISE
 from stimrig.identify.simulation.predict import same_data, slopes, unforeseen
 
@@ -164,22 +163,17 @@ def bands(model: Model) -> dict[str, Any]:
         return {}
     width = np.linspace(0.0, model.recruitment.basis.largest_us, POINTS)
     time_s = np.linspace(0.0, linear.memory_s, POINTS)
-    curve = _band(model.recruitment(width), recruitment_slopes(model.recruitment.basis, covariance, width), covariance)
+    found = np.zeros((width.size, len(covariance.names)))
+    # f's coefficients stand after the dynamics, before the effects (`effect.parameter`).
+    last = len(covariance.names) - sum("." in name for name in covariance.names)
+    found[:, last - model.recruitment.basis.size : last] = model.recruitment.basis.design(width)
+    curve = _band(model.recruitment(width), found, covariance)
     step = _band(linear.step_response(time_s), step_slopes(linear, covariance, time_s), covariance)
     return {
         "level_percent": 95,
         "recruitment": {"pulse_width_us": width} | curve,
         "step_response": {"time_s": time_s} | step,
     }
-
-
-def recruitment_slopes(basis: Basis, covariance: Covariance, width_us: np.ndarray) -> np.ndarray:
-    """Derivatives of f(u) by all parameters, shape (len(width_us), P)."""
-    found = np.zeros((width_us.size, len(covariance.names)))
-    # f's coefficients stand after the dynamics, before the effects (`effect.parameter`).
-    last = len(covariance.names) - sum("." in name for name in covariance.names)
-    found[:, last - basis.size : last] = basis.design(width_us)
-    return found
 
 
 def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray) -> np.ndarray:

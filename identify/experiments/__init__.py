@@ -58,12 +58,7 @@ def _short(value: Any) -> str:
 def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     """The shortest test that separates rivals, each simulated as it was fitted to a record.
 
-    Parameters
-    ----------
-    record : Record
-        The record that does not separate the rivals.
-    fits : mapping of str to Fitted
-        By effect id, or `NOTHING`.
+    `record`: the record that does not separate the rivals; `fits`: by effect id, or `NOTHING`.
     """
     largest_us = float(record.pulse_width_us.max())
     rows = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(largest_us)]
@@ -99,15 +94,13 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
     Held random levels, in the design after which the model's own standard error on other such levels is smallest: jumps
     of level while stimulated are what the paper's test lacks. A further ramp taught muscles of other physics nothing.
 
-    Parameters
-    ----------
-    record : Record
-        In which structure is left.
-    fitted : Fitted
-        The last model of it.
+    `record`: in which structure is left; `fitted`: the last model of it.
     """
     largest_us, rate_hz = float(record.pulse_width_us.max()), record.pulse_rate_hz
-    threshold_us = _threshold_us(fitted)
+    # the smallest width with a tenth of the largest torque
+    widths_us = np.linspace(0.0, fitted.problem.setup.basis.largest_us, 201)
+    torque_nm = fitted.problem.setup.basis.design(widths_us) @ fitted.physical[fitted.problem.coefficients]
+    threshold_us = float(widths_us[np.argmax(np.abs(torque_nm) >= 0.1 * np.abs(torque_nm).max())])
     rows = [(one, one.pulse_widths(rate_hz)) for one in held_levels(largest_us, threshold_us, rate_hz)]
     others = [one.pulse_widths(rate_hz) for one in held_levels(largest_us, threshold_us, rate_hz, REFERENCE)]
     reference = _simulate(fitted, _blank(record, np.concatenate(others)), True)[1]
@@ -121,13 +114,6 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
         f"levels is expected to fall by {100.0 * fall:.0f} %."
     )
     return Experiment((), *played, 0.0, False, text, fall)
-
-
-def _threshold_us(fitted: Fitted) -> float:
-    """Smallest width with a tenth of the largest torque, µs."""
-    widths_us = np.linspace(0.0, fitted.problem.setup.basis.largest_us, 201)
-    torque_nm = fitted.problem.setup.basis.design(widths_us) @ fitted.physical[fitted.problem.coefficients]
-    return float(widths_us[np.argmax(np.abs(torque_nm) >= 0.1 * np.abs(torque_nm).max())])
 
 
 def _whitened_slopes(fitted: Fitted, record: Record) -> np.ndarray:
@@ -144,7 +130,7 @@ def _expected_nm(fitted: Fitted, reference: np.ndarray | None, white: np.ndarray
 
 
 def _text(design: Design, duration_s: float, gain: float, names: tuple[str, ...]) -> str:
-    those = " from ".join(find_effect(name).name.lower() for name in names[:2])
+    those = " from ".join([*(find_effect(name).name.lower() for name in names[:2]), "no effect"][:2])
     test = f"{design.words} ({duration_s:.0f} s)"
     if gain >= ENOUGH:
         return f"{test} should separate {those}: expected log evidence {gain:.0f}."

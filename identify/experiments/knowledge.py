@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from stimrig.identify.dynamics.linear import step_responses
 from stimrig.identify.dynamics.states import FROM_START, held_states, step_matrix
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.short_record import Short
@@ -123,16 +124,6 @@ def whole_band(at: np.ndarray, draws: np.ndarray, factor: float = 1.0) -> Band:
     return Band(at, mean, factor * float(np.quantile(farthest, LEVEL)) * sd)
 
 
-def step_responses(dynamics: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-    """Responses to a unit step of many (T, ζ, delay), shape (S, len(time_s))."""
-    t = np.maximum(time_s[None, :] - dynamics[:, 2:3], 0.0) / dynamics[:, :1]
-    zeta = dynamics[:, 1:2]
-    gap = zeta * zeta - 1.0
-    root = np.sqrt(np.where(np.abs(gap) < 1e-6, 1e-6, gap).astype(complex))
-    p, q = -zeta + root, -zeta - root
-    return np.real(1.0 + (q * np.exp(p * t) - p * np.exp(q * t)) / (p - q))
-
-
 # ---- what pieces would teach ----
 
 
@@ -166,7 +157,10 @@ class Foresight:
         width, time_s = known.curve.at, known.step.at
         f = curves @ short.basis.design(width).T / short.plateau_nm
         steps = step_responses(cores, time_s)
-        factor = _factor(known.curve.half, draws[:, :-3] @ short.basis.design(width).T / short.plateau_nm)
+        # standard deviations in the half-width of the whole band
+        sd = (draws[:, :-3] @ short.basis.design(width).T / short.plateau_nm).std(axis=0)
+        at = int(np.argmax(sd))
+        factor = float(np.clip(known.curve.half[at] / max(sd[at], 1e-12), 2.0, 8.0))
         of_curve = (f[1:] - f[0]).T * (factor * 100.0 / target.curve_percent)
         of_step = (steps[1:] - steps[0]).T * (WIDTHS_SD * 100.0 / target.step_percent)
         design = short.basis.design(played_us)
@@ -195,13 +189,6 @@ class Foresight:
         variance = np.einsum("bi,cij,bj->cb", self.targets, left, self.targets, optimize=True)
         dose = np.add.reduceat(curves[0][index], places[:-1]) * step_s
         return _norm(np.maximum(variance, 0.0)), dose
-
-
-def _factor(half: np.ndarray, draws: np.ndarray) -> float:
-    """Standard deviations in the half-width of the whole band."""
-    sd = draws.std(axis=0)
-    at = int(np.argmax(sd))
-    return float(np.clip(half[at] / max(sd[at], 1e-12), 2.0, 8.0))
 
 
 def _norm(variance: np.ndarray) -> np.ndarray:

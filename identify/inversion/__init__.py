@@ -13,8 +13,10 @@ from stimrig.identify.inversion.plant import NOTHING, Plant
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
+from stimrig.identify.results import Result
 from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.pulses import above_rest
+from stimrig.identify.summary import Sheet, quantity
 
 __all__ = ["Inversion", "Reference", "invert"]
 
@@ -27,7 +29,7 @@ ENOUGH = 2e-3
 GAIN = 0.97
 """A correction that leaves more than this share of the best error so far is the last one but one."""
 TOLERANCE = 0.02
-"""A torque that is missed by less of the largest torque counts as reached."""
+"""A torque that is missed by less of the largest one that the widest pulse gives counts as reached."""
 JOINED = 3
 """Stretches of one reason with fewer pulses between them are one."""
 REASONS = ("above-plateau", "below-zero", "rises-too-fast", "falls-too-fast", "under-threshold", "not-followed")
@@ -45,8 +47,8 @@ class Stretch:
     shortfall_nm: float  # the largest difference between reference and prediction in it, positive
 
 
-@dataclass(frozen=True)
-class Inversion:
+@dataclass(frozen=True, repr=False, eq=False)
+class Inversion(Result):
     """Pulse widths for a reference; arrays of shape (K,)."""
 
     reference: Reference  # what was asked for
@@ -56,6 +58,15 @@ class Inversion:
     fit_percent: float | None  # best fit where it can be reached; None if the reference does not change there
     whole_fit_percent: float | None  # of all of it
     tolerance_nm: float  # a smaller difference counts as reached
+
+    def _sheet(self) -> Sheet:
+        fit = f"fit {quantity(self.fit_percent, '%')} where it can be reached"
+        missed = [
+            (f"{one.begin_s:.2f} to {one.end_s:.2f} s", f"lacks {one.shortfall_nm:.2g} N·m: {one.reason}")
+            for one in self.unreachable
+        ]
+        rows = [("widths", f"up to {quantity(self.pulse_width_us.max(), 'µs')}"), *missed[:8]]
+        return Sheet(f"Pulse widths for a torque: {self.pulse_width_us.size} pulses, {fit}", tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
@@ -86,6 +97,7 @@ def invert(
     largest_us: float | None = None,
     rise_us: float | None = None,
     whole: bool = True,
+    shortest_us: float = 0.0,
 ) -> Inversion:
     """The pulse widths whose predicted torque follows a reference best.
 
@@ -106,6 +118,8 @@ def invert(
         Largest rise from pulse to pulse, µs. The rig's gate has such a limit.
     whole : bool
         Whole µs. What rounding takes is given back by the pulses after.
+    shortest_us : float
+        The stimulator's shortest pulse, µs: a narrower one is not sent, so it is 0 here.
 
     Raises
     ------
@@ -115,7 +129,7 @@ def invert(
     BadRequest
         A limit is not a positive number.
     """
-    plant = Plant.of(model, reference, largest_us, rise_us, whole)
+    plant = Plant.of(model, reference, largest_us, rise_us, whole, shortest_us)
     wanted, motion = plant.sign * reference.torque_nm, reference.motion
     gain, passive_nm = _joint(model, reference, plant.sign)
     needed = (wanted - passive_nm) / gain  # what the muscle has to give at the model's own angle
@@ -229,7 +243,7 @@ def _reasons(
 
 
 def _change(wanted: np.ndarray, k: int, near: int, tolerance_nm: float) -> float:
-    """The steepest change of the reference about a pulse, the nearest one of such; 0 if it hardly changes.
+    """The nearest change of the reference that in a settling time would be more than the tolerance; 0 if there is none.
 
     One that is too fast is missed on both sides: the best demand begins before it.
     """
@@ -238,5 +252,5 @@ def _change(wanted: np.ndarray, k: int, near: int, tolerance_nm: float) -> float
     if np.ptp(part) <= tolerance_nm:
         return 0.0
     change = np.diff(part)
-    steep = np.flatnonzero(np.abs(change) >= 0.5 * np.max(np.abs(change)))
+    steep = np.flatnonzero(np.abs(change) >= min(tolerance_nm / near, np.max(np.abs(change))))
     return float(change[steep[np.argmin(np.abs(steep + first - k))]])

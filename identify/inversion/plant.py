@@ -38,11 +38,13 @@ class Plant:
     settled: int  # pulses after which a step has gone 95 % of its way
     rise_us: float | None  # largest rise from pulse to pulse
     whole: bool  # whether widths are whole µs
+    shortest_us: float = 0.0  # a stimulator sends no narrower pulse
 
     @classmethod
     def of(
-        cls, model: Model, reference: Reference, largest_us: float | None, rise_us: float | None, whole: bool
-    ) -> Plant:
+        cls, model: Model, reference: Reference, largest_us: float | None, rise_us: float | None, whole: bool,
+        shortest_us: float = 0.0,
+    ) -> Plant:  # fmt: skip
         """Of a model, for a reference. Raises BadModel and BadRequest as `invert`."""
         rate_hz = reference.pulse_rate_hz
         if not isinstance(model.linear, SecondOrder):
@@ -55,6 +57,8 @@ class Plant:
         for name, limit in (("largest_us", largest_us), ("rise_us", rise_us)):
             if limit is not None and not 0.0 < limit < np.inf:
                 raise BadRequest(f"{limit:g} µs", place=name, fix="Give a positive number, or leave it out.")
+        if not 0.0 <= shortest_us < np.inf:
+            raise BadRequest(f"{shortest_us:g} µs", place="shortest_us", fix="Give 0, or a positive number.")
         sign, width_us, level_nm = _curve(model, largest_us, whole)
         top = np.maximum.accumulate(np.maximum(level_nm, 0.0))
         first = np.r_[True, top[1:] > top[:-1]]
@@ -62,7 +66,7 @@ class Plant:
         a, b = on_pulses(linear, rate_hz)
         step = recursion(a, np.cumsum(np.r_[b, np.zeros(round(30.0 * rate_hz))]))
         settled = 1 + int(np.max(np.flatnonzero(np.abs(step - 1.0) > 0.05), initial=0))
-        return cls(sign, width_us, level_nm, top[first], width_us[first], a, b, settled, rise_us, whole)
+        return cls(sign, width_us, level_nm, top[first], width_us[first], a, b, settled, rise_us, whole, shortest_us)
 
     @property
     def largest_nm(self) -> float:
@@ -94,7 +98,8 @@ class Plant:
     def _ready_us(self) -> float:
         """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing."""
         quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= 0.002 * self.largest_nm)
-        return float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+        ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+        return ready_us if ready_us >= self.shortest_us else 0.0
 
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:
         """f⁻¹ of a demand, µs, shape (K,); what rounding and the rise limit take, the pulses after give back."""
@@ -109,8 +114,8 @@ class Plant:
                 width = min(width, last + self.rise_us)
             if self.whole:
                 width = min(round(width), int(widest_us), int(last + (self.rise_us or widest_us)))
-            widths[k] = last = width
-            owed = min(max(owed + demand - float(self.level(width)), -most_owed), most_owed) if demand > 0.0 else 0.0
+            widths[k] = last = width if width >= self.shortest_us else 0.0
+            owed = min(max(owed + demand - float(self.level(last)), -most_owed), most_owed) if demand > 0.0 else 0.0
         return widths
 
     def _lead_in(self, widths_us: np.ndarray) -> np.ndarray:
@@ -121,6 +126,7 @@ class Plant:
         coming = 0.0
         for k in range(widths_us.size - 1, -1, -1):
             least[k] = min(max(coming - self.rise_us, 0.0), self._ready_us)
+            least[k] = max(least[k], self.shortest_us) if least[k] > 0.0 else 0.0
             coming = max(widths_us[k], least[k])
         return np.floor(least) if self.whole else least
 

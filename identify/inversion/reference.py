@@ -164,21 +164,8 @@ def _on_pulses(time_s: np.ndarray, torque_nm: np.ndarray, pulse_rate_hz: float) 
 def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Reference:
     """The reference in a CSV file; semicolons or tabs between cells and decimal commas are read, too.
 
-    Parameters
-    ----------
-    content : bytes
-        The file.
-    name : str
-        How messages call it.
-    pulse_rate_hz : float
-        Pulses per second.
-
-    Raises
-    ------
-    BadRecord
-        It is no such table: with line and column.
-    BadRequest
-        As `Reference.of`.
+    `content`: the file; `name`: how messages call it; `pulse_rate_hz`: pulses per second. Raises BadRecord: it is no
+    such table: with line and column.
     """
     encoding, _ = encoding_of(content, name)
     lines = ((number, line.strip("\r\n ")) for number, line in enumerate(text_lines(content, encoding, name), 1))

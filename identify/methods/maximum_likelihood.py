@@ -173,8 +173,10 @@ METHOD = Method(
 def _why(fitted: Fitted) -> list[str]:
     time_constant_s, damping, delay_s = fitted.physical[:3]
     noise = fitted.noise
-    said = "white" if noise.is_white else f"slow and white; {100 * min(noise.share, 1.0):.0f} % of the variance is slow"
-    enough = "a white residual" if noise.is_white else "the residual is not white: see the diagnosis"
+    slow = 100 * min(noise.share, 1.0)
+    mixed = f"slow and white; {slow:.0f} % of the variance of the residual's means over pulse intervals is slow"
+    said = "white" if noise.is_white else mixed
+    enough = "a white residual" if noise.is_white else "what is left is not white: slow noise, or see the diagnosis"
     return [
         f"second order: T {time_constant_s:.4g} s, damping {damping:.3g}, delay {1e3 * delay_s:.1f} ms; {enough}",
         f"noise: {said}",

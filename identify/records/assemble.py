@@ -44,7 +44,7 @@ def find_segments(time_s: np.ndarray, width_us: np.ndarray) -> tuple[np.ndarray,
     known = list(dict.fromkeys(names))
     lengths = np.diff([*starts, width_us.size])
     code = np.repeat([known.index(name) for name in names], lengths)
-    return code, known, _note(names, time_s[starts], float(time_s[-1]), float(level.min()))
+    return code, known, _note(names, time_s[starts], float(time_s[-1]))
 
 
 def _active(level: np.ndarray, held_s: np.ndarray, offset: int, span_us: float) -> list[tuple[int, str]]:
@@ -68,12 +68,11 @@ def _switching(level: np.ndarray) -> str:
     return "prbs" if level.size >= LEAST_PRBS else "steps"
 
 
-def _note(names: list[str], starts_s: np.ndarray, end_s: float, lowest_us: float) -> str:
+def _note(names: list[str], starts_s: np.ndarray, end_s: float) -> str:
     ends_s = np.append(starts_s[1:], end_s)
     told = [f"{name} {a:.4g} to {b:.4g} s" for name, a, b in zip(names, starts_s, ends_s, strict=True)]
     more = f" and {len(told) - MOST_TOLD} more" if len(told) > MOST_TOLD else ""
-    low = f"; the lowest width, {lowest_us:.4g} µs, is taken as rest" if lowest_us > 0 and "rest" in names else ""
-    return f"no segment column: found from the pulse widths: {', '.join(told[:MOST_TOLD])}{more}; none is held out{low}"
+    return f"no segment column: found from the pulse widths: {', '.join(told[:MOST_TOLD])}{more}; none is held out"
 
 
 def record_of(found: FileContent) -> Record:

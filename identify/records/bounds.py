@@ -39,6 +39,8 @@ LARGEST_CALENDAR_S = 1e11
 """Times as they are read may be counted from 1970, or from 1904."""
 LONGEST_NAME = 100
 LONGEST_TEXT = 10_000
+LONGEST_PLAN = 8 * 2**20
+"""What the rig writes of a test as one text (configuration, events): a plan lists each pulse of its trains."""
 MOST_SEGMENTS = 1000
 MOST_PARTS = 1000
 PULSE_RATES_HZ = (1.0, 200.0)
@@ -119,7 +121,10 @@ def check_sampling(rate_hz: float, place: str) -> None:
     Raises BadRecord: below 40 Hz or above 2 kHz, by more than rounding.
     """
     if not (LOWEST_HZ <= rate_hz <= HIGHEST_HZ):
-        raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, fix="40 Hz to 2 kHz can be used.")
+        fix = "40 Hz to 2 kHz can be used."
+        if LOWEST_HZ <= 1000 * rate_hz <= HIGHEST_HZ:
+            fix = "40 Hz to 2 kHz can be used; if time is in milliseconds, give --map time_s=time_s:ms."
+        raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, fix=fix)
 
 
 def check_name(name: str, place: str) -> None:

@@ -271,6 +271,7 @@ def _resampled(found: FileContent, step_s: float) -> FileContent:
     columns["pulse_width_us"] = _width_in_slots(found, even_s, before)
     note = (
         f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms): resampled to "
-        f"{1 / step_s:.5g} Hz, torque on straight lines between samples"
+        f"{1 / step_s:.5g} Hz, torque on straight lines between samples: "
+        "noise and error figures come out too small"
     )
     return found.noting(note, _lost_note(found, gaps), columns=columns)

@@ -56,7 +56,8 @@ def unit_factor(target: str, unit: str) -> float | None:
 TARGETS = (*NEEDED, "segment", *OPTIONAL)
 NAMES = {
     "time_s": "time t timestamp elapsed_time zeit temps tiempo tempo",
-    "pulse_width_us": "pulse_width pulsewidth pw pulse_duration pulse_length stim_pw pulsbreite impulsbreite pulsdauer",
+    "pulse_width_us": "pulse_width pulsewidth pw pulse_duration pulse_length stim_pw "
+    "pulsbreite impulsbreite pulsweite pulsdauer",
     "torque_nm": "torque moment joint_torque elbow_torque drehmoment couple",
     "angle_rad": "angle joint_angle elbow_angle winkel gelenkwinkel",
     "velocity_rad_s": "velocity angular_velocity joint_velocity speed winkelgeschwindigkeit",

@@ -31,6 +31,12 @@ MOST_BEFORE = 100
 BLANKS = " "
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", BLANKS: "blanks"}
 COMMENTS = ("#", "%", "//")
+PACKED = {
+    b"\x1f\x8b": ("packed with gzip", "Unpack it with gunzip first."),
+    b"PK\x03\x04": ("an Excel workbook or a ZIP archive", "Save the sheet as CSV text, or unpack the archive."),
+    b"\xd0\xcf\x11\xe0": ("an old Excel workbook", "Save the sheet as CSV text."),
+}
+"""How files begin that hold a table and are no text, what they are, and the mend."""
 Row = tuple[int, list[str]]
 
 
@@ -39,6 +45,9 @@ def encoding_of(content: bytes, name: str) -> tuple[str, str]:
 
     Raises BadRecord: no text.
     """
+    for start, (what, fix) in PACKED.items():
+        if content.startswith(start):
+            raise BadRecord(what, place=f"{name}, line 1", fix=fix)
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", ""
     if b"\0" in content:
@@ -338,8 +347,8 @@ class Table:
             return np.nan
         if is_number(cell):
             return float(cell)
-        message, fix = f"{columns.short(cell)!r} is no number", "Give a number with a decimal point."
-        raise BadRecord(message, place=self.at(line, column), fix=fix)
+        fix = "Give a number with a decimal point, without signs between thousands."
+        raise BadRecord(f"{columns.short(cell)!r} is no number", place=self.at(line, column), fix=fix)
 
     def _new_name(self, text: str, line: int) -> int:
         bounds.check_name(text, self.at(line, "segment"))

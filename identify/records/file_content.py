@@ -45,7 +45,9 @@ class FileContent:
 
     def record(self, **more: object) -> Record:
         """The columns as a record, as they are; `more` is what else `Record.from_arrays` takes."""
-        known = {"segment_names": self.names, "pulse_rate_hz": self.pulse_rate_hz, "source": self.source}
+        low_us = float(np.min(self.columns["pulse_width_us"], initial=np.inf))
+        source = self.noting(f"the lowest width, {low_us:.4g} µs, is taken as rest" if low_us > 0 else "").source
+        known = {"segment_names": self.names, "pulse_rate_hz": self.pulse_rate_hz, "source": source}
         return Record.from_arrays(**self.columns, **known, **more)  # pyright: ignore[reportArgumentType]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from h5py import h5a, h5d, h5f, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records.bounds import LARGEST_ROWS, LONGEST_TEXT, MOST_SEGMENTS, BadPiece, inflated
+from stimrig.identify.records.bounds import LARGEST_ROWS, LONGEST_PLAN, LONGEST_TEXT, MOST_SEGMENTS, BadPiece, inflated
 
 LARGEST_CHUNK_BYTES = 16 * 2**20
 MOST_CHUNKS = 100_000
@@ -97,12 +97,7 @@ FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 class StrictFile:
     """An HDF5 file that somebody else may have made, opened from its bytes.
 
-    Parameters
-    ----------
-    content : bytes
-        The whole file.
-    name : str
-        How messages call it.
+    `content`: the whole file; `name`: how messages call it.
     """
 
     def __init__(self, content: bytes, name: str) -> None:
@@ -111,10 +106,10 @@ class StrictFile:
             self._file = h5f.open_file_image(content)
             self._root = h5g.open(self._file, b"/")
 
-    def text(self, name: str, default: str | None = None) -> str:
-        """A text attribute of the root. Raises BadRecord: not there and no default, or no text."""
+    def text(self, name: str, default: str | None = None, longest: int = LONGEST_TEXT) -> str:
+        """A text attribute of the root. Raises BadRecord: not there and no default, no text, or longer."""
         value = self._attribute(name, default)
-        if not isinstance(value, str | bytes) or len(value) > LONGEST_TEXT:
+        if not isinstance(value, str | bytes) or len(value) > longest:
             raise self.bad("no text, or one without an end", f"attribute {name}")
         return _sound(value)
 
@@ -195,7 +190,7 @@ class StrictFile:
                 return default
             attribute = h5a.open(self._file, name.encode())
             kind = attribute.get_type()
-            known = kind.get_class() in (h5t.STRING, h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= 8 * LONGEST_TEXT
+            known = kind.get_class() in (h5t.STRING, h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= LONGEST_PLAN
             if not known or attribute.get_space().get_simple_extent_type() != h5s.SCALAR:
                 raise self.bad("no single number or text", f"attribute {name}")
             return h5py.File(self._file).attrs[name]

@@ -132,26 +132,14 @@ Pace = tuple[float, float]
 
 @dataclass(frozen=True)
 class JointMotion:
-    """How the joint moved, and what its sensor is like.
+    """How the joint moved, and what its sensor is like."""
 
-    Parameters
-    ----------
-    angle_rad, velocity_rad_s, acceleration_rad_s2 : ndarray, shape (N,)
-        At the record's samples.
-    noise_rad : ndarray, shape (P,)
-        White noise of a sample's angle in each part, rad.
-    jerk : ndarray, shape (P,)
-        Intensity of the white jerk in each part, rad²/s⁵.
-    step_rad : float
-        Steps in which the sensor tells the angle, rad; 0 where none are seen.
-    """
-
-    angle_rad: np.ndarray
+    angle_rad: np.ndarray  # shape (N,), as the next two; at the record's samples
     velocity_rad_s: np.ndarray
     acceleration_rad_s2: np.ndarray
-    noise_rad: np.ndarray
-    jerk: np.ndarray
-    step_rad: float = 0.0
+    noise_rad: np.ndarray  # shape (P,); white noise of a sample's angle in each part, rad
+    jerk: np.ndarray  # shape (P,); intensity of the white jerk in each part, rad²/s⁵
+    step_rad: float = 0.0  # steps in which the sensor tells the angle, rad; 0 where none are seen
 
     @classmethod
     def of(cls, time_s: np.ndarray, angle_rad: np.ndarray, first: Sequence[int] = (0,)) -> JointMotion:

@@ -52,12 +52,8 @@ class Sent:
 def locate_pulses(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[Pulses, np.ndarray]:
     """The pulses on their even slots with what they were late, and the samples that are doubted, bool, (N,).
 
-    Parameters
-    ----------
-    sent : Sent
-        What the host knows of them; may be none.
-    time_s, sync : array, shape (N,)
-        Of the samples: when they were taken, on the clock of the pulses, and the sync line (1: a pulse; 255: no line).
+    `sent`: what the host knows of them; may be none. `time_s`, `sync`: shape (N,); of the samples: when they were
+    taken, on the clock of the pulses, and the sync line (1: a pulse; 255: no line).
     """
     if not sent.planned_s.size:
         nothing = np.zeros(0)

@@ -35,27 +35,13 @@ WIDEST = 256
 
 @dataclass(frozen=True)
 class Readings:
-    """The readings behind the samples of a record that has fewer readings than samples, or coarse ones.
+    """The readings behind the samples of a record that has fewer readings than samples, or coarse ones."""
 
-    Parameters
-    ----------
-    kind : str
-        "held", "counts" (coarse), "interpolated" or "smoothed".
-    at : ndarray of int
-        Samples that are readings of their own, rising.
-    samples_each : float
-        Samples for each reading, at least 1.
-    count_nm : float
-        One count of a coarse converter, N·m; else 0.
-    held_s : float
-        How long a reading is held, s; 0 where none is, or where that is not known.
-    """
-
-    kind: str
-    at: np.ndarray
-    samples_each: float
-    count_nm: float = 0.0
-    held_s: float = 0.0
+    kind: str  # "held", "counts" (coarse), "interpolated" or "smoothed"
+    at: np.ndarray  # samples that are readings of their own, rising
+    samples_each: float  # samples for each reading, at least 1
+    count_nm: float = 0.0  # one count of a coarse converter, N·m; else 0
+    held_s: float = 0.0  # how long a reading is held, s; 0 where none is, or where that is not known
 
     @property
     def words(self) -> str:
@@ -111,12 +97,7 @@ def _held(size: int, changes: np.ndarray, step_nm: np.ndarray) -> Readings:
 def smoothed_readings(torque_nm: np.ndarray, rests: np.ndarray) -> Readings | None:
     """Readings apart of a torque whose noise was smoothed; None if it was not, or if that cannot be told.
 
-    Parameters
-    ----------
-    torque_nm : ndarray, shape (N,)
-        Torque without mains hum, N·m.
-    rests : ndarray of bool, shape (N,)
-        Samples at which the muscle rests.
+    `torque_nm`: shape (N,); torque without mains hum, N·m. `rests`: shape (N,); samples at which the muscle rests.
     """
     found, apart = [], 1
     while 3 * apart < torque_nm.size and apart <= WIDEST:

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from stimrig.identify.records.joint_motion import JointMotion
 
 HELD_OUT = "validate"
-"""Rows of this segment are never used to fit or to choose an effect; they may only speak against one."""
+"""Rows of this segment are never used to fit or to choose an effect; they may only speak against one. Another case, or
+blanks around it, make no other segment."""
 NEEDED = ("time_s", "pulse_width_us", "torque_nm")
 OPTIONAL = ("angle_rad", "velocity_rad_s", "late_s", "doubted")
 """Every column that a record may have or not: what cuts, joins or copies records goes by these lists and loses none."""
@@ -53,96 +54,48 @@ def joined_source(parts: Sequence[Source], name: str = "joined", sha256: str = "
 
 @dataclass(frozen=True)
 class Part:
-    """One of the recordings that a record is made of.
+    """One of the recordings that a record is made of."""
 
-    Parameters
-    ----------
-    first : int
-        Index of its first sample in the record.
-    own_s : float
-        Time of that sample on the part's own clock, s.
-    begun_s : float or None
-        When that clock was 0, as Unix time, where it is known.
-    pause_s : float
-        The true pause before it, s, in whole pulse intervals; at most a day; 0 before the first, and where not known.
-    folded_s : float
-        What of that pause there is in `time_s`, s, in whole pulse intervals; at most `pause_s`.
-    """
-
-    first: int = 0
-    own_s: float = 0.0
-    begun_s: float | None = None
+    first: int = 0  # index of its first sample in the record
+    own_s: float = 0.0  # time of that sample on the part's own clock, s
+    begun_s: float | None = None  # when that clock was 0, as Unix time, where it is known
     pause_s: float = 0.0
-    folded_s: float = 0.0
+    """The true pause before it, s, in whole pulse intervals; at most a day; 0 before the first, and where not known."""
+    folded_s: float = 0.0  # what of that pause there is in `time_s`, s, in whole pulse intervals; at most `pause_s`
 
 
 @dataclass(frozen=True)
 class Pulses:
-    """The pulses themselves, for the times at which a record has no samples.
+    """The pulses themselves, for the times at which a record has no samples."""
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (P,)
-        Even slot of each, s, rising.
-    width_us : ndarray, shape (P,)
-        Width felt, µs; 0 where there was none.
-    late_s : ndarray, shape (P,)
-        By how much later than its slot it was felt, s.
-    lost : ndarray of bool, shape (P,)
-        Planned, and not sent.
-    """
-
-    time_s: np.ndarray
-    width_us: np.ndarray
-    late_s: np.ndarray
-    lost: np.ndarray
+    time_s: np.ndarray  # shape (P,); even slot of each, s, rising
+    width_us: np.ndarray  # shape (P,); width felt, µs; 0 where there was none
+    late_s: np.ndarray  # shape (P,); by how much later than its slot it was felt, s
+    lost: np.ndarray  # shape (P,); planned, and not sent
 
 
 @dataclass(frozen=True, repr=False)
 class Record(Summarised):
-    """Pulse widths applied and torque measured, uniformly sampled.
+    """Pulse widths applied and torque measured, uniformly sampled."""
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (N,)
-        Sample times, s, strictly increasing and uniform.
-    pulse_width_us : ndarray, shape (N,)
-        Pulse width in force at each sample, µs, held between pulses.
-    torque_nm : ndarray, shape (N,)
-        Measured torque, N·m.
-    segment : ndarray of int, shape (N,)
-        Index into `segment_names` for each sample.
-    segment_names : tuple of str
-        One name for each contiguous run of rows; a name may occur several times.
-    angle_rad, velocity_rad_s : ndarray or None, shape (N,)
-        Joint angle, rad, and angular velocity, rad/s, as they were recorded: `motion` is what is reckoned with.
-    late_s : ndarray or None, shape (N,)
-        By how much later than its even slot the pulse in force was felt, s; may be slightly negative.
-    doubted : ndarray of bool or None, shape (N,)
-        Samples in which it is not known what was felt: never used to fit or to choose, and the error there not counted.
-    pulses : Pulses or None
-        What was applied while there were no samples, where it is known.
-    pulse_rate_hz : float
-        Pulses a second.
-    source : Source
-        Origin.
-    parts : tuple of Part
-        The recordings it is made of, in order; one, except for a joined record.
-    """
-
-    time_s: np.ndarray
-    pulse_width_us: np.ndarray
-    torque_nm: np.ndarray
-    segment: np.ndarray
-    segment_names: tuple[str, ...]
+    time_s: np.ndarray  # shape (N,); sample times, s, strictly increasing and uniform
+    pulse_width_us: np.ndarray  # shape (N,); pulse width in force at each sample, µs, held between pulses
+    torque_nm: np.ndarray  # shape (N,); measured torque, N·m
+    segment: np.ndarray  # shape (N,); index into `segment_names` for each sample
+    segment_names: tuple[str, ...]  # one name for each contiguous run of rows; a name may occur several times
     angle_rad: np.ndarray | None = None
     velocity_rad_s: np.ndarray | None = None
+    """Shape (N,); joint angle, rad, and angular velocity, rad/s, as they were recorded: `motion` is what is reckoned
+    with."""
     late_s: np.ndarray | None = None
+    """Shape (N,); by how much later than its even slot the pulse in force was felt, s; may be slightly negative."""
     doubted: np.ndarray | None = None
-    pulses: Pulses | None = None
-    pulse_rate_hz: float = 40.0
-    source: Source = field(default_factory=Source)
-    parts: tuple[Part, ...] = (Part(),)
+    """Shape (N,); samples in which it is not known what was felt: never used to fit or to choose, and the error there
+    not counted."""
+    pulses: Pulses | None = None  # what was applied while there were no samples, where it is known
+    pulse_rate_hz: float = 40.0  # pulses a second
+    source: Source = field(default_factory=Source)  # origin
+    parts: tuple[Part, ...] = (Part(),)  # the recordings it is made of, in order; one, except for a joined record
 
     @classmethod
     def from_arrays(
@@ -171,7 +124,8 @@ class Record(Summarised):
         """
         time_s = np.ascontiguousarray(time_s, float)
         size = time_s.size
-        code, known = _coded(size, segment, segment_names)
+        code, known, note = _coded(size, segment, segment_names)
+        source = source or Source()
         columns = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": code, "angle_rad": angle_rad}
         columns |= {"velocity_rad_s": velocity_rad_s, "late_s": late_s, "doubted": doubted}
         optional: dict[str, np.ndarray] = {}
@@ -192,7 +146,7 @@ class Record(Summarised):
             segment_names=tuple(known[index] for index in code[changed]),
             pulses=pulses,
             pulse_rate_hz=pulse_rate_hz,
-            source=source or Source(),
+            source=replace(source, notes=(*source.notes, note)) if note else source,
             parts=tuple(parts),
             **optional,
         )
@@ -317,16 +271,19 @@ def _checked(label: str, column: np.ndarray) -> np.ndarray:
 
 def _coded(
     size: int, segment: np.ndarray | list[str] | None, names: Sequence[str] | None
-) -> tuple[np.ndarray, list[str]]:
-    """A number for each row's segment, the same for the same name, and the names by number."""
+) -> tuple[np.ndarray, list[str], str]:
+    """A number for each row's segment, the same for the same name; the names by number; what to say of them."""
     if segment is None:
-        return np.zeros(size, np.int64), ["prbs"]
+        return np.zeros(size, np.int64), ["prbs"], ""
     if names is None:
-        known, code = np.unique(np.asarray(segment, dtype=str), return_inverse=True)
-        return code.reshape(np.shape(segment)), [str(name) for name in known]
-    first = {name: index for index, name in reversed(list(enumerate(names)))}
-    same = np.array([first[name] for name in names], np.int64)
-    return same[np.asarray(segment, np.int64)], [str(name) for name in names]
+        unique, code = np.unique(np.asarray(segment, dtype=str), return_inverse=True)
+        names, segment = [str(name) for name in unique], code.reshape(np.shape(segment))
+    known = [HELD_OUT if name.strip().lower() == HELD_OUT else str(name) for name in names]
+    first = {name: index for index, name in reversed(list(enumerate(known)))}
+    same = np.array([first[name] for name in known], np.int64)
+    other = dict.fromkeys(name for name, own in zip(names, known, strict=True) if name != own)
+    note = f"segment {', '.join(map(repr, other))} is taken as {HELD_OUT}" if other else ""
+    return same[np.asarray(segment, np.int64)], known, note
 
 
 def _from_to(values: np.ndarray, unit: str) -> str:

@@ -13,18 +13,10 @@ from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis, SplineB
 
 @dataclass(frozen=True)
 class Curve:
-    """f(u) = sum of coefficients times basis functions, N·m.
+    """f(u) = sum of coefficients times basis functions, N·m."""
 
-    Parameters
-    ----------
-    basis : Basis
-        Functions of the pulse width.
-    coefficients_nm : ndarray, shape (basis.size,)
-        N·m.
-    """
-
-    basis: Basis
-    coefficients_nm: np.ndarray
+    basis: Basis  # functions of the pulse width
+    coefficients_nm: np.ndarray  # shape (basis.size,), N·m
 
     def __call__(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Torque at steady state for pulse widths of any shape, N·m, or a derivative by the pulse width, N·m/µs."""
@@ -111,12 +103,8 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
 
     A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients.
 
-    Parameters
-    ----------
-    curve : Curve
-        f(u); where it falls, its plateau is below zero.
-    covariance_nm2 : ndarray, shape (basis.size, basis.size), optional
-        Covariance of the coefficients, N²·m².
+    `curve`: f(u); where it falls, its plateau is below zero. `covariance_nm2`: shape (basis.size, basis.size);
+    covariance of the coefficients, N²·m².
     """
     width_us, torque_nm = curve.table()
     top = int(np.argmax(np.abs(torque_nm)))
@@ -168,14 +156,8 @@ def fit_shape(
 ) -> SigmoidBasis:
     """Least-squares estimate of the two shape parameters: a coarse scan, then a bounded trust-region search.
 
-    Parameters
-    ----------
-    residual_of : callable
-        Gives the residual for a shape, with all linear parameters solved for.
-    largest_us : float
-        Largest pulse width.
-    seen_us : ndarray
-        Pulse widths that were applied, µs; they bound the middle.
+    `residual_of`: gives the residual for a shape, with all linear parameters solved for. `largest_us`: largest pulse
+    width. `seen_us`: pulse widths that were applied, µs; they bound the middle.
     """
     from scipy.optimize import least_squares
 

@@ -17,14 +17,9 @@ class SplineBasis:
     They are the same functions as in equation (8) of the paper. The cubes |u - u_i|³ used there are nearly collinear,
     and their normal equations lose half of the digits; B-splines lose none. f(0) = 0 holds because the one B-spline
     that is not zero there is left out.
-
-    Parameters
-    ----------
-    knots_us : ndarray, shape (m,)
-        Strictly increasing, µs, first 0, last the largest pulse width.
     """
 
-    knots_us: np.ndarray
+    knots_us: np.ndarray  # shape (m,); strictly increasing, µs, first 0, last the largest pulse width
 
     @property
     def size(self) -> int:
@@ -108,18 +103,11 @@ def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 
 
 @dataclass(frozen=True)
 class PowerBasis:
-    """Powers 1 … size of u / largest_us.
+    """Powers 1 … size of u / largest_us."""
 
-    Parameters
-    ----------
-    size : int
-        Highest power, and so the number of coefficients.
-    largest_us : float
-        Pulse width beyond which the curve is held, µs. It is scaled to 1, so that all powers have a similar size.
-    """
-
-    size: int
+    size: int  # highest power, and so the number of coefficients
     largest_us: float
+    """Pulse width beyond which the curve is held, µs. It is scaled to 1, so that all powers have a similar size."""
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Powers (or a derivative) at pulse widths of any shape; shape (..., size)."""
@@ -136,21 +124,11 @@ class PowerBasis:
 
 @dataclass(frozen=True)
 class SigmoidBasis:
-    """The sigmoid of equation (30) with its two shape parameters fixed: one coefficient, the gain a1 in N·m.
+    """The sigmoid of equation (30) with its two shape parameters fixed: one coefficient, the gain a1 in N·m."""
 
-    Parameters
-    ----------
-    a2_per_us : float
-        Steepness, 1/µs, positive.
-    a3 : float
-        Position: half of the gain is reached where e^{a2 u} = a3 + 2.
-    largest_us : float
-        Largest pulse width it was fitted on, µs.
-    """
-
-    a2_per_us: float
-    a3: float
-    largest_us: float = 300.0
+    a2_per_us: float  # steepness, 1/µs, positive
+    a3: float  # position: half of the gain is reached where e^{a2 u} = a3 + 2
+    largest_us: float = 300.0  # largest pulse width it was fitted on, µs
     size: int = field(default=1, init=False)
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:

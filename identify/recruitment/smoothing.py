@@ -62,14 +62,8 @@ def spline_roughness(
     where the curve bends: it follows the third derivative of a pilot, or else the spacing of the knots. So a rise
     within a few µs does not make the plateau rough.
 
-    Parameters
-    ----------
-    basis : SplineBasis
-        The spline that is penalised.
-    pilot : tuple of SplineBasis and ndarray, optional
-        Basis and coefficients of a first estimate.
-    order : int
-        Derivative that the penalty keeps small, 3 or 2 (see `bending_order`).
+    `basis`: the spline that is penalised; `pilot`: basis and coefficients of a first estimate; `order`: derivative that
+    the penalty keeps small, 3 or 2 (see `bending_order`).
     """
     if order == 2:
         return basis.roughness * basis.largest_us**3

@@ -117,7 +117,7 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
 
 
 def _foreseen(model: Muscle, record: Record, problem: Problem, theta: np.ndarray) -> np.ndarray:
-    """Torque at the samples; on held-out rows of its own record without what cannot be foreseen."""
+    """Torque at the samples; on held-out pulses of its own record without what cannot be foreseen."""
     whole, own = problem.at_samples(theta), unforeseen(model)
     if not own or not same_data(model, record):
         return whole
@@ -241,7 +241,7 @@ def states_of(model: Muscle) -> dict[str, float]:
     """
     given = {entry["id"]: entry["state"] for entry in model.effects if "state" in entry}
     for effect, value in given.items():
-        model_schema.EFFECT_STATE(value, f"effects.{effect}.state")
+        model_schema.check(value, model_schema.STATE, f"effects.{effect}.state")
     return given
 
 

@@ -54,12 +54,8 @@ class Problem:
 
     `theta` holds parameters on the scale on which they are varied: logarithms for those of scale "log".
 
-    Parameters
-    ----------
-    setup : Setup
-        What all candidates of a record share.
-    effects : list of (str, Form)
-        Effects by id, each in one form, in the order in which they were added.
+    `setup`: what all candidates of a record share; `effects`: effects by id, each in one form, in the order in which
+    they were added.
     """
 
     def __init__(self, setup: Setup, effects: list[tuple[str, Form]]) -> None:

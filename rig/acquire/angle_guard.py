@@ -41,12 +41,7 @@ LEAVING = 2.0
 class AngleGuard:
     """The angle sensor during one test. Of a plan that asks nothing only whether the sensor can be believed is noted.
 
-    Parameters
-    ----------
-    receiver
-        None: the rig has no angle sensor.
-    table
-        The tightest of rig file, profile and plan.
+    `receiver`: None: the rig has no angle sensor; `table`: the tightest of rig file, profile and plan.
     """
 
     def __init__(
@@ -217,12 +212,8 @@ async def await_angle(receiver: AngleReceiver, tasks: Tasks) -> None:
 def check_start(receiver: AngleReceiver, plan: TestPlan, table: dict[str, Limit], clock: Clock) -> None:
     """Check where the joint is before a test that asks for its angle.
 
-    Raises
-    ------
-    DeviceError
-        No angle arrives.
-    RefusedError
-        It is outside the range, or away from the target; says by how much.
+    Raises DeviceError: no angle arrives. RefusedError: it is outside the range, or away from the target; says by how
+    much.
     """
     if plan.angle is None:
         return

@@ -44,10 +44,7 @@ async def watch_decay(
 ) -> tuple[bool, str]:
     """Wait until the torque has fallen to half or close to rest, or until the time for that is over.
 
-    Parameters
-    ----------
-    rest_nm, at_stop_nm
-        Torque right before the first pulse and at the stop, N·m; None if unknown.
+    `rest_nm`, `at_stop_nm`: torque right before the first pulse and at the stop, N·m; None if unknown.
     """
     if gate.last_pulse_s is None:
         return True, "no pulse had been sent"

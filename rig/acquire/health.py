@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pydantic import BaseModel, ConfigDict, Field
 
 from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.acquire.stream import LOOK_AT
 from stimrig.rig.clock import Clock
 from stimrig.rig.errors import JournalError
 from stimrig.rig.gate import Gate
@@ -35,6 +36,7 @@ class Watch(BaseModel):
     missing_ack_s: float = Field(0.1, gt=0, le=0.5)
     late_pulse_periods: float = Field(0.15, gt=0, le=0.6)
     stuck_torque_s: float = Field(0.5, gt=0.05, le=10)
+    unmoved_torque_s: float = Field(10.0, gt=0.5, le=3600)
     clipped_torque_s: float = Field(3.0, gt=0.05, le=10)
     stale_disk_s: float = Field(3.0, gt=0.5, le=10)
     stale_angle_s: float = Field(0.1, gt=0, le=0.5)
@@ -96,19 +98,20 @@ class Health:
         self._gate, self._receiver, self._disk, self._clock, self._watch = gate, receiver, disk, clock, watch
         self._angle = angle
 
+    def doubt(self) -> tuple[str, float] | None:
+        """Why the first pulse may not come yet, and for how long it may be waited for; see `Receiver.doubt`."""
+        return self._receiver.doubt(self._watch.stuck_torque_s, self._watch.unmoved_torque_s)
+
     def fault(self, stood_s: float = 0.0) -> str | None:
         """What is wrong, in words; None: all checks pass.
 
-        Parameters
-        ----------
-        stood_s
-            Real seconds for which this computer has just stood still: what came meanwhile could not be taken, so a
-            silence counts without them.
+        `stood_s`: real seconds for which this computer has just stood still: what came meanwhile could not be taken, so
+        a silence counts without them.
         """
         now_s, speed, watch = self._clock.now_s(), self._clock.speed, self._watch
         age_s = self._receiver.age_s(now_s) / speed - stood_s
         if not (age_s <= watch.stale_torque_s):
-            return f"load cell: torque is stale, the newest sample is {age_s * 1e3:.0f} ms old"
+            return f"load cell: torque is stale, the newest sample is {age_s * 1e3:.0f} ms old; {LOOK_AT}"
         if (wrong := self._angle(stood_s)) is not None:
             return wrong
         pulse = self._gate.on_its_way

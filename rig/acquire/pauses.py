@@ -31,13 +31,7 @@ POLL_S = 0.005
 
 
 class Pauses:
-    """Those of one test.
-
-    Parameters
-    ----------
-    halt
-        Set when the test is being ended.
-    """
+    """Those of one test. `halt`: set when the test is being ended."""
 
     def __init__(
         self, health: Health, gate: Gate, receiver: Receiver, journal: Journal, machine: Machine, halt: Signal
@@ -50,7 +44,7 @@ class Pauses:
         """When the newest one ended, rig time."""
         self.all: list[Pause] = []
 
-    async def fault(self, due_s: float, t0_s: float) -> str | None:
+    async def fault(self, due_s: float, t0_s: float, first: bool = False) -> str | None:
         """What must end the test before the pulse that is due; None: nothing, or it is being ended.
 
         After a standstill it returns once all is whole again.
@@ -61,23 +55,31 @@ class Pauses:
             When the sender should have asked. What came due in a pause is not asked about again.
         t0_s
             Start of the test's clock.
+        first
+            Whether the first pulse is due: with a doubt of the torque it waits as after a standstill.
         """
         if due_s < self.until_s:
             return None
         stood_s = self._since(due_s)
-        if stood_s <= BLOCKED_S and self._health.fault() is None:
+        if stood_s <= BLOCKED_S and self._health.fault() is None and not (first and self._health.doubt()):
             return None
-        return self._too_much(stood_s, due_s) or await self._sit_out(stood_s, due_s, t0_s)
+        return self._too_much(stood_s, due_s) or await self._sit_out(stood_s, due_s, t0_s, first)
 
-    async def _sit_out(self, stood_s: float, due_s: float, t0_s: float) -> str | None:
+    async def _sit_out(self, stood_s: float, due_s: float, t0_s: float, first: bool) -> str | None:
         """Wait until all is whole at one moment. Nothing is sent meanwhile, and the device's watchdog is not fed.
 
         The stimulator is asked beside it: who stops waits for no answer of it.
         """
         longest_s, cause = stood_s, self._machine.blocked_by(stood_s)
         asked = self._tasks.spawn(self._gate.changed(), "stimulator after a pause")
-        while not (asked.done.is_set() and self._receiver.settled() and self._health.fault() is None):
-            if self._since(due_s) > LONGEST_S + RECOVERY_S:
+        while True:
+            doubt = self._health.doubt() if first else None
+            if asked.done.is_set() and self._receiver.settled() and doubt is None and self._health.fault() is None:
+                break
+            waited_s = self._since(due_s)
+            if doubt is not None and waited_s >= min(doubt[1], LONGEST_S + RECOVERY_S):
+                return doubt[0]
+            if waited_s > LONGEST_S + RECOVERY_S:
                 return self._health.fault() or "not everything was in order again soon after the computer was blocked"
             looked_s = self._clock.now_s()
             if await self._tasks.sleep(POLL_S, self._halt):

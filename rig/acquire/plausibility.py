@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig.acquire.stream import steps_from
+from stimrig.rig.acquire.stream import LOOK_AT, steps_from
 from stimrig.rig.align import RATE_TOLERANCE
 
 RATE_WINDOW_S = 3.0
@@ -52,12 +52,8 @@ class RateCheck:
     def fault(self, count: int, number: int, now_s: float) -> str | None:
         """What is wrong with the rate; None: nothing.
 
-        Parameters
-        ----------
-        count, number
-            Of samples in this block; of its last sample, -1 if the device counts none.
-        now_s
-            When the block arrived.
+        `count`, `number`: of samples in this block; of its last sample, -1 if the device counts none. `now_s`: when the
+        block arrived.
         """
         if self._anew:
             self._anew, self._from_s, self._prompt = False, None, []
@@ -206,7 +202,7 @@ class PlausibilityCheck:
         text = f"load cell: its value has stayed at exactly {torque_nm[0]:.3f} N·m"
         if at_end:
             return f"{text}, the end of its range, for too long: higher torque is not seen; widen it or stimulate less"
-        return f"{text}; it is stuck, check its amplifier"
+        return f"{text}; it is stuck: check its amplifier, and {LOOK_AT}"
 
 
 class _Rail:

@@ -5,6 +5,7 @@ It reports at once a torque outside its limit or one that is not a number.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stimrig.rig.acquire.stream import Stream
+from stimrig.rig.acquire.stream import LOOK_AT, SETTLE_S, SETTLING_S, Stream
 from stimrig.rig.devices import LoadCell
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.signals import Recorded
@@ -40,7 +41,37 @@ class TorqueTime:
         self._last_s = time_s
 
 
+class Stillness:
+    """Whether a value that stands exactly still is odd for this cell: a bridge without its plug gives a constant.
+
+    A coarse cell of a limb at rest stands still, too. It did so before, so nothing is odd about it.
+    """
+
+    def __init__(self) -> None:
+        self.since_s: float | None = None
+        """When it began to stand, rig time; None: it changes."""
+        self.ever_changed = False
+        self._changed: deque[bool] = deque(maxlen=200)
+        """Of the newest blocks; of each standstill only the beginning."""
+
+    @property
+    def restless(self) -> bool:
+        """Whether most blocks before this standstill brought a change."""
+        return 2 * sum(self._changed) > len(self._changed)
+
+    def add(self, changes: bool, now_s: float, brief_s: float) -> None:
+        """A block of samples; `brief_s`: of how much of a standstill the blocks count, rig seconds."""
+        self.ever_changed |= changes
+        self.since_s = None if changes else now_s if self.since_s is None else self.since_s
+        if self.since_s is None or now_s - self.since_s <= brief_s:
+            self._changed.append(changes)
+
+
 LIVE_BLOCKS = 4000
+FRESH_S = 0.5
+"""Real seconds to wait for a new torque sample before arming."""
+LATEST_S = 0.1
+"""Age of the newest sample before the first pulse, real seconds, also where the rig file allows more in a test."""
 RANGE_MEAN_S = 0.01
 """Seconds of torque of which one mean counts for the range: less noise than in single samples."""
 
@@ -58,6 +89,8 @@ class Receiver(Stream):
         self._unaveraged_nm = np.empty(0)
         self.live: deque[NDArray[Any]] = deque(maxlen=LIVE_BLOCKS)
         self.recent: deque[tuple[float, float]] = deque(maxlen=400)
+        self._stillness = Stillness()
+        self._opened_s = self._clock.now_s()
 
     def record(
         self,
@@ -90,6 +123,38 @@ class Receiver(Stream):
         means_nm = [torque for _, torque in tuple(self.recent)]
         return int(np.sum(np.abs(np.diff(means_nm)) > 1e-9))  # means of equal samples differ by rounding
 
+    def doubt(self, stuck_s: float, unmoved_s: float) -> tuple[str, float] | None:
+        """Why no pulse may come yet: what arrives may not be the torque of now; None: it is.
+
+        Parameters
+        ----------
+        stuck_s, unmoved_s
+            Of `Watch`: how long a restless cell may stand still, and one that never gave another value; real seconds.
+
+        Returns
+        -------
+        tuple of str and float
+            In words, with what to look at; and for how many real seconds it may be waited for.
+        """
+        now_s, speed, still = self._clock.now_s(), self._clock.speed, self._stillness
+        age_s = self.age_s(now_s) / speed
+        if not math.isfinite(age_s):
+            return f"no torque has come from the load cell on {self._place} yet: {LOOK_AT}", FRESH_S
+        if not (age_s <= LATEST_S):
+            return f"no torque from the load cell on {self._place} for {age_s:.1f} s: {LOOK_AT}", FRESH_S
+        same_nm, stood_s = self.last_torque_nm, (now_s - (still.since_s or self._opened_s)) / speed
+        if not still.ever_changed and stood_s > unmoved_s:
+            return (
+                f"the load cell on {self._place} has given exactly {same_nm:.3f} N·m since it was connected: pull at "
+                f"it, the value must follow; if not, {LOOK_AT}"
+            ), 0.0
+        if still.restless and still.since_s is not None and stood_s > SETTLING_S:
+            words = f"the load cell on {self._place} has given exactly {same_nm:.3f} N·m for {stood_s:.1f} s: {LOOK_AT}"
+            return words, 0.0 if stood_s >= stuck_s else math.inf
+        if now_s - self.error_s <= SETTLING_S * speed:
+            return f"the adapter of the load cell on {self._place} reports errors of the bus: {LOOK_AT}", SETTLE_S
+        return None
+
     def _keep(self, samples: NDArray[Any]) -> None:
         self._remember(samples)
         self._write(Kind.TORQUE, samples)
@@ -98,6 +163,9 @@ class Receiver(Stream):
 
     def _remember(self, samples: NDArray[Any]) -> None:
         now_s, mean_nm = float(samples["host_time_s"][-1]), float(samples["torque_nm"].mean())
+        before_nm = samples["torque_nm"][0] if self.last_torque_nm is None else self.last_torque_nm
+        changes = bool((samples["torque_nm"] != before_nm).any())
+        self._stillness.add(changes, now_s, SETTLING_S * self._clock.speed)
         self.last_torque_nm = float(samples["torque_nm"][-1])
         self.recent.append((now_s, mean_nm))
         self.torque_time.add(now_s, mean_nm)

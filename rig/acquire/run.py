@@ -21,7 +21,8 @@ from stimrig.rig.acquire.evidence import AROUND_S, stop_device, watch_decay
 from stimrig.rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
 from stimrig.rig.acquire.pauses import Pauses
 from stimrig.rig.acquire.plausibility import PlausibilityCheck
-from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.acquire.receiver import FRESH_S, Receiver
+from stimrig.rig.acquire.stream import SETTLE_S
 from stimrig.rig.clock import Clock
 from stimrig.rig.errors import DeviceError, JournalError
 from stimrig.rig.gate import Gate
@@ -72,10 +73,9 @@ log = logging.getLogger("rig.run")
 
 LEAD_S = 0.1
 """Real seconds between arming and the first deadline."""
-SETTLE_S = 3.0
-"""Real seconds to wait until a backlog in buffers has been read."""
-FRESH_S = 0.5
-"""Real seconds to wait for a new torque sample before arming."""
+POLL_S = 0.005
+LONGEST_LOOK_S = 0.05
+"""Real seconds that count at most between two looks: a computer that stood still has not waited for a device."""
 
 
 @dataclass(slots=True)
@@ -166,7 +166,7 @@ class TestRun:
         health = Health(self.gate, self._receiver, disk, self._clock, self._watch, self._angle.fault)
         self.pauses = Pauses(health, self.gate, self._receiver, self.journal, self._machine, self.halt.signal)
         try:
-            if await self._arm():
+            if await self._arm(health):
                 with self._machine.undisturbed():
                     await self._play(self.pauses)
         except (DeviceError, JournalError) as error:
@@ -211,22 +211,22 @@ class TestRun:
     def _fault(self, reason: str) -> None:
         self.halt.set("fault", reason)
 
-    async def _arm(self) -> bool:
-        speed = self._clock.speed
-        began_s = self._clock.now_s()
+    async def _arm(self, health: Health) -> bool:
+        """Wait until every sensor that this test relies on gives whole samples of now."""
+        waited_s = 0.0
         while not self.halt.signal.is_set():
-            fresh = self._receiver.age_s(self._clock.now_s()) <= self._watch.stale_torque_s * speed
-            settled, seen = fresh and self._receiver.settled(), self._angle.fresh()
-            if settled and seen:
+            doubt, seen = health.doubt(), self._angle.fresh()
+            if doubt is None and seen and self._receiver.settled():
                 return await self._open_gate()
-            waited_s = (self._clock.now_s() - began_s) / speed
-            if not fresh and waited_s >= FRESH_S:
-                self._fault("load cell: no torque arrived before the test; check its cable and power supply")
+            if doubt is not None and waited_s >= doubt[1]:
+                self._fault(doubt[0])
             if not seen and waited_s >= FRESH_S:
                 self._fault(self._angle.fault() or "angle sensor: no angle arrived before the test; check its cable")
             if waited_s >= SETTLE_S:
                 self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
-            await self._tasks.sleep(0.005, self.halt.signal)
+            looked_s = self._clock.now_s()
+            await self._tasks.sleep(POLL_S, self.halt.signal)
+            waited_s += min((self._clock.now_s() - looked_s) / self._clock.speed, LONGEST_LOOK_S)
         return False
 
     async def _open_gate(self) -> bool:
@@ -248,12 +248,13 @@ class TestRun:
         index, resting, rise = 0, True, Rise(self._table["width_rise_us"].hi, self.plan.pulse_rate_hz)
         while (width_us := self.score.pulse(index, self.torque_time_nms)) is not None:
             due_s = t0_s + index * period_s
-            if resting and width_us > 0:
+            first = resting and width_us > 0
+            if first:
                 resting = False
                 self._at_rest()
             if await self._tasks.wait(due_s - self._machine.head_start_s * clock.speed, self.halt.signal):
                 return
-            if (wrong := await pauses.fault(due_s, t0_s)) is not None:
+            if (wrong := await pauses.fault(due_s, t0_s, first)) is not None:
                 self._fault(wrong)
             if self.halt.signal.is_set():
                 return
@@ -364,10 +365,7 @@ CLIMB = 10
 class Rise:
     """How wide the next pulse may be: after pulses that were left out the width climbs back within the limit.
 
-    Parameters
-    ----------
-    most_us
-        The largest step from one pulse to the next, µs.
+    `most_us`: the largest step from one pulse to the next, µs.
     """
 
     def __init__(self, most_us: float, pulse_rate_hz: float) -> None:

@@ -33,6 +33,10 @@ then use a whole processor."""
 LONGEST_READ_S = 0.25
 """Real seconds for which one reading counts at most: a machine that stood still did not read."""
 SETTLING_S = 0.1
+SETTLE_S = 3.0
+"""Real seconds to wait until a backlog in buffers has been read, and no errors come."""
+LOOK_AT = "look at its plug and supply, and at the CAN adapter"
+"""What a person does about a sensor from which nothing comes."""
 BACKLOG_RATE = 1.6
 BEHIND_S = 0.1
 """Real seconds by which the newest sample may be later than the promptest one of the last `PROMPT_S` real seconds. A
@@ -88,12 +92,7 @@ def steps_from(before: float, values: NDArray[Any]) -> NDArray[Any]:
 class Stream:
     """Base of the receivers.
 
-    Parameters
-    ----------
-    source
-        A device that is not open yet.
-    on_lost
-        Called once, with the reason, when the device is gone.
+    `source`: a device that is not open yet; `on_lost`: called once, with the reason, when the device is gone.
     """
 
     def __init__(self, name: str, source: Sensor, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
@@ -114,6 +113,9 @@ class Stream:
         self._rate: deque[tuple[float, int, float]] = deque(maxlen=2000)
         self._total = 0
         self.counts = Recorded()
+        self.error_s = -math.inf
+        """When the adapter last reported an error of the bus, rig time."""
+        self._place = "its bus"
         self.last_s: float | None = None
         self.last_unix_s: float | None = None
 
@@ -127,6 +129,7 @@ class Stream:
         await self._ended()
         self._lost.clear()
         identity = await self._source.open(self._receive, self._lose)
+        self._place = identity.get("bus", self._place)
         self._watch = self._tasks.spawn(self._watch_silence(), f"{self._name} receiver")
         return identity
 
@@ -184,6 +187,8 @@ class Stream:
         """Process one block from the device: unwrap, record, check."""
         self.counts.malformed_frames += block.malformed
         self.counts.error_frames += block.error_frames
+        if block.error_frames:
+            self.error_s = self._clock.now_s()
         if len(block) == 0:
             return
         samples = self._placed(block.samples)
@@ -204,14 +209,8 @@ class Stream:
     ) -> None:
         """From now on write and check every sample.
 
-        Parameters
-        ----------
-        wrong
-            Says of a block what is wrong with it, None: nothing.
-        on_fault
-            Called with that, at once.
-        on_broken
-            Called if the journal cannot be written.
+        `wrong`: says of a block what is wrong with it, None: nothing; `on_fault`: called with that, at once;
+        `on_broken`: called if the journal cannot be written.
         """
         self._journal, self._wrong, self._on_fault, self._on_broken = journal, wrong, on_fault, on_broken
         self.counts = Recorded()
@@ -298,7 +297,7 @@ class Stream:
             looked_s = min(self._clock.now_s() - began_s, LONGEST_READ_S * self._clock.speed)
             silent_s = silent_s + looked_s if self.last_s == newest_s else 0.0  # frames that repeat are silence, too
             if silent_s > SILENCE_S * self._clock.speed:
-                self._lose(f"{self._name}: silent for {SILENCE_S:g} s; check its cable and supply")
+                self._lose(f"{self._name} on {self._place}: silent for {SILENCE_S:g} s; {LOOK_AT}")
 
     def _lose(self, reason: str) -> None:
         if not (self._closing.is_set() or self._lost.is_set()):

@@ -83,12 +83,7 @@ class Previews(Builder):
     async def reply(self, line: bytes, angle_set_at_utc: str | None = None) -> bytes:
         """Reply to a preview request; both are one line of JSON. `angle_set_at_utc`: see `check_range`.
 
-        Raises
-        ------
-        BusyError
-            Too many requests are waiting.
-        PlanError
-            It took too much memory.
+        Raises BusyError: too many requests are waiting. PlanError: it took too much memory.
         """
         if self._waiting >= MAX_WAITING:
             raise BusyError(f"previews: {self._waiting} requests are waiting; try again in a moment")

@@ -80,12 +80,7 @@ _registering = threading.Lock()
 class CanBus:
     """See `stimrig.rig.machine.Bus`.
 
-    Parameters
-    ----------
-    arguments
-        Of can.Bus.
-    name
-        Of the device that opens it, in words; with `_` it is its table in the rig file.
+    `arguments`: of can.Bus. `name`: of the device that opens it, in words; with `_` it is its table in the rig file.
     """
 
     def __init__(

@@ -96,14 +96,8 @@ class AngleCalibrating:
     async def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit, first: bool = False) -> bool:
         """Take a pose; True if it completed a calibration. `first`: it begins anew, whichever one waits.
 
-        Raises
-        ------
-        RefusedError
-            No angle of a joint, the joint moved, or the two poses do not fit each other.
-        DeviceError
-            The sensor gives no angle.
-        RigError
-            The calibration could not be stored: the old one holds.
+        Raises RefusedError: no angle of a joint, the joint moved, or the two poses do not fit each other. DeviceError:
+        the sensor gives no angle. RigError: the calibration could not be stored: the old one holds.
         """
         refuse(bound, angle_rad, "angle_pose")
         pose = AnglePose(angle_rad=angle_rad, raw=still_raw(receiver, self._clock.speed))
@@ -170,12 +164,7 @@ def _check_poses(kept: AngleCalibration) -> AngleCalibration:
 def still_raw(receiver: AngleReceiver, speed: float) -> float:
     """What the sensor gave during the last moment, in its unit.
 
-    Raises
-    ------
-    DeviceError
-        Too little came.
-    RefusedError
-        The joint moved, or the sensor reports a fault.
+    Raises DeviceError: too little came. RefusedError: the joint moved, or the sensor reports a fault.
     """
     samples = receiver.recent(POSE_S * speed)
     raw = samples["raw"]
@@ -270,14 +259,8 @@ class Joint:
     async def pose(self, request: AnglePoseRequest, phase: Phase) -> None:
         """The goniometer's angle of a joint that is held still; the second one completes a calibration.
 
-        Raises
-        ------
-        PlanError
-            This rig has no angle sensor.
-        BusyError
-            A test is in progress.
-        DeviceError, RefusedError, RigError
-            See `AngleCalibrating.pose`.
+        Raises PlanError: this rig has no angle sensor. BusyError: a test is in progress. DeviceError, RefusedError,
+        RigError: see `AngleCalibrating.pose`.
         """
         self._refuse_absent("angle_pose")
         if phase.busy:

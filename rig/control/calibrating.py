@@ -36,12 +36,8 @@ class Calibrations:
     async def start(self, request: CalibrateStartRequest) -> None:
         """Open a guided calibration; nothing is sent yet.
 
-        Raises
-        ------
-        BusyError, LatchedError, UncertainError, DeviceError
-            As for a test.
-        PlanError, RefusedError
-            Wrong name or id; step, train, current or rate outside the limits, or too small to stimulate.
+        Raises BusyError, LatchedError, UncertainError, DeviceError: as for a test. PlanError, RefusedError: wrong name
+        or id; step, train, current or rate outside the limits, or too small to stimulate.
         """
         state, latch = self._state, self._state.latch
         async with state.in_turn():
@@ -58,11 +54,8 @@ class Calibrations:
     async def step(self, request: CalibrateStepRequest) -> None:
         """Play one train: a step up, a step down, or the same again; returns when it has started.
 
-        Raises
-        ------
-        PlanError, BusyError, RefusedError
-            No calibration is open, or another width was shown; a train is playing; above a limit or the marked comfort
-            maximum; its day is over.
+        Raises PlanError, BusyError, RefusedError: no calibration is open, or another width was shown; a train is
+        playing; above a limit or the marked comfort maximum; its day is over.
         """
         async with self._state.in_turn():
             calibration = self._open(today=True)

@@ -117,12 +117,8 @@ class Calibration:
     def next_width_us(self, direction: str) -> float:
         """Width of the train that is asked for, as the stimulator sends it: the next step begins there.
 
-        Raises
-        ------
-        RefusedError
-            Above the limits, the request's maximum or the marked comfort maximum; names the bound and the excess.
-        PlanError
-            There is no lower step.
+        Raises RefusedError: above the limits, the request's maximum or the marked comfort maximum; names the bound and
+        the excess. PlanError: there is no lower step.
         """
         ceiling = self._ceiling()
         width_us = self._asked_us(direction)

@@ -25,38 +25,20 @@ FIRST_SHARE = 0.6
 
 @dataclass(frozen=True, slots=True)
 class StepRule:
-    """The steps of one calibration.
-
-    Attributes
-    ----------
-    fine_us, large_us, known_us : float
-        A fine step; a large one; a large one to where an earlier calibration was.
-    first_us : float
-        Width of the first train.
-    last_us : mapping
-        Marks of the earlier calibration; empty where none is used.
-    halves : bool
-        Whether steps down and after it go half the way; else every step is a fine one.
-    """
+    """The steps of one calibration."""
 
     fine_us: float
     large_us: float
-    known_us: float
-    first_us: float
-    last_us: Mapping[Threshold, float]
-    halves: bool
+    known_us: float  # a large step to where an earlier calibration was
+    first_us: float  # width of the first train
+    last_us: Mapping[Threshold, float]  # marks of the earlier calibration; empty where none is used
+    halves: bool  # whether steps down and after it go half the way; else every step is a fine one
 
     def up(self, width_us: float, waiting: Threshold | None, above_us: float | None) -> float:
         """Width of the next wider train.
 
-        Parameters
-        ----------
-        width_us
-            Of the last train; 0 before the first.
-        waiting
-            The threshold that is to be marked next.
-        above_us
-            The narrowest wider train that a person stepped back from; None: there is none.
+        `width_us`: of the last train; 0 before the first. `waiting`: the threshold that is to be marked next.
+        `above_us`: the narrowest wider train that a person stepped back from; None: there is none.
         """
         if width_us == 0:
             return self.first_us

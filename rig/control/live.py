@@ -28,27 +28,15 @@ IDLE = {"test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "
 
 
 class Taken(NamedTuple):
-    """What is new since the last time, as arrays and plain values.
+    """What is new since the last time, as arrays and plain values."""
 
-    Attributes
-    ----------
-    fields
-        Of the event, as they are.
-    blocks, angles
-        Of torque and of angles, as they came; None: the rig has no angle sensor.
-    done
-        Pulses of which it is known what became of them.
-    segments, pulse_rate_hz
-        Of the test; of one that is not adaptive no segments.
-    """
-
-    fields: dict[str, Any]
+    fields: dict[str, Any]  # of the event, as they are
     origin_s: float
     samples: bool
-    blocks: list[NDArray[Any]]
-    angles: list[NDArray[Any]] | None
-    done: list[Done]
-    segments: tuple[tuple[Any, ...], ...] = ()
+    blocks: list[NDArray[Any]]  # of torque, as they came
+    angles: list[NDArray[Any]] | None  # None: the rig has no angle sensor
+    done: list[Done]  # pulses of which it is known what became of them
+    segments: tuple[tuple[Any, ...], ...] = ()  # of the test; of one that is not adaptive none
     pulse_rate_hz: float = 1.0
 
 

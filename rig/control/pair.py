@@ -8,8 +8,8 @@ from typing import Any
 
 from stimrig.rig import devices, limits
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
-from stimrig.rig.acquire.receiver import Receiver
-from stimrig.rig.acquire.run import FRESH_S, SETTLE_S
+from stimrig.rig.acquire.receiver import FRESH_S, Receiver
+from stimrig.rig.acquire.stream import SETTLE_S
 from stimrig.rig.config import RigConfig
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.gate import Gate

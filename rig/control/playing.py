@@ -69,14 +69,8 @@ class Player:
 
         From here on a stop ends this test, also while its files are being made. Raises RigError: it does not begin.
 
-        Parameters
-        ----------
-        following
-            The state from now on.
-        angle
-            What the journal says of the angle sensor; None: there is none.
-        key
-            What extensions of an adaptive test must know.
+        `following`: the state from now on. `angle`: what the journal says of the angle sensor; None: there is none.
+        `key`: what extensions of an adaptive test must know.
         """
         state, before, halt = self.state, self.state.phase, Halt(self._clock)
         halt.on_set(lambda: self._ending(halt))

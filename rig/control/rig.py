@@ -51,10 +51,7 @@ SEALED_WITHIN_S = 30.0
 class Rig:
     """Its parts, and what needs several of them. All but `status`, `trouble` and `live` are tasks of the machine.
 
-    Parameters
-    ----------
-    publish
-        Receives all events except live ones; must not block.
+    `publish`: receives all events except live ones; must not block.
     """
 
     def __init__(self, config: RigConfig, machine: Machine, publish: Callable[[Event], None]) -> None:
@@ -89,6 +86,7 @@ class Rig:
         if receiver and (measured_hz := receiver.measured_rate_hz()) is not None:
             cell["measured_rate_hz"] = round(measured_hz, 2)
         seen = receiver is not None and receiver.last_s is not None
+        stimulator = self.pair.identity["stimulator"]
         return Status(
             state=phase.state,
             reason=phase.reason_stopped,
@@ -98,7 +96,7 @@ class Rig:
             segment=run.segment() if run else None,
             elapsed_s=run.elapsed_s() if run else 0.0,
             duration_s=run.score.longest_s if run else 0.0,
-            stimulator=self.pair.identity["stimulator"],
+            stimulator=stimulator and {**stimulator, "shortest_us": self.pair.steps.shortest_us},
             load_cell=cell,
             torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
             torque_nm=finite(receiver.last_torque_nm) if receiver else None,
@@ -134,10 +132,7 @@ class Rig:
     async def open(self) -> None:
         """Seal what a crash left, then connect; a missing device is reported in the status, not raised.
 
-        Raises
-        ------
-        ConfigError, BusyError
-            The data folder cannot be used, or another rig is using it.
+        Raises ConfigError, BusyError: the data folder cannot be used, or another rig is using it.
         """
         work = self._tasks.work
         try:
@@ -269,14 +264,8 @@ class Rig:
     async def rearm(self, by: str, latch: str) -> Status:
         """A person has checked participant and rig: ask both devices again, then be ready.
 
-        Raises
-        ------
-        BusyError
-            A test is in progress.
-        LatchChangedError
-            The rig was stopped since that person was shown `latch`, before this or meanwhile.
-        DeviceError
-            A device does not answer: the rig stays stopped.
+        Raises BusyError: a test is in progress. LatchChangedError: the rig was stopped since that person was shown
+        `latch`, before this or meanwhile. DeviceError: a device does not answer: the rig stays stopped.
         """
         state = self.state
         async with state.in_turn():

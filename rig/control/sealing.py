@@ -46,11 +46,8 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
 
     Part of a finished test's summary.
 
-    Parameters
-    ----------
-    lost_s
-        Rig seconds before the test's end of which nothing may stand in the journal, as the computer lost its power:
-        what was planned for so long counts, too.
+    `lost_s`: rig seconds before the test's end of which nothing may stand in the journal, as the computer lost its
+    power: what was planned for so long counts, too.
     """
     columns, rate_hz = recording.columns, recording.attributes["pulse_rate_hz"]
     status, n = columns["pulses/status"], len(columns["pulses/status"])
@@ -211,10 +208,11 @@ def _disturbed_line(recording: Recording) -> list[str]:
             "meanwhile were dropped"
         )
     planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
-    if weaker := int(np.count_nonzero((planned_us - sent_us > ROUNDED_US) & ~_climbing(recording, pauses))):
+    narrower = (planned_us - sent_us > ROUNDED_US) & (sent_us > 0)  # one below the shortest pulse is not sent at all
+    if weaker := int(np.count_nonzero(narrower & ~_climbing(recording, pauses))):
         found.append(
-            f"stimulator: {weaker} pulses were narrower than planned, since after dropped pulses the width climbs back "
-            "no faster than its limit"
+            f"stimulator: {weaker} pulses were narrower than planned, since after a pulse that was dropped, or too "
+            "short to be sent, the width climbs no faster than its limit"
         )
     return found
 
@@ -250,12 +248,7 @@ class RecordingStore:
     def check_room(self, test_id: str) -> None:
         """Check that a test of that id can be stored.
 
-        Raises
-        ------
-        PlanError
-            The id was already used.
-        JournalError
-            The disk is nearly full.
+        Raises PlanError: the id was already used. JournalError: the disk is nearly full.
         """
         sealed = any(name.endswith(f"Z_{test_id}.h5") for name in self._disk.names(self.recordings))
         if sealed or f"{test_id}.journal" in self._disk.names(self.journals):
@@ -284,7 +277,7 @@ class RecordingStore:
             "recording_id": self._machine.new_id(),
             "boot_id": self._machine.boot_id,
             "plan": test.plan.model_dump(mode="json"),
-            "segments": [{"name": s.name, "start": s.start, "end": s.end, "by": "plan"} for s in certain],
+            "segments": [segment._asdict() for segment in certain],
             "current_ma": test.plan.profile.current_ma,
             "sample_rate_hz": self._config.load_cell.model_dump().get("sample_rate_hz", 0.0),
             "software": software(),
@@ -314,10 +307,7 @@ class RecordingStore:
     def recover(self, reason: str) -> list[FinishedEvent]:
         """Seal the journals that a crash or a full disk left; a journal with nothing to seal is renamed, never deleted.
 
-        Parameters
-        ----------
-        reason
-            Why it was left; used for journals that do not say how the test ended.
+        `reason`: why it was left; used for journals that do not say how the test ended.
         """
         events = []
         for name in self._disk.names(self.journals):

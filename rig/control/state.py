@@ -27,12 +27,7 @@ class State:
     Requests that begin something take their turn, one after the other. A stop never waits for it: it changes the state
     at once, and what was begun finds that out before it goes on.
 
-    Parameters
-    ----------
-    instance
-        Of this process, another one for each.
-    publish
-        Called after each change.
+    `instance`: of this process, another one for each; `publish`: called after each change.
     """
 
     def __init__(self, file: LatchFile, tasks: Tasks, instance: str, publish: Callable[[], None]) -> None:

@@ -171,12 +171,7 @@ class SampleFrame:
 class CanSensor:
     """Base of the drivers of sensors on a CAN bus; see `rig.devices.Sensor` for what the methods promise.
 
-    Parameters
-    ----------
-    table
-        In the rig file; begins the words of a ConfigError.
-    frame
-        Makes the decoder of its frames.
+    `table`: in the rig file; begins the words of a ConfigError. `frame`: makes the decoder of its frames.
     """
 
     name: ClassVar[str]

@@ -65,26 +65,14 @@ class Framing:
 
     Each header byte stands behind an escape, xor 55. A frame's end is found by its length, since a header byte may
     itself look like `F0` or `0F`. After damage the reader continues at the next `F0 81`.
-
-    Parameters
-    ----------
-    header_fields
-        Number of header bytes, without their escapes.
-    header
-        Stuffed body -> header: length and CRC. Raises WireError if the body is too long.
-    frame_length
-        Header -> length of the whole frame, bytes.
-    max_frame_bytes
-        Longest frame that a reader waits for.
-    command_bits
-        Of the payload's first two bytes, which are packet number and command; data follow.
     """
 
-    header_fields: int
+    header_fields: int  # number of header bytes, without their escapes
     header: Callable[[bytes], bytes]
-    frame_length: Callable[[bytes], int]
-    max_frame_bytes: int
-    command_bits: int
+    """Stuffed body -> header: length and CRC. Raises WireError if the body is too long."""
+    frame_length: Callable[[bytes], int]  # header -> length of the whole frame, bytes
+    max_frame_bytes: int  # longest frame that a reader waits for
+    command_bits: int  # of the payload's first two bytes, which are packet number and command; data follow
 
     @property
     def numbers(self) -> int:
@@ -221,14 +209,8 @@ log = logging.getLogger("rig.line")
 class PacketLine:
     """One serial port.
 
-    Parameters
-    ----------
-    port
-        Not opened yet.
-    name
-        Its path.
-    on_packet
-        Called with each packet and the time at which it was read (rig clock).
+    `port`: not opened yet; `name`: its path; `on_packet`: called with each packet and the time at which it was read
+    (rig clock).
     """
 
     def __init__(
@@ -271,12 +253,8 @@ class PacketLine:
     def tell(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
         """Write the frame that `make` returns for the next packet number; returns the number.
 
-        Raises
-        ------
-        LateError
-            The clock had passed `latest_s` right before the write: nothing was written.
-        DeviceError
-            The line accepts no bytes, or the frame cannot be encoded.
+        Raises LateError: the clock had passed `latest_s` right before the write: nothing was written. DeviceError: the
+        line accepts no bytes, or the frame cannot be encoded.
         """
         self._number = (self._number + 1) % self._framing.numbers
         try:

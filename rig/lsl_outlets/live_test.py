@@ -110,14 +110,8 @@ class LiveAlignment:
 class LiveTest:
     """Takes blocks, gives batches; knows no LSL and no files.
 
-    Parameters
-    ----------
-    offset_s
-        LSL's clock minus the machine's monotonic clock, s.
-    since_s
-        Only what came after it is sent, rig time (s): another process sent what was before.
-    sample_rate_hz
-        Used if the journal does not say it.
+    `offset_s`: LSL's clock minus the machine's monotonic clock, s; `since_s`: only what came after it is sent, rig time
+    (s): another process sent what was before; `sample_rate_hz`: used if the journal does not say it.
     """
 
     def __init__(self, offset_s: float = 0.0, since_s: float = -np.inf, sample_rate_hz: float = 1000.0) -> None:
@@ -134,13 +128,7 @@ class LiveTest:
         self.sent_samples = self.sent_pulses = 0
 
     def take(self, kind: Kind, payload: bytes) -> None:
-        """Take the next block.
-
-        Raises
-        ------
-        ValueError, KeyError, TypeError, struct.error
-            Its content is not valid.
-        """
+        """Take the next block. Raises ValueError, KeyError, TypeError, struct.error: its content is not valid."""
         if kind == Kind.TORQUE:
             self._torque(np.frombuffer(payload, SAMPLE))
         elif kind in (Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED):

@@ -162,12 +162,8 @@ class Outlets:
     So a LabRecorder that was started before the first test records them all. What differs from test to test (its ids,
     the participant's code, begin and end) goes out as marks.
 
-    Parameters
-    ----------
-    sample_rate_hz
-        Nominal rate of the cell in samples per real second; 0: not known.
-    devices
-        Load cell and stimulator, as the rig file names them.
+    `sample_rate_hz`: nominal rate of the cell in samples per real second; 0: not known. `devices`: load cell and
+    stimulator, as the rig file names them.
     """
 
     def __init__(self, lsl: Any, sample_rate_hz: float, devices: dict[str, str], name: str = "stimrig") -> None:
@@ -322,7 +318,11 @@ class Streaming:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    options = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(prog="python -m stimrig.rig.lsl_outlets", description="Torque and pulses for LSL.")
+    configuration.add_arguments(parser, required=False, about="rig file: says rate and devices")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="data folder of the rig; overrides the rig file")
+    parser.add_argument("--name", default="stimrig", help="what the streams' names begin with (default: stimrig)")
+    options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s lsl: %(message)s", stream=sys.stderr, force=True)
     try:
         # the rig's socket is not used
@@ -359,11 +359,3 @@ def _stream(folder: Path, config: configuration.RigConfig | None, name: str) -> 
     streaming.close()
     if streams.wanted():
         time.sleep(LAST_S)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m stimrig.rig.lsl_outlets", description="Torque and pulses for LSL.")
-    configuration.add_arguments(parser, required=False, about="rig file: says rate and devices")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="data folder of the rig; overrides the rig file")
-    parser.add_argument("--name", default="stimrig", help="what the streams' names begin with (default: stimrig)")
-    return parser

@@ -19,6 +19,8 @@ ARGUMENTS = [
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
 WIDE, NARROW, PHONE = (1280, 860), (1024, 768), (390, 844)
+TABLET, ZOOMED = (820, 1180), (640, 430)
+"""ZOOMED: what a window of WIDE shows at 200 %."""
 
 
 NAME, PASSWORD = "Ada", "correct horse battery"
@@ -101,6 +103,30 @@ def sign_in_with_token(page: Any, service: Service) -> None:
     page.goto(f"{service.url}/sign-in#token={TOKEN}")
     page.get_by_role("button", name="Sign in with the token").click()
     there(page, "Participants")
+
+
+def chart(page: Any, name: str) -> Any:
+    """A chart's still, once it has been scrolled to and is there."""
+    page.locator(f"[data-figure={name}]").first.scroll_into_view_if_needed()
+    still = page.locator(f"[data-figure={name}] > svg.still").first
+    still.wait_for()
+    return still
+
+
+def settled(page: Any) -> None:
+    """Wait until the page follows no work at whose end it would load itself anew."""
+    follows = page.locator("[data-job], [data-next^=identifying]")
+    for _ in range(2):  # one that is half loaded has nothing yet
+        page.wait_for_load_state()
+        expected(follows).to_have_count(0)
+
+
+def look_closer(page: Any, *names: str) -> None:
+    """Take hold of charts: each is drawn by the plot library in its still's place."""
+    for name in names:
+        chart(page, name)
+        page.locator(f"[data-figure={name}] .chart-tools button").click()
+        page.locator(f"[data-figure={name}] .modebar-btn").first.wait_for()
 
 
 def participant(page: Any, service: Service, code: str) -> None:

@@ -85,6 +85,7 @@ class FakeRig:
         self.path, self.data, self.speed, self.rate_hz = path, data, speed, rate_hz
         self.state, self.reason = "ready", ""
         self.stops = 0
+        self.shortest_us = 20.0
         self.calibrated: m.Calibrated | None = None
         self.withdrawn: list[rig_requests.WithdrawRequest] = []
         self.plan: m.TestPlan | None = None
@@ -134,7 +135,8 @@ class FakeRig:
             test_id=self.plan.test_id if self.plan else None,
             participant=self.plan.participant if self.plan else None, segment=self.segment,
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
-            stimulator={"device": "fake P24", "firmware": "1.0"}, load_cell={"device": "fake cell", "rate_hz": 400.0},
+            stimulator={"device": "fake P24", "firmware": "1.0", "shortest_us": self.shortest_us},
+            load_cell={"device": "fake cell", "rate_hz": 400.0},
             torque_age_s=self.torque_age_s, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
             limits=self.limits, require_calibration=self.require_calibration,
@@ -348,7 +350,9 @@ class FakeRig:
             self.state, self.reason = "latched", f"stopped by {request.by}"
             self._send(m.StateEvent(status=self.status()))
         words = "No pulse since the stop command." if self.confirms_stop else "No ack."
-        return m.StopEvidence(confirmed=self.confirms_stop, detail=words, last_pulse_age_s=0.06, device_state="stopped")
+        return m.StopEvidence(
+            confirmed=self.confirms_stop, detail=words, last_pulse_age_s=0.06, device_state="not initialised"
+        )
 
     async def _on_rearm(self, request: Any, writer: Any) -> Any:
         if self.state == "running":  # as the rig does until its recording is sealed, also after a stop

@@ -244,10 +244,8 @@ class Stub:
             say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="tried fatigue")
             if slow.exists():
                 self.pause(60)
-            return {"result": diagnosis(arguments.get("model_json"))}
-        if verb == "improve":
-            say(progress=0.5, text="adding fatigue")
-            return {"result": improvement(arguments.get("model_json"))}
+            held = arguments.get("model_json")
+            return {"result": {**diagnosis(held), "improvement": improvement(held)}}
         if verb == "adaptive_outlook":
             if arguments["target"]["step_percent"] == 49.0:
                 self.pause(2.0)
@@ -269,7 +267,13 @@ class Stub:
         if verb == "track":
             return {"result": tracked(arguments, self.pause)}
         if verb == "forecast":
-            return {"result": {"torque_nm": [width / 100 for width in arguments["pulse_width_us"]]}}
+            rate_hz = arguments["pulse_rate_hz"] or 40.0
+            return {
+                "result": {
+                    "pulse_rate_hz": rate_hz,
+                    "torque_nm": [width / 100 for width in arguments["pulse_width_us"]],
+                }
+            }
         if verb == "invert":
             if arguments.get("table") == "":
                 return {

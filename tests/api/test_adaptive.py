@@ -248,7 +248,7 @@ def test_what_is_no_target_is_refused_by_its_place(client: httpx.Client, partici
         ({"target": {"curve": 2}}, "target.curve"),
         ({"max_duration_s": 0}, "max_duration_s"),
         ({"max_torque_time_nm_s": -3}, "max_torque_time_nm_s"),
-        ({"kind": "pre-session", "target": {"curve_percent": 2}}, ""),
+        ({"kind": "pre-session", "target": {"curve_percent": 3}}, ""),
         ({"segments": [{"name": "a", "sequence": "rest"}]}, ""),
     ]
     for more, place in wrong:

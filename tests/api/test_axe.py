@@ -1,4 +1,4 @@
-"""Every page in every state under axe: no violation; wide and on a phone stop is uncovered, nothing sticks out."""
+"""Every page in every state under axe: no violation; at every size stop is uncovered, and nothing sticks out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,21 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.api.browser import PASSWORD, PHONE, WIDE, open_tab, participant, sign_in_with_token, start
+from stimrig.api.store.tables import Model
+from tests.api.browser import (
+    PASSWORD,
+    PHONE,
+    TABLET,
+    WIDE,
+    ZOOMED,
+    chart,
+    look_closer,
+    open_tab,
+    participant,
+    settled,
+    sign_in_with_token,
+    start,
+)
 from tests.api.conftest import Service, play_test, run_test, shared_service, soon, wait_done
 
 axe_path = pytest.importorskip("axe_playwright_python.base").AXE_FILE_PATH
@@ -52,9 +66,9 @@ def fits(page: Any, what: str) -> None:
 
 
 def examined(page: Any, what: str, stop: bool = True) -> None:
-    """Both widths are looked at; axe takes one of them, chosen by the state's name: to run it is dear."""
+    """All sizes are looked at; axe takes one of two, chosen by the state's name: to run it is dear."""
     look = (WIDE, PHONE)[zlib.crc32(re.sub(r"[0-9a-f-]{8,}|T[0-9-]+\w*", "", what).encode()) % 2][0]
-    for width, height in (WIDE, PHONE):
+    for width, height in (WIDE, TABLET, ZOOMED, PHONE):
         page.set_viewport_size({"width": width, "height": height})
         fits(page, f"{what} at {width}")
         assert width != look or violations(page) == [], (what, width)
@@ -64,6 +78,7 @@ def examined(page: Any, what: str, stop: bool = True) -> None:
 def visit(page: Any, service: Service, path: str, ready: Callable[[], Any] | None = None, stop: bool = True) -> None:
     page.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
     page.goto(service.url + path)
+    settled(page)
     if ready:
         ready()
     examined(page, path, stop)
@@ -136,24 +151,31 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: http
 
     def drawn() -> None:
         tab.get_by_role("link", name="Fatigue").wait_for()
-        tab.locator("[data-figure=overview] .main-svg").first.wait_for()
+        chart(tab, "overview")
 
     def opened() -> None:
         tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-        for figure in ("comparison", "recruitment", "step", "residual"):
-            tab.locator(f"[data-figure={figure}] .main-svg").first.wait_for()
+        for figure in ("comparison", "recruitment", "residual"):
+            chart(tab, figure)
+        look_closer(tab, "step")
 
     visit(tab, service, f"/models/{first['model_id']}", drawn)
     opened()
     examined(tab, "model, all open")
     tab.get_by_role("button", name="Add this effect").click()
-    tab.locator("[data-figure=falling] .main-svg").first.wait_for()
+    chart(tab, "falling")
+    settled(tab)
     examined(tab, "versions")
     visit(tab, service, f"/models/{first['model_id']}/report", stop=False)
     visit(tab, service, f"/tests/{first['id']}")
     both = f"/compare?model={first['model_id']}&model={second['model_id']}"
-    visit(tab, service, both, lambda: tab.locator("[data-figure=step] .main-svg").first.wait_for())
-    visit(tab, service, "/participants/X3")
+    visit(tab, service, both, lambda: chart(tab, "step"))
+    for path in ("/participants/X3", "/participants/X3/trend", f"/models/{first['model_id']}/widths"):
+        visit(tab, service, path)
+    visit(tab, service, "/jobs/none")
+    row = service.context.store.get(Model, second["model_id"])
+    service.change(Model, row.id, fit={**row.fit, "verdict": "not usable"})
+    visit(tab, service, f"/models/{row.id}/approve")
 
 
 def test_trials_of_a_controller(tab: Any, service: Service, client: httpx.Client) -> None:
@@ -173,7 +195,7 @@ def test_in_the_dark(browser: Any, service: Service, client: httpx.Client) -> No
 
     def opened() -> None:
         page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-        page.locator("[data-figure=comparison] .main-svg").first.wait_for()
+        chart(page, "comparison")
 
     for page in open_tab(browser, service, color_scheme="dark"):
         for path, ready in (("/", None), ("/participants/X5", None), (model, opened), (f"/tests/{done['id']}", None)):
@@ -194,7 +216,7 @@ def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:
     def opened() -> None:
         tab.get_by_role("link", name="Ermüdung").wait_for()
         tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-        tab.locator("[data-figure=comparison] .main-svg").first.wait_for()
+        chart(tab, "comparison")
 
     tab.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
     visit(tab, service, f"/models/{done['model_id']}", opened)
@@ -208,6 +230,7 @@ def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:
         tab.set_viewport_size({"width": width, "height": height})
         tab.goto(f"{service.url}/models/{version.json()['id']}")
         tab.get_by_text("diese", exact=True).wait_for()
+        settled(tab)
         assert tab.locator(".scroll:has(> .versions)").evaluate("(e) => e.scrollWidth <= e.clientWidth"), width
 
 
@@ -241,7 +264,9 @@ def test_a_diagnosis_under_way(tab: Any, service: Service) -> None:
             http.post("/v1/participants", json={"code": "X4"})
             started = http.post("/v1/tests", json={"participant": "X4"}).json()
             model = wait_done(http, started["id"], 60.0)["model_id"]
-        visit(tab, service, f"/models/{model}", lambda: tab.get_by_role("button", name="Cancel").wait_for())
+        tab.goto(f"{service.url}/models/{model}")
+        tab.get_by_role("button", name="Cancel").wait_for()
+        examined(tab, "diagnosing")
     finally:
         marker.unlink()
         tab.get_by_role("button", name="Cancel").click()
@@ -256,7 +281,7 @@ def test_without_a_rig(tab: Any, service: Service) -> None:
         examined(tab, "no rig")
         tab.get_by_role("button", name="Stop stimulation").click()
         tab.get_by_role("heading", name="The stop is not confirmed").wait_for(timeout=15_000)
-        assert "emergency switch" in tab.locator("[role=alert]").first.inner_text()
+        assert "emergency switch" in tab.locator("section [role=alert]").first.inner_text()
         examined(tab, "stop without a rig")
     finally:
         service.rig_thread.__enter__()

@@ -57,7 +57,10 @@ def test_start_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, clien
     told = rows(page)
     assert (told["Who"], told["Current of every pulse"], told["How long"]) == ("P017", "20 mA", "25 s")
     assert told["Widest pulse"] == "300 µs, comfort maximum 300 µs" and told["Stops at"] == "30.0 N·m"
-    assert re.fullmatch(r"\d+ pulses, \d\.\d\d mC", told["Dose"]) and "FAKE P24" in told["Rig"]
+    assert (
+        re.fullmatch(r"\d+ pulses, \d\.\d\d.mC \(charge of one phase, all pulses together\)", told["Dose"])
+        and "FAKE P24" in told["Rig"]
+    )
     assert told["Calibration"] == "not calibrated"
     assert (told["Side and muscle"], told["Run by"]) == ("right, triceps brachii", "administrator")
     assert re.search(r'class="stimulate big" data-needs-ready[^>]*>Start now: 20 mA, 300 µs<', page)

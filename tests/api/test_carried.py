@@ -168,7 +168,7 @@ def test_model_page_says_what_carries_over(
     page = pages.get(f"/models/{child['id']}").text
     section = page[page.index('id="carried"') :].partition("</section>")[0]
     assert "has the structure of the last approved model" in section
-    assert "<b>Fatigue</b>" in section and "still needed" in section
+    assert "<b>Fatigue</b>" in section and ">kept<" in section
     assert "<b>Threshold_drift</b>" in section and "asked for again" in section  # by the stub's diagnosis
     assert f"/models/{plain['id']}" in section
     other = pages.get(f"/models/{plain['id']}").text

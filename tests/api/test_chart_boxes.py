@@ -1,24 +1,26 @@
-"""Charts in a real browser: nothing covers anything, colours follow at once, a finger scrolls the page."""
+"""Charts in a real browser: stills as they are reached, the plot library on demand; nothing covers anything."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
 
-from tests.api.browser import open_tab
+from tests.api.browser import chart, look_closer, open_tab
 from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = {"width": 1366, "height": 768}, {"width": 820, "height": 1180}
 
-COVERED = """() => [...document.querySelectorAll('.js-plotly-plot')].flatMap((chart) => {
+COVERED = """() => [...document.querySelectorAll('.figure-box:has(.js-plotly-plot)')].flatMap((chart) => {
   const boxes = (names) => names.flatMap((name) => [...chart.querySelectorAll(name)].map((part) => {
     const at = part.getBoundingClientRect();
     return at.width && at.height ? { name, left: at.left, right: at.right, top: at.top, bottom: at.bottom } : null;
   })).filter(Boolean);
   const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
-  const above = boxes(['.modebar-group', '.legend']), below = boxes(['.legend', '.annotation', '.nsewdrag',
+  const above = boxes(['.modebar-group', '.legend', '.chart-tools']);
+  const below = boxes(['.legend', '.annotation', '.nsewdrag',
     '.g-xtitle', '.g-ytitle', '.g-y2title', '.g-y3title']);
   return above.flatMap((one) => below.filter((other) => other.name !== one.name && meet(one, other))
     .map((other) => [chart.dataset.figure, one.name, other.name])); })"""
@@ -41,8 +43,7 @@ def drawn(page: Any, service: Service, model: str) -> None:
     page.goto(f"{service.url}/models/{model}?diagnose=1")
     page.locator("[data-figure=signature-fatigue]").wait_for(state="attached")
     page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-    for name in ("comparison", "recruitment", "step", "residual", "signature-fatigue"):
-        page.locator(f"[data-figure={name}] .modebar-btn").first.wait_for()
+    look_closer(page, "comparison", "recruitment", "step", "residual", "signature-fatigue")
 
 
 def test_toolbar_legend_and_titles_leave_each_other_room(tab: Any, service: Service, model: str) -> None:
@@ -76,7 +77,7 @@ def test_switching_colours_recolours_what_is_drawn_and_keeps_the_page(tab: Any, 
     assert tab.locator(".bar").get_by_role("button", name="Dark").get_attribute("aria-pressed") == "true"
 
 
-RANGE = "() => document.querySelector('[data-figure=comparison]').layout.xaxis.range.map((s) => +s.toFixed(3))"
+RANGE = "() => document.querySelector('[data-figure=comparison] .plot').layout.xaxis.range.map((s) => +s.toFixed(3))"
 
 
 def test_other_colours_keep_the_view(tab: Any, service: Service, model: str) -> None:
@@ -173,7 +174,7 @@ def test_a_finger_scrolls_the_page_and_zooms_when_asked(browser: Any, service: S
         before = page.evaluate(AT_REST)
         swipe(page, chart)
         assert page.evaluate(AT_REST) > before + 100
-        state = "() => document.querySelector('[data-figure=comparison]').layout.dragmode"
+        state = "() => document.querySelector('[data-figure=comparison] .plot').layout.dragmode"
         assert page.evaluate(state) is False
         chart.locator(".modebar-btn[data-val=zoom]").click()
         assert page.evaluate(state) == "zoom"
@@ -183,3 +184,120 @@ def test_a_finger_scrolls_the_page_and_zooms_when_asked(browser: Any, service: S
         assert page.evaluate(AT_REST) == before, "this finger draws a box"
         page.wait_for_function(f"() => ({state})() === false")
         assert chart.locator(".nsewdrag").first.evaluate("(plane) => getComputedStyle(plane).touchAction") == "auto"
+
+
+# ---- stills, and the plot library that comes when it is asked for ---------------------------------------------------
+
+PLOTLY = "plotly.min.js"
+SHAPE = """(name) => { const box = document.querySelector(`[data-figure=${name}]`), fold = box.closest("details");
+  return [box.clientWidth, box.clientHeight, fold.clientHeight]; }"""
+"""Of a chart and of the fold it stands in; above it a notice may come, for instance where the machine stood still."""
+
+
+def test_a_page_is_light_until_a_chart_is_taken_hold_of(tab: Any, service: Service, model: str) -> None:
+    tab.set_viewport_size(LAPTOP)
+    tab.goto(f"{service.url}/models/{model}?diagnose=0")
+    chart(tab, "overview")
+    tab.wait_for_load_state("networkidle")
+    asked = [url for url in tab.requests if "/figures/" in url or PLOTLY in url]
+    assert asked == [], "the first chart stands in the page, and the others are folded"
+    size = tab.evaluate("performance.getEntriesByType('navigation')[0].transferSize")
+    assert size < 120_000 and "application/json" not in tab.content().split('id="rig-words"')[1]
+    tab.locator("#curves > summary").click()
+    chart(tab, "recruitment")
+    chart(tab, "step")  # beside it: the fold has its height once both are there
+    before = tab.evaluate(SHAPE, "recruitment")
+    assert any("recruitment.html" in url for url in tab.requests) and not any(PLOTLY in url for url in tab.requests)
+    look_closer(tab, "recruitment")
+    assert tab.evaluate(SHAPE, "recruitment") == before, "nothing jumps"
+    assert tab.locator("[data-figure=recruitment] > svg.still").count() == 0
+    assert any("recruitment.json" in url for url in tab.requests) and any(PLOTLY in url for url in tab.requests)
+    assert not any("step.json" in url or "comparison" in url for url in tab.requests), "one chart's lines alone"
+
+
+def test_a_chart_is_taken_hold_of_by_keyboard_and_by_touch(browser: Any, service: Service, model: str) -> None:
+    for page in open_tab(browser, service, has_touch=True):
+        page.goto(f"{service.url}/models/{model}?diagnose=0")
+        button = page.get_by_role(
+            "button", name="Look closer: zoom, and read values: Measured and predicted torque, and"
+        )
+        button.focus()
+        page.keyboard.press("Enter")
+        page.locator("[data-figure=overview] .modebar-btn").first.wait_for()
+        assert button.get_attribute("aria-pressed") == "true" and button.evaluate("e => e === document.activeElement")
+        page.keyboard.press("Enter")
+        chart(page, "overview").tap(position={"x": 200, "y": 60})
+        page.locator("[data-figure=overview] .modebar-btn").first.wait_for()
+        assert page.errors == []
+
+
+def test_a_still_says_the_values_under_the_pointer(browser: Any, service: Service, model: str) -> None:
+    for page in open_tab(browser, service):
+        page.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
+        page.goto(f"{service.url}/models/{model}?diagnose=0")
+        chart(page, "overview").hover(position={"x": 300, "y": 60})
+        at, *lines = page.locator(".read-out").inner_text().split("\n")
+        assert at.endswith(" s") and len(lines) == 3 and all(line.endswith("N·m") for line in lines)
+        measured, predicted, left = (float(re.findall(r"[+−]?\d+,\d+", line)[0].replace(",", ".").replace("−", "-"))
+                                     for line in lines)  # fmt: skip
+        assert abs(measured - predicted - left) < 0.1, "what the pointer reads agrees"
+        page.mouse.move(5, 5)
+        assert page.locator(".read-out").count() == 0
+
+
+def test_stills_follow_the_colours_and_fit_their_boxes(tab: Any, service: Service, model: str) -> None:
+    tab.set_viewport_size(LAPTOP)
+    tab.goto(f"{service.url}/models/{model}?diagnose=0")
+    line = "() => getComputedStyle(document.querySelector('[data-figure=overview] [data-name]')).stroke"
+    wide = "() => document.querySelector('[data-figure=overview] > svg.still').viewBox.baseVal.width"
+    for words in ("Light", "Dark"):
+        tab.locator(".bar").get_by_role("button", name=words).click()
+        assert tab.evaluate(line) == tab.evaluate(NAMED, "measured")
+    tab.set_viewport_size({"width": 390, "height": 844})
+    tab.wait_for_function(f"() => ({wide})() < 390")
+
+
+def test_a_chart_that_does_not_come_can_be_asked_for_again(tab: Any, service: Service, model: str) -> None:
+    tab.goto(f"{service.url}/models/{model}?diagnose=0")
+    tab.route("**/figures/step.html*", lambda route: route.abort())
+    tab.locator("#curves > summary").click()
+    tab.locator("[data-figure=step]").scroll_into_view_if_needed()
+    again = tab.get_by_role("button", name="The chart could not be loaded.")
+    again.wait_for()
+    tab.unroute("**/figures/step.html*")
+    again.click()
+    chart(tab, "step")
+    assert again.count() == 0
+    tab.errors.clear()  # the browser's own words on the request that was broken off
+
+
+def test_without_scripts_stills_are_pictures(browser: Any, service: Service, model: str) -> None:
+    for page in open_tab(browser, service, java_script_enabled=False):
+        page.goto(f"{service.url}/models/{model}?diagnose=0")
+        page.locator("[data-figure=overview] > svg.still").wait_for()
+        page.locator("#curves > summary").click()
+        picture = page.locator("[data-figure=step] img.still")
+        picture.scroll_into_view_if_needed()
+        page.wait_for_load_state("networkidle")
+        assert picture.evaluate("image => image.naturalWidth") > 100
+        assert picture.get_attribute("alt") == "Share of the final torque over time in seconds"
+
+
+def test_charts_are_private_kept_and_asked_about_again(service: Service, model: str) -> None:
+    with service.client() as http:
+        at = f"/models/{model}/figures/comparison"
+        still = http.get(at + ".html?width=900")
+        assert still.headers["cache-control"] == "private, no-cache" and 'viewBox="0 0 900 720"' in still.text
+        again = http.get(at + ".html?width=900", headers={"If-None-Match": still.headers["etag"]})
+        assert again.status_code == 304 and not again.content
+        assert len(still.content) < 60_000 and "var(--" in still.text
+        kept = http.get(at + ".svg")
+        assert kept.headers["content-type"].startswith("image/svg+xml") and "var(--" not in kept.text
+        assert {"data", "layout", "config"} == set(http.get(at + ".json").json())
+        for wrong in ("none.svg", "comparison.png", "comparison"):
+            assert http.get(f"/models/{model}/figures/{wrong}").status_code == 404
+        assert http.get(at + ".svg?width=5").status_code == 422
+        assert "Schrittantwort" not in http.get(f"/models/{model}/figures/step.svg").text
+    with service.client(None) as http:
+        for kind in ("html", "svg", "json"):
+            assert http.get(f"{at}.{kind}", headers={"If-None-Match": still.headers["etag"]}).status_code == 401

@@ -19,13 +19,14 @@ from stimrig import identify
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import LIGHT, in_light, interpolate
-from stimrig.api.charts.svg import svg, ticks
+from stimrig.api.charts.strokes import ticks
+from stimrig.api.charts.svg import svg
 from stimrig.api.language import using
 from stimrig.api.sessions import joint_plan
 from stimrig.api.workers.curves import curves
 from stimrig.api.workers.pool import WORKER
 from tests.api import made_up_joint
-from tests.api.browser import open_tab
+from tests.api.browser import look_closer, open_tab
 from tests.api.conftest import Service, play_test, run_test, serving, shared_service
 from tests.api.fake_rig import default_widths, muscle
 from tests.api.test_axe import examined
@@ -140,8 +141,54 @@ def test_still_pictures_are_whole_svg_with_the_values_in_their_place() -> None:
     line = {"type": "scatter", "x": [0, 10], "y": [0.0, 1.0], "name": "a", "line": {"color": "#000", "width": 1}}
     figure = {"data": [line], "layout": {"height": 200, "xaxis": {}, "yaxis": {}}}
     (path,) = ElementTree.fromstring(str(svg(figure, 300.0))).iter("{http://www.w3.org/2000/svg}path")
-    start, end = (tuple(map(float, point.split())) for point in path.attrib["d"][1:].split("L"))
+    start, end = points(path.attrib["d"])
     assert start[0] < end[0] <= 300 and start[1] > end[1] >= 0, "up is up"
+
+
+def points(way: str) -> list[tuple[float, float]]:
+    """The corners of a still's path without a gap, px."""
+    found: list[tuple[float, float]] = []
+    for step in way.removeprefix("M").split("l"):
+        dx, dy = (float(part) for part in re.findall(r"-?[\d.]+", step))
+        x, y = found[-1] if found else (0.0, 0.0)
+        found.append((x + dx, y + dy))
+    return found
+
+
+def test_a_still_is_as_small_as_what_a_screen_shows_and_loses_no_peak() -> None:
+    """A line of 20 000 points, and one peak of a single point in it."""
+    y = [math.sin(0.9 * k) for k in range(20_000)]
+    y[7_777] = 5.0
+    line = {"type": "scatter", "x": list(range(20_000)), "y": y, "name": "a", "line": {"color": "#000", "width": 1}}
+    figure = {"data": [line], "layout": {"height": 200, "xaxis": {}, "yaxis": {}}}
+    picture = str(svg(figure, 300.0))
+    (path,) = ElementTree.fromstring(picture).iter("{http://www.w3.org/2000/svg}path")
+    corners = points(path.attrib["d"])
+    assert len(corners) <= 2 * 300 and len(picture) < 12_000
+    highest = min(corners, key=lambda corner: corner[1])
+    others = sorted(y for x, y in corners if abs(x - highest[0]) > 1)
+    assert highest[1] < others[0] - 50 and abs((highest[0] - 62) / (300 - 62 - 14) - 7_777 / 20_000) < 0.01
+    assert max(x for x, _y in corners) <= 300 - 14 + 0.1, "rounding does not add up"
+
+
+def test_a_still_has_stairs_gaps_dashes_and_markers_as_the_chart_has() -> None:
+    stairs = {"x": [0, 1, 2], "y": [1.0, 3.0, 3.0], "name": "a", "line": {"color": "#000", "width": 1, "shape": "hv"}}
+    dashed = {"x": [0, 1, 2], "y": [1.0, None, 2.0], "name": "b", "mode": "lines+markers",
+              "line": {"color": "#111", "width": 1, "dash": "longdash"},
+              "marker": {"symbol": "diamond", "size": 6}}  # fmt: skip
+    picture = str(svg({"data": [stairs, dashed], "layout": {"height": 200, "xaxis": {}, "yaxis": {}}}, 300.0))
+    first, second, *diamonds = re.findall(r'<path d="(M[^"]*)"', picture)
+    (x0, y0), (x1, y1), (x2, y2), (_x3, y3) = points(first)
+    assert x0 < x1 and x1 == pytest.approx(x2) and y0 == pytest.approx(y1) and y1 > y2 and y2 == pytest.approx(y3)
+    assert second.count("M") == 2 and picture.count('stroke-dasharray="11 4"') == 2, "in the legend, too"
+    assert len(diamonds) == 3 and all(way.endswith("Z") for way in diamonds)
+
+
+def test_names_that_have_no_room_in_one_row_of_the_legend_take_another(figures: dict[str, Any]) -> None:
+    for width, rows in ((1100.0, {14}), (200.0, {14, 32})):
+        found = re.findall(r'<text x="([\d.]+)" y="(14|32)\.0"[^>]*>([^<]+)', str(svg(figures["comparison"], width)))
+        assert {int(y) for _x, y, words in found if words in ("measured", "model, free run")} == rows
+        assert all(float(x) + 6 * len(words) < width for x, _y, words in found)
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-3.2, 7.9), (0.001, 0.004), (0.0, 47.7)])
@@ -256,7 +303,7 @@ def test_a_still_on_paper_has_its_colours_and_its_words(figures: dict[str, Any])
     figure = {**figures["falling"], "data": [{**figures["falling"]["data"][0], "name": 'fill="var(--ink)"'}] * 2}
     on_page, on_paper = str(svg(figure)), str(svg(figure, on_paper=True))
     assert 'stroke="var(--measured)"' in on_page
-    assert f'stroke="{LIGHT["measured"]}"' in on_paper and on_paper.count("var(--") == 2, "words are words"
+    assert f'stroke="{LIGHT["measured"]}"' in on_paper and on_paper.count("var(--") == 4, "words are words"
 
 
 def test_compared_models_differ_in_colour_and_in_dash() -> None:
@@ -372,7 +419,7 @@ def test_figures_are_drawn_on_paper_with_every_name(of_joint: dict[str, Any]) ->
         picture = str(svg(figure, 760.0, 215.0, on_paper=True))
         ends = [
             float(at) + 6.3 * len(words)
-            for at, words in re.findall(r'<text x="([\d.]+)" y="14.0"[^>]*>([^<]+)', picture)
+            for at, words in re.findall(r'<text x="([\d.]+)" y="(?:14|32).0"[^>]*>([^<]+)', picture)
         ]
         assert len(ends) == len([each for each in figure["data"] if each.get("showlegend", True)])
         assert max(ends) < 780 and "var(" not in picture
@@ -397,15 +444,14 @@ def models(service: Service) -> tuple[str, str]:
 def opened(page: Any, service: Service, model: str) -> None:
     page.goto(f"{service.url}/models/{model}?diagnose=0")
     page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-    for name in ("joint_g", "joint_h"):
-        page.locator(f"[data-figure={name}] .modebar-btn").first.wait_for()
+    look_closer(page, "joint_g", "joint_h")
 
 
 def test_reports_have_them_and_pages_of_other_models_do_not(client: httpx.Client, models: tuple[str, str]) -> None:
     at_rest, moving = models
     for path, count in ((f"/models/{moving}", 2), (f"/models/{at_rest}", 0)):
         page = client.get(path).text
-        assert page.count('data-figure="joint_') == count and ('"joint_g"' in page) == bool(count)
+        assert page.count('data-figure="joint_') == count and ("joint_g.json" in page) == bool(count)
     assert client.get(f"/models/{moving}/report").text.count("<svg") == 5
     assert client.get(f"/models/{at_rest}/report").text.count("<svg") == 3
 
@@ -419,7 +465,7 @@ def test_the_page_is_examined(browser: Any, service: Service, models: tuple[str,
         opened(page, service, models[1])
         assert page.evaluate(COVERED) == []
         examined(page, f"joint, {scheme}")
-        assert page.evaluate(COVERED) == [], "on a phone"
+        page.wait_for_function(f"() => !({COVERED})().length")  # on a phone, once it is drawn in its new size
         for name in ("joint_g", "joint_h"):
             box = page.locator(f"[data-figure={name}] .nsewdrag").first.bounding_box()
             assert box["height"] > 150 and box["width"] > 180, "the legend leaves the lines room"

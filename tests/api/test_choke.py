@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import logging
 import os
 import socket
 import threading
@@ -131,6 +132,29 @@ def test_a_body_that_does_not_come_is_not_waited_for(service: Service, monkeypat
     head = "POST /v1/participants HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 10\r\n"
     connection = connect(service.url, f"{head}Authorization: Bearer x\r\n\r\n{{".encode())
     assert connection.recv(12) == b"HTTP/1.1 408"
+
+
+def test_who_leaves_in_the_middle_of_a_form_is_no_error_of_ours(
+    service: Service, client: httpx.Client, caplog: pytest.LogCaptureFixture
+):
+    client.post("/v1/users", json={"name": "Ada", "password": "correct horse battery"})
+    with service.client(None) as page:
+        page.post("/sign-in", data={"name": "Ada", "password": "correct horse battery"})
+        cookie = "; ".join(f"{name}={value}" for name, value in page.cookies.items())
+    kinds = {"host": "x", "content-type": "application/x-www-form-urlencoded", "content-length": "10", "cookie": cookie}
+    scope = {"type": "http", "method": "POST", "path": "/participants/none/calibration", "query_string": b""}
+    scope |= {"headers": [(name.encode(), value.encode()) for name, value in kinds.items()], "http_version": "1.1"}
+    told = iter([{"type": "http.request", "body": b"co", "more_body": True}, {"type": "http.disconnect"}])
+
+    async def receive() -> Any:
+        return next(told)
+
+    async def send(message: Any) -> None:
+        assert message["type"] != "http.response.start" or message["status"] == 400
+
+    with caplog.at_level(logging.INFO, logger="stimrig.api"):
+        service.run(service.app(scope, receive, send))
+    assert "unexpected" not in caplog.text and "left before" in caplog.text
 
 
 def test_too_many_previews_at_once_are_refused_before_they_are_read(

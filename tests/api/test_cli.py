@@ -16,9 +16,12 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.cli import main
+from stimrig.api.cli.commands.explain import story_lines
+from stimrig.api.models.explanation import place
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.workers import verbs
 from stimrig.hardware_sim import hidden_records
+from stimrig.identify.healing import place_words
 from stimrig.identify.records.join import write_joined
 from tests.api.test_worker import made_up_csv
 from tests.harness import few_effects
@@ -141,6 +144,33 @@ def test_models_and_predictions_as_mat_files(
     found = loadmat(tmp_path / "p.mat", squeeze_me=True)
     assert found["predicted_torque_nm"].shape == found["time_s"].shape == (1000,)
     assert "MODEL.json of the same fit" in refused(capsys, "compare", str(tmp_path / "M.mat"), str(record))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fix"),
+    [
+        (["compare", "{record}", "{model}"], "The model comes first: stimrig compare MODEL.json DATA."),
+        (["predict", "{record}", "{model}", "-o", "p.csv"], "first: stimrig predict MODEL.json DATA -o FILE."),
+        (["diagnose", "{record}", "--model", "{record}"], "Give a file written by `stimrig fit -o`."),
+    ],
+)
+def test_a_recording_in_the_place_of_a_model_is_called_one(
+    capsys: pytest.CaptureFixture[str], record: Path, model: Path, arguments: list[str], fix: str
+) -> None:
+    words = refused(capsys, *[part.format(record=record, model=model) for part in arguments]).strip()
+    assert f"{record}: this is a recording, not a model. " in words and words.endswith(fix)
+
+
+def test_a_story_at_the_terminal_names_segments_as_the_file_does() -> None:
+    text = "falling validate, 0-300 µs: model too low by 0.5 N·m, 20 % of the error above the noise"
+    found = {"segment": "validate", "pulse_width_us": [0.0, 300.0], "direction": "falling", "share_of_excess": 0.2}
+    row = dict.fromkeys(("fit_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm"), 1.0)
+    places = [{**place({**found, "text": text}, 1), "became": "the error there fell"}]
+    made = {"title": "", "noise_sd_nm": 0.1, "rows": [row, row], "places": places, "steps": [], "ended": ""}
+    why = {"title": "", "missing": [], "free": []}
+    lines = story_lines({"story": {**made, "why": why, "then": {"experiment": None}}})
+    assert f"2 fails in     {text}" in lines
+    assert "  healed       falling validate, 0-300 µs: the error there fell" in lines
 
 
 def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -296,7 +326,8 @@ def test_a_fit_of_two_is_of_both(parts: list[Path], tmp_path: Path, capsys: pyte
     code, out, err = run(capsys, "compare", model, *parts, "--html", tmp_path / "report.html")
     assert code == 0 and "plain.csv and " in out, err
     assert "plain.csv, moved.csv" in (tmp_path / "report.html").read_text("utf-8")
-    code, out, err = run(capsys, "diagnose", *parts, "--model", model, "--json")
+    with few_effects.only("fatigue", "baseline_drift"):
+        code, out, err = run(capsys, "diagnose", *parts, "--model", model, "--json")
     assert code == 0 and json.loads(out)["verdict"], err
 
 
@@ -427,6 +458,45 @@ def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds
     assert [step["added"] for step in further["steps"]] == [None] and further["verdict"] == "nothing_missing"
     assert further["steps"][0]["rms_nm"] == pytest.approx(fitted["fit"]["rms_nm"], rel=0.02)
     assert "fatigue" in report.read_text().lower()
+
+
+def test_explain_tells_how_the_error_falls_and_agrees_with_the_other_verbs(tired: Path, tmp_path: Path) -> None:
+    data, model, page, figures = tired / "record.csv", tmp_path / "m.json", tmp_path / "s.html", tmp_path / "figures"
+    found = json.loads(stimrig("explain", data, "-o", model, "--html", page, "--figures", figures, "--json"))
+    improved = json.loads((tired / "improved.json").read_text())
+    assert {**found["improvement"], "steps": _without_ids(found["improvement"])} == {
+        **{name: improved[name] for name in found["improvement"]}, "steps": _without_ids(improved)
+    }  # fmt: skip
+    added = [step["added"] for step in improved["steps"][1:]]
+    assert found["diagnosis"]["add"] == added and found["diagnosis"]["conclusion"]["advice"].startswith("Add “Fatigue”")
+    assert (
+        found["left"]["conclusion"] == json.loads(stimrig("diagnose", data, "--model", model, "--json"))["conclusion"]
+    )
+    assert found["places"] and all(place["after_nm"] < place["before_nm"] for place in found["places"])
+    assert all(place_words(place) in page.read_text() for place in found["places"]), "the same in words and numbers"
+    noise_nm = found["diagnosis"]["noise_sd_nm"]
+    assert any(place["healed"] and place["before_nm"] > 1.3 * noise_nm for place in found["places"])
+    text = page.read_text()
+    assert text.count('class="still"') == 3 and found["ended"].split(". ")[0] in text
+    assert "The held-out error fell from" in text
+    names = {f"{name}.{kind}" for name in ("story-torque", "story-place", "falling") for kind in ("svg", "pdf")}
+    assert {path.name for path in figures.iterdir()} == names
+    for path in figures.iterdir():
+        assert path.read_bytes().startswith({".svg": b"<svg", ".pdf": b"%PDF"}[path.suffix])
+        assert b"rgba(" not in path.read_bytes() and b"var(--" not in path.read_bytes()
+
+
+def _without_ids(improved: dict) -> list[dict]:
+    return [{key: value for key, value in step.items() if key != "model_id"} for step in improved["steps"]]
+
+
+def test_what_diagnose_writes_is_what_the_page_shows_and_small(tired: Path, tmp_path: Path) -> None:
+    report = tmp_path / "diagnosis.html"
+    said = stimrig("diagnose", tired / "record.csv", "--html", report)
+    text = report.read_text()
+    for part in ('id="why"', 'id="missing-fatigue"', 'id="effect-fatigue"', 'id="error"', 'id="shares"', 'id="others"'):
+        assert part in text
+    assert said.split(" (probability")[0] in text and len(text) < 1_000_000
 
 
 def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:

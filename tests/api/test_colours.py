@@ -98,7 +98,7 @@ TEXT = [
     *((ink, kind + "-bg") for kind in ("good", "warn", "bad") for ink in (kind, kind + "-ink", "ink", "dim")),
     *((f"on-{name}", name) for name in ("primary", "stimulate", "stop", "tag", "running", "unknown", "emulated")),
     *((f"on-{name}", f"{name}-hover") for name in ("primary", "stimulate", "stop")),
-    ("ink", "field"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"),
+    ("ink", "field"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"), ("card", "good"),
 ]  # fmt: skip
 """Ink and what it stands on."""
 SEEN = [

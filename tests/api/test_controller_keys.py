@@ -95,6 +95,8 @@ def test_every_route_that_is_not_opened_is_closed(shared: Service, one_key: str,
             assert answer.status_code == stranger.request(method, path).status_code
     elif (method, path) == ("POST", "/v1/stop"):
         assert answer.status_code == 200 and "rig" not in answer.json()
+    elif (method, path) == ("GET", "/v1/sequences"):
+        assert answer.status_code == 200
     elif (method, path) == ("POST", "/v1/tests"):
         assert answer.status_code == 428  # no body: which participant is meant is not known yet
     elif (method, path) in (("POST", "/sign-in"), ("POST", "/v1/sessions")):
@@ -115,7 +117,20 @@ def test_it_opens_what_is_its_participants(key: httpx.Client, done: dict[str, di
     assert key.get(f"/v1/tests/{test['id']}").json()["participant"] == "P1"
     assert key.get(f"/v1/recordings/{test['recording_id']}").content.startswith(b"\x89HDF")
     assert key.get(f"/v1/recordings/{test['recording_id']}/csv").status_code == 200
-    assert len(OPEN) == 8, "what is opened further is tried here"
+    assert key.get("/v1/sequences").json()["sequences"]
+    assert len(OPEN) == 9, "what is opened further is tried here"
+
+
+def test_whoever_does_not_say_with_which_model_is_told_of_a_document_that_the_key_reads(
+    shared: Service, one_key: str, done: dict[str, Any], admin: httpx.Client
+) -> None:
+    person = admin.get("/v1/participants/P1").headers["etag"]
+    with httpx.Client(base_url=shared.url, headers={"Authorization": f"Bearer {one_key}"}) as key:
+        for head, status in (({}, 428), ({"If-Match": '"abc"'}, 428), ({"If-Match": person}, 409)):
+            answer = key.post("/v1/tests", json=TRIAL, headers=head)
+            assert answer.status_code == status, answer.text
+            told = re.findall(r"/v1/participants/[\w/]+", answer.json()["detail"])
+            assert told == ["/v1/participants/P1/model"] and key.get(told[0]).status_code == 200
 
 
 def test_what_is_anothers_is_refused_as_what_is_not_there(key: httpx.Client, done: dict[str, dict[str, Any]]) -> None:
@@ -306,6 +321,33 @@ def test_after_a_rejection_it_plays_nothing_and_plans_nothing(
     for path, body in asked.items():
         for version in (other["model_id"], f"{model}.{approval.id}.1", f"{model}.99.0"):
             assert "approved model" in refused(key.post(f"/v1/models/{version}/{path}", json=body))
+
+
+def test_a_program_makes_one_by_the_same_rules_as_the_page(
+    shared: Service, admin: httpx.Client, done: dict[str, Any]
+) -> None:
+    path, plan = "/v1/participants/P1/keys", {name: float(value) for name, value in PLAN.items() if name != "name"}
+    body = {**plan, "name": "ilc", "trials": 1}
+    scopes = ("approve-model", "run-test", "read-live", "read-model")
+    told = admin.get("/v1/participants/P1").headers["etag"]
+    with shared.client(shared.token("a program", *scopes)) as program:
+        made = program.post(path, json=body)
+        wider = program.post(path, json={**body, "current_ma": 21})
+        assert wider.status_code == 422 and wider.json()["type"] == "/problems/wider-profile"
+        assert program.post(path, json={**body, "trials": 201}).status_code == 422
+        assert program.post("/v1/participants/nobody/keys", json=body, headers={"If-Match": told}).status_code == 409
+        assert admin.put("/v1/participants/P1/profile", json={"max_torque_nm": 29.0}).is_success
+        late = program.post(path, json=body, headers={"If-Match": told})
+        assert late.status_code == 409 and late.json()["type"] == "/problems/changed-meanwhile"
+    assert made.status_code == 201 and (made.json()["participant"], made.json()["plan"]["trials"]) == ("P1", 1)
+    assert admin.post("/v1/controller-keys", json={"name": "reader"}).json()["scopes"] == ["read-model"]
+    with shared.client(made.json()["key"]) as key:
+        wait_done(key, key.post("/v1/tests", json=TRIAL).json()["id"])
+        assert "all 1 trials" in refused(key.post("/v1/tests", json=TRIAL), "beyond-plan").lower()
+        assert admin.delete(f"/v1/tokens/{made.json()['id']}").status_code == 204
+        assert key.get("/v1/participants/P1/model").status_code == 401
+    with shared.client(shared.token("lacks run-test", *{*scopes} - {"run-test"})) as lacking:
+        assert "run-test" in lacking.post(path, json=body, headers={"If-Match": told}).json()["detail"]
 
 
 def test_it_signs_nobody_in_on_the_page(shared: Service, admin: httpx.Client) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 
 from stimrig.api.sessions import controllers
@@ -27,8 +30,15 @@ PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 30.0,
         "site": [None, None, None]}  # fmt: skip
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
+def blocks(language: str, text: str = TEXT) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def weaker(record: Path, share: float) -> bytes:
+    """The record of a muscle that has become stronger since: what there is to learn."""
+    head, *rows = record.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    return "\n".join([head, *(",".join([a, b, str(share * float(c)), d]) for a, b, c, d in cells)]).encode()
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +48,14 @@ def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterato
     for service in run_service(folder, short_dir, REAL):
         with service.client(timeout=120) as admin:
             admin.post("/v1/participants", json={"code": "P017"})
-            body = made_up_csv(folder / "record.csv").read_bytes()
-            model = admin.post("/v1/participants/P017/recordings", content=body).json()["model"]["id"]
-            assert admin.post(f"/v1/models/{model}/approve", json={"reason": "for the page's test"}).status_code == 200
+            approve(admin, weaker(made_up_csv(folder / "record.csv"), 0.87))
         text, _ = controllers.make_key(service.context.auth, "page", "P017", PLAN, "test")
         yield service, text
+
+
+def approve(admin: httpx.Client, recording: bytes) -> None:
+    model = admin.post("/v1/participants/P017/recordings", content=recording).json()["model"]["id"]
+    assert admin.post(f"/v1/models/{model}/approve", json={"reason": "for the page's test"}).status_code == 200
 
 
 @pytest.fixture(autouse=True)
@@ -72,7 +85,7 @@ def in_shell(served: tuple[Service, str], folder: Path, lines: list[str]) -> str
 def test_every_line_for_the_shell_runs_in_order(served: tuple[Service, str], tmp_path: Path) -> None:
     shell = blocks("bash")
     assert len(shell) >= 8
-    live = [block for block in shell if "live_torque" in block]
+    live = [block for block in shell if "live_torque" in block or "ten_minutes" in block]  # they have their own tests
     out = in_shell(served, tmp_path, [block for block in shell if block not in live])
     assert "304" in out and '"torque_nm"' in out and '"state":"completed"' in out.replace(" ", "")
     assert (tmp_path / "trial.h5").read_bytes().startswith(b"\x89HDF") and "fit_percent" in out
@@ -106,17 +119,89 @@ def test_whoever_interrupts_the_live_example_stops_its_trial(served: tuple[Servi
             run.send_signal(number)
             said = run.stderr.read()
         assert run.returncode == 1 and "stop was pressed" in said and "Traceback" not in said
-        assert service.rig.stopped_by.startswith("page (")
+        assert str(service.rig.stopped_by).startswith("page (")
     finally:
         service.rig.speed = 12.0
 
 
+PROGRAMS = {
+    "ilc.py": ("python3", ""),
+    "ilc.m": ("octave-cli", ""),
+    "ilc.cpp": ("g++", "#include <curl/curl.h>\n#include <nlohmann/json.hpp>\n"),
+}
+"""What runs each program that learns, and the headers that it includes."""
+
+
+def skip_without(program: str) -> None:
+    tool, headers = PROGRAMS[program]
+    if shutil.which(tool) is None:
+        pytest.skip(f"not run: there is no {tool} (Debian: {'octave' if program == 'ilc.m' else tool})")
+    command = ["g++", "-x", "c++", "-E", "-"]
+    if headers and subprocess.run(command, input=headers, text=True, capture_output=True, check=False).returncode:
+        pytest.skip("not compiled: libcurl4-openssl-dev and nlohmann-json3-dev are not installed")
+
+
+def learner(served: tuple[Service, str], program: str) -> tuple[tuple[Service, str], list[str]]:
+    """A key of its own, and the page's lines for a program."""
+    skip_without(program)
+    (lines,) = [block for block in blocks("bash") if f"ten_minutes/{program}" in block]
+    text, _ = controllers.make_key(served[0].context.auth, program, "P017", PLAN, "test")
+    return (served[0], text), ["export URL KEY", lines]
+
+
 @pytest.mark.slow
-def test_every_block_of_python_runs(served: tuple[Service, str]) -> None:
-    scope = {"url": served[0].url, "key": served[1], "code": "P017"}
-    for block in blocks("python"):
-        exec(compile(block, "controllers.md", "exec"), scope)
-    assert scope["ended"]["state"] == "completed"  # pyright: ignore
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_each_program_learns(served: tuple[Service, str], tmp_path: Path, program: str) -> None:
+    own, lines = learner(served, program)
+    out = in_shell(own, tmp_path, lines)
+    percent = [float(value) for value in re.findall(r"trial \d: ([\d.]+) %", out)]
+    assert len(percent) == 6 and percent[0] > 10, out
+    assert percent[-1] < percent[0] / 4, out
+    assert served[0].rig.state == "ready", "nothing was stopped"
+
+
+@pytest.mark.slow
+def test_a_program_ends_where_a_person_has_to_look(served: tuple[Service, str], tmp_path: Path) -> None:
+    """The muscle is twice as strong as its approved model: more than a person allowed."""
+    service, _ = served
+    with service.client(timeout=120) as admin:
+        approve(admin, weaker(made_up_csv(tmp_path / "record.csv"), 0.5))
+        own, _ = learner(served, "ilc.py")
+        run = subprocess.run([sys.executable, "examples/ten_minutes/ilc.py"], cwd=ROOT, env=environment(own),
+                             capture_output=True, text=True)  # fmt: skip
+        approve(admin, weaker(made_up_csv(tmp_path / "again.csv"), 0.87))
+    assert run.returncode == 1 and "a person has to look first" in run.stderr and "trial 6" not in run.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("program", "number"),
+    [*((program, signal.SIGINT) for program in PROGRAMS), ("ilc.py", signal.SIGTERM), ("ilc.cpp", signal.SIGTERM)],
+)
+def test_whoever_interrupts_a_program_stops_its_trial(
+    served: tuple[Service, str], tmp_path: Path, program: str, number: signal.Signals
+) -> None:
+    service, _ = served
+    (own, lines), service.rig.speed = learner(served, program), 0.2
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    script = "\n".join(lines).splitlines()
+    try:
+        subprocess.run(["bash", "-euc", "\n".join(script[:-1])], cwd=tmp_path, env=environment(own), check=True)
+        words = shlex.split(script[-1])
+        with subprocess.Popen(words, cwd=tmp_path, env=environment(own), stderr=subprocess.PIPE, text=True) as run:
+            await_state(service, "running")
+            run.send_signal(number)
+            run.communicate(timeout=60)
+        assert run.returncode != 0 and str(service.rig.stopped_by).startswith(program)
+    finally:
+        service.rig.speed = 12.0
+
+
+def await_state(service: Service, state: str) -> None:
+    until = time.monotonic() + 60
+    while service.rig.state != state:
+        assert time.monotonic() < until, service.rig.state
+        time.sleep(0.05)
 
 
 def test_every_address_on_the_page_is_a_route() -> None:
@@ -144,3 +229,13 @@ def test_the_c_program_plays_a_trial(program: Path, served: tuple[Service, str],
         [*run[:2], "P018", str(out)], env=environment(served), capture_output=True, text=True, check=False
     )
     assert wrong.returncode == 1 and "This key is for one participant" in wrong.stderr
+
+
+@pytest.mark.slow
+def test_every_line_of_the_page_on_rest_runs(served: tuple[Service, str], tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "api.md").read_text("utf-8")
+    shell = blocks("bash", text)
+    assert shell and len(re.findall(r"^```.", text, re.MULTILINE)) == len(shell), "of no other kind"
+    service, _ = served
+    lines = [f"TOKEN={service.token('api.md', 'run-test', 'read-model')}", *shell]
+    assert '"current_ma":18' in in_shell(served, tmp_path, lines).replace(" ", "")

@@ -13,7 +13,7 @@ import pytest
 
 from stimrig.api.cli import deciding
 from stimrig.api.cli.commands import test as verb
-from stimrig.api.cli.commands.diagnose import next_step
+from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.cli.errors import InputError
 from stimrig.api.client.errors import NotFound
 from stimrig.api.errors import ApiError
@@ -46,9 +46,13 @@ def test_it_goes_before_the_test_between_rivals_and_the_page_shows_it() -> None:
     ExperimentOut.model_validate(found)
     shown = explanation.tidy_experiment(found, {})
     assert shown["shown"] == ["Levels held at random", "Rest 2 s"] and shown["text"] == DECIDING["text"]
-    left = {"verdict": "unexplained_structure", "deciding_experiment": DECIDING}
-    assert "stimrig test --decide" in next_step(left, "") and "stimrig improve" not in next_step(left, "")
-    assert "stimrig improve DATA -o MODEL.json` adds the free effect" in next_step({**left, "free": [{}]}, "")
+    left = {"verdict": "unexplained_structure", "deciding_experiment": DECIDING, "base": {}, "probability": 1.0,
+            "structure": [], "noise_sd_nm": 0.05}  # fmt: skip
+    said = diagnosis_lines(left)[-1]
+    assert "stimrig test --decide" in said and "stimrig explain" not in said and "next experiment" in said
+    gate = {"effect": "free_gate", "name": "A gate", "words": "", "left_out": ""}
+    said = diagnosis_lines({**left, "free": [gate], "add": ["free_gate"]})[-1]
+    assert "Add “A gate”" in said and "`stimrig explain DATA -o MODEL.json` adds" in said
 
 
 def test_the_page_says_of_a_test_without_rivals_that_it_teaches_and_of_others_that_they_tell_apart() -> None:
@@ -92,8 +96,13 @@ def recordings(monkeypatch: pytest.MonkeyPatch) -> list[list[Path]]:
         return SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=source)
 
     monkeypatch.setattr(deciding, "load_record", load)
-    monkeypatch.setattr(deciding.identify, "diagnose", lambda *_: found, raising=False)
-    monkeypatch.setattr(deciding.identify, "next_experiment", lambda _: planned, raising=False)
+    left = SimpleNamespace(to_dict=dict)  # of the first model nothing is open, of the last one something is
+    explained = SimpleNamespace(diagnosis=found, left=left, improvement=SimpleNamespace(models=[None]))
+    monkeypatch.setattr(deciding, "held_by", lambda *_: [])
+    monkeypatch.setattr(deciding.identify, "explain", lambda *_: explained, raising=False)
+    monkeypatch.setattr(
+        deciding.identify, "next_experiment", lambda one: planned if one is left else None, raising=False
+    )
     return loaded
 
 
@@ -123,7 +132,8 @@ def test_the_verb_asks_for_it_and_diagnoses_all_together(
 def test_both_are_diagnosed_together(recordings: list[list[Path]], tmp_path: Path) -> None:
     first = tmp_path / "first.h5"
     first.touch()
-    assert deciding.diagnosed([first], b"second")["verdict"] == "nothing_missing"
+    found = deciding.diagnosed([first], b"second")
+    assert found["verdict"] == "nothing_missing" and found["left"]["structure"] == []
     assert recordings[0][0] == first and len(recordings[0]) == 2
 
 

@@ -190,7 +190,7 @@ CASES = {
             world.colleague.post(f"/v1/participants/{world.code}/calibration/finish", json={"discard": True}),
             world.colleague.post(f"/v1/participants/{world.code}/calibration", json={}),
         ][-1], None, {}, TRAIN.ready, TRAIN.page, "colleague has begun another calibration"),
-    "keys": Case(World.lower, None, KEY),
+    "keys": Case(World.lower, {name: text if name == "name" else int(text) for name, text in KEY.items()}, KEY),
     "strike": Case(
         lambda world: world.colleague.post(f"/v1/participants/{world.code}/notes/{world.names['note_id']}/strike"),
         None, {}, note),
@@ -280,5 +280,5 @@ UNWRITTEN = {"POST /v1/participants/{code}/notes/{note_id}/strike", "POST /parti
 """Done twice it changes nothing; a train is in the calibration's own recording; a jump is asked about first."""
 TWICE = {"POST /v1/rearm", "POST /rearm", "POST /v1/models/{model_id}/reject", "POST /models/{model_id}/reject",
          "POST /v1/participants/{code}/recordings", "POST /participants/{code}/recordings",
-         "POST /participants/{code}/keys"}  # fmt: skip
+         "POST /participants/{code}/keys", "POST /v1/participants/{code}/keys"}  # fmt: skip
 """A rig that is armed stays armed, what was rejected stays rejected; a recording and a key are added."""

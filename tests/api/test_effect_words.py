@@ -39,7 +39,7 @@ def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -
 
 def test_words_in_german() -> None:
     with language.using("de"):
-        assert effects_words(["fatigue:by_pulses", "mains_hum"]) == "Ermüdung (by pulses), Netzbrummen"
+        assert effects_words(["fatigue:by_pulses", "mains_hum"]) == "Ermüdung, Netzbrummen"
         assert effects_words(["fatigue", "my_swing"]) == "Ermüdung, My swing", "a person's own effect: its id in words"
         assert changes.name_of("fatigue.depth", "1").words == "Ermüdung, Tiefe"
         assert translated("recruitment_hysteresis: the evidence is too weak (log evidence +0.3): what it explains "
@@ -51,10 +51,10 @@ def test_words_in_german() -> None:
 def test_a_parameter_is_told_by_what_it_is() -> None:
     library = {entry["id"]: entry for entry in effects.library()}
     given = {name: {"value": 1.0, "sd": 0.1, "unit": "1"} for name in ("depth", "onset_s")}
-    found = explanation.card({"effect": "fatigue", "parameters": given}, library)["parameters"]
+    found = explanation.card({"effect": "fatigue", "parameters": given}, library, {})["parameters"]
     assert found["depth"]["label"] == "largest share of torque that is lost"
     assert found["onset_s"]["symbol"] == "onset", "as the equation calls it"
-    assert explanation.card({"effect": "own", "parameters": {"my_gain_nm": {}}}, {})["parameters"] == {
+    assert explanation.card({"effect": "own", "parameters": {"my_gain_nm": {}}}, {}, {})["parameters"] == {
         "my_gain_nm": {"label": "my gain", "symbol": "my_gain"}
     }
 
@@ -66,7 +66,7 @@ def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
     with language.using("de"):
         assert explanation.label(row) == "+ Ermüdung, Drift der Rekrutierungsschwelle"
         for known in ({}, library):
-            assert explanation.card(rival, known)["rivals"] == ["Drift der Rekrutierungsschwelle"]
+            assert explanation.card(rival, known, {})["rivals"] == ["Drift der Rekrutierungsschwelle"]
 
 
 def test_no_page_shows_an_id(service: Service, client: httpx.Client) -> None:

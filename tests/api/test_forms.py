@@ -33,7 +33,8 @@ def fields(tab: httpx.Client, page: str = PAGE) -> dict[str, str]:
 
 
 def inputs(html: str, page: str = PAGE) -> dict[str, str]:
-    form = next(part for part in html.split("<form")[1:] if f'action="{page}' in part.split(">")[0])
+    mine = [part for part in html.split("<form")[1:] if f'action="{page}' in part.split(">")[0]]
+    form = next((part for part in mine if "<label" in part.split("</form>")[0]), mine[0])  # the one that is typed into
     tags = [tag for tag in re.findall(r"<input[^>]*>", form.split("</form>")[0]) if _sent(tag)]
     found = [re.search(r'name="([^"]*)".*value="([^"]*)"', tag) for tag in tags]
     return {match[1]: match[2] for match in found if match}
@@ -275,6 +276,6 @@ def test_every_button_that_stimulates_looks_like_it() -> None:
         if count:
             with_class[path.name] = count
     assert with_class == {
-        "next.html": 1, "participant.html": 1, "calibration.html": 1, "question.html": 1, "model.html": 1,
-        "trials.html": 1,
+        "next.html": 1, "participant.html": 1, "calibration.html": 1, "question.html": 1,
+        "trials.html": 1, "experiment_form.html": 1,
     }  # fmt: skip

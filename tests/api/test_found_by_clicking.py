@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from stimrig.api.workers.pool import WORKER
-from tests.api.browser import PASSWORD, expected, participant, there
+from tests.api.browser import PASSWORD, chart, expected, participant, there
 from tests.api.conftest import Service, run_service
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -27,7 +27,7 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 
 
 def error_of(row: Any) -> float:
-    """Error on held-out rows of a version's row, N·m."""
+    """Error on held-out pulses of a version's row, N·m."""
     return float(row.locator("td").nth(4).inner_text())
 
 
@@ -42,13 +42,13 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     tab.get_by_text("An effect is missing in this model").wait_for(timeout=PATIENCE_MS)
     first = tab.url.split("#")[0].split("?")[0]
     tab.locator("#missing-recruitment_hysteresis").get_by_role("link", name="Hysteresis of recruitment").click()
-    tab.locator("[data-figure=signature-recruitment_hysteresis] .main-svg").first.wait_for()
+    chart(tab, "signature-recruitment_hysteresis")
     card = tab.locator("#missing-recruitment_hysteresis")
     assert "very probably missing" in card.inner_text()
     tab.locator("summary", has_text="Where the error sits").click()
     assert tab.locator(".places li").count() >= 3, "the worst places are named"
     card.get_by_role("button", name="Add this effect").click()
-    tab.locator("[data-figure=falling] .main-svg").first.wait_for(timeout=PATIENCE_MS)
+    chart(tab, "falling")
     rows = tab.locator(".versions tbody tr")
     assert rows.count() == 2 and rows.nth(1).inner_text().startswith("2. + hysteresis of recruitment")
     assert error_of(rows.nth(1)) < 0.5 * error_of(rows.nth(0)), "the error falls to less than half on rows not seen"

@@ -11,10 +11,11 @@ import pytest
 from stimrig import identify
 from stimrig.api.charts import diagnosis_charts
 from stimrig.api.charts.plot import plot
+from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.web.pages.environment import environment
-from stimrig.api.web.pages.report_file import improvement_html
+from stimrig.api.web.pages.report_file import diagnosis_html
 from stimrig.identify.errors import BadRequest
 from tests.api.test_own_effect_export import with_gate
 
@@ -49,9 +50,7 @@ def test_a_picture_has_each_curve_with_its_band_and_axes_that_are_no_links() -> 
 
 
 def test_the_report_says_the_sentence_and_what_left_out_parts_say() -> None:
-    steps = [{"added": None, "fit_percent": 90.0, "rms_nm": 0.1, "held_out_rms_nm": 0.1, "held_out_fit_percent": 90.0}]
-    found = {"verdict": "unexplained_structure", "noise_sd_nm": 0.05, "refused": [], "steps": steps}
-    html = improvement_html(found, "record", diagnosis())
+    html = diagnosis_html(diagnosis(), {}, [], "record")
     for words in ("Pulses open a gate.", "It falls by 78 %.", "names no cause", 'data-figure="free-free_gate"'):
         assert words in html
 
@@ -61,7 +60,8 @@ def test_a_model_that_holds_it_shows_it_and_the_diagnosis_does_not_offer_it_agai
     (card,) = explanation.held_free(document)
     assert card["words"] == "Pulses open a gate." and card["axis"] == SHAPE["effect"]
     assert list(diagnosis_charts.pictures([card])) == ["free-free_gate"]
-    shown = environment.get_template("why.html").module.free(card)  # pyright: ignore[reportAttributeAccessIssue]
+    drawn = Figures(diagnosis_charts.pictures([card]))
+    shown = environment.get_template("why.html").module.free(card, drawn)  # pyright: ignore[reportAttributeAccessIssue]
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
     assert explanation.view(diagnosis(), None, ["free_gate"])["free"] == []
     assert explanation.held_free({"effects": [{"id": "fatigue"}]}) == []

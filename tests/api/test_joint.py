@@ -215,7 +215,7 @@ def test_the_three_cost_at_most_the_papers_test(client: httpx.Client, ready: str
 def test_what_does_not_go_together_is_refused(client: httpx.Client, ready: str) -> None:
     wrong: list[tuple[str, dict[str, Any]]] = [
         ("passive", {"segments": [{"name": "rest", "sequence": "rest"}]}), ("held", {"protocol": "paper"}),
-        ("moving", {"target": {"curve_percent": 2}}), ("held", {"max_duration_s": 20}), ("passive", {"joins": "M1"}),
+        ("moving", {"target": {"curve_percent": 3}}), ("held", {"max_duration_s": 20}), ("passive", {"joins": "M1"}),
         ("passive", {"angle": {"target_rad": 1.0}}), ("pre-session", {"angle": {}}), ("held", {"angle": {"x": 1}}),
         ("passive", {"max_torque_time_nm_s": 3}), ("held", {"angle": {"target_rad": 2.5}}),
         ("held", {"angle": {"tolerance_rad": 1.0}}), ("moving", {"angle": {"still_s": 0}}),

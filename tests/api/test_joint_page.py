@@ -45,7 +45,7 @@ def test_without_a_sensor_there_is_nothing_of_it(tab: Any, service: Service) -> 
     assert tab.locator(".joint-link").count() == 0 == tab.locator("#angle_from_deg").count()
     tab.goto(f"{service.url}/participants/X1/joint")
     tab.get_by_text("This rig has no angle sensor.").wait_for()
-    assert tab.locator("main button").count() == 0, "no dead controls"
+    assert tab.locator("main button:visible").count() == 0, "no dead controls"
     assert tab.goto(f"{service.url}/rig/angle").status == 409
     tab.goto(f"{service.url}/participants/X1")
     tab.get_by_role("button", name="Start the pre-session test").click()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import pytest
@@ -17,7 +17,6 @@ from stimrig.api.sessions.joint_plan import (
     ENOUGH,
     Coverage,
     Curve,
-    covered,
     curve_of,
     layout,
     targets,
@@ -213,14 +212,19 @@ def test_no_number_a_gap_or_a_step_back_counts_for_nothing(odd: Sample) -> None:
     assert found.share == 0.0 and sum(map(sum, found.time_s)) == 0.0
 
 
+def covered(samples: list[Sample], counts: Callable[[Sample], bool] = lambda _: True) -> Coverage:
+    found = Coverage(grid(RANGE_RAD, 0.1))
+    for sample in samples:
+        found.add(*sample, counts(sample))
+    return found
+
+
 def test_what_does_not_count_is_passed_over() -> None:
     """Under stimulation only: the pauses between two levels say nothing of the muscle."""
     samples = list(sweep(0.4, 2)) + list(sweep(1.2, 2, 20.0))
-    columns = list(zip(*samples, strict=True))
-    cells = grid(RANGE_RAD, 0.1)
-    assert covered(cells, *columns).enough
-    assert covered(cells, *columns, counts=[False] * len(samples)).share == 0.0
-    only_flexion = covered(cells, *columns, counts=[velocity > 0 for _, _, velocity in samples])
+    assert covered(samples).enough
+    assert covered(samples, lambda _: False).share == 0.0
+    only_flexion = covered(samples, lambda sample: sample[2] > 0)
     assert {each.direction for each in only_flexion.missing()} == {"extension"}
 
 

@@ -39,7 +39,7 @@ def test_every_document_and_every_table_has_it(name: str) -> None:
     pytest.importorskip("pyarrow")
     from stimrig.api.cohort import bids, parquet, table
 
-    assert {name} <= set(table.SCHEMA.names) & set(parquet.schema_of("records").names)
+    assert {name} <= set(table.SCHEMA.names) & set(parquet.SCHEMAS["records"].names)
     assert name in bids.SCANS or name == "participant"
 
 

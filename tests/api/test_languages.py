@@ -18,8 +18,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stimrig.api import language
+from stimrig.api.effect_words import effects_words
 from stimrig.api.language import best, extract, translated
 from stimrig.api.language.translated import PERSON, of
+from stimrig.api.models import advice
+from stimrig.api.store.tables import Model
 from tests.api.conftest import STUB, Service, csrf, run_service, run_test, signed_in
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
@@ -67,7 +70,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "Fatigue": "Ermüdung",
         "the plateau is %(share)s lower": "das Plateau ist %(share)s tiefer",
         "Its error is %(times)s times the noise.": "Sein Fehler ist das %(times)sfache des Rauschens.",
-        "%(name)s: it raises the error on held-out rows.": "%(name)s: es erhöht den Fehler.",
+        "%(name)s: it raises the error on held-out pulses.": "%(name)s: es erhöht den Fehler.",
         "load cell: nothing for %(value)s s": "Kraftsensor: nichts seit %(value)s s",
         "The fit is good.": "Die Anpassung ist gut.",
     }.items():
@@ -100,7 +103,7 @@ def forget() -> None:
             "The fit is good. Its error is 1.3 times the noise.",
             "Die Anpassung ist gut. Sein Fehler ist das 1,3fache des Rauschens.",
         ),
-        ("Fatigue: it raises the error on held-out rows.", "Ermüdung: es erhöht den Fehler."),
+        ("Fatigue: it raises the error on held-out pulses.", "Ermüdung: es erhöht den Fehler."),
         (
             "load cell: nothing for 0.5 s; the plateau is 3 % lower",
             "Kraftsensor: nichts seit 0,5 s; das Plateau ist 3 % tiefer",
@@ -200,19 +203,22 @@ def test_each_message_is_recognised_as_itself(code: str) -> None:
     "sentence",
     [
         "Nothing is missing: what is left is noise",
-        "Nothing more is missing: what is left is noise",
         "Fatigue is very probably missing (99 %). The muscle tires: the longer it has worked, the less torque the same "
         "pulse gives. It recovers at rest. After a stroke, muscles tire sooner. Late in a session the muscle needs "
         "more charge, or longer rests. This record cannot clearly separate it from: potentiation, drift of the "
         "baseline. To decide: The ramp repeated after stimulation, and once more after a rest.",
         "data.csv, line 1: column 'Time' is taken for time_s, but its unit is not said. Give --map time_s=Time:s.",
-        "The recording gives evidence for: fatigue and drift of the baseline. Its error is 1.3 times the noise.",
-        "The error depends on what the muscle does, so it is not measurement noise. It sits mostly here: rising prbs, "
-        "100-200 µs: model too low by 0.12 N·m, 34 % of the error above the noise. Its error is 2.1 times "
-        "the noise.",
+        "The record gives evidence for: “Fatigue” and “Drift of the baseline”. On held-out pulses the model's error is "
+        "1.3 times the noise.",
+        "Add “Fatigue”, then “Drift of the baseline” to the model. The next experiment tells it from its rivals.",
+        "Nothing more can be learnt from this record alone. Fatigue: log evidence would rise by 40 with it, too little "
+        "beside all that is explained, too much for chance. Play the next experiment: it is planned to decide.",
+        "Nothing more can be learnt from this record alone. 2 effects are possibly missing in this model. Add nothing "
+        "yet: held-out pulses speak against adding any.",
+        "Most of it is here: rising prbs, 100-200 µs: model too low by 0.12 N·m, 34 % of the error above the noise.",
         "Do not use this model: the fit of 20.0 % is too poor: the torque hardly follows the pulses.",
-        "Check this before use: on held-out rows the fit is 80.1 %, and the noise allows 96.3 %: something is missing; "
-        "see the diagnosis.",
+        "Check this before use: on held-out pulses the fit is 80.1 %, and the noise allows 96.3 %: something is "
+        "missing; see the diagnosis.",
         "Valid for pulse widths of 100–300 µs, torques down to -5.0 N·m, 40–40 pulses/s.",
         "A fast ramp (20 s) should separate fatigue from potentiation.",
         "charge_per_phase_uc 12 µC is outside 0 … 10 (hard limit, over by 2): own rule",
@@ -248,6 +254,13 @@ def test_a_text_of_many_half_sentences_is_given_up(code: str) -> None:
     text = " ".join(pieces[(7 * k + k // 5) % len(pieces)] for k in range(400))
     with language.using(code):
         assert of(code, text) is None
+
+
+def test_an_effects_title_stands_after_a_colon_and_quotes_are_german() -> None:
+    with language.using("de"):
+        within = language._("with %(effects)s", effects=effects_words(["activation_dependent_speed"]))
+        assert within == "mit: Von der Aktivierung abhängige Geschwindigkeit"
+        assert "„Ermüdung“" in advice.advice("usable", [], ["Fatigue"]).words
 
 
 @pytest.mark.parametrize("code", LANGUAGES)
@@ -359,26 +372,31 @@ def browser(service: Service) -> Iterator[httpx.Client]:
 def ids(service: Service) -> dict[str, str]:
     """Of a participant with two tests, what its pages' addresses name."""
     with service.client() as http:
-        for code in ("X1", "X2"):
+        for code in ("X1", "X2", "X3"):
             http.post("/v1/participants", json={"code": code})
-        first, second = (run_test(http, "X1") for _ in range(2))
-        model, other = first["model_id"], second["model_id"]
+        http.post("/v1/participants/X3/archive")
+        first, *more = (run_test(http, "X1") for _ in range(3))
+        model, (other, poor) = first["model_id"], (test["model_id"] for test in more)
+        fit = service.context.store.get(Model, poor).fit
+        service.change(Model, poor, fit={**fit, "verdict": "not usable"})
         http.get(f"/v1/models/{model}/diagnosis")
         http.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"})
-    return {"model": model, "other": other, "test": first["id"]}
+    return {"model": model, "other": other, "poor": poor, "test": first["id"]}
 
 
 PAGES = (
     "/", "/participants/X2", "/participants/X1", "/models/{model}", "/models/{other}", "/tests/{test}",
     "/participants/X1/calibration", "/participants/X1/trend", "/compare?model={model}&model={other}",
-    "/models/{model}/report", "/administration", "/sign-in", "/models/none",
+    "/models/{model}/report", "/administration", "/sign-in", "/models/none", "/participants/X3",
+    "/models/{poor}/approve", "/models/{model}/widths", "/participants/X1/joint", "/rig/angle", "/jobs/none",
+    "/participants/none", "/compare", "/models/{model}/story",
 )  # fmt: skip
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_every_text_of_a_page_is_a_message(page: str, browser: httpx.Client, ids: dict[str, str]) -> None:
     answer = browser.get(page.format(**ids), headers={"Accept": "text/html"})
-    assert answer.headers["content-language"] == MADE_UP and answer.status_code in (200, 404)
+    assert answer.headers["content-language"] == MADE_UP and answer.status_code in (200, 404, 409, 422)
     assert untranslated(answer.text) == [], "\n".join(untranslated(answer.text))
 
 
@@ -442,3 +460,11 @@ def test_the_brackets_are_seen_through() -> None:
     html = '<p title="No words">⟦A <b>much</b> ⟦b⟧ c⟧ and more</p><p class="mono">words</p>'
     assert untranslated(html) == ["No words", "and more"]
     assert language.code() == "en"
+
+
+def test_a_number_takes_in_no_sentence_before_it() -> None:
+    """The conclusion stood in the middle of the sentence after it."""
+    ended = "Nothing more can be learnt from this record alone."
+    with language.using("de"):
+        found = of("de", f"{ended} 2 effects are possibly missing in this model.")
+        assert found == f"{of('de', ended)} {of('de', '2 effects are possibly missing in this model.')}"

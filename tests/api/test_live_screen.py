@@ -77,9 +77,9 @@ def test_what_flows_is_told_in_numbers_and_a_clinicians_words(running: Any, serv
     running.locator("#segment", has_text="Random pulses").wait_for(timeout=30_000)
     assert running.locator("#segment").get_attribute("title") == "prbs"
     assert running.locator("#current").inner_text() == "20.0 mA"
-    expected(running.locator("#dose")).not_to_have_text(re.compile("^0 µC"))
-    charge_uc, pulses = map(int, re.findall(r"(\d+) µC · (\d+) pulses", running.locator("#dose").inner_text())[0])
-    assert charge_uc == 6 * pulses, "300 µs at 20 mA are 6 µC"
+    expected(running.locator("#dose")).not_to_have_text(re.compile("^0.00 mC"))
+    charge_mc, pulses = map(float, re.findall(r"([\d.]+) mC · (\d+) pulses", running.locator("#dose").inner_text())[0])
+    assert charge_mc == pytest.approx(0.006 * pulses, abs=0.005), "300 µs at 20 mA are 6 µC"
     assert "Check (not used for fitting)" in running.locator("#track").inner_text()
     for chart in ("torque-chart", "width-chart"):
         assert running.evaluate(LIMIT_PIXELS, chart) > 300, "the limits are lines in the charts"
@@ -162,6 +162,8 @@ def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service
     tab.get_by_role("heading", name=re.compile(r"Stopped at \d\d:\d\d:\d\d")).wait_for()
     expected(tab.get_by_text("Ada: stop pressed on the page")).to_be_visible()
     assert "/stopped/" in tab.url
+    tab.get_by_text("not initialised: switched off, as it is after each stop").wait_for()
+    tab.get_by_role("button", name="I have checked: re-arm").wait_for()
     before = stops(service)
     with tab.expect_request(lambda request: request.is_navigation_request()) as asked:
         tab.reload()

@@ -3,56 +3,102 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import re
 from typing import Any
 
 import httpx
 import pytest
 
+from stimrig.api.sessions import controllers
 from stimrig.api.store.tables import Model, Test
 from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.next_view import Situation, Today, next_step
 from tests.api.conftest import Service, csrf, run_test, signed_in, wait_done
 
 READY, DONE, POOR = Today("M1", "usable"), Today("M1", "usable", decided=True), Today("M1", "not usable")
+RUNS = {"test": "T1", "state": "running", "rig": "running", "holder": "P1"}
+SERVED = {"model": DONE, "served_until": "23:59"}
+TRIAL = {**SERVED, "of": "trial"}
 TABLE: list[tuple[dict[str, Any], str, str, str]] = [
-    # what is so; then: kind, a part of the words, where the button leads ("form": it starts the test; "": no button)
+    # what is so; then: kind, a part of the words, where the button leads ("form": it is a form's own; "": no button)
     ({}, "test", "Start the pre-session test", "form"),
-    ({"calibration": "none", "may_start": False}, "calibrate", "Calibrate for today", "/participants/P1/calibration"),
-    ({"calibration": "none"}, "calibrate", "Calibrate for today", "/participants/P1/calibration"),
-    ({"calibration": "expired"}, "calibrate", "another day", "/participants/P1/calibration"),
+    ({"calibration": "none"}, "calibrate", "Calibrate for today", "form"),
+    ({"calibration": "expired"}, "calibrate", "another day", "form"),
     ({"rig": "calibrating", "holder": "P1"}, "calibrating", "has begun", "/participants/P1/calibration"),
+    ({"unstored": True}, "calibrating", "waits to be stored", "/participants/P1/calibration"),
     ({"rig": "calibrating", "holder": "P2"}, "wait", "in use for P2", ""),
-    ({"running": "T1", "holder": "P1", "rig": "running"}, "running", "is running", "/tests/T1"),
+    # a test under way, whatever else there is
+    ({**RUNS, "rig": "arming"}, "running", "The test is running", "/tests/T1"),
+    (RUNS, "running", "The test is running", "/tests/T1"),
+    ({**RUNS, "rig": "passive"}, "running", "The test is running", "/tests/T1"),
+    ({**RUNS, "of": "joint"}, "running", "The test is running", "/tests/T1"),
+    ({**RUNS, "model": READY}, "running", "The test is running", "/tests/T1"),
+    ({**RUNS, "rig": "stopping"}, "running", "is being stopped", "/tests/T1"),
+    ({**RUNS, "rig": "unreachable"}, "running", "last heard of", "/tests/T1"),
+    ({**RUNS, "rig": "silent"}, "running", "last heard of", "/tests/T1"),
+    ({**RUNS, "state": "sealing"}, "identifying", "is being saved", "/tests/T1"),
+    ({**TRIAL, **RUNS}, "running", "The controller plays a trial.", "/tests/T1"),
+    ({**TRIAL, **RUNS, "asked": True}, "running", "The controller plays a trial.", "/tests/T1"),
+    ({**TRIAL, **RUNS, "state": "sealing"}, "identifying", "is being saved", "/tests/T1"),
+    ({"state": "identifying", "test": "T1"}, "identifying", "is being made", "/tests/T1"),
+    ({"state": "identifying", "test": "T1", "rig": "latched"}, "identifying", "is being made", "/tests/T1"),
+    ({"state": "identifying", "test": "T1", "rig": "silent"}, "identifying", "is being made", "/tests/T1"),
     ({"rig": "running", "holder": "P2"}, "wait", "in use for P2", ""),
-    ({"identifying": "T1"}, "identifying", "is being made", "/tests/T1"),
-    ({"identifying": "T1", "rig": "latched"}, "identifying", "is being made", "/tests/T1"),
-    ({"model": READY}, "look", "then approve or reject", "/models/M1"),
+    ({"rig": "running"}, "wait", "is in use. Wait", ""),
+    # a model waits for a decision
+    ({"model": READY}, "look", "The model is ready. Look at it, then approve or reject", "/models/M1"),
     ({"model": READY, "rig": "latched"}, "look", "then approve or reject", "/models/M1"),
+    ({"model": READY, "state": "stopped"}, "look", "was stopped. The model is ready", "/models/M1"),
     ({"model": READY, "calibration": "expired"}, "look", "then approve or reject", "/models/M1"),
     ({"model": READY, "served_until": "23:59"}, "look", "then approve or reject", "/models/M1"),
+    ({"model": READY, "of": "joint", "state": "completed"}, "look", "The model is ready.", "/models/M1"),
     ({"model": dataclasses.replace(READY, verdict="usable with care")}, "look", "Look at it", "/models/M1"),
-    ({"model": DONE, "served_until": "23:59"}, "done", "today's model until 23:59", "/"),
-    ({"model": DONE, "served_until": "23:59", "rig": "latched"}, "done", "until 23:59", "/"),
-    ({"model": POOR, "served_until": "23:59"}, "done", "until 23:59", "/"),
-    ({"model": DONE, "served_until": "23:59", "asked": True}, "asked", "new test is needed", "/participants/P1#trials"),
+    # the controller has one
+    (SERVED, "done", "Done. The controller has today's model until 23:59", "/"),
+    ({**SERVED, "lacks_key": "mine"}, "done", "Today's model is approved until 23:59, but no controller has a key",
+     "/participants/P1#keys"),
+    ({**SERVED, "lacks_key": "another's"}, "done", "no controller has a key", "/"),
+    ({**SERVED, "lacks_key": "mine", "rig": "latched"}, "rearm", "no controller has a key yet. The rig has", ""),
+    ({**SERVED, "holder": "P2", "rig": "running"}, "done", "until 23:59", "/"),
+    ({**SERVED, "calibration": "expired"}, "done", "until 23:59", "/"),
+    ({**SERVED, "rig": "latched"}, "rearm", "until 23:59. The rig has stopped and needs a re-arm", ""),
+    ({**SERVED, "rig": "silent"}, "wait", "until 23:59. The rig does not answer", ""),
+    ({**SERVED, "rig": "disconnected"}, "wait", "until 23:59. A device is not connected", ""),
+    ({**SERVED, "model": POOR}, "done", "until 23:59", "/"),
+    ({**SERVED, "state": "stopped"}, "done", "The last test was stopped. The controller has", "/"),
+    ({**TRIAL, "state": "completed"}, "done", "Done. The controller has", "/"),
+    ({**TRIAL, "state": "stopped"}, "done", "The last trial was stopped. The controller has", "/"),
+    ({**TRIAL, "state": "stopped", "rig": "latched"}, "rearm", "needs a re-arm", ""),
+    ({**TRIAL, "state": "fault"}, "done", "The last trial ended by a fault.", "/"),
+    ({**TRIAL, "state": "refused"}, "done", "The last trial was not started.", "/"),
+    ({**TRIAL, "state": "failed"}, "done", "The last trial was not finished.", "/"),
+    ({**SERVED, "asked": True}, "asked", "new test is needed", "/participants/P1#trials"),
+    ({**SERVED, "asked": True, "rig": "latched"}, "rearm", "needs a re-arm", ""),
+    ({**SERVED, "of": "joint", "state": "completed"}, "joint", "Go on with", "/participants/P1/joint"),
+    # nothing to serve
     ({"model": DONE, "asked": True}, "test", "Start the pre-session test", "form"),
     ({"model": DONE}, "test", "Start the pre-session test", "form"),
+    ({"of": "trial", "state": "stopped"}, "test", "trial was stopped. Calibrated. Start", "form"),
+    ({"of": "joint", "state": "completed"}, "joint", "Go on with the tests of the joint", "/participants/P1/joint"),
+    ({"of": "joint", "state": "stopped"}, "joint", "was stopped. Go on with", "/participants/P1/joint"),
+    ({"of": "joint", "state": "stopped", "calibration": "none"}, "calibrate", "was stopped. Calibrate", "form"),
     ({"model": POOR}, "again", "is not usable. Test again", "form"),
-    ({"model": POOR, "calibration": "expired"}, "calibrate", "not usable. The last", "/participants/P1/calibration"),
+    ({"model": POOR, "calibration": "expired"}, "calibrate", "not usable. The last", "form"),
     ({"rejected": True}, "again", "was rejected. Test again", "form"),
-    ({"ended": "stopped"}, "again", "was stopped. Test again", "form"),
-    ({"ended": "stopped", "rig": "latched"}, "rearm", "needs a re-arm", ""),
-    ({"ended": "fault"}, "again", "ended by a fault", "form"),
-    ({"ended": "refused"}, "again", "was not started", "form"),
-    ({"ended": "failed"}, "again", "gave no model", "form"),
+    ({"state": "stopped"}, "again", "was stopped. Test again", "form"),
+    ({"state": "stopped", "rig": "latched"}, "rearm", "needs a re-arm", ""),
+    ({"state": "fault"}, "again", "ended by a fault", "form"),
+    ({"state": "refused"}, "again", "was not started", "form"),
+    ({"state": "failed"}, "again", "gave no model", "form"),
+    # nothing starts
     ({"rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({"rig": "uncertain"}, "rearm", "needs a re-arm", ""),
-    ({"rig": "latched", "calibration": "none", "may_start": False}, "rearm", "needs a re-arm", ""),
+    ({"rig": "latched", "calibration": "none"}, "rearm", "needs a re-arm", ""),
     ({"archived_since": "today"}, "archived", "In the archive since today", "/participants/P1/unarchive"),
     ({"archived_since": "today", "rig": "latched"}, "archived", "no test starts", "/participants/P1/unarchive"),
     ({"archived_since": "today", "model": READY}, "archived", "no test starts", "/participants/P1/unarchive"),
-    ({"archived_since": "today", "running": "T1"}, "running", "is running", "/tests/T1"),
+    ({"archived_since": "today", **RUNS}, "running", "is running", "/tests/T1"),
     ({"rig": "disconnected"}, "wait", "not connected", ""),
     ({"rig": "unreachable"}, "wait", "does not answer", ""),
     ({"rig": "silent"}, "wait", "does not answer", ""),
@@ -75,47 +121,89 @@ def test_the_table_names_every_kind_and_every_state_of_the_rig() -> None:
         assert next_step(Situation("P1", rig=state)).words
 
 
-def test_keys_tell_steps_apart() -> None:
-    """A page that shows one step and hears of another key is out of date."""
-    keys = {next_step(Situation("P1", **so)).key for so, *_ in TABLE}
-    assert len(keys) > 15
+def test_keys_change_with_what_is_shown_and_with_nothing_else() -> None:
+    """A page that shows one line and hears of another key is out of date."""
+    steps = [next_step(Situation("P1", **so)) for so, *_ in TABLE]
+    shown = {(step.kind, step.words, step.button, step.href): step.key for step in steps}
+    assert len(set(shown.values())) == len(shown) > 40
+    assert all(step.key == shown[step.kind, step.words, step.button, step.href] for step in steps)
 
 
 # ---- the page -----------------------------------------------------------------------------------------------
 
 
 def shown(service: Service, path: str = "/participants/P017") -> tuple[str, str]:
-    """The line's key and words."""
+    """The line's kind with what it is about, and its words."""
     with signed_in(service) as browser:
         text = browser.get(path).text
         found = re.search(r'data-next="([^"]*)".*?data-words>(.*?)</b>', text, re.DOTALL)
         assert found, "the page has the line"
         assert text.count("data-next=") == 1
-        if path.startswith("/participants"):
-            assert browser.get(f"{path}/next").json() == {"key": found[1]}
-    return found[1], found[2]
+        section = text[found.start() : text.index("</section>", found.end())]
+        assert len(re.findall(r"<button|<a ", section)) <= 1
+        code = re.search(r'data-from="/participants/([^/"]*)/next"', text)
+        assert code and browser.get(f"/participants/{code[1]}/next").json() == {"key": found[1]}
+    leads = re.search(r'href="/(?:tests|models)/([^"]*)"', section)
+    return f"{found[1].split()[0]} {leads[1] if leads else ''}".strip(), html.unescape(found[2])
+
+
+PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 15.0, "trials": 20}
+KEYLESS_NOW = ("done", "Today's model is approved until 23:59, but no controller has a key yet.")
+DONE_NOW = ("done", "Done. The controller has today's model until 23:59.")
 
 
 def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service, participant: str) -> None:
-    assert shown(service)[0] == "calibrate may"
+    assert shown(service)[0] == "calibrate"
     model = run_test(client, participant)["model_id"]
     assert shown(service)[0] == f"look {model}"
     client.post(f"/v1/models/{model}/reject", json={"reason": "electrode slipped"})
     assert shown(service)[1].startswith("The last model was rejected.")
     second = run_test(client, participant)["model_id"]
     client.post(f"/v1/models/{second}/approve")
-    assert shown(service)[0] == "done 23:59" == shown(service, f"/models/{second}")[0]
+    assert shown(service) == shown(service, f"/models/{second}") == KEYLESS_NOW
+    controllers.make_key(service.context.auth, "arm", participant, PLAN, "test")
+    assert shown(service) == shown(service, f"/models/{second}") == DONE_NOW
     better = client.post(f"/v1/models/{second}/effects", json={"effects": ["fatigue"]}).json()["id"]
     assert shown(service)[0] == f"look {better}"
     client.post(f"/v1/models/{better}/undo")
-    assert shown(service)[0] == "done 23:59"
+    assert shown(service) == DONE_NOW
+
+
+def test_what_is_next_of_a_rejected_model_is_about_it_first(
+    client: httpx.Client, pages: httpx.Client, participant: str
+) -> None:
+    first = run_test(client, participant)["model_id"]
+    client.post(f"/v1/models/{first}/reject", json={"reason": "electrode slipped"})
+    assert (
+        "This model no longer counts. <b data-words>The last model was rejected." in pages.get(f"/models/{first}").text
+    )
+    second = run_test(client, participant)["model_id"]
+    text = pages.get(f"/models/{first}").text
+    assert "This model no longer counts; another one of today waits. <b data-words>" in text and second in text
+
+
+def test_an_undo_is_called_so_and_says_how_to_have_it_back(
+    client: httpx.Client, pages: httpx.Client, participant: str
+) -> None:
+    model = run_test(client, participant)["model_id"]
+    better = client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
+    client.post(f"/v1/models/{better}/approve")
+    assert "was undone" not in pages.get(f"/models/{model}").text
+    client.post(f"/v1/models/{better}/undo", json={"reason": "not plausible"})
+    before, after = (pages.get(f"/models/{each}").text for each in (model, better))
+    assert "The version after this one was undone." in before and f'href="/models/{better}">To have it again' in before
+    assert "This model is approved." in before
+    assert "Undone by" in after and "Approve this one to have it again." in after and "Rejected by" not in after
+    assert ">undone</span>" in after and "not plausible" in after
+    client.post(f"/v1/models/{better}/approve")
+    assert "was undone" not in pages.get(f"/models/{model}").text
 
 
 def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Service, participant: str) -> None:
     document = run_test(client, participant)
     service.change(Model, document["model_id"], created_utc="2026-01-02T10:00:00.000Z")
     service.change(Test, document["id"], requested_utc="2026-01-02T09:00:00.000Z")
-    assert shown(service)[0] == "calibrate may"
+    assert shown(service)[0] == "calibrate"
 
 
 def test_of_two_versions_of_a_test_the_offered_one_is_next(client: httpx.Client, service: Service, participant: str):
@@ -133,9 +221,49 @@ def test_a_stopped_test_says_so_until_the_next_one(client: httpx.Client, service
     assert shown(service)[0] == f"running {test}"
     client.post("/v1/stop")
     wait_done(client, test)
-    assert shown(service)[0] == "rearm latched"
+    assert shown(service)[0] == "rearm"
     client.post("/v1/rearm")
     assert shown(service)[1].startswith("The last test was stopped.")
+
+
+def test_while_a_trial_plays_the_line_says_so_and_after_it_what_became_of_it(
+    client: httpx.Client, service: Service, approved: str
+) -> None:
+    service.rig.speed = 0.5
+    trial = client.post("/v1/tests", json={"participant": "P017", "kind": "sequence"}).json()["id"]
+    for path in ("/participants/P017", f"/models/{approved}"):
+        assert shown(service, path) == (f"running {trial}", "The controller plays a trial.")
+    client.post("/v1/stop")
+    wait_done(client, trial)
+    assert shown(service)[1].startswith("The controller has today's model until 23:59. The rig has stopped")
+    client.post("/v1/rearm")
+    assert shown(service) == ("done", "The last trial was stopped. The controller has today's model until 23:59.")
+
+
+def test_a_test_that_goes_on_over_midnight_is_still_running(client: httpx.Client, service: Service, participant: str):
+    service.rig.speed = 0.5
+    test = client.post("/v1/tests", json={"participant": participant}).json()["id"]
+    service.change(Test, test, requested_utc="2026-01-02T22:59:30.000Z")
+    assert shown(service) == (f"running {test}", "The test is running.")
+    client.post("/v1/stop")
+    wait_done(client, test)
+
+
+def test_the_button_of_the_line_begins_the_calibration_with_the_current_it_names(
+    client: httpx.Client, service: Service, pages: httpx.Client, participant: str
+) -> None:
+    seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
+    page = pages.get("/participants/P017").text
+    assert "Begin the calibration: 20 mA" in page
+    form = {"csrf": csrf(pages), "seen": seen}
+    assert (
+        pages.post("/participants/P017/calibration", data=form).headers["location"] == "/participants/P017/calibration"
+    )
+    opened = pages.get("/participants/P017/calibration").text
+    assert "20.0 mA · trains of" in opened and "nothing sent yet" in opened and "sends one short train" in opened
+    assert "no step above 45 µs" in opened and "tests go no further than what you mark as comfortable" in opened
+    assert "fine near a mark" not in opened, "without earlier marks no step is fine by itself"
+    assert service.rig.calibration is not None and service.rig.calibration.trains == []
 
 
 def test_the_start_in_the_line_sets_what_was_typed(client: httpx.Client, pages: httpx.Client, participant: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,11 @@ import pytest
 import stimrig
 from stimrig import identify
 from stimrig.api.charts.figure import CHART_CONFIG
-from stimrig.api.web.pages.report_file import comparison_html, improvement_html
-from stimrig.api.workers.curves import curves, thinned
-from tests.api.browser import open_tab
+from stimrig.api.models.explanation import step_versions
+from stimrig.api.models.story import story
+from stimrig.api.web.pages.report_file import comparison_html, story_html
+from stimrig.api.workers.curves import curves, rounded
+from tests.api.browser import look_closer, open_tab, settled
 from tests.api.conftest import Service, play_test, shared_service
 from tests.api.test_worker import made_up_csv
 
@@ -107,14 +110,13 @@ def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service
         tab.goto(service.url + path)
         if path == paths[0]:
             tab.locator("[data-figure=signature-fatigue]").first.wait_for(state="attached")
-        tab.wait_for_load_state()
+        settled(tab)
         tab.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
-        if path == paths[0]:
-            tab.locator("[data-figure=signature-fatigue] .main-svg").first.wait_for()
         tab.downloads.clear()
-        boxes = tab.locator("[data-figure]").all()
-        press_everything(tab, len(boxes))
-        seen |= {str(box.get_attribute("data-figure")) for box in boxes}
+        names = [str(box.get_attribute("data-figure")) for box in tab.locator("[data-figure]").all()]
+        look_closer(tab, *names)
+        press_everything(tab, len(names))
+        seen |= set(names)
     assert seen == {"overview", "comparison", "recruitment", "step", "residual", "falling", "signature-fatigue"}
 
 
@@ -126,23 +128,45 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     record.write_text(record.read_text().replace(",prbs", ',"' + LINK.replace('"', '""') + '"'))
     read = identify.read(record)
     model = identify.fit(read)
-    drawn, against = curves(model, read), thinned(identify.compare(model, read).to_dict())
+    drawn, against = curves(model, read), rounded(identify.compare(model, read).to_dict())
     (folder / "compare.html").write_text(comparison_html(model.to_dict(), drawn, LINK, None, against))
-    found = {"verdict": "effect_missing", "noise_sd_nm": 0.04, "refused": [], "steps": [
+    steps = [
         {"added": added, "fit_percent": 97.0, "rms_nm": rms, "held_out_rms_nm": rms, "held_out_fit_percent": 97.0}
         for added, rms in ((None, 0.12), (LINK, 0.041))
-    ]}  # fmt: skip
-    improved = improvement_html(found, LINK, None, against, against, drawn["segments"])
+    ]
+    told = story(step_versions({"noise_sd_nm": 0.04, "steps": steps}), against, against, None, None)
+    measured = {"curves": drawn, "comparison": against}
+    improved = story_html(told, measured, {**measured}, LINK)
     (folder / "improve.html").write_text(improved)
     (folder / "notebook.html").write_text(f"<!doctype html><body>{stimrig.plot(model, read)._repr_html_()}")
     return folder
 
 
-@pytest.mark.parametrize(("name", "figures"), [("compare", 4), ("improve", 3), ("notebook", 1)])
-def test_no_request_leaves_a_file_whatever_is_pressed(tab: Any, files: Path, name: str, figures: int) -> None:
-    tab.goto((files / f"{name}.html").as_uri())
-    press_everything(tab, figures)
+def test_no_request_leaves_a_notebook_whatever_is_pressed(tab: Any, files: Path) -> None:
+    tab.goto((files / "notebook.html").as_uri())
+    press_everything(tab, 1)
     assert tab.locator(".js-plotly-plot a[href]").count() == 0, "words of a recording are words, no links"
+
+
+@pytest.mark.parametrize(("name", "figures"), [("compare", 4), ("improve", 3)])
+def test_a_report_is_one_small_file_whose_charts_are_read_and_saved_offline(
+    tab: Any, files: Path, name: str, figures: int
+) -> None:
+    path = files / f"{name}.html"
+    assert path.stat().st_size < 1_000_000 and "Plotly." not in path.read_text()
+    tab.goto(path.as_uri())
+    stills = tab.locator(".figure-box svg.still")
+    assert stills.count() == figures and tab.locator("svg a, svg script").count() == 0, "a recording's words are words"
+    stills.first.hover()
+    assert "N·m" in tab.locator(".read-out").inner_text()
+    links = tab.get_by_role("link", name="Save as SVG")
+    assert links.count() == figures
+    for link in links.all():
+        with tab.expect_download() as saved:
+            link.click()
+        picture = ElementTree.parse(saved.value.path()).getroot()
+        assert picture.tag.endswith("svg") and "var(--" not in Path(saved.value.path()).read_text()
+    assert tab.left == [] and tab.errors == []
 
 
 def test_a_report_lets_nothing_out_by_itself(tab: Any, files: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from stimrig.api.web.responses.rig import SequencesOut
 from stimrig.rig import plan
+from stimrig.rig.limits import HARD_LIMITS
 from tests.api.browser import open_tab
 from tests.api.conftest import Service, run_test, shared_service
 
@@ -122,6 +123,47 @@ def test_real_answers_hold_to_the_document(client: httpx.Client, document: dict[
         assert errors == [], path
         tried += 1
     assert tried > 12
+
+
+def test_each_member_that_a_problem_carries_is_in_its_schema(client: httpx.Client, document: dict[str, Any]) -> None:
+    client.post("/v1/participants", json={"code": "P018"}).raise_for_status()
+    old = client.get("/v1/participants/P018").headers["etag"]
+    client.put("/v1/participants/P018/profile", json={"current_ma": 8}).raise_for_status()
+    stopped = client.get("/v1/rig")
+    assert stopped.json()["latch"] == stopped.headers["etag"].strip('"')
+    client.post("/v1/stop").raise_for_status()
+    answers = [
+        client.put("/v1/participants/P018/profile", json={"current_ma": 9}, headers={"If-Match": old}),
+        client.post("/v1/rearm", headers={"If-Match": stopped.headers["etag"]}),
+        client.post("/v1/tests", json={}),
+    ]
+    client.post("/v1/rearm").raise_for_status()
+    named = document["components"]["schemas"]["Problem"]
+    for answer in answers:
+        assert answer.is_error and set(answer.json()) <= set(named["properties"]), answer.text
+        schema = {**named, "components": document["components"]}
+        assert not list(jsonschema_rs.Draft202012Validator(schema).iter_errors(answer.json())), answer.text
+    assert {"latch", "changes", "seen", "place", "fix"} <= set(named["properties"])
+    assert "latch" in document["components"]["schemas"]["RigOut"]["properties"]
+
+
+def test_the_document_describes_live_messages_and_what_was_tracked(document: dict[str, Any]) -> None:
+    schemas = document["components"]["schemas"]
+    assert {"time_s", "torque_min_nm", "pulse_width_us"} <= set(schemas["LiveOut"]["properties"])
+    assert "negative" in schemas["LiveOut"]["description"]
+    assert schemas["ModelJson"]["properties"]["tracking"] == {"$ref": "#/components/schemas/TrackedOut"}
+    assert {"ask", "disturbed_s"} <= set(schemas["TrackedOut"]["properties"])
+
+
+def test_a_pulse_rate_has_the_range_of_the_rig_where_it_is_played(document: dict[str, Any]) -> None:
+    schemas, own = document["components"]["schemas"], HARD_LIMITS["pulse_rate_hz"]
+    asked = schemas["TestIn"]["properties"]["pulse_rate_hz"]
+    assert (asked["minimum"], asked["maximum"]) == (own.lo, own.hi)
+    for name in ("WidthsIn", "ReferenceIn"):
+        asked = schemas[name]["properties"]["pulse_rate_hz"]
+        assert "default" not in asked or asked["default"] is None
+        (number,) = (part for part in asked["anyOf"] if part["type"] == "number")
+        assert (number["minimum"], number["maximum"]) == (own.lo, 100.0), "a model of another tool's recording, too"
 
 
 def test_a_client_sees_which_sequences_there_are_and_what_they_take(service: Service) -> None:

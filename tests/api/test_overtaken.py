@@ -229,6 +229,7 @@ def test_a_rearm_that_a_stop_overtakes_is_not_done(service: Service, client: htt
     changed = answer.json()["changes"][0]
     assert changed["seen"]["detail"]["state"] == changed["now"]["detail"]["state"] == "latched"
     assert answer.json()["latch"] == service.rig.latch != seen.strip('"')
+    assert answer.json()["detail"] == f"{service.rig.reason}; look, then re-arm", "and no entry without a name"
 
 
 # ---- a site, another's recording, a result that could not be stored -------------------------------------------------

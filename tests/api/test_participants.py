@@ -13,6 +13,7 @@ from sqlalchemy import event
 from stimrig.api import language
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
+from tests.api.browser import chart
 from tests.api.conftest import Service, csrf, run_test, shared_service, signed_in, soon, wait_done
 
 service = shared_service()
@@ -130,7 +131,7 @@ def test_the_page_of_an_archived_participant_offers_the_way_out_and_no_test(page
     make(http, "A3")
     http.post("/v1/participants/A3/archive")
     page = pages.get("/participants/A3").text
-    assert 'data-next="archived"' in page and "In the archive since" in page
+    assert 'class="card next next-archived"' in page and "In the archive since" in page
     assert "Start the pre-session test" not in page and "A3/calibration" not in page
     assert page.count('action="/participants/A3/unarchive"') == 2, "in the line that says what is next, and below"
     out = pages.post("/participants/A3/unarchive", data={"csrf": csrf(pages)})
@@ -283,14 +284,14 @@ def test_a_fold_stays_as_it_was_left(tab: Any, service: Service, model: str) -> 
     )
     tab.reload()
     assert fold.get_attribute("open") is not None
-    fold.locator("[data-figure=recruitment] .main-svg").first.wait_for()
+    chart(tab, "recruitment")
     assert tab.locator("#figures").get_attribute("open") is None
     assert tab.errors == []
 
 
 def test_new_pulses_come_first() -> None:
     both = {"fit_percent": 98.5, "ceiling_percent": 99.0, "held_out_fit_percent": 97.9}
-    assert (followed(both).percent, followed(both).where) == (97.9, "On pulses not used for fitting")
+    assert (followed(both).percent, followed(both).where) == (97.9, "On held-out pulses (not used for fitting)")
     crossed = {**both, "held_out_by": "cross-validation"}
     assert followed(crossed).where == "On parts of the recording that were left out in turn"
     alone = followed({**both, "held_out_fit_percent": None})
@@ -305,7 +306,7 @@ def test_every_page_shows_the_same_fit(service: Service, client: httpx.Client) -
     with signed_in(service) as browser:
         for place in pages:
             page = browser.get(place).text
-            assert "97.9" in page and 'title="On pulses not used for fitting"' in page, place
+            assert "97.9" in page and 'title="On held-out pulses (not used for fitting)"' in page, place
             page = re.sub(r"<(script|svg)\b.*?</\1>", "", page, flags=re.DOTALL)
             others = page.count("98.5")  # on the pulses that it was fitted to; said so where it is shown
-            assert others == page.count("On fitted pulses</span><b>98.5"), place
+            assert others == page.count("Fit, fitted pulses</span><b>98.5"), place

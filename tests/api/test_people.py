@@ -305,7 +305,7 @@ def test_stop_by_json_and_without_a_body_says_the_rigs_evidence(
     service.rig.speed = 0.5
     client.post("/v1/tests", json={"participant": participant})
     answer = client.post("/v1/stop", json={"reason": "pain"}).json()
-    assert answer["stopped"] and answer["evidence"]["device_state"] == "stopped"
+    assert answer["stopped"] and answer["evidence"]["device_state"] == "not initialised"
     assert client.post("/v1/stop").json()["stopped"]
 
 

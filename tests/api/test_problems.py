@@ -66,6 +66,7 @@ def test_what_is_not_there(shared_client: httpx.Client, method: str, path: str, 
 def test_body_that_is_no_json(shared_client: httpx.Client) -> None:
     answer = shared_client.post("/v1/tests", content=b"{", headers={"content-type": "application/json"})
     problem(answer, 422)
+    assert answer.json()["detail"].startswith("The body is no JSON from character 1 on.")
 
 
 def test_test_of_nobody(shared_client: httpx.Client) -> None:

@@ -64,5 +64,5 @@ def test_commands_do_what_they_are_said_to(tmp_path: Path, monkeypatch: pytest.M
             with contextlib.redirect_stdout(out):
                 assert main.run(words) == 0, command
             assert out.getvalue().strip(), command
-    for name in ("first.h5", "MODEL.json", "predicted.csv", "report.html", "hidden.h5", "improved.html"):
+    for name in ("first.h5", "MODEL.json", "predicted.csv", "report.html", "hidden.h5", "story.html", "better.json"):
         assert (tmp_path / "out" / name).stat().st_size > 1000, name

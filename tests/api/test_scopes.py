@@ -77,6 +77,11 @@ GET    /v1/effects                                         read-model     200
 GET    /v1/jobs/x                                          read-model     404
 GET    /models/x                                           read-model     404
 GET    /models/x/report                                    read-model     404
+GET    /models/x/figures/x                                 read-model     404
+GET    /models/x/story                                     read-model     404
+GET    /models/x/story.html                                read-model     404
+GET    /models/x/story/figures/x                           read-model     404
+GET    /compare/figures/x                                  read-model     422
 GET    /participants/x/trend                               read-model     404
 GET    /compare                                            read-model     422
 GET    /jobs/x                                             read-model     404
@@ -135,6 +140,7 @@ POST   /participants/x/unarchive                           run-test       428
 POST   /participants/x/muscle                              run-test       428
 POST   /tests/x/ran-by                                     run-test       428
 POST   /participants/x/keys/x/revoke                       run-test       404
+POST   /v1/participants/x/keys                             approve-model  428
 POST   /participants/x/keys                                approve-model  428
 POST   /v1/rearm                                           rearm          428
 POST   /rearm                                              rearm          428

@@ -15,6 +15,8 @@ import httpx
 import pytest
 
 from stimrig import identify
+from stimrig.api.charts import trend_charts
+from stimrig.api.charts.trend_charts import WIDE
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.store.tables import Analysis, Model
@@ -120,6 +122,16 @@ def test_other_effects_are_said_and_only_large_differences_told() -> None:
     other = replace(before, figures=more, structure=("fatigue:fitness",))
     assert changes.changed(before, other) == []
     assert [one["kind"] for one in changes.doubts(before, other)] == ["effects"]
+    assert changes.doubt_sentences(before, other)[0].startswith("The models' effects differ (none, then fatigue):")
+    again = replace(other, structure=("fatigue:two_pools",))
+    assert changes.doubt_sentences(other, again)[0].startswith("The models describe fatigue in different ways:")
+
+
+def test_a_dose_is_told_in_one_unit_and_says_what_it_counts(client: httpx.Client, days: list[str]) -> None:
+    assert changes.dose_words(12_345.6) == "12.35\u00a0mC" and changes.dose_words(None) == "–"
+    page = compared(client, days[:2])
+    assert "Dose of the day" in page and "behind a difference that of both values together" in page
+    assert "over all pulses of all 1 tests of that day, stopped ones, too" in page
 
 
 def test_models_from_before_the_figures_are_read_once(tmp_path: Path, short_dir: Path) -> None:
@@ -253,6 +265,13 @@ def weeks(service: Service) -> list[str]:
     return made(service, "WEEKS", sessions.weeks(COUNT))
 
 
+def at(tab: Any, picture: Any, number: int) -> None:
+    """The pointer at a session of a picture."""
+    box = picture.bounding_box()
+    x = tab.evaluate("(number) => JSON.parse(document.getElementById('told').textContent)[number][0]", number)
+    tab.mouse.move(box["x"] + x * box["width"] / WIDE, box["y"] + box["height"] / 2)
+
+
 @pytest.mark.browser
 def test_twenty_sessions_fit_a_laptop_and_lead_to_their_models(tab: Any, service: Service, weeks: list[str]) -> None:
     tab.set_viewport_size(LAPTOP)
@@ -262,14 +281,14 @@ def test_twenty_sessions_fit_a_laptop_and_lead_to_their_models(tab: Any, service
     assert pictures.count() == 9
     lowest = max(pictures.nth(k).bounding_box()["y"] + pictures.nth(k).bounding_box()["height"] for k in range(9))
     assert lowest <= LAPTOP["height"]  # all of them in the first screen
-    dots = [pictures.nth(1).locator(f".dot{kind}").count() for kind in ("", ".hollow")]
+    dots = [pictures.nth(1).locator(f".{kind}").get_attribute("d").count("M") for kind in ("dot", "hole")]
     assert dots == [COUNT, sum(not one.approved for one in sessions.weeks(COUNT))]
-    column = pictures.nth(1).locator(".column").nth(6)
-    column.hover()
+    at(tab, pictures.nth(1), 6)
     told = tab.locator("#tip").inner_text()
     assert re.search(r"Plateau [\d.]+ ± [\d.]+\s*N·m", told) and "approved by Ada" in told and "baclofen" in told
     assert tab.locator(".column.here").count() == 9  # the same session in every picture
-    column.click()
+    tab.mouse.down()
+    tab.mouse.up()
     tab.wait_for_url(f"**/models/{weeks[6]}")
     assert tab.errors == []
 
@@ -280,7 +299,7 @@ def test_notes_are_text_and_pictures_have_no_markup_of_theirs(tab: Any, service:
     planned = [Planned(Patient(), 0.0), Planned(replace(Patient(), gain=5.0), 3.0, notes={"electrodes": evil})]
     made(service, "EVIL", planned)
     tab.goto(service.url + "/participants/EVIL/trend")
-    tab.locator("svg.trend").first.locator(".column").nth(1).hover()
+    at(tab, tab.locator("svg.trend").first, 1)
     assert "<script>" in tab.locator("#tip").inner_text()
     assert tab.title() == "Trend of EVIL · stimrig" and tab.locator("main img").count() == 0
 
@@ -309,3 +328,8 @@ def test_no_violation(tab: Any, service: Service, weeks: list[str]) -> None:
     for path in ("/participants/WEEKS/trend", compared):
         tab.goto(service.url + path)
         examined(tab, f"{path}, dark")
+
+
+def test_the_band_of_a_single_value_is_within_the_picture() -> None:
+    low, high = trend_charts.span([{"value": -0.5, "half": 1.4}])
+    assert low < -1.9 and high > 0.9

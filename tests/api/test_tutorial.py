@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,8 +35,11 @@ def test_every_block_runs_in_order(tmp_path: Path) -> None:
     with few_effects.only("asymmetric_relaxation", "fatigue", "output_saturation", "free_gate", "free_speed"):
         for piece in pieces:
             exec(compile(piece, "tutorial.md", "exec"), scope)
+    free: Any = scope["free"]
+    opened_ms, closed_ms = (int(one) for one in re.findall(r"(\d+) ms", free["words"]))
+    assert 15 <= opened_ms <= 25 and 70 <= closed_ms <= 90, free["words"]
     figure = stimrig.plot(scope["better"])  # pyright: ignore[reportArgumentType]
-    assert [trace.name for trace in figure.data] == ["rows used to fit", "rows not used to fit"]
+    assert [trace.name for trace in figure.data] == ["fitted pulses", "held-out pulses"]
     drawn = stimrig.plot(scope["model"], scope["record"])  # pyright: ignore[reportArgumentType]
     assert {"measured", "model, free run", "measured − model", "pulse width"} <= {trace.name for trace in drawn.data}
 

@@ -22,6 +22,7 @@ from stimrig.api.cli.commands.diagnose import effect_lines
 from stimrig.api.cli.session_report import report_lines
 from stimrig.api.models import advice, explanation, registry, stored_model
 from stimrig.api.models.registry import Versions
+from stimrig.api.web.pages import report_view
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.identify.estimation import quality
@@ -29,6 +30,19 @@ from tests.api.conftest import REAL, Service, csrf, run_test, serving, signed_in
 from tests.harness import few_effects
 from tests.harness.patients import Patient, make_record
 from tests.identify import hidden_muscles
+
+
+def test_the_report_names_the_hash_of_the_file_and_that_of_its_contents(
+    monkeypatch: pytest.MonkeyPatch, client: httpx.Client, pages: httpx.Client, participant: str
+) -> None:
+    model = run_test(client, participant)["model_id"]
+    told = {"data": {"sha256": "c0ffee" * 11}}
+    assert "of its contents" not in pages.get(f"/models/{model}/report").text
+    monkeypatch.setattr(report_view.stored_model, "read", lambda row: json.loads(row.document) | told)
+    text = pages.get(f"/models/{model}/report").text
+    assert "SHA-256 of the file <span" in text and ", of its contents, as in MODEL.json <span" in text
+    assert ">c0ffeec0ffeec0ff…</span>" in text
+
 
 GATE = {"passed": False, "severity": "refuse", "says": "the dynamics are unstable"}
 
@@ -93,7 +107,7 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
 def test_level_held_out_torque_has_no_percent(tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]):
     data = record_csv(tmp_path / "level.csv", follows=True, level=True)
     printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
-    assert f"held out       {stored_model.UNDEFINED}, rms" in printed
+    assert f"held out       fit {stored_model.UNDEFINED}, error" in printed
     fit = json.loads((tmp_path / "MODEL.json").read_text())["fit"]
     assert fit["held_out_fit_percent"] is None and fit["held_out_ceiling_percent"] is None
     assert fit["held_out_rms_nm"] > 0
@@ -223,13 +237,14 @@ def found(*gates: tuple[str, str]) -> list[advice.Finding]:
     ("verdict", "gates", "missing", "act", "words"),
     [
         ("usable", [], [], "approve", "Usable: approve it."),
-        ("usable", [], ["Fatigue"], "approve", "Usable: approve it. Fatigue may make it better."),
+        ("usable", [], ["Fatigue"], "add", "Usable, and better with “Fatigue”: add that first."),
+        ("usable", [], ["Fatigue", "Tremor"], "improve", "“Fatigue” and “Tremor”: add that first."),
         ("usable with care", [("ceiling", "care")], [], "approve", "look at where the error sits first"),
         ("usable with care", [("sensor", "care")], [], "approve", "look at the highest torques"),
-        ("usable with care", [("gap", "care")], ["Fatigue"], "add", "look at Fatigue first, and add it"),
+        ("usable with care", [("gap", "care")], ["Fatigue"], "add", "add “Fatigue” first"),
         ("usable with care", [], [], "approve", "look at where the error sits first"),
         ("not usable", [("torque", "refuse")], [], "test", "test again with electrodes, current and load cell"),
-        ("not usable", [("gap", "refuse"), ("range", "care")], ["Fatigue"], "add", "add Fatigue, or test again"),
+        ("not usable", [("gap", "refuse"), ("range", "care")], ["Fatigue"], "add", "add “Fatigue”, or test again"),
         ("not usable", [("torque", "refuse"), ("gap", "refuse")], ["Fatigue"], "test", "test again with electrodes"),
         ("not usable", [], [], "test", "test again"),
         ("unknown", [], [], "fit", "There is no verdict"),
@@ -242,12 +257,25 @@ def test_the_verdict_says_what_to_do(
     assert said.act == act and words in said.words
 
 
+def test_verdict_and_diagnosis_are_one_sentence() -> None:
+    """Beside "this record cannot tell" the page said no more than that the model is to be approved, and said so
+    before anybody had looked for what is missing."""
+    unsure = advice.advice("usable", [], [], "unsure")
+    assert unsure.act == "approve" and "this recording cannot tell" in unsure.words
+    assert "no effect explains" in advice.advice("usable", [], [], "unexplained").words
+    for kind, act in (("unsure", "approve"), ("unexplained", "look"), (None, "look")):
+        assert advice.advice("usable with care", [], [], kind).act == act
+    for verdict in ("usable", "usable with care"):
+        assert advice.advice(verdict, [], [], None, looking=True).act == "wait"
+    assert advice.advice("not usable", [], [], None, looking=True).act == "test"
+
+
 def test_the_worst_finding_comes_first_and_risks_are_said_once() -> None:
     rows = found(("range", "care"), ("torque", "refuse"), ("sensor", "care"))
     assert [row.gate for row in rows] == ["torque", "range", "sensor"]
     said = advice.risks({"fit": {"held_out_fit_percent": 69.0}}, rows)
     assert any("too wide pulses" in words for words in said) and len(set(said)) == len(said)
-    assert said[-1] == "On pulses not used for fitting the error is 31 % of the torque."
+    assert said[-1] == "On held-out pulses the error is 31 % of the torque."
     assert advice.risks({}, []), "never nothing"
 
 
@@ -256,20 +284,21 @@ def test_the_worst_finding_comes_first_and_risks_are_said_once() -> None:
     [
         (
             {"held_out_fit_percent": 96.2, "held_out_ceiling_percent": 96.3, "held_out_by": "validate"},
-            "On pulses not used for fitting the model follows 96.2 % of the torque; sensor noise limits this to "
-            "96.3 %.",
+            "On held-out pulses (not used for fitting) the fit is 96.2 %; the noise allows 96.3 %.",
         ),
-        ({"held_out_fit_percent": 90.0}, "On pulses not used for fitting the model follows 90.0 % of the torque."),
+        ({"held_out_fit_percent": 90.0}, "On held-out pulses (not used for fitting) the fit is 90.0 %."),
         (
             {"held_out_fit_percent": 90.0, "held_out_by": "cross-validation"},
-            "On parts of the recording that were left out in turn the model follows 90.0 % of the torque.",
+            "On parts of the recording that were left out in turn the fit is 90.0 %.",
         ),
         (
             {"fit_percent": 88.0, "ceiling_percent": 89.0, "held_out_rms_nm": 0.1},
-            "On the pulses that it was fitted to the model follows 88.0 % of the torque; sensor noise limits this to "
-            "89.0 %.",
+            "On the pulses that it was fitted to the fit is 88.0 %; the noise allows 89.0 %.",
         ),
-        ({"held_out_fit_percent": -5.0}, "On pulses not used for fitting the model does not follow the torque at all."),
+        (
+            {"held_out_fit_percent": -5.0},
+            "On held-out pulses (not used for fitting) the model does not follow the torque at all.",
+        ),
         ({}, ""),
     ],
 )
@@ -382,8 +411,8 @@ def test_the_diagnosis_tells_it_too_in_a_terminal_and_on_the_page() -> None:
     entry = next(entry for entry in missing if entry["effect"] == "baseline_drift")
     assert any(line.endswith(PULLS) for line in effect_lines(entry))
     effect = environment.get_template("why.html").make_module().effect  # type: ignore[attr-defined]
-    assert PULLS in effect(explanation.card(entry, {}), 1, {})
-    assert PULLS not in effect(explanation.card(upright[0], {}), 1, {})
+    assert PULLS in effect(explanation.card(entry, {}, {}), 1, {})
+    assert PULLS not in effect(explanation.card(upright[0], {}, {}), 1, {})
 
 
 def test_threshold_plateau_and_validity_are_those_of_the_same_cell_mounted_upright() -> None:

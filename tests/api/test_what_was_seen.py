@@ -21,7 +21,7 @@ from stimrig.api.store.tables import Token
 from stimrig.api.web import guards
 from stimrig.rig import messages as m
 from stimrig.rig.requests import WithdrawRequest
-from tests.api.conftest import HTML, Service, csrf, run_test, signed_in, soon
+from tests.api.conftest import HTML, TOKEN, Service, csrf, run_test, signed_in, soon
 from tests.api.fake_arm import still
 from tests.api.test_forms import fields
 from tests.api.test_overtaken import TRIAL, key_of
@@ -170,6 +170,51 @@ def test_a_program_is_held_to_what_it_read(service: Service, client: httpx.Clien
         assert lab.start_test(participant)["state"] in ("requested", "running")
 
 
+def test_what_a_program_decided_itself_is_no_news_to_it(
+    service: Service, client: httpx.Client, participant: str
+) -> None:
+    """It read the participant and both models once; then it approves, changes limits and starts on what it read."""
+    first, second = (run_test(client, participant)["model_id"] for _ in range(2))
+    with Client(service.url, TOKEN) as lab:
+        lab.participant(participant)
+        assert lab.version(first)["id"] == first and lab.version(second)["id"] == second
+        assert lab.approve(first)["served"] and lab.approve(second)["served"] and lab.reject(second)["decision"]
+        lab.set_limits(participant, current_ma=9.0)
+        lab.set_limits(participant, current_ma=8.0)
+        lab.archive(participant)
+        lab.unarchive(participant)
+        assert lab.run_test(participant)["state"] == "completed"
+        with pytest.raises(Conflict, match="first version"):
+            lab.undo(first)
+        kept: Any = lab.http.auth
+        assert HOME in kept.seen and f"/v1/models/{first}" in kept.seen, "nothing was read again"
+
+
+@pytest.mark.parametrize("other", ["another person", "another program of the same person"])
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_what_somebody_else_decided_between_ones_own_decisions_is(
+    service: Service, client: httpx.Client, participant: str, other: str, when: str
+) -> None:
+    model = run_test(client, participant)["model_id"]
+    text = service.token("colleague", "administer", "run-test") if other == "another person" else TOKEN
+    with Client(service.url, TOKEN) as lab, Client(service.url, text) as theirs:
+        lab.participant(participant)
+        if when == "before":
+            theirs.set_limits(participant, current_ma=7.0)
+        lab.approve(model, "good")
+        if when == "after":
+            theirs.set_limits(participant, current_ma=7.0)
+        said: Any = lab.http.auth
+        said.own += [] if other != "another person" else [str(number) for number in range(200)]
+        with pytest.raises(Conflict) as caught:
+            lab.start_test(participant)
+        assert caught.value.document["changes"][-1]["now"]["action"] == "set profile"
+        with pytest.raises(Conflict):
+            lab.set_limits(participant, current_ma=9.0)
+        assert lab.participant(participant)["profile"]["current_ma"] == 7.0
+        assert lab.start_test(participant)["state"] in ("requested", "running"), "it has read it now"
+
+
 def test_another_documents_version_says_nothing_and_several_count_in_any_order(
     service: Service, client: httpx.Client, participant: str
 ) -> None:
@@ -177,10 +222,12 @@ def test_another_documents_version_says_nothing_and_several_count_in_any_order(
     old = client.get(HOME).headers["etag"]
     client.put(f"{HOME}/profile", json={"max_torque_nm": 12})
     new, others = (client.get(f"/v1/participants/{code}").headers["etag"] for code in (participant, "P018"))
-    for tag in (others, '"abc"', '"99999999999999999999"', client.get("/v1/rig").headers["etag"]):
+    unread = ('"abc"', '"99999999999999999999"', client.get("/v1/rig").headers["etag"], "*")
+    for tag, status, words in ((others, 409, "no version of"), *((tag, 428, "Send the ETag of GET") for tag in unread)):
         refused = client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": tag})
-        assert refused.status_code == 409 and f"no version of {HOME}" in refused.json()["detail"], tag
-        assert client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": tag}).status_code == 409
+        assert refused.status_code == status and f"{words} {HOME}" in refused.json()["detail"], tag
+        begun = client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": tag})
+        assert begun.status_code == status, tag
     assert service.rig.starts == 0
     assert client.put(f"{HOME}/profile", json={"current_ma": 7}, headers={"If-Match": old}).status_code == 409
     lines = [("If-Match", old), ("If-Match", new)]

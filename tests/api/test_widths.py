@@ -30,6 +30,7 @@ def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterato
     folder = tmp_path_factory.mktemp("widths")
     for service in run_service(folder, short_dir, REAL):
         service.rig.limits["width_rise_us"] = Bound(hi=50.0, unit="µs/pulse", owner="hard limit")
+        service.rig.shortest_us = 45.0
         with service.client() as client:
             client.timeout = 120
             limits = {"current_ma": 20.0, "max_pulse_width_us": 250.0, "max_torque_nm": 30.0}
@@ -64,7 +65,9 @@ def test_the_muscle_follows_what_was_asked_for(served: tuple[Service, str]) -> N
     wanted = np.array(found["reference_torque_nm"])
     assert np.linalg.norm(came - wanted) < 0.1 * np.linalg.norm(wanted)
     assert found["fit_percent"] > 95 and found["unreachable"] == []
-    assert (found["max_pulse_width_us"], found["max_rise_us"]) == (250.0, 50.0)
+    limits = ("max_pulse_width_us", "max_rise_us", "shortest_pulse_us")
+    assert [found[name] for name in limits] == [250.0, 50.0, 45.0]
+    assert {width for width in found["pulse_width_us"] if width < 45.0} == {0.0}, found["pulse_width_us"]
     rest, trial, _ = found["segments"]
     assert (rest["sequence"], trial["sequence"]) == ("rest", "widths")
     assert trial["settings"]["pulse_width_us"] == found["pulse_width_us"]
@@ -79,6 +82,11 @@ def test_foretold_torque_is_the_muscles(client: httpx.Client, served: tuple[Serv
     assert max(abs(value) for value in found["torque_nm"][:18]) < 0.02, "no pulse, no torque"
     for body in ({"pulse_width_us": []}, {"pulse_width_us": [-1]}, {"pulse_width_us": [1e9]}, {}):
         assert client.post(f"/v1/models/{served[1]}/prediction", json=body).status_code == 422, body
+    for rate_hz, status in ((None, 200), (40.0, 200), (49.9, 200), (20.0, 422), (60.0, 422), (0.5, 422), (1e300, 422)):
+        body = {"pulse_width_us": [1], **({} if rate_hz is None else {"pulse_rate_hz": rate_hz})}
+        answer = client.post(f"/v1/models/{served[1]}/prediction", json=body)
+        assert answer.status_code == status, answer.text
+        assert status == 422 or answer.json()["pulse_rate_hz"] == (rate_hz or 40.0)
     assert client.post("/v1/models/none/prediction", json={"pulse_width_us": [1]}).status_code == 404
 
 
@@ -164,7 +172,7 @@ def test_the_verb_writes_the_same_table(
     model, reference, out = (tmp_path / name for name in ("MODEL.json", "reference.csv", "widths.csv"))
     model.write_bytes(client.get(f"/v1/models/{served[1]}/file").content)
     reference.write_bytes(table())
-    options = ["invert", str(model), str(reference), "-o", str(out), "--largest-us", "250"]
+    options = ["invert", str(model), str(reference), "-o", str(out), "--largest-us", "250", "--shortest-us", "45"]
     assert main.run([*options, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     body = {"reference_torque_nm": WANTED_NM.tolist(), "time_s": TIME_S.tolist()}

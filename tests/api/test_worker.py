@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from stimrig.api.errors import ApiError
+from stimrig.api.workers import process
 from stimrig.api.workers.pool import WORKER, Pool
 from stimrig.api.workers.process import environment
 from tests.api.fake_rig import default_widths, muscle
@@ -135,6 +136,24 @@ async def test_expected_error_names_the_place(pool: Pool) -> None:
     with pytest.raises(ApiError) as caught:
         await pool.submit("fit", data="x", effects=["bad"]).result
     assert caught.value.status == 422 and caught.value.extra["place"] == "effects"
+
+
+def test_the_time_that_is_left_never_grows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither while nothing is heard, nor where a step takes longer than the ones before."""
+    now_s = 100.0
+    monkeypatch.setattr(process.time, "monotonic", lambda: now_s)
+
+    async def left() -> list[float | None]:
+        nonlocal now_s
+        call, found = process.Call(1, "fit", {}, state="running", started_s=100.0), []
+        for at_s, progress in ((101, 0.01), (102, 0.1), (105, None), (110, 0.2), (111, 0.5), (121, None), (130, 0.6)):
+            now_s = float(at_s)
+            if progress is not None:
+                call.advance(progress, "")
+            found.append(call.time_left_s)
+        return found
+
+    assert asyncio.run(left()) == pytest.approx([None, 18.0, 15.0, 10.0, 9.0, 0.0, 0.0])
 
 
 def made_up_csv(path: Path) -> Path:

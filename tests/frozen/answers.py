@@ -27,6 +27,13 @@ VOLATILE = (
     (re.compile(r"\bm-[0-9a-f]{6,}\b|\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f-]{22}\b"), "<id>"),
     (re.compile(r"\b[0-9a-f]{64}\b"), "<digest>"),
     (re.compile(r"stimrig-error-\d+"), "stimrig-error-<id>"),
+    (
+        re.compile(
+            r"\b(look|test|again|running|identifying|done|asked|calibrate|calibrating|wait|rearm|archived|trial) "
+            r"[0-9a-f]{8}\b"
+        ),
+        r"\1 <id>",
+    ),
     (re.compile(r"ses-s[0-9a-f]{10}"), "ses-<hidden>"),
     (re.compile(r"(done before, |in )\d+(?:\.\d+)? m?s\b"), r"\1<duration>"),
     (re.compile(r"(stimrig_rig_|Model )(?:[\w-]{30,}|[0-9a-f]{8}\b)"), r"\1<id>"),

@@ -29,7 +29,7 @@ def test_the_tables_add_up_series_fit_a_screen_and_words_name_a_place(compared):
         assert abs(sum(row["share_of_excess"] for row in rows) - 1.0) < 1e-9
     power = sum(row["rms_nm"] ** 2 for row in result.by["frequency"])
     assert abs(np.sqrt(power) - result.rms_nm) < 0.02 * result.rms_nm + 1e-3
-    assert len(result.series["time_s"]) <= 4000
+    assert len(result.series["time_s"]) <= 2400
     assert result.fit_percent < result.ceiling_percent
     assert any("N·m" in place["text"] and "%" in place["text"] for place in result.where)
     json.dumps(result.to_dict(), allow_nan=False)

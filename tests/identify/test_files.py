@@ -154,6 +154,26 @@ def test_reads_a_sealed_recording(tmp_path):
     assert model.data["recording_id"] == "rec-1"
 
 
+def test_held_out_rows_in_another_case_or_with_blanks_are_held_out_and_told(tmp_path):
+    seal(tmp_path / "r.h5")
+    expected = read(tmp_path / "r.h5")
+    with h5py.File(tmp_path / "r.h5", "a") as file:
+        names = [name.decode().replace("validate", "Validate ") for name in file["/segments/name"][()]]
+        del file["/segments/name"]
+        file["/segments/name"] = names
+    row = "{:.3f},{:.0f},1,{}".format
+    half = [row(k / 100, k % 90, "rest" if k < 100 else (" VALIDATE", "validate")[k % 2]) for k in range(200)]
+    (tmp_path / "r.csv").write_text("time_s,pulse_width_us,torque_nm,segment\n" + "\n".join(half))
+    sealed, table = read(tmp_path / "r.h5"), read(tmp_path / "r.csv")
+    assert np.array_equal(sealed.held_out, expected.held_out) and sealed.segment_names == expected.segment_names
+    assert sealed.notes == ("segment 'Validate ' is taken as validate",) and expected.notes == ()
+    assert table.segment_names == ("rest", "validate") and table.held_out.sum() == 100
+    assert table.notes == ("segment 'VALIDATE' is taken as validate",)
+    assert sealed.take(sealed.held_out).notes == sealed.notes
+    given = identify.Record.from_arrays(*(np.arange(3.0),) * 3, segment=["rest", "Validate", "validate "])
+    assert given.held_out.tolist() == [False, True, True] and len(given.segment_names) == 2
+
+
 def test_a_dropped_pulse_counts_as_none(tmp_path):
     widths, _ = seal(tmp_path / "r.h5")
     drop = int(np.flatnonzero(widths > 0)[30])

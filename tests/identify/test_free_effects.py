@@ -14,7 +14,7 @@ import pytest
 from stimrig import identify
 from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import free, result
-from stimrig.identify.diagnosis.search import search_effects, silent
+from stimrig.identify.diagnosis.search import resembles_earlier, search_effects, silent
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
@@ -39,8 +39,8 @@ from tests.identify import hidden_muscles
 STEP_S, SIZE = 0.025, 400
 FREE = [effect for effect in registry().values() if effect.shape]
 FORMS = [(effect, form) for effect in FREE for form in effect.forms]
-TRIED = "free_gate", "free_level", "free_ways", "asymmetric_relaxation", "baseline_drift"
-"""Each costs seconds; what all of them find is in bench.strange."""
+TRIED = "free_gate", "free_level", "asymmetric_relaxation", "baseline_drift"
+"""Each costs seconds, free_ways as much as all of these; what all of them find is in bench.strange."""
 named = partial(pytest.mark.parametrize, ids=lambda one: getattr(one, "id", getattr(one, "name", None)))
 
 
@@ -216,6 +216,13 @@ def test_free_lags_do_not_stand_beside_another_speed_law():
 
     base = SimpleNamespace(effects=[("asymmetric_relaxation", relaxed)])
     assert not free._applicable(gate, base) and free._applicable(ways, base)
+
+
+def test_beside_a_free_effect_a_name_may_only_repair_its_form():
+    drift = registry()["threshold_drift"]
+    for there, repairs in (("free_strength", True), ("mixed_fibres", False)):
+        model = SimpleNamespace(effects=[(there, registry()[there].forms[0])])
+        assert resembles_earlier(model, drift, drift.forms[0].stage, []) is repairs, there
 
 
 def test_no_picture_of_an_effect_that_is_not_free():

@@ -96,6 +96,8 @@ def test_every_step_keeps_what_the_structure_held():
     with few_effects.only("baseline_drift", "fatigue", "mains_hum", "tremor"):
         held = identify.fit(record, effects=["baseline_drift:linear"])
         result = identify.improve(record, model=held)
+        last = identify.diagnose(record, result.models[-1])
+    assert last.verdict == "nothing_missing", "where no effect is left to try, that is no error"
     assert [step["added"] for step in result.steps] == [None, "mains_hum", "fatigue"]
     for model in result.models:
         assert model.effects[0]["id"] == "baseline_drift"

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
 
 from stimrig import identify
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
@@ -18,6 +19,7 @@ from stimrig.identify.inversion.reference import read_reference
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SigmoidBasis
+from stimrig.identify.simulation.pulses import above_rest
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 from tests.identify import hidden_muscles
 
@@ -115,10 +117,64 @@ def test_changes_faster_than_the_muscle_are_named_at_the_change():
     assert reasons(found) == ["rises-too-fast", "falls-too-fast"]
     up, down = found.unreachable
     assert up.begin_s <= 2.0 < up.end_s < 3.0 and down.begin_s <= 6.0 < down.end_s < 9.0
+    ramp = np.interp(np.arange(320) / 40, [0, 2, 4, 5, 5.25, 8], [0, 0, 6.5, 6.5, 0, 0])
+    slow = invert(muscle(time_constant_s=0.5), Reference.of(ramp)).unreachable
+    assert {one.reason for one in slow if one.begin_s < 4.0} == {"rises-too-fast"}, "a steeper fall comes, but later"
     quick = invert(muscle(time_constant_s=0.03), Reference.of(wanted))
     assert sum(one.end_s - one.begin_s for one in quick.unreachable) < 0.3 * (
         up.end_s - up.begin_s + down.end_s - down.begin_s
     )
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.0113])
+def test_the_filter_of_a_model_gives_what_is_predicted_as_the_docs_say(delay_s: float):
+    """The recipe for Simulink in docs/controllers.md: table, held widths, filter, mean of eight values a period."""
+    model = Model("maximum-likelihood", muscle().recruitment, SecondOrder(0.1, 0.8, delay_s), 40.0, 1600.0)
+    document, widths = model.to_dict(), np.r_[np.zeros(10), np.full(40, 200.0), np.full(30, 120.0), np.zeros(40)]
+    curve, linear = document["recruitment"], document["linear"]
+    drive = np.interp(np.repeat(widths, 40), curve["pulse_width_us"], curve["torque_nm"])
+    came = lfilter(np.r_[np.zeros(linear["delay_samples"]), linear["b"]], linear["a"], drive - drive[0])
+    predicted = above_rest(model, widths, 40.0)
+    np.testing.assert_allclose(came.reshape(-1, 8, 5)[:, :, 0].mean(axis=1), predicted, atol=2e-3)
+    late = np.interp(np.arange(came.size) - 2, np.arange(came.size), came)
+    np.testing.assert_allclose(late.reshape(-1, 40).mean(axis=1), predicted, atol=2e-3)
+
+
+def sent_by_a_rig(widths_us: np.ndarray, shortest_us: float, rise_us: float) -> np.ndarray:
+    """As the rig's gate: no pulse below the shortest, and none that rises faster from the one that was sent."""
+    sent = np.zeros(widths_us.size)
+    for k, width in enumerate(widths_us):
+        sent[k] = width if width >= shortest_us and width - (sent[k - 1] if k else 0.0) <= rise_us else 0.0
+    return sent
+
+
+@pytest.mark.parametrize(("whole", "shortest_us"), [(True, 20.0), (False, 20.5), (True, 45.0)])
+def test_no_pulse_is_planned_that_the_stimulator_does_not_send(whole: bool, shortest_us: float):
+    linear = Model(
+        "maximum-likelihood", Curve(SigmoidBasis(0.012, 3.0), np.array([6.9])), SecondOrder(0.1, 0.8), 40.0, 40.0
+    )
+    for model in (muscle(), linear):
+        wanted = np.r_[np.zeros(20), smooth(1.5, 200), np.linspace(0.0, 0.2, 60)]
+        free = invert(model, Reference.of(wanted), rise_us=50.0, whole=whole)
+        assert np.any((free.pulse_width_us > 0.0) & (free.pulse_width_us < shortest_us)), "else nothing is tried"
+        found = invert(model, Reference.of(wanted), rise_us=50.0, whole=whole, shortest_us=shortest_us)
+        np.testing.assert_array_equal(sent_by_a_rig(found.pulse_width_us, shortest_us, 50.0), found.pulse_width_us)
+        assert np.any(found.pulse_width_us > 0.0)
+        missed = [np.sqrt(np.mean((one.predicted_nm - wanted) ** 2)) for one in (found, free)]
+        assert missed[0] < missed[1] + 0.02 * 6.9
+
+
+def test_a_rise_begins_with_the_shortest_pulse_that_is_sent():
+    wanted = np.r_[np.zeros(20), np.full(60, 5.5), np.zeros(20)]
+    found = invert(muscle(), Reference.of(wanted), rise_us=50.0, whole=True, shortest_us=30.0)
+    first = int(np.flatnonzero(found.pulse_width_us)[0])
+    assert found.pulse_width_us[first] == 30.0 and first < 20 and found.pulse_width_us[first + 1] > 50.0
+
+
+@pytest.mark.parametrize("shortest_us", [float("nan"), float("inf"), -5.0])
+def test_a_shortest_pulse_that_is_no_width_is_refused(shortest_us: float):
+    with pytest.raises(BadRequest, match="shortest_us"):
+        invert(muscle(), Reference.of(smooth(3.0)), shortest_us=shortest_us)
 
 
 def test_what_is_below_zero_is_named_and_gets_no_pulse():

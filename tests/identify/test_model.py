@@ -84,7 +84,7 @@ def test_bad_models_are_refused(case):
         (json.dumps(document | {"schema_version": "9.0"}), "schema version 9.0"),
         (json.dumps({k: v for k, v in document.items() if k != "linear"}), "linear: the key is missing"),
         (json.dumps(document | {"linear": {"kind": "second-order", "time_constant_s": "x"}}), "'x' is not a number"),
-        (json.dumps(document | {"recruitment": {"basis": {"kind": "magic"}}}), "unknown basis"),
+        (json.dumps(document | {"recruitment": {"basis": {"kind": "magic"}}}), "'magic' is not cubic-spline or"),
     ):
         with pytest.raises(identify.BadModel, match=says):
             identify.Model.from_json(spoiled)
@@ -96,7 +96,10 @@ def test_bad_models_are_refused(case):
         ({"unforeseen_nm": -1.0}, r"fit\.unforeseen_nm: -1\.0 is not a number"),
         ({"unforeseen_nm": True}, r"fit\.unforeseen_nm: True is not a number"),
         ({"repetition": []}, r"fit\.repetition: a list is not a JSON object"),
-        ({"repetition": {"found_by": "hearsay"}}, r"fit\.repetition\.found_by: 'hearsay' is not null or exact repeats"),
+        (
+            {"repetition": {"found_by": "hearsay"}},
+            r"fit\.repetition\.found_by: 'hearsay' is not exact repeats or estimate or null",
+        ),
         ({"explained_percent": 100.1}, r"fit\.repetition\.explained_percent: 100\.1 is not a number from 0 to 100"),
         ({"rms_nm": "0.1"}, r"fit\.repetition\.rms_nm: '0\.1' is not a number"),
     ],

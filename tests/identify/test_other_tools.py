@@ -185,10 +185,11 @@ def test_segments_are_found_and_none_is_held_out(tmp_path: Path) -> None:
 def test_a_width_that_never_becomes_zero(tmp_path: Path) -> None:
     """All widths 20 µs higher, of a muscle that answers 20 µs later: the same model, moved."""
     lifted = replace(measured(), pulse_width_us=measured().pulse_width_us + 20.0)
-    path = tmp_path / "data.csv"
+    path, named = tmp_path / "data.csv", tmp_path / "named.csv"
     path.write_text(table(OURS[:3], rows(lifted, segment=False)))
+    named.write_text(table(OURS, rows(lifted)))
     record = identify.read(path)
-    assert "the lowest width, 20 µs, is taken as rest" in record.notes[0]
+    assert record.notes[1:] == identify.read(named).notes == ("the lowest width, 20 µs, is taken as rest",)
     assert {"rest", "prbs", "ramp"} <= set(record.segment_names)
     model, plain = (
         identify.fit(record),
@@ -197,6 +198,8 @@ def test_a_width_that_never_becomes_zero(tmp_path: Path) -> None:
     assert model.linear.time_constant_s == pytest.approx(plain.linear.time_constant_s, rel=2e-3)
     curve = plain.recruitment(WIDTHS_US)
     assert np.max(np.abs(model.recruitment(WIDTHS_US + 20.0) - curve)) < 0.01 * np.ptp(curve)
+    old = identify.fit(record, method="ramp-deconvolution")
+    assert [one.valid_for["pulse_width_us"][0] for one in (model, old, plain)] == [20.0, 20.0, 0.0]
 
 
 def test_rows_without_a_number_and_lost_rows_are_gaps(tmp_path: Path) -> None:
@@ -236,6 +239,7 @@ def test_uneven_samples_are_resampled_and_the_pulses_stay_in_place(tmp_path: Pat
     record = identify.read(path)
     assert np.ptp(np.diff(record.time_s)) < 1e-9
     assert record.notes[0].startswith("uneven time stamps (steps of 5 to 15 ms): resampled to ")
+    assert record.notes[0].endswith("noise and error figures come out too small")
     assert record.sample_rate_hz == pytest.approx(100, rel=0.02)
     model = identify.fit(record)
     assert model.linear.time_constant_s == pytest.approx(0.2, rel=0.01)

@@ -59,7 +59,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_file_is_short() -> None:
-    assert len([line for line in GOOD.splitlines() if line.strip()]) < 40
+    most = re.search(r"one Python file of less than (\d+) lines", PAGE.read_text(encoding="utf-8"))
+    assert most and len(GOOD.splitlines()) < int(most[1])
 
 
 def test_without_it_the_library_does_not_explain_the_record(place: Path) -> None:
@@ -195,6 +196,11 @@ def test_the_command_line_says_it_in_one_line(tmp_path: Path, verb: list[str]) -
     (tmp_path / "mine.py").write_text(GOOD.replace('stage="output"', 'stage="outptu"'))
     line = run(verb, tmp_path, str(tmp_path), status=2)
     assert line.startswith(f"stimrig {verb[0]}: {tmp_path / 'mine.py'}, form 'sine': no stage is called 'outptu'")
+
+
+def test_an_effect_that_is_not_found_names_the_way_to_its_file() -> None:
+    with pytest.raises(stimrig.errors.BadRequest, match=r"set STIMRIG_EFFECTS_DIR to the folder with its .*fatigue"):
+        effects.find_effect("sensor_gain_swing")
 
 
 # ---- names ----

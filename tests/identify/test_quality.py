@@ -80,7 +80,7 @@ def test_the_gap_on_rows_not_seen_is_in_the_verdict(
     seen = {"held_out_fit_percent": reached, "held_out_ceiling_percent": 98.0, "held_out_rms_nm": rms_nm}
     found = judged(model, record, **seen)
     assert found["verdict"] == verdict
-    assert ("held-out rows" in found["words"]) == (rms_nm <= 0.3 or verdict == "not usable")
+    assert ("held-out pulses" in found["words"]) == (rms_nm <= 0.3 or verdict == "not usable")
 
 
 def test_a_residual_that_is_not_noise_asks_for_care_alone(record: identify.Record, model: identify.Model) -> None:

@@ -16,6 +16,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.methods import methods
+from stimrig.identify.model_schema import SCHEMA
 from stimrig.identify.summary import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
 from tests.harness import few_effects
 from tests.harness.made_once import made_once
@@ -25,7 +26,7 @@ from tests.identify.dear import fatigued, improved_with_a_delay
 pytestmark = pytest.mark.slow
 
 FOLDER = Path(__file__).parents[2] / "api" / "schemas"
-SCHEMAS = {path.stem: json.loads(path.read_text("utf-8")) for path in sorted(FOLDER.glob("*.json"))}
+SCHEMAS = {"model": SCHEMA} | {path.stem: json.loads(path.read_text("utf-8")) for path in sorted(FOLDER.glob("*.json"))}
 RESULTS = ("comparison", "diagnosis", "improvement", "model")
 UNITS = {
     "nm": "N·m", "us": "µs", "s": "s", "hz": "Hz", "percent": "%", "nm_s": "N·m·s", "per_us": "1/µs",
@@ -151,7 +152,9 @@ def test_the_contracts_keys_are_there(results):
 
 def test_a_dict_holds_the_fields_in_order(results):
     for name in ("comparison", "diagnosis", "improvement"):
-        assert list(results[name].to_dict()) == [item.name for item in dataclasses.fields(results[name])]
+        more = ["conclusion"] if name == "diagnosis" else []
+        fields = [item.name for item in dataclasses.fields(results[name])]
+        assert list(results[name].to_dict()) == [*fields, *more]
 
 
 # ---- for people ---------------------------------------------------------------------------------------------
@@ -188,7 +191,7 @@ def test_summaries_say_what_was_found(results):
     assert "fatigue" in repr(results["diagnosis"]) and "probability" in repr(results["diagnosis"])
     assert "fatigue, electromechanical_delay added" in repr(results["improvement"])
     assert re.search(
-        r"held out +fit [\d.]+ % \(the noise allows [\d.]+ %\), rms [\d.]+ N·m", str(results["comparison"])
+        r"held out +fit [\d.]+ % \(the noise allows [\d.]+ %\), error [\d.]+ N·m", str(results["comparison"])
     )
     last = str(results["improvement"].models[-1])
     assert re.search(r"depth [\d.e-]+ ± [\d.e-]+", last) and re.search(r"onset_s [\d.e-]+ ± [\d.e-]+ s", last)
@@ -292,6 +295,6 @@ def test_results_are_drawn_by_the_registered_plotter(results, record, monkeypatc
 
 def test_small_words():
     assert [probability(p) for p in (0.0, 0.964, 0.9999, 1.0)] == ["0 %", "96 %", "99 %", "100 %"]
-    assert fit_words({}) == "fit –, rms –" and one_line("a\tb\u202e c\n") == "a b c"
+    assert fit_words({}) == "fit –, error –" and one_line("a\tb\u202e c\n") == "a b c"
     assert len(one_line("x" * 1000)) == 300
     assert Sheet("T", ()).text() == "T" and Sheet("T", (("", ""),)).text() == "T\n"

@@ -13,7 +13,7 @@ import pytest
 from stimrig import identify
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Form, Scene
-from stimrig.identify.model_schema import JOINT_SETTINGS
+from stimrig.identify.model_schema import SCHEMA
 from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow
@@ -83,7 +83,8 @@ def test_settings_of_an_effect_are_checked(name: str, value: float, plain):
 
 def test_a_fit_writes_the_settings_that_are_read_and_no_more(record):
     settings = identify.fit(record, effects=["fatigue"]).effects[0]["settings"]
-    joint = set(JOINT_SETTINGS) - {"angle_late_s"}  # told where it is late
+    known = SCHEMA["properties"]["effects"]["items"]["properties"]["settings"]
+    joint = set(known["properties"]) - set(known["required"]) - {"angle_late_s"}  # told where it is late
     assert set(settings) == set(SETTINGS) | (set() if record.angle_rad is None else joint)
     still = replace(record, angle_rad=np.full(record.time_s.size, 1.2), velocity_rad_s=0 * record.time_s)
     assert set(identify.fit(still, effects=["fatigue"]).effects[0]["settings"]) == set(SETTINGS) | joint

@@ -299,7 +299,7 @@ def test_rows_not_seen_may_contradict(
     assert len(found.notes) == contradicted
     if contradicted:
         assert found.notes == [
-            "On held-out rows the error of the last model is 2.5 times what noise and its uncertainty allow: "
+            "On held-out pulses the error of the last model is 2.5 times what noise and its uncertainty allow: "
             "something is still missing."
         ]
     assert made.forms[:2] == [0.01, 0.01]

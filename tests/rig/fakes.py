@@ -136,7 +136,7 @@ class FakeCell:
         self._seen = 0
 
     async def open(self, *_: Callable[..., None]) -> dict[str, Any]:
-        return {"device": "fake"}
+        return {"device": "fake", "bus": "can0"}
 
     async def close(self) -> None:
         self.silent = True

@@ -179,6 +179,10 @@ def test_a_refusal_in_words():
     assert str(limits.check(row, 0.5)) == "current_ma 0.5 mA is outside 2 … 100 (hard limit, under by 1.5): because"
     assert str(limits.check(row, math.nan)) == "current_ma nan mA is outside 2 … 100 (hard limit): because"
     assert str(limits.check(row, math.inf)) == "current_ma inf mA is outside 2 … 100 (hard limit): because"
+    rest = replace(HARD_LIMITS["rest_between_tests_s"], reason="because")
+    short = "rest_between_tests_s 0.25 s is not at least 1 (hard limit, under by 0.75): because"
+    assert str(limits.check(rest, 0.25)) == short
+    assert all("inf" not in str(limits.check(row, math.nan)) for row in HARD_LIMITS.values())
 
 
 def test_a_stimulator_s_steps_round_toward_zero_and_what_is_too_short_is_no_pulse():

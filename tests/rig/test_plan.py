@@ -62,7 +62,10 @@ def test_limits_hold_over_the_whole_test(
     ("settings", "words"),
     [
         ({"pulse_width_us": [50.0, 100.0, 0.0, 50.0]}, None),
-        ({"pulse_width_us": [50.0, 100.5]}, "mine, pulse 2: width_rise_us 50.5 µs/pulse is outside .* over by 0.5"),
+        (
+            {"pulse_width_us": [50.0, 100.5]},
+            "mine, pulse 2: width_rise_us 50.5 µs/pulse is not at most 50 .* over by 0.5",
+        ),
         ({"pulse_width_us": [60.0]}, "mine, pulse 1: width_rise_us 60"),
         ({"pulse_width_us": [60.0, 0.0, 300.0], "jumps": True}, None),
     ],

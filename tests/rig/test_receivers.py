@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from stimrig.rig.acquire.angle_receiver import REOPEN_S, AngleReceiver
 from stimrig.rig.acquire.receiver import Receiver
-from stimrig.rig.acquire.stream import LONGEST_READ_S, LOOK_S, SILENCE_S, CounterUnwrapper
+from stimrig.rig.acquire.stream import LONGEST_READ_S, LOOK_AT, LOOK_S, SILENCE_S, CounterUnwrapper
 from stimrig.rig.signals import SAMPLE, AngleScale, Block
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, OpenedSensor, journal_at
 from tests.simulator.virtual_time import VirtualMachine
@@ -110,7 +110,7 @@ def test_a_cell_is_silent_after_a_second_of_reading_not_of_standing_still():
     began_s = clock.now_s()
     clock.call_at(began_s + 0.01, lambda: clock.advance(2 * SILENCE_S))
     assert clock.run(receiver.machine.tasks, began_s + 60.0, lambda: bool(receiver.lost))
-    assert receiver.lost == ["load cell: silent for 1 s; check its cable and supply"]
+    assert receiver.lost == [f"load cell on can0: silent for 1 s; {LOOK_AT}"]
     read_s = clock.now_s() - began_s - 2 * SILENCE_S
     assert SILENCE_S - LONGEST_READ_S < read_s < SILENCE_S - LONGEST_READ_S + 2 * LOOK_S
     assert receiver.cell.silent, "it was closed"
@@ -246,7 +246,7 @@ def test_silence_is_told_and_ends_when_an_angle_comes(heard: HeardAngle, how: st
     began_s = heard.clock.now_s()
     told_s = heard.until(lambda: bool(receiver.problem))
     assert told_s - began_s == pytest.approx(SILENCE_S, abs=2.1 * LOOK_S)
-    assert receiver.problem == "angle sensor: silent for 1 s; check its cable and supply"
+    assert receiver.problem == f"angle sensor on its bus: silent for 1 s; {LOOK_AT}"
     setattr(sensor, how, False)
     assert heard.until(lambda: not receiver.problem) - told_s == pytest.approx(REOPEN_S, abs=0.02)
     heard.machine.run(receiver.close())

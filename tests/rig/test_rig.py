@@ -110,6 +110,7 @@ def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
 
 def test_a_test_of_which_the_stimulator_would_send_nothing_is_refused(make: Make):
     live = make()
+    assert live.rig.status().stimulator["shortest_us"] == live.rig.pair.steps.shortest_us
     with pytest.raises(PlanError, match=r"300 µs at 0.4 mA would stimulate nothing"):
         live.start(live.plan("weak", profile=Profile(current_ma=0.4)))
 
@@ -119,7 +120,8 @@ def test_a_cell_that_sticks_right_before_the_test_is_a_fault(make: Make):
     live.machine.wait(0.8)  # it has noise
     live.cell.frozen, live.cell.last_nm = True, 0.25
     live.start(live.plan("one", hold_s=20.0))
-    assert "has stayed at exactly 0.250" in live.wait("latched")
+    assert "has given exactly 0.250" in live.wait("latched")
+    assert live.stimulator.sent == []
 
 
 def test_a_mistake_in_a_driver_is_told_as_one(make: Make):

@@ -17,6 +17,7 @@ from stimrig.hardware_sim.settings import Settings
 from stimrig.rig import archive
 from stimrig.rig.acquire.evidence import DECAY_S, NO_SIGNAL, SILENT_S, watch_decay
 from stimrig.rig.acquire.health import DEFAULT_WATCH, SYNC_PERIOD_S
+from stimrig.rig.acquire.stream import LOOK_AT
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.control.sealing import warnings
 from stimrig.rig.devices import find, library
@@ -140,6 +141,22 @@ def test_pulses_that_are_left_out_make_no_steeper_rise_than_the_plan(tmp_path: P
     assert [f"{len(climbed)} pulses were narrower" in line for line in warnings(rig.recording())] == [True] * (
         up_s == 0.2
     )
+
+
+def test_pulses_too_short_to_be_sent_are_none_that_were_narrowed(tmp_path: Path):
+    """Each ramp on a stimulator whose shortest pulse is 10 µs told of dropped pulses; there were none."""
+    rig = VirtualRig(tmp_path, [SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 2.0, "down_s": 1.0})])
+    rig.execute()
+    recording = rig.recording()
+    planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
+    assert np.any((planned_us > 1) & (planned_us < 10))
+    sent_us[planned_us < 10] = 0.0
+    assert not [line for line in warnings(recording) if "narrower" in line]
+    sent_us[np.argmax(planned_us)] -= 20.0
+    assert [line.split(":")[1] for line in warnings(recording) if "narrower" in line] == [
+        " 1 pulses were narrower than planned, since after a pulse that was dropped, or too short to be sent, the "
+        "width climbs no faster than its limit"
+    ]
 
 
 def test_after_a_rest_the_width_climbs_from_nothing(tmp_path: Path):
@@ -289,7 +306,7 @@ def test_no_torque_no_test(tmp_path: Path):
     rig.cell.silent = True
     result = rig.execute()
     assert result.outcome == "fault"
-    assert "no torque arrived" in result.reason
+    assert result.reason == f"no torque has come from the load cell on its bus yet: {LOOK_AT}"
     assert rig.stimulator.sent == []
     recording = rig.recording()
     assert recording.names == []

@@ -81,6 +81,28 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     assert rearmed["body"]["state"] == "ready"
 
 
+@pytest.mark.parametrize("fault", ["cell_silent", "torque_stuck", "bus_off", "error_frames"])
+def test_a_load_cell_that_fails_before_the_start_is_told_before_the_first_pulse(
+    shared: tuple[Bench, RigClient], fault: str
+):
+    bench, client = shared
+    client.ask("subscribe")
+    before = bench.state()["pulses_received"]
+    assert bench.fault(cmd="fault", name=fault, on=True)["ok"]
+    time.sleep(0.15)
+    test_id = f"{fault}-before"
+    reply = client.start(default_plan(test_id, segments=STEPS))
+    if reply["ok"]:
+        assert client.wait_finished(test_id, timeout_s=20)["outcome"] == "fault"
+    # also where the rest between two tests left the rig the time to find it silent
+    reason = client.status()["reason"] if reply["ok"] else reply["problem"]["detail"]
+    assert "load cell" in reason and "look at its plug and supply, and at the CAN adapter" in reason, reply
+    assert bench.state()["pulses_received"] == before
+    bench.fault(cmd="fault", name=fault, on=False)
+    time.sleep(0.1)
+    assert client.rearm("nurse")["body"]["state"] == "ready"
+
+
 def test_a_load_cell_that_is_unplugged_and_comes_back_elsewhere(bench: Bench):
     client = start(bench, "unplugged")
     assert bench.fault(cmd="fault", name="cell_unplugged", on=True)["ok"]

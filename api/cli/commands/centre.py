@@ -221,12 +221,8 @@ class EmulatedRig:
 def play(folder: Path, port: int) -> None:
     """A whole centre on one machine, until Ctrl-C or SIGTERM: PostgreSQL, a folder as the bucket, two emulated rigs.
 
-    Raises
-    ------
-    LaunchError
-        A process did not come up, or ended.
-    SettingsError
-        PostgreSQL is not installed, or cannot be set up.
+    Raises LaunchError: a process did not come up, or ended. SettingsError: PostgreSQL is not installed, or cannot be
+    set up.
     """
     from stimrig.api.centre.postgres import Cluster
 

@@ -9,14 +9,15 @@ import importlib.util
 import inspect
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stimrig.api.cli.errors import CommandError, InputError
+from stimrig.api.cli.commands.fit import METHOD
+from stimrig.api.cli.errors import INTERRUPTED, CommandError, InputError
 from stimrig.api.cli.terminal import Json, names, say, say_json, table, write
 from stimrig.api.progress_bar import in_notebook, progress_bar
 
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from stimrig.api.cohort.run import Tally
 
 NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
-METHOD = "maximum-likelihood"
-INTERRUPTED = 130
 
 Given = Annotated[
     list[str],
@@ -120,6 +119,19 @@ def run(
     as_json: Json = False,
 ) -> None:
     """One run."""
+    given = {name: value for name, value in locals().items() if name != "as_json"}
+    found = computed(**given)
+    say_json(found) if as_json else say(*run_lines(found))
+    refuse_nothing(found["ok"], found["errors"], f"{output} says of each why")
+
+
+def computed(
+    verb: str, data: Sequence[str], output: Path, *, select: str = "", method: str = METHOD, effects: str = "",
+    scheduler: str = "", workers: int = 2, memory: str = "1GB", limit: float = 600.0, renew: int = 500,
+    dashboard: bool = False, wait: float = 60.0, again: bool = False, token: str = "",
+    columns: Sequence[str] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """One run, and the keys of `--json`. Raises InputError, CommandError."""
     need_extra()
     from stimrig.api.cohort import cluster
     from stimrig.api.cohort.computing import Bounds
@@ -153,7 +165,7 @@ def run(
             f"stimrig cohort: workers could not be shut in: {tally.left_open}. See `stimrig doctor` there.",
             file=sys.stderr,
         )
-    found = {
+    return {
         "output": str(output),
         "records": counts["ok"] + counts["error"],
         "ok": counts["ok"],
@@ -164,7 +176,13 @@ def run(
         "copies": tally.copies,
         "took_s": round(time.monotonic() - began_s, 1),
     }
-    say_json(found) if as_json else say(*run_lines(found))
+
+
+def refuse_nothing(done: int, failed: int, where: str) -> None:
+    """End with an exit code where nothing of what was asked for was done. Raises CommandError, after the report."""
+    if not done:
+        why = f"none of {failed} records gave a result: {where}." if failed else "no record was selected."
+        raise CommandError(f"nothing was done: {why}")
 
 
 def changed(
@@ -186,6 +204,13 @@ def figures(
     as_json: Json = False,
 ) -> None:
     """Draw a cohort: effects by prevalence, parameters over sessions, repeatability, errors by reason."""
+    found = drawn(results, html)
+    ended = f"{found['records']} records, {found['ok']} with a result, {found['participants']} participants"
+    say_json(found) if as_json else say(ended, f"written to {html}")
+
+
+def drawn(results: Path, html: Path) -> dict[str, Any]:
+    """Draw a cohort into a file; the keys of `--json`. Raises InputError."""
     need_extra()
     from stimrig.api.cohort.figures import page, repeats
     from stimrig.api.cohort.statistics import read_statistics
@@ -193,14 +218,11 @@ def figures(
     found = read_statistics(results)
     write(html, page(found, results.name))
     of_what, total, counts = found.prevalence()
-    if as_json:
-        say_json({
-            "output": str(html), "records": found.records, "ok": found.ok, "errors": dict(found.errors),
-            "participants": len(found.people), "verdicts": dict(found.verdicts), "counted": of_what, "of": total,
-            "effects": dict(counts), "repeatability": repeats(found),
-        })  # fmt: skip
-        return
-    say(f"{found.records} records, {found.ok} with a result, {len(found.people)} participants", f"written to {html}")
+    return {
+        "output": str(html), "records": found.records, "ok": found.ok, "errors": dict(found.errors),
+        "participants": len(found.people), "verdicts": dict(found.verdicts), "counted": of_what, "of": total,
+        "effects": dict(counts), "repeatability": repeats(found),
+    }  # fmt: skip
 
 
 def need_extra() -> None:
@@ -221,10 +243,7 @@ LEAST_S = 5.0
 def telling(dashboard: str = "") -> Iterator[Callable[[Tally], None]]:
     """A function that shows a tally on standard error.
 
-    Parameters
-    ----------
-    dashboard : str
-        Address of Dask's dashboard, said first; empty: none.
+    `dashboard`: address of Dask's dashboard, said first; empty: none.
     """
     if dashboard:
         print(f"dashboard      {dashboard}", file=sys.stderr, flush=True)

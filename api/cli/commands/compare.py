@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from stimrig import identify
+from stimrig.api.cli.result_files import report
 from stimrig.api.cli.terminal import (
     ColumnMap,
+    Html,
     Json,
     ModelFile,
     SeveralData,
@@ -27,7 +26,7 @@ from stimrig.api.cli.terminal import (
 def compare(
     model_json: ModelFile,
     data: SeveralData,
-    html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
+    html: Html = None,
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
@@ -35,16 +34,12 @@ def compare(
 
     The model runs free: it is given the pulse widths alone, never the measured torque.
     """
-    from stimrig.api.web.pages.report_file import comparison_html
-    from stimrig.api.workers.curves import curves, thinned
-    from stimrig.identify.json_text import json_value
-
-    model = load_model(model_json)
+    model = load_model(model_json, "compare MODEL.json DATA")
     record = load_record(data, columns)
-    found = identify.compare(model, record).to_dict()
+    compared = identify.compare(model, record)
+    found = compared.to_dict()
     if html is not None:
-        drawn = json_value(curves(model, record))
-        write(html, comparison_html(model.to_dict(), drawn, short(data), comparison=thinned(found)))
+        write(html, report(model, record, short(data), compared))
     if as_json:
         say_json(found)
         return

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from stimrig import identify
 from stimrig.api.cli.terminal import (
     ColumnMap,
     HeldModel,
+    Html,
     Json,
     SeveralData,
     load_held,
@@ -16,18 +18,20 @@ from stimrig.api.cli.terminal import (
     repetition_lines,
     say,
     say_json,
+    short,
+    write,
 )
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.structure import in_words, worded
 
-VERDICTS = {
-    "effect_missing": "An effect is missing in the model.",
-    "nothing_missing": "Nothing is missing: what is left looks like noise.",
-    "unexplained_structure": "The error has structure that no effect of the library explains.",
-}
 
-
-def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap = None, as_json: Json = False) -> None:
+def diagnose(
+    data: SeveralData,
+    model_json: HeldModel = None,
+    html: Html = None,
+    columns: ColumnMap = None,
+    as_json: Json = False,
+) -> None:
     """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
 
     Takes 5 to 30 s, longer where structure is left or with several recordings. DATA decides: a model given with --model
@@ -35,32 +39,43 @@ def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap
     """
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
-        found = {"structure": structure, **identify.diagnose(record, model, progress).to_dict()}
-    say_json(found) if as_json else say(*diagnosis_lines(found))
+        if html is None:
+            found = identify.diagnose(record, model, progress)
+        else:
+            found, improved = identify.diagnose_and_improve(record, progress, model)
+            write(html, _report(record, found, improved, structure, short(data)))
+    shown = {"structure": structure, **found.to_dict()}
+    if as_json:
+        say_json(shown)
+        return
+    say(*diagnosis_lines(shown), *([] if html is None else ["", f"report         {html}"]))
+
+
+def _report(record: Any, found: Any, improved: Any, structure: Sequence[str], name: str) -> str:
+    from stimrig.api.web.pages.report_file import diagnosis_html
+    from stimrig.api.workers.curves import rounded, segments_of
+    from stimrig.api.workers.verbs import finding_of
+
+    comparison = rounded(identify.compare(improved.models[0], record).to_dict())
+    return diagnosis_html(finding_of(record, found, improved, structure), comparison, segments_of(record), name)
 
 
 def diagnosis_lines(found: dict[str, Any]) -> list[str]:
     """A diagnosis for people."""
-    from stimrig.identify.caution import caution
-    from stimrig.identify.summary import held_out_label, probability, sure
+    from stimrig.identify.conclusion import conclude
+    from stimrig.identify.summary import certainty, held_out_label
 
-    base, verdict, doubt = found["base"], found["verdict"], caution(found)
-    said = str(VERDICTS.get(verdict, verdict)).rstrip(".")
-    certainty = f" (probability {probability(found['probability'])})"
-    if doubt:
-        said, certainty = "This record cannot tell whether something is missing", ""
-    if verdict == "effect_missing":
-        said = said.replace(" is ", f" is {sure(found['probability'])} ", 1)
+    base, verdict, said = found["base"], found["verdict"], conclude(found)
     lines = [
-        f"{said}{certainty}.",
-        *([doubt] if doubt else []),
+        f"{said.title}{certainty(found)}.",
+        said.words,
         "",
         f"structure      {in_words(found['structure'])}",
         f"noise          {number(found['noise_sd_nm'], 4)} N·m",
         *repetition_lines(base),
-        f"the model      fit {percent(base.get('fit_percent'))}, rms {number(base.get('rms_nm'), 4)} N·m; "
-        f"{held_out_label(base)} {percent(base.get('held_out_fit_percent'))}, "
-        f"rms {number(base.get('held_out_rms_nm'), 4)} N·m",
+        f"the model      fit {percent(base.get('fit_percent'))}, error {number(base.get('rms_nm'), 4)} N·m; "
+        f"{held_out_label(base)} fit {percent(base.get('held_out_fit_percent'))}, "
+        f"error {number(base.get('held_out_rms_nm'), 4)} N·m",
     ]
     if verdict == "unexplained_structure" and found.get("missing"):
         lines += ["", "Nearest in the library, but not near enough: adding it leaves the structure."]
@@ -70,29 +85,22 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
         lines += ["", f"{row['effect']}: a free effect; it describes, and names no cause", f"  {row['words']}"]
         lines += [f"  {row['left_out']}"]
     # Where nothing is missing the worst of the noise is no place to look at.
-    places = [] if verdict == "nothing_missing" else found.get("where") or []
+    places = [] if said.kind == "nothing" else found.get("where") or []
     if places:
-        lines += ["", "worst places, of the fitted rows"]
+        lines += ["", "worst places"]
         lines += [f"  {place['start_s']:.1f}-{place['end_s']:.1f} s, {place['text']}" for place in places]
     lines += ["", *found["notes"]] if found.get("notes") else []
-    return [*lines, "", f"next           {next_step(found, doubt)}"]
+    return [*lines, "", f"next           {said.advice} {_command(found, said.kind)}".rstrip()]
 
 
-def next_step(found: dict[str, Any], doubt: str) -> str:
-    """What to do with a diagnosis."""
-    if found["verdict"] == "unexplained_structure":
-        add = "`stimrig improve DATA -o MODEL.json` adds the free effect. " if found.get("free") else ""
-        if plan := found.get("deciding_experiment"):
-            return f"{add}{worded(plan['text'])} `stimrig test --decide DATA` plays it and judges both together"
-        return (
-            "look at the worst places and at electrodes, cell and fixture, and record again; an effect of your own: "
-            "docs/add-an-effect.md"
-        )
-    if found["verdict"] == "effect_missing":
-        rivals = any(effect.get("confused_with") for effect in found["missing"])
-        add = "`stimrig improve DATA -o MODEL.json` adds what is missing, as long as the evidence lasts"
-        return f"the next experiment above decides between the rivals; {add}" if rivals else add
-    return "record a longer test" if doubt else "nothing to add: use the model of `stimrig fit DATA -o MODEL.json`"
+def _command(found: dict[str, Any], kind: str) -> str:
+    """The commands that do what is advised."""
+    if kind == "nothing":
+        return "It is that of `stimrig fit DATA -o MODEL.json`."
+    plays = "`stimrig test --decide DATA` plays the next experiment." if found.get("deciding_experiment") else ""
+    adds = "`stimrig explain DATA -o MODEL.json` adds, and shows how the error falls." if found.get("add") else ""
+    own = "An effect of your own: docs/add-an-effect.md." if kind == "unexplained" and not adds else ""
+    return " ".join(filter(None, (adds, plays, own)))
 
 
 def effect_lines(effect: dict[str, Any]) -> list[str]:
@@ -103,7 +111,7 @@ def effect_lines(effect: dict[str, Any]) -> list[str]:
     lines = [
         f"{effect['effect']}: {sure(p)} missing (probability {probability(p)})",
         *([f"  {effect['plain']}"] if effect.get("plain") else []),
-        f"  rms {number(effect.get('rms_before_nm'), 4)} -> {number(effect.get('rms_after_nm'), 4)} N·m, held out "
+        f"  error {number(effect.get('rms_before_nm'), 4)} -> {number(effect.get('rms_after_nm'), 4)} N·m, held out "
         f"{number(effect.get('held_out_rms_before_nm'), 4)} -> {number(effect.get('held_out_rms_after_nm'), 4)} N·m",
     ]
     for name, parameter in (effect.get("parameters") or {}).items():

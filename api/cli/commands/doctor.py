@@ -30,16 +30,11 @@ LATE_MS, SLOW_DISK_MS = 5.0, 200.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at.
-
-    Attributes
-    ----------
-    verdict : {'ok', 'care', 'fails'}
-        `fails`: a test would be refused or lost. `care`: it works, but not as it should.
-    """
+    """One thing looked at."""
 
     check: str
     verdict: Verdict
+    """`fails`: a test would be refused or lost. `care`: it works, but not as it should."""
     says: str
     fix: str = ""
 

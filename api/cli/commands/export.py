@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.commands.cohort import Columns, Given, Select, Token, need_extra, passed_over
+from stimrig.api.cli.commands.cohort import Columns, Given, Select, Token, need_extra, passed_over, refuse_nothing
 from stimrig.api.cli.errors import CommandError, InputError
 from stimrig.api.cli.terminal import Json, say, say_json
 
@@ -25,6 +26,17 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Hand records on: Parquet or a BIDS-style folder; one that is cut off goes on with the same command."""
+    given = {name: value for name, value in locals().items() if name != "as_json"}
+    found = exported(**given)
+    say_json(found) if as_json else say(*report(found))
+    refuse_nothing(found["records"], found["errors"], f"{found['errors_file']} says of each why")
+
+
+def exported(
+    data: Sequence[str], parquet: Path | None = None, bids: Path | None = None, select: str = "",
+    no_dates: bool = False, shift_days: int = 0, columns: Sequence[str] | None = None, token: str = "",
+) -> dict[str, Any]:  # fmt: skip
+    """One export, and the keys of `--json`. Raises InputError, CommandError."""
     need_extra()
     if (parquet is None) == (bids is None):
         raise InputError("give --parquet FOLDER or --bids FOLDER, one of them.")
@@ -52,12 +64,11 @@ def export(
             told = Export(sources, selection, state, writer, days, mapped, lambda t: bar(0.0, _words(t))).go()
         except CutOffError as error:
             raise CommandError(f"{error}") from error
-        found = {
+        return {
             "output": str(folder), "format": writer.NAME, "records": state.count("done"),
             "errors": state.count("failed"), "written": told.written, "done_before": told.before,
             "left_out": told.left_out, "copies": told.copies, "errors_file": str(folder / ERRORS),
         }  # fmt: skip
-    say_json(found) if as_json else say(*report(found))
 
 
 def _words(tally: Any) -> str:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli.commands.diagnose import VERDICTS
+from stimrig.api.cli.result_files import story_page, told
 from stimrig.api.cli.terminal import (
     ColumnMap,
     HeldModel,
+    Html,
     Json,
+    LastModel,
     SeveralData,
     load_held,
     number,
@@ -35,10 +33,8 @@ FEW = 3
 def improve(
     data: SeveralData,
     model_json: HeldModel = None,
-    html: Annotated[Path | None, typer.Option(help="write a report with charts here")] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="write the last MODEL.json, or MODEL.mat")
-    ] = None,
+    html: Html = None,
+    output: LastModel = None,
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
@@ -48,34 +44,21 @@ def improve(
     """
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
-        improved = identify.improve(record, progress=progress, model=model)
-    found, models = {"structure": structure, **improved.to_dict()}, improved.models
+        if html is None:
+            improved = identify.improve(record, progress=progress, model=model)
+        else:
+            explained = identify.explain(record, progress, model)
+            improved = explained.improvement
+            write(html, story_page(told(record, explained, structure), short(data)))
+    found = {"structure": structure, **improved.to_dict()}
     del found["models"]
     if output is not None:
-        write_model(output, models[-1])
-    if html is not None:
-        write(html, report(record, found, models, short(data), model))
+        write_model(output, improved.models[-1])
     if as_json:
         say_json(found)
         return
     say(*improvement_lines(found))
     say(*[f"written to     {path}" for path in (output, html) if path is not None])
-
-
-def report(record: Any, found: dict[str, Any], models: Sequence[Any], name: str, held: Any | None = None) -> str:
-    """The report: what was found, what each effect is, what is left before and after."""
-    import numpy as np
-
-    from stimrig.api.web.pages.report_file import improvement_html
-    from stimrig.api.workers.curves import runs, thinned
-    from stimrig.api.workers.verbs import diagnosed
-
-    before, after = (thinned(identify.compare(model, record).to_dict()) for model in (models[0], models[-1]))
-    labels = [str(record.segment_names[index]) for index in record.segment]
-    segments = runs(labels, np.asarray(record.time_s))
-    with progress_bar() as progress:
-        missing = diagnosed(record, progress, None if held is None else held.to_json())
-    return improvement_html(found, name, missing, before, after, segments)
 
 
 def improvement_lines(found: dict[str, Any]) -> list[str]:
@@ -92,13 +75,12 @@ def improvement_lines(found: dict[str, Any]) -> list[str]:
         )
         for step in found["steps"]
     ]
-    header = ("added", "fit %", "rms N·m", "held-out %", "held-out rms N·m")
+    header = ("added", "fit %", "error N·m", "held-out fit %", "held-out error N·m")
     lines = [f"structure      {in_words(found['structure'])}", "", *table(header, rows), ""]
     lines.append(f"noise          {number(found['noise_sd_nm'], 4)} N·m: of a sample, which no model can explain")
     lines += repetition_lines(found["steps"][-1])
     added = [step for step in found["steps"] if step["added"]]
     lines += [f"{step['added']:15}{step['reason']}" for step in added if any_free([step["added"]])]
-    lines.append(f"at first       {VERDICTS.get(found['verdict'], found['verdict'])}")
     refused = [f"{row['effect']}: {row['reason']}" for row in found.get("refused") or []]
     if len(refused) > FEW:
         refused[FEW:] = [f"and {len(refused) - FEW} effects more (--json says which)"]

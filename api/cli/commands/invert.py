@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import Json, ModelFile, load_model, number, percent, say, say_json, table, writing
+from stimrig.api.cli.terminal import Json, ModelFile, load_model, number, percent, say, say_json, table, write
 
 
 def invert(
@@ -21,6 +21,9 @@ def invert(
         float | None, typer.Option(help="widest pulse, µs; default: what the model holds for")
     ] = None,
     rise_us: Annotated[float | None, typer.Option(help="largest rise from pulse to pulse, µs")] = 50.0,
+    shortest_us: Annotated[
+        float, typer.Option(help="shortest pulse of the stimulator, µs; a narrower one is not sent")
+    ] = 0.0,
     as_json: Json = False,
 ) -> None:
     """Pulse widths whose predicted torque follows a reference best, and what of it is out of reach."""
@@ -29,18 +32,17 @@ def invert(
     from stimrig.identify.inversion import invert as widths_for
     from stimrig.identify.inversion.reference import read_reference
 
-    model = load_model(model_json)
+    model = load_model(model_json, "invert MODEL.json REFERENCE.csv -o FILE")
     try:
         content = reference.read_bytes()
     except OSError as error:
         raise InputError(f"{reference}: {error.strerror}. Give a CSV file with time_s,torque_nm.") from error
     try:
         wanted = read_reference(content, str(reference), model.pulse_rate_hz)
-        found = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us).to_dict()
+        found = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us, shortest_us=shortest_us).to_dict()
     except IdentifyError as error:
         raise InputError(str(error)) from error
-    with writing(output):
-        output.write_text(inverted.table(found), "utf-8", newline="")
+    write(output, inverted.table(found))
     if as_json:
         say_json({"output": str(output), **found})
         return

@@ -36,15 +36,15 @@ def predict(
 
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
 
-    model = load_model(model_json)
+    model = load_model(model_json, "predict MODEL.json DATA -o FILE")
     record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))
     found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
     if output.suffix.lower() == ".mat":
         write_mat(output, found)
     else:
-        with writing(output):
-            np.savetxt(output, np.column_stack(list(found.values())), "%.9g", ",", header=",".join(found), comments="")
+        with writing(output) as place:
+            np.savetxt(place, np.column_stack(list(found.values())), "%.9g", ",", header=",".join(found), comments="")
     residual = record.torque_nm - predicted
     reached = best_fit_percent(record.torque_nm, predicted)
     rms_nm = float(np.sqrt(np.mean(residual**2)))

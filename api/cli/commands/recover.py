@@ -19,10 +19,15 @@ def recover(
     as_json: Json = False,
 ) -> None:
     """Make a sealed recording from a journal, and say what is missing. The journal is kept."""
-    options = [*(["-o", str(output)] if output else []), *(["--json"] if as_json else [])]
+    print(sealed(journal, output, as_json), end="")
+
+
+def sealed(journal: Path, folder: Path | None, as_json: bool = True) -> str:
+    """Seal it in a process of its own, and what that says. Raises InputError, LaunchError: it cannot."""
+    options = [*(["-o", str(folder)] if folder else []), *(["--json"] if as_json else [])]
     command = [sys.executable, "-m", "stimrig.rig.recover", *options, "--", str(journal)]
     ended = subprocess.run(command, capture_output=True, text=True)
     if ended.returncode:
         words = (ended.stderr.strip().splitlines() or ["it ended without a message"])[-1].removeprefix("recover: ")
         raise InputError(words) if ended.returncode == 2 else LaunchError(words, ended.returncode)
-    print(ended.stdout, end="")
+    return ended.stdout

@@ -93,8 +93,8 @@ def test(
         found = on_own_services(rig, data, emulate, code, asked)
     recording = found.pop("recording")
     if output is not None:  # first: what was measured is not lost, whatever comes after
-        with writing(output):
-            output.write_bytes(recording)
+        with writing(output) as place:
+            place.write_bytes(recording)
     if decide:
         found["diagnosis"] = deciding.diagnosed(decide, recording)
     if as_json:
@@ -103,6 +103,8 @@ def test(
     say(*report_lines(found["test"], None if decide else found["model"]))
     if decide:
         say("", "both together", "", *diagnosis_lines(found["diagnosis"]), "")
+        if found["diagnosis"]["left"]["structure"]:
+            say("with what was added", "", *diagnosis_lines(found["diagnosis"]["left"]), "")
     say(f"recording      {output or found['test']['recording_url']}")
 
 
@@ -113,8 +115,10 @@ def check_output(output: Path | None) -> None:
     """
     if output is None:
         return
-    with writing(output):
+    try:
         output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{output}: {error.strerror}. Give a file in a folder that can be written.") from error
     if output.is_dir() or not os.access(output if output.exists() else output.parent, os.W_OK):
         raise InputError(f"{output}: give a file in a folder that can be written.")
 
@@ -206,12 +210,8 @@ def through(
 ) -> dict[str, Any]:
     """The test through a service; `events` and `over` as in `run_test`.
 
-    Raises
-    ------
-    InputError
-        As `deciding.check_participant`, where `asked` has `recorded_ma`.
-    ServiceError
-        The service cannot be reached, or the test did not end in a model.
+    Raises InputError: as `deciding.check_participant`, where `asked` has `recorded_ma`. ServiceError: the service
+    cannot be reached, or the test did not end in a model.
     """
     more = dict(asked or {})
     with Client(url, token) as client:

@@ -57,16 +57,20 @@ async def show_page(
         found = None
     kept = context.rig.status.calibrated if context.rig.status and found is None else None
     waits = kept if kept is not None and kept.participant == code else None
-    own = {"current_ma": typed.number_text(row.profile["current_ma"]), "step_us": typed.number_text(DEFAULTS.step_us)}
     limits = context.rig.status.limits if context.rig.status else {}
     low_us, high_us = fine_range(context.rig.status)
     status = problem.status if problem else 422 if errors else 200
     return page(
         request, "calibration.html", status,
         participant=row, found=found, waits=waits, marks=MARKS, last=last(row), problem=problem,
-        texts=texts or own, errors=errors or {},
+        texts=texts or usual(row), errors=errors or {},
         help={"current_ma": profiles.takes("current_ma", limits), "step_us": f"{low_us:g} to {high_us:g} µs"},
     )  # fmt: skip
+
+
+def usual(row: Participant) -> dict[str, str]:
+    """The participant's own current and the usual fine step: what holds where a form has neither."""
+    return {"current_ma": typed.number_text(row.profile["current_ma"]), "step_us": typed.number_text(DEFAULTS.step_us)}
 
 
 def last(row: Participant) -> dict[str, float]:
@@ -100,7 +104,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     """Open one; a current that is far above the participant's is asked about first."""
     row = await asyncio.to_thread(participants.find, context, code)
     sent = await request.form()
-    texts = {name: str(sent.get(name, ""))[:60] for name in ("current_ma", "step_us")}
+    texts = {name: str(sent.get(name, text))[:60] for name, text in usual(row).items()}
     values, errors = read(texts, row, context.rig.status)
     if errors:
         return await show_page(request, context, code, texts, errors)

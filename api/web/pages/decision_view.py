@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Form, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 from starlette.datastructures import FormData
 
@@ -22,10 +22,10 @@ from stimrig.api.web.dependencies import Approver, Context, Ctx, Version
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import models
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
-Reason = Annotated[str, Form()]
 LABELS = {
     "gain_percent": lazy("Gain (± %%)"),
     "threshold_percent": lazy("Threshold (± %%)"),
@@ -42,7 +42,7 @@ async def ask(request: Request, context: Ctx, who: Approver, row: Version) -> Re
 
 
 @router.post("/approve")
-async def approve(request: Request, context: Ctx, who: Approver, row: Version, reason: Reason = "") -> Response:
+async def approve(request: Request, context: Ctx, who: Approver, row: Version, reason: Text = "") -> Response:
     """Let the controller have a version; one that is not usable wants a reason."""
     sent = await request.form()
     tracking = read_tracking(sent)
@@ -54,7 +54,7 @@ async def approve(request: Request, context: Ctx, who: Approver, row: Version, r
 
 
 @router.post("/reject")
-async def reject(context: Ctx, who: Approver, model_id: str, reason: Reason = "") -> Response:
+async def reject(context: Ctx, who: Approver, model_id: str, reason: Text = "") -> Response:
     """Keep a version from the controller. Raises ApiError: 422 no reason was given."""
     if not reason.strip():
         detail = "Go back and say in a few words why; it is kept in the audit trail. Nothing was decided."
@@ -110,12 +110,8 @@ def tracking_fields(sent: Mapping[str, Any] | None = None) -> list[dict[str, Any
 def tracking_words(limits: Mapping[str, Any] | None, threshold_us: float | None) -> str:
     """What is allowed, in a sentence.
 
-    Parameters
-    ----------
-    limits : mapping or None
-        Of `LABELS`, each in percent, or as it was typed; None: the usual ones.
-    threshold_us : float or None
-        Of the model's curve, µs; without one its threshold stays as approved, whatever the limit.
+    `limits`: of `LABELS`, each in percent, or as it was typed; None: the usual ones. `threshold_us`: of the model's
+    curve, µs; without one its threshold stays as approved, whatever the limit.
     """
     given = {
         name: typed.number(str(value)) if isinstance(value, str) else value for name, value in (limits or {}).items()

@@ -13,8 +13,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 
 from stimrig.api import clinical_words, effect_words, language
-from stimrig.api.charts.figure import PAGE_CONFIG
-from stimrig.api.models.stored_model import followed
+from stimrig.api.models.changes import dose_words
+from stimrig.api.models.stored_model import followed, was_undone
 from stimrig.rig.messages import LABEL_TITLES
 
 HERE = Path(__file__).parent
@@ -69,12 +69,11 @@ def in_its_language(words: Callable[..., Any]) -> Callable[..., Any]:
 
 environment.filters.update({name: in_its_language(words_of) for name, words_of in {
     "number": number, "followed": followed, "figures": figures, "when": language.when, "clock": language.clock,
-    "day": language.day, "until": language.until,
+    "was_undone": was_undone, "day": language.day, "until": language.until,
     "translated": language.translated, "plain_words": language.plain, "localised": language.localised,
     "words": clinical_words.words, "segment_words": clinical_words.segment_words, "degrees": clinical_words.degrees,
     "effect_words": effect_words.effect_words, "effects_words": effect_words.effects_words,
-    "label_rows": clinical_words.label_rows,
+    "label_rows": clinical_words.label_rows, "dose": dose_words,
 }.items()})  # fmt: skip
-environment.globals["chart_config"] = PAGE_CONFIG
 environment.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": in_words}
 environment.globals |= {"language": language, "known_words": clinical_words.WORDS, "label_titles": LABEL_TITLES}

@@ -18,7 +18,7 @@ from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store.seen import ChangedError
 from stimrig.api.store.tables import Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
-from stimrig.api.web.pages import limits_form, next_view, starting, typed
+from stimrig.api.web.pages import limits_form, starting, typed
 from stimrig.api.web.pages.model_view import to_job
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.routes import joint, participants
@@ -44,26 +44,21 @@ async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Respo
 
 
 def _gather(context: Context, row: Participant, found: dict[str, Any]) -> dict[str, Any]:
-    rows = _recorded_today(context, row.code)
+    conditions = (
+        Test.participant == row.code, Test.state == "completed", Test.recording_id.is_not(None), Test.kind != SEQUENCE,
+        Test.requested_utc >= context.clock.start_of_day_utc(),
+    )  # fmt: skip
+    rows = context.store.all(Test, *conditions, order=Test.requested_utc)
     picked = _picked(rows)
     return {
         "range_rad": profiles.range_of(row.profile),
         "may_start": starting.calibrated(context, row).may_start,
-        "archived": next_view.step(context, row).kind == "archived",
+        "archived": row.archived_utc is not None,
         "held": [{**each, "deg": starting.allowed_deg({"target_rad": each["angle_rad"]})} for each in found["targets"]],
         "allowed": None if found["next_rad"] is None else starting.allowed_deg({"target_rad": found["next_rad"]}),
         "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],
         "kinds_lacking": [kind for kind in (PASSIVE, HELD, MOVING) if not any(test.kind == kind for test in rows)],
     }
-
-
-def _recorded_today(context: Context, code: str) -> list[Test]:
-    """Tests of today that ended well and have a recording, oldest first; no trials of a controller."""
-    conditions = (
-        Test.participant == code, Test.state == "completed", Test.recording_id.is_not(None), Test.kind != SEQUENCE,
-        Test.requested_utc >= context.clock.start_of_day_utc(),
-    )  # fmt: skip
-    return context.store.all(Test, *conditions, order=Test.requested_utc)
 
 
 def _picked(rows: list[Test]) -> set[str]:

@@ -26,27 +26,13 @@ HALF_A_STEP_DEG = 0.006
 
 @dataclass
 class LimitsForm:
-    """The form, as it is shown or was sent.
+    """The form, as it is shown or was sent."""
 
-    Parameters
-    ----------
-    texts : dict
-        What stands in each field.
-    seen : dict
-        What stood in each field when it was made.
-    asked : dict
-        The limits that change, as numbers.
-    errors : dict
-        What is wrong, one line a field.
-    notice : str
-        What is to be said above it.
-    """
-
-    texts: dict[str, str]
-    seen: dict[str, str]
-    asked: dict[str, Any] = field(default_factory=dict)
-    errors: dict[str, str] = field(default_factory=dict)
-    notice: str = ""
+    texts: dict[str, str]  # what stands in each field
+    seen: dict[str, str]  # what stood in each field when it was made
+    asked: dict[str, Any] = field(default_factory=dict)  # the limits that change, as numbers
+    errors: dict[str, str] = field(default_factory=dict)  # what is wrong, one line a field
+    notice: str = ""  # what is to be said above it
 
 
 def fresh(profile: Mapping[str, Any], status: Status | None) -> LimitsForm:

@@ -10,14 +10,17 @@ from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api import language
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
+from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import advice, carried_structure, explanation, stored_model
-from stimrig.api.people.auth import Scope
+from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.sessions import controllers
 from stimrig.api.sessions.requests import EffectsIn, TestIn
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.pages import next_view, starting, trend_view, typed
 from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.report_file import missing_parts
 from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import criticism, participants
 from stimrig.api.workers.jobs import FIT_TOGETHER, Job
@@ -34,7 +37,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
     measured = await measurement(context, row)
     diagnosis = await looked_at(context, row, who.name, diagnose)
     found = advice.findings(document)
-    shown = await asyncio.to_thread(gather, context, row, measured, diagnosis, advice.leaves_structure(found))
+    shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
     version = await asyncio.to_thread(context.versions.document, row)
     why = shown["why"]
     return page(
@@ -42,21 +45,34 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
         "model.html",
         model=version,
         findings=found,
-        advice=advice.advice(version["verdict"], found, why["likely"] if why else []),
+        advice=advice.advice(
+            version["verdict"], found, why["likely"] if why else [], why and why["kind"], shown["job"] is not None
+        ),
         fit_words=advice.fit_sentence(document.get("fit") or {}),
-        step=await next_step_of(context, row, version, who.may(Scope.RUN_TEST)),
+        step=await next_step_of(context, row, version, who),
         changes=await trend_view.changes_of(context, row),
         ask_password=not await context.people.is_confirmed(who.session_hash),
         **await facts(context, row, document),
         threshold_us=stored_model.threshold_us(row),
+        has_key=version["served"] and await asyncio.to_thread(controllers.has_key, context.auth, row.participant),
         problem=measured["problem"],
         reasons=[] if found else version["reasons"],
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
         may_test=who.may(Scope.RUN_TEST),
         may_approve=who.may(Scope.APPROVE_MODEL),
-        **{key: value for key, value in shown.items() if key != "figures"},
-        figures={**draw_figures(document, measured), **shown["figures"]},
+        **shown,
     )
+
+
+async def figures_of(context: Context, row: Model) -> Figures:
+    """The charts of a model's page, with what its diagnosis adds once it is there."""
+    measured = await measurement(context, row)
+
+    def draw() -> Figures:
+        known = {"found": context.analyses.known_diagnosis(row), "job": None}
+        return gather(context, row, measured, known)["figures"]
+
+    return await asyncio.to_thread(draw)
 
 
 async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[str, Any]:
@@ -73,7 +89,7 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
     }
 
 
-def draw_figures(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
+def draw_own(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
     """The model's own figures; the first one low enough for the first screen."""
     figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
     first = {"overview": model_charts.overview(figures[model_charts.LARGE])} if model_charts.LARGE in figures else {}
@@ -81,13 +97,13 @@ def draw_figures(document: dict[str, Any], measured: dict[str, Any]) -> dict[str
     return figures | first | held | joint_charts.joint_figures(document)
 
 
-async def next_step_of(context: Context, row: Model, version: dict[str, Any], may_test: bool) -> next_view.Step | None:
+async def next_step_of(context: Context, row: Model, version: dict[str, Any], who: Principal) -> next_view.Step | None:
     """What comes after the decision on this model; before it the verdict says what to do."""
-    if version["decision"] is None or not may_test:
+    if version["decision"] is None or not who.may(Scope.RUN_TEST):
         return None
     participant = await asyncio.to_thread(participants.find, context, row.participant)
-    step = await asyncio.to_thread(next_view.step, context, participant)
-    return None if (step.kind, step.subject) == ("look", row.id) else step
+    step = await asyncio.to_thread(next_view.step, context, participant, who)
+    return None if step.href == f"/models/{row.id}" else step
 
 
 async def measurement(context: Context, row: Model) -> dict[str, Any]:
@@ -117,32 +133,28 @@ async def looked_at(context: Context, row: Model, by: str, diagnose: int) -> dic
     return {"found": known, "job": newest}
 
 
-def gather(
-    context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any], leaves_structure: bool
-) -> dict[str, Any]:
+def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
     """What is missing, and where the error sits."""
     found, comparison, job = diagnosis["found"], measured["comparison"], diagnosis["job"]
-    view = explanation.view(found, comparison, row.effects, leaves_structure) if found else None
+    view = explanation.view(found, comparison, row.effects) if found else None
     rows = versions_of(context, row)
     segments = (measured["curves"] or {}).get("segments") or []
     signatures = (found or {}).get("signatures") or {}
-    # Where all is noise the worst of it is no place to look at.
-    quiet = view is not None and view["kind"] in ("nothing", "unsure") and not explanation.noisy(comparison or {})
-    if view is not None and quiet:
-        view["places"] = []
-    places = view["places"] if view else diagnosis_charts.places_of(comparison or {})
+    later = rows[[each["id"] for each in rows].index(row.id) + 1 :]
     return {
-        "quiet": quiet,
-        "why": view,
+        **missing_parts(view, comparison),
         # One that has just ended is shown as running once more: the page asks after it, and then shows what it found.
         "job": job.document() if job and not found and job.state in ("running", "completed") else None,
         "why_problem": job.problem if job and job.state == "failed" else None,
-        "places": places,
-        "splits": explanation.splits(comparison),
-        "tests": view["tests"] if view else [],
         "versions": rows,
+        "undone": next((each for each in later[:1] if stored_model.was_undone(each)), None),
+        "added": {effect: each["id"] for each in later for effect in (each["added_effect"] or "").split(",")},
         "carried": carried_structure.carried_context(context.versions, row, found),
-        "figures": diagnosis_charts.diagnosis_figures(comparison, segments, view, signatures, rows),
+        "figures": Figures(
+            draw_own(stored_model.read(row), measured)
+            | diagnosis_charts.diagnosis_figures(comparison, segments, view, signatures, rows),
+            f"/models/{row.id}/figures/{{}}",
+        ),
     }
 
 
@@ -212,7 +224,8 @@ def result_page(job: Job) -> str | None:
     """The page on which the result is seen."""
     if job.result_url is None:
         return None
-    return job.result_url.removeprefix("/v1").removesuffix("/diagnosis")
+    page_url = job.result_url.removeprefix("/v1").removesuffix("/diagnosis")
+    return f"{page_url}/story" if job.kind == "improve" else page_url
 
 
 @router.get("/jobs/now/{job_id}")

@@ -5,11 +5,16 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from typing import Any, Literal
+from zlib import crc32
 
 from fastapi import APIRouter
+from sqlalchemy import or_
 
 from stimrig.api import language
 from stimrig.api.language import _, lazy
+from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.sessions import controllers
+from stimrig.api.sessions.joint_plan import KINDS
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store.tables import OPEN_STATES, Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
@@ -18,11 +23,18 @@ from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
 Kind = Literal[
-    "running", "identifying", "look", "asked", "done", "archived", "rearm", "wait", "calibrating", "calibrate", "test",
-    "again",
+    "running", "identifying", "look", "asked", "done", "archived", "rearm", "wait", "calibrating", "calibrate", "joint",
+    "test", "again",
 ]  # fmt: skip
-NO_MODEL = ("stopped", "fault", "refused", "failed")
-"""How a test ends that gives no model."""
+BUSY = ("arming", "running", "stopping", "sealing", "calibrating", render.PASSIVE)
+"""States in which the rig plays something, or lets go of it."""
+REARM = lazy("The rig has stopped and needs a re-arm. Look at the participant, then press the button above.")
+SILENT = lazy("The rig does not answer. A test is possible when it does.")
+STANDS = {
+    "latched": REARM, "uncertain": REARM, "unreachable": SILENT, "silent": SILENT,
+    "disconnected": lazy("A device is not connected. See above what to check."),
+}  # fmt: skip
+"""What to do about a rig that plays nothing."""
 BEFORE = {
     "poor": lazy("The last model is not usable."),
     "rejected": lazy("The last model was rejected."),
@@ -30,6 +42,12 @@ BEFORE = {
     "fault": lazy("The last test ended by a fault."),
     "refused": lazy("The last test was not started."),
     "failed": lazy("The last test gave no model."),
+}
+TRIAL_BEFORE = {
+    "stopped": lazy("The last trial was stopped."),
+    "fault": lazy("The last trial ended by a fault."),
+    "refused": lazy("The last trial was not started."),
+    "failed": lazy("The last trial was not finished."),
 }
 
 
@@ -49,30 +67,34 @@ class Situation:
     code: str
     rig: str = "ready"
     """Its state, as the bar shows it."""
+    current: str = ""
+    """Of every pulse."""
     calibration: Literal["none", "valid", "expired"] = "valid"
-    may_start: bool = True
-    """Whether this rig lets a test begin now as far as the calibration is concerned."""
     holder: str = ""
     """Whose test or calibration the rig is busy with."""
-    running: str = ""
-    """The participant's own test that is under way."""
-    identifying: str = ""
-    """Their test whose model is being made."""
-    ended: str = ""
-    """How today's last test ended where it gave no model: stopped, fault, refused, failed."""
+    test: str = ""
+    """Their newest test of today, or the one that goes on since yesterday."""
+    of: Literal["test", "trial", "joint"] = "test"
+    """What kind of test it is: one that gives a model, a controller's trial, one of a joint that moves."""
+    state: str = ""
+    """Its state."""
     model: Today | None = None
     rejected: bool = False
     """Today's models have all been rejected."""
     served_until: str = ""
     """Until when the controller has an approved model (time of day)."""
+    lacks_key: Literal["", "mine", "another's"] = ""
+    """No controller has a key for that model: whether who looks may make one."""
     archived_since: str = ""
     asked: bool = False
     """The trials of the approved model ask for a new test."""
+    unstored: bool = False
+    """The rig keeps a finished calibration of theirs that the service could not store."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """The line. `href` empty: the button is a form's own (kind `test`), or there is none (no `button`).
+    """The line. `href` empty: the button is a form's own (`test`, `calibrate`), or there is none (no `button`).
 
     To the `href` of the kind `archived` a form is sent: it changes something.
     """
@@ -81,30 +103,43 @@ class Step:
     words: str
     button: str = ""
     href: str = ""
-    subject: str = ""
 
     @property
     def key(self) -> str:
         """Changes when the line does."""
-        return f"{self.kind} {self.subject}".strip()
+        shown = crc32(f"{self.words} {self.button} {self.href}".encode())
+        return f"{self.kind} {shown:08x}"
 
 
 def next_step(now: Situation) -> Step:
     """The next step."""
-    return _under_way(now) or _archived(now) or _model_waits(now) or _rig_waits(now) or _test_waits(now)
+    looks = (_under_way, _archived, _model_waits, _rig_stands, _served, _rig_is_busy)
+    return next(filter(None, (look(now) for look in looks)), None) or _test_waits(now)
 
 
 def _under_way(now: Situation) -> Step | None:
-    place = f"/participants/{now.code}/calibration"
-    if now.running:
-        words = _("The test is running.")
-        return Step("running", words, _("Go to the test"), f"/tests/{now.running}", now.running)
-    if now.identifying:
-        words = _("The test is done. The model is being made; it takes a few seconds.")
-        return Step("identifying", words, _("Go to the test"), f"/tests/{now.identifying}", now.identifying)
-    if now.rig == "calibrating" and now.holder == now.code:
-        return Step("calibrating", _("The calibration has begun."), _("Go on with the calibration"), place)
+    """Their test, or their calibration."""
+    if now.state in OPEN_STATES:
+        button = _("Go to the trial") if now.of == "trial" else _("Go to the test")
+        kind: Kind = "running" if now.state in ("requested", "running") else "identifying"
+        return Step(kind, _playing(now), button, f"/tests/{now.test}")
+    if now.unstored or (now.rig == "calibrating" and now.holder == now.code):
+        words = _("A calibration waits to be stored.") if now.unstored else _("The calibration has begun.")
+        return Step("calibrating", words, _("Go on with the calibration"), f"/participants/{now.code}/calibration")
     return None
+
+
+def _playing(now: Situation) -> str:
+    """What their open test does, as far as it is known."""
+    if now.state == "identifying":
+        return _("The test is done. The model is being made; it takes a few seconds.")
+    if now.rig in ("unreachable", "silent"):
+        return _("A test was running when the rig was last heard of. Its state is not known.")
+    if now.state == "sealing":
+        return _("The test is over. Its recording is being saved.")
+    if now.rig == "stopping":
+        return _("The test is being stopped.")
+    return _("The controller plays a trial.") if now.of == "trial" else _("The test is running.")
 
 
 def _archived(now: Situation) -> Step | None:
@@ -116,34 +151,49 @@ def _archived(now: Situation) -> Step | None:
 
 
 def _model_waits(now: Situation) -> Step | None:
-    """Look at today's model; done where the controller has one and nothing newer waits."""
+    """Look at today's model; what became of a test after it is said first."""
     model = now.model
-    if model is not None and not model.decided and model.verdict != "not usable":
-        words = _("The model is ready. Look at it, then approve or reject it.")
-        return Step("look", words, _("Look at the model"), f"/models/{model.id}", model.id)
+    if model is None or model.decided or model.verdict == "not usable":
+        return None
+    words = _("The model is ready. Look at it, then approve or reject it.")
+    return Step("look", _ended(now) + words, _("Look at the model"), f"/models/{model.id}")
+
+
+def _rig_stands(now: Situation) -> Step | None:
+    """What keeps the rig from playing anything, a controller's trials, too."""
+    words = STANDS.get(now.rig)
+    has = f"{_has_model(now)} " if now.served_until else ""
+    kind: Kind = "rearm" if now.rig in ("latched", "uncertain") else "wait"
+    return None if words is None else Step(kind, f"{has}{words}")
+
+
+def _served(now: Situation) -> Step | None:
+    """Done where the controller has a model, unless its trials, or tests of the joint, ask for more."""
     if now.served_until and now.asked:
         words = _("The trials say that a new test is needed.")
-        return Step("asked", words, _("See why"), f"/participants/{now.code}#trials", now.served_until)
+        return Step("asked", words, _("See why"), f"/participants/{now.code}#trials")
+    if now.of == "joint":
+        return None
     if now.served_until:
-        words = _("Done. The controller has today's model until %(time)s.", time=now.served_until)
-        return Step("done", words, _("Back to the participants"), "/", now.served_until)
+        said = f"{_ended(now) or ('' if now.lacks_key else _('Done.') + ' ')}{_has_model(now)}"
+        if now.lacks_key == "mine":
+            return Step("done", said, _("Make a controller key"), f"/participants/{now.code}#keys")
+        return Step("done", said, _("Back to the participants"), "/")
     return None
 
 
-def _rig_waits(now: Situation) -> Step | None:
-    """What keeps the rig from a test or a calibration."""
-    if now.rig in ("latched", "uncertain"):
-        words = _("The rig has stopped and needs a re-arm. Look at the participant, then press the button above.")
-        return Step("rearm", words, subject=now.rig)
-    if now.rig == "disconnected":
-        words = _("A device is not connected. See above what to check.")
-        return Step("wait", words, subject=now.rig)
-    if now.rig in ("unreachable", "silent"):
-        words = _("The rig does not answer. A test is possible when it does.")
-        return Step("wait", words, subject=now.rig)
+def _has_model(now: Situation) -> str:
+    if now.lacks_key:
+        return _("Today's model is approved until %(time)s, but no controller has a key yet.", time=now.served_until)
+    return _("The controller has today's model until %(time)s.", time=now.served_until)
+
+
+def _rig_is_busy(now: Situation) -> Step | None:
     if now.holder and now.holder != now.code:
         words = _("The rig is in use for %(code)s. Wait until it is free.", code=now.holder)
-        return Step("wait", words, subject=now.holder)
+        return Step("wait", words)
+    if now.rig in BUSY:
+        return Step("wait", _("The rig is in use. Wait until it is free."))
     return None
 
 
@@ -154,68 +204,85 @@ def _test_waits(now: Situation) -> Step:
         words = _("Calibrate for today: find the pulse widths that are felt, move the arm and are comfortable.")
         if now.calibration == "expired":
             words = _("The last calibration was for another day. Calibrate for today.")
-        subject = "may" if now.may_start else ""
-        return Step("calibrate", before + words, _("Calibrate"), f"/participants/{now.code}/calibration", subject)
+        button = _("Begin the calibration: %(current)s", current=now.current)
+        return Step("calibrate", before + words, button)
+    if now.of == "joint":
+        words = _("Go on with the tests of the joint, or make the model of them.")
+        return Step("joint", before + words, _("To the tests of the joint"), f"/participants/{now.code}/joint")
     button = _("Start the pre-session test")
-    if before:
-        return Step("again", before + _("Test again."), button, subject=now.ended or "again")
-    return Step("test", _("Calibrated. Start the pre-session test."), button)
+    if before and now.of == "test":
+        return Step("again", before + _("Test again."), button)
+    return Step("test", before + _("Calibrated. Start the pre-session test."), button)
 
 
 def _before(now: Situation) -> str:
     """What came of the last test where it gave no model to approve; with a space at its end, or empty."""
-    came = now.ended
-    if now.model is not None and now.model.verdict == "not usable":
-        came = "poor"
-    elif now.rejected:
-        came = "rejected"
-    return f"{BEFORE[came]} " if came else ""
+    if now.of != "joint" and now.model is not None and now.model.verdict == "not usable":
+        return f"{BEFORE['poor']} "
+    return f"{BEFORE['rejected']} " if now.of != "joint" and now.rejected else _ended(now)
+
+
+def _ended(now: Situation) -> str:
+    """How the newest test ended where it gave nothing; with a space at its end, or empty."""
+    words = (TRIAL_BEFORE if now.of == "trial" else BEFORE).get(now.state)
+    return f"{words} " if words else ""
 
 
 # ---- how things stand now -----------------------------------------------------------------------------------------
 
 
 @router.get("/participants/{code}/next")
-async def key(context: Ctx, _who: Tester, code: str) -> dict[str, str]:
+async def key(context: Ctx, who: Tester, code: str) -> dict[str, str]:
     """Whether the line is still the one that the page shows."""
     row = await asyncio.to_thread(participants.find, context, code)
-    return {"key": (await asyncio.to_thread(step, context, row)).key}
+    return {"key": (await asyncio.to_thread(step, context, row, who)).key}
 
 
-def step(context: Context, row: Participant) -> Step:
-    """The participant's next step now."""
-    standing = starting.calibrated(context, row)
+def step(context: Context, row: Participant, who: Principal) -> Step:
+    """The participant's next step now, for who looks."""
     state, current = render.state_of(context), context.runner.current
     opened = context.rig.status.calibration if context.rig.status else None
     holder = current.participant if current else opened.participant if opened else ""
     test = _last_test(context, row.code)
-    open_test = test is not None and test.state in OPEN_STATES
-    mine = current is not None and test is not None and current.test_id == test.id
+    kept_by_rig = context.rig.status.calibrated if context.rig.status else None
     models = context.versions.of(row.code, since_utc=context.clock.start_of_day_utc())
     kept = next(filter(_counts, models), None)
     served = context.versions.approved(row.code)
+    of = _kind_of(test, models)  # a trial of today was played by somebody's own token where there is no key
+    keyless = served is not None and of != "trial" and not controllers.has_key(context.auth, row.code)
     now = Situation(
         code=row.code,
         rig=state,
-        calibration=standing.state,
-        may_start=standing.may_start,
+        current=starting.current_words(row),
+        calibration=starting.calibrated(context, row).state,
         holder=holder,
-        running=test.id if test is not None and mine and not (served and test.kind == SEQUENCE) else "",
-        identifying=test.id if test is not None and open_test and not mine else "",
-        ended=test.state if test is not None and test.state in NO_MODEL and test.kind != SEQUENCE else "",
+        test=test.id if test else "",
+        of=of,
+        state=context.runner.document(test)["state"] if test else "",
         model=Today(kept["id"], kept["verdict"], kept["decision"] == "approved") if kept else None,
         rejected=bool(models) and kept is None,
         served_until=language.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
+        lacks_key="" if not keyless else "mine" if who.may(Scope.APPROVE_MODEL) else "another's",
         archived_since=language.when(row.archived_utc) if row.archived_utc else "",
         asked=served is not None and context.tracked.asks(served.id) is not None,
+        unstored=kept_by_rig is not None and kept_by_rig.participant == row.code,
     )
     return next_step(now)
 
 
 def _last_test(context: Context, code: str) -> Test | None:
-    """The newest test of today."""
-    today = (Test.participant == code, Test.requested_utc >= context.clock.start_of_day_utc())
-    return context.store.first(Test, *today, order=Test.requested_utc.desc())
+    """The newest test of today, or one that goes on."""
+    since = or_(Test.requested_utc >= context.clock.start_of_day_utc(), Test.state.in_(OPEN_STATES))
+    return context.store.first(Test, Test.participant == code, since, order=Test.requested_utc.desc())
+
+
+def _kind_of(test: Test | None, models: list[dict[str, Any]]) -> Literal["test", "trial", "joint"]:
+    """A test of the joint is one among others once there is a model that was made after it."""
+    if test is None or test.kind not in (SEQUENCE, *KINDS):
+        return "test"
+    if test.kind == SEQUENCE:
+        return "trial"
+    return "joint" if all(model["created_utc"] < test.requested_utc for model in models) else "test"
 
 
 def _counts(version: dict[str, Any]) -> bool:

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from markupsafe import Markup
-from pydantic import StringConstraints
 from starlette.datastructures import FormData
 
 from stimrig.api.charts import trend_charts
@@ -19,12 +18,10 @@ from stimrig.api.models.places import site_of
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
 from stimrig.api.sessions import controllers, profiles
-from stimrig.api.sessions.controllers import PlanIn, plan_within
-from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
 from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MuscleIn, NoteIn, TargetIn, TestIn
 from stimrig.api.store import seen
-from stimrig.api.store.tables import Participant, Recording, Test
+from stimrig.api.store.tables import Participant, Recording
 from stimrig.api.web.dependencies import Approver, Context, Ctx, Tester
 from stimrig.api.web.guards import local
 from stimrig.api.web.pages import limits_form, next_view, render, starting, typed
@@ -33,7 +30,7 @@ from stimrig.api.web.pages.limits_form import LimitsForm
 from stimrig.api.web.pages.render import page, signed
 from stimrig.api.web.pages.starting import site_words
 from stimrig.api.web.pages.typed import Text
-from stimrig.api.web.routes import participants, recordings
+from stimrig.api.web.routes import participants, people, recordings
 from stimrig.rig.messages import LABEL_TITLES
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
@@ -56,17 +53,19 @@ async def show_page(
 
     def gather() -> dict[str, Any]:
         row = participants.find(context, code)
-        history = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc(), limit=200)
+        models, shown = context.versions.of(code), render.rows_shown(request)
+        tests = context.runner.documents(code, models, shown and shown + 1)
         return {
             "participant": row,
             "notes": context.notes.participant_notes(code),
             "calibrated": starting.calibrated(context, row),
-            "step": next_view.step(context, row),
+            "step": next_view.step(context, row, who),
             "form": form or limits_form.fresh(row.profile, context.rig.status),
             "meanwhile": participants.meanwhile(context, code),
             "fields": limits_form.fields(context.rig.status),
-            "tests": [context.runner.document(test) for test in history],
-            "models": context.versions.of(code),
+            "tests": tests[:shown],
+            "models": models[:shown],
+            "more": shown is not None and max(len(models), len(tests)) > shown,
             "keys": controllers.keys_of(context.auth, code),
             "made": made,
             "trials": trials_of(context, who, code),
@@ -79,7 +78,10 @@ async def show_page(
 def trials_of(context: Context, who: Principal, code: str) -> Markup | None:
     """The card of the trials; empty before the first one, None where no model may be tracked."""
     found = trials_card(context, code)
-    return None if found is None else Markup(trials_html(context, who, code, found))
+    if found is None:
+        return None
+    values = {"code": code, "ready": render.rig_now(context, who)["ready"], "signed": signed(who)}
+    return Markup(environment.get_template("trials.html").render(trials=found, **values))
 
 
 @router.post("/profile")
@@ -203,30 +205,16 @@ async def upload(
     return RedirectResponse(f"/models/{model.id}", 303)
 
 
-class KeyFor(PlanIn):
-    """A key's name and plan."""
-
-    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,60}$")]
-
-
 @router.post("/keys")
 async def make_key(
     request: Request, context: Ctx, who: Approver, code: str, name: Text = "", current_ma: Text = "",
     max_pulse_width_us: Text = "", max_duration_s: Text = "", trials: Text = "",
 ) -> Response:  # fmt: skip
     """A key that ends with its day; its text is shown on the answering page only."""
-    row = await asyncio.to_thread(participants.find, context, code)
-    controllers.refuse_maker_without(who)
-    refuse_archived(row)
-    about = (seen.participant(code), seen.decisions(code))
-    await asyncio.to_thread(context.store.refuse_changed, *about)
     asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
     numbers = {field: typed.wanted(text, lambda why, field=field: f"{field}: {why}.") for field, text in asked.items()}
-    body = typed.checked(KeyFor, name=name.strip(), trials=typed.whole(trials), **numbers)
-    plan = plan_within(PlanIn(**body.model_dump(exclude={"name"})), row)
-    text, made = await asyncio.to_thread(
-        controllers.make_key, context.auth, body.name, code, plan, who.name, who.token_hash
-    )
+    body = typed.checked(controllers.KeyFor, name=name.strip(), trials=typed.whole(trials), **numbers)
+    text, made = await asyncio.to_thread(people.key_of, context, who, code, body)
     return await show_page(request, context, who, code, made={"text": text, "name": made.name})
 
 
@@ -326,16 +314,9 @@ async def trials(context: Ctx, who: Tester, code: str) -> Response:
     def gather() -> str:
         participants.find(context, code)
         seen.looked.set(context.store.seen(context.clock))
-        found = trials_card(context, code)
-        return "" if found is None else trials_html(context, who, code, found)
+        return trials_of(context, who, code) or ""
 
     return HTMLResponse(await asyncio.to_thread(gather))
-
-
-def trials_html(context: Context, who: Principal, code: str, found: dict[str, Any]) -> str:
-    """The card as HTML."""
-    values = {"code": code, "ready": render.rig_now(context, who)["ready"], "signed": signed(who)}
-    return environment.get_template("trials.html").render(trials=found, **values)
 
 
 def trials_card(context: Context, code: str) -> dict[str, Any] | None:
@@ -356,7 +337,6 @@ def trials_card(context: Context, code: str) -> dict[str, Any] | None:
         "sentences": sentences(told["trials"], recording.created_utc),
         "age": served_age(context, told),
         "rows": [trial_row(trial) for trial in reversed(told["trials"])],
-        "asks": told["ask"],
     }
 
 

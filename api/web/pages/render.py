@@ -46,6 +46,15 @@ class Face:
     bar: Callable[[Request, Principal | None, Principal | None], dict[str, Any]]
 
 
+NEWEST = 30
+"""Rows of a long table that are shown before somebody asks for all."""
+
+
+def rows_shown(request: Request) -> int | None:
+    """How many rows of a long table are asked for; None: all."""
+    return None if request.query_params.get("all") else NEWEST
+
+
 BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
 
 
@@ -57,7 +66,8 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     bar = {**face.bar(request, looking, principal), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
     shown["signed"] = signed(principal)
-    shown["colours"] = chosen_colours(request)
+    kept = request.cookies.get(COLOURS, "")
+    shown["colours"] = kept if kept in MEDIA else "system"
     html = face.environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
 
@@ -256,9 +266,3 @@ def what_to_check(reason: str) -> str:
 
 
 environment.filters["what_to_check"] = what_to_check
-
-
-def chosen_colours(request: Request) -> str:
-    """The colours that were chosen, else as the system is set."""
-    kept = request.cookies.get(COLOURS, "")
-    return kept if kept in MEDIA else "system"

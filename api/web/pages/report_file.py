@@ -1,18 +1,18 @@
-"""Reports as one HTML file that works anywhere, offline: charts, figures and plotly inside."""
+"""Reports as one HTML file that works anywhere, offline: its charts are stills, with a small script that reads them."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Sequence
 from typing import Any
 
 from markupsafe import Markup
 
-from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
+from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts, story_charts
+from stimrig.api.charts.svg import Figures
 from stimrig.api.models import explanation, stored_model
 from stimrig.api.web.pages.environment import HERE, environment
-from stimrig.api.web.pages.static import packaged
-from stimrig.identify.yardstick import repetition_sentences
 
 
 def comparison_html(
@@ -48,12 +48,12 @@ def comparison_html(
         dynamics=stored_model.dynamics(document),
         repetition=stored_model.repetition(document),
         test=test,
-        figures={
-            **model_charts.model_figures(document, curves, comparison),
-            **joint_charts.joint_figures(document),
-            **diagnosis_charts.pictures(held),
-            **diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, []),
-        },
+        figures=Figures(
+            model_charts.model_figures(document, curves, comparison)
+            | joint_charts.joint_figures(document)
+            | diagnosis_charts.pictures(held)
+            | diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, [])
+        ),
         plain=(comparison or {}).get("plain") or [],
         places=diagnosis_charts.places_of(comparison or {}),
         splits=explanation.splits(comparison),
@@ -61,64 +61,80 @@ def comparison_html(
     )
 
 
-def improvement_html(
-    found: dict[str, Any],
-    name: str,
-    diagnosis: dict[str, Any] | None = None,
-    before: dict[str, Any] | None = None,
-    after: dict[str, Any] | None = None,
-    segments: list[dict[str, Any]] | None = None,
+def diagnosis_html(
+    diagnosis: dict[str, Any], comparison: dict[str, Any], segments: list[dict[str, Any]], name: str
 ) -> str:
-    """Effects added one by one, what each is, and the falling error.
+    """What the page shows of what is missing, as a file.
 
     Parameters
     ----------
-    found : dict
-        As `stimrig.identify.diagnosis.improvement` gives it.
+    diagnosis : dict
+        As `stimrig.api.workers.verbs.diagnosis` gives it.
+    comparison : dict
+        Of the examined model with the record, thinned.
+    segments : list of dict
+        The record's, as `stimrig.api.workers.curves.runs` gives them.
     name : str
         The record's.
-    diagnosis : dict or None
-        As `stimrig.api.workers.verbs.diagnosis` gives it: explanations, parameters, signatures.
-    before, after : dict or None
-        Comparisons of the first model and of the last one with the record.
-    segments : list of dict or None
-        The record's, as `stimrig.api.workers.curves.runs` gives them.
     """
-    rows = explanation.step_versions(found)
-    view = explanation.view(diagnosis, before, []) if diagnosis else None
-    drawn = diagnosis_charts.diagnosis_figures(
-        before, segments or [], view, (diagnosis or {}).get("signatures") or {}, rows
-    )
-    if after:
-        places = diagnosis_charts.places_of(after)
-        shown = places if explanation.noisy(after) else []
-        drawn["residual-after"] = diagnosis_charts.residual(after, segments or [], shown)
+    view = explanation.view(diagnosis, comparison, [])
     return _page(
-        "report_improve.html",
-        title=f"{name}: what was missing",
-        found=found,
-        rows=rows,
-        why=view,
-        figures=drawn,
-        repetition=repetition_sentences(found["steps"][-1]),
+        "report_diagnosis.html",
+        title=f"{name}: what is missing",
+        figures=Figures(
+            diagnosis_charts.diagnosis_figures(comparison, segments, view, diagnosis.get("signatures") or {}, [])
+        ),
+        **missing_parts(view, comparison),
     )
+
+
+def missing_parts(view: dict[str, Any] | None, comparison: dict[str, Any] | None) -> dict[str, Any]:
+    """What `missing.html` shows, on the page and in a file; where all is noise, no place of it."""
+    if view is not None and view["kind"] == "nothing" and not explanation.noisy(comparison or {}):
+        view["places"] = []
+    return {
+        "why": view,
+        "places": view["places"] if view else diagnosis_charts.places_of(comparison or {}),
+        "splits": explanation.splits(comparison),
+        "tests": view["tests"] if view else [],
+    }
+
+
+def story_html(
+    told: dict[str, Any], before: dict[str, Any], after: dict[str, Any], name: str,
+    refused: Sequence[dict[str, Any]] = (), structure: str = "",
+) -> str:  # fmt: skip
+    """The story as a file.
+
+    Parameters
+    ----------
+    told : dict
+        As `stimrig.api.models.story.story` gives it.
+    before, after : dict
+        ``curves`` and ``comparison`` of the first model and of the last one.
+    name : str
+        The record's.
+    refused : sequence of dict
+        What was tried and not added.
+    structure : str
+        What it was begun with.
+    """
+    figures = story_charts.story_figures(told, before, after)
+    shown = {"story": told, "figures": figures, "refused": refused, "structure": structure}
+    return _page("report_story.html", title=f"{name}: {told['title']}", name=name, **shown)
 
 
 def _page(template: str, **values: Any) -> str:
-    inside = {
-        "style": Markup((HERE / "static" / "page.css").read_text("utf-8")),
-        "plotly": Markup(packaged("plotly.min.js").read_text("utf-8").replace("</script", "<\\/script")),
-        "script": Markup((HERE / "static" / "charts.js").read_text("utf-8")),
-    }
-    policy = report_policy(inside["plotly"], inside["script"])
-    return environment.get_template(template).render(**values, **inside, policy=policy)
+    files = ("page.css", "lead.css", "stills.js")
+    *styles, script = (Markup((HERE / "static" / name).read_text("utf-8")) for name in files)
+    inside = {"style": Markup("").join(styles), "script": script, "policy": report_policy(script)}
+    return environment.get_template(template).render(**values, **inside)
 
 
-def report_policy(*scripts: str) -> str:
-    """The Content-Security-Policy of a report: these scripts run, nothing is loaded, nothing leaves."""
-    hashes = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
-    allowed = " ".join(f"'sha256-{value}'" for value in hashes)
+def report_policy(script: str) -> str:
+    """The Content-Security-Policy of a report: this script runs, nothing is loaded, nothing leaves."""
+    allowed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data: blob:; "
+        f"default-src 'none'; script-src 'sha256-{allowed}'; style-src 'unsafe-inline'; "
         "connect-src 'none'; form-action 'none'; base-uri 'none'"
     )

@@ -12,7 +12,7 @@ from stimrig.api.charts import joint_charts, model_charts
 from stimrig.api.charts.svg import svg
 from stimrig.api.clock import local_day
 from stimrig.api.language import _
-from stimrig.api.models import advice, explanation, stored_model
+from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.places import site_of, site_of_recording
 from stimrig.api.store.tables import Note, Participant, Recording, Test
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
@@ -45,7 +45,6 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
         "joint_h": _("Passive torque over the angle of the joint"),
     }
     drawn = {name: svg(figures[name], *SIZES[name], words[name], on_paper=True) for name in words if name in figures}
-    leaves = advice.leaves_structure(advice.findings(document))
     return page(
         request,
         "report_sheet.html",
@@ -53,7 +52,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
         **await facts(context, row, document),
         drawn=drawn,
         problem=measured["problem"],
-        why=explanation.view(found, measured["comparison"], row.effects, leaves) if found else None,
+        why=explanation.view(found, measured["comparison"], row.effects) if found else None,
         versions=await asyncio.to_thread(versions_of, context, row),
         recording=recording,
         session=await asyncio.to_thread(session_of, context, recording),

@@ -25,14 +25,15 @@ router = APIRouter(include_in_schema=False)
 @router.get("/rig/now")
 async def rig_now(request: Request, context: Ctx) -> Response:
     """The state for the bar of every page, also of one whose session has ended."""
-    principal, locked = None, False
+    principal, locked, known = None, False, True
     try:
         principal = await context.auth.ask(request)
     except ApiError as error:  # the state is told all the same
         locked = error.code == LOCKED[0]
     except SQLAlchemyError:
-        pass
-    return JSONResponse({**render.rig_now(context, principal), "signed_in": principal is not None, "locked": locked})
+        known = False
+    signed_in = principal is not None if known else None
+    return JSONResponse({**render.rig_now(context, principal), "signed_in": signed_in, "locked": locked})
 
 
 @router.post("/rig/acted")

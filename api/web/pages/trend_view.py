@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from typing import Annotated, Any
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
@@ -12,12 +13,13 @@ from fastapi.responses import Response
 from stimrig.api import language
 from stimrig.api.charts import model_charts, trend_charts
 from stimrig.api.charts.model_charts import MOST
+from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.trend import Session
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader
-from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.render import page, rows_shown
 from stimrig.api.web.routes import trend as rest
 
 router = APIRouter(include_in_schema=False)
@@ -36,13 +38,12 @@ async def compare(
     reference: str = "",
 ) -> Response:
     """Models of one participant, the oldest first; differences are to `reference`, or to the oldest."""
-    rows = await chosen(context, list(dict.fromkeys(model or [])))
+    rows = await chosen(context, model)
     participant = rows[0].participant
     sessions = await context.trend.for_models(participant, [row.id for row in rows])
     at = next((number for number, row in enumerate(rows) if row.id == reference), 0)
     sides = await asyncio.gather(*(side(context, rows, number) for number in range(len(rows))))
     names = [language.when(row.created_utc) for row in rows]
-    documents = [stored_model.read(row) for row in rows]
     return page(
         request,
         "compare.html",
@@ -55,15 +56,29 @@ async def compare(
             for number, one in enumerate(sessions)
             if number != at
         ],
-        figures={
-            "recruitment": model_charts.compared_recruitment(documents, names),
-            "step": model_charts.compared_step([one["curves"] for one in sides], names),
-        },
+        figures=draw(rows, [one["curves"] for one in sides]),
     )
 
 
-async def chosen(context: Context, ids: list[str]) -> list[Model]:
+def draw(rows: Sequence[Model], curves: Sequence[dict[str, Any] | None]) -> Figures:
+    """The models' curves over one another."""
+    names, asked = [language.when(row.created_utc) for row in rows], urlencode([("model", row.id) for row in rows])
+    figures = {
+        "recruitment": model_charts.compared_recruitment([stored_model.read(row) for row in rows], names),
+        "step": model_charts.compared_step(curves, names),
+    }
+    return Figures(figures, f"/compare/figures/{{}}?{asked}")
+
+
+async def figures_of(context: Context, rows: Sequence[Model]) -> Figures:
+    """The charts of models side by side."""
+    sides = await asyncio.gather(*(side(context, [row], 0) for row in rows))
+    return draw(rows, [one["curves"] for one in sides])
+
+
+async def chosen(context: Context, asked: list[str] | None) -> list[Model]:
     """The models, the oldest first; 422 where they are too few, too many, or of different participants."""
+    ids = list(dict.fromkeys(asked or []))
     if not 2 <= len(ids) <= MOST:
         detail = f"{len(ids)} are chosen. Go back and choose 2 to {MOST} models of the participant."
         raise ApiError(422, "two-models", "Choose two models or more to compare", detail)
@@ -138,8 +153,10 @@ async def trend(request: Request, context: Ctx, _who: ModelReader, code: str) ->
         request,
         "trend.html",
         participant=code,
-        sessions=[row(one) for one in reversed(documents)],
+        sessions=[row(one) for one in documents[::-1][: rows_shown(request)]],
+        more=len(documents) > (rows_shown(request) or len(documents)),
         panels=trend_charts.panels(documents),
+        told=trend_charts.sessions_told(documents),
         changes=rest.newest(found),
         columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(changes.name_of, COLUMNS)],
         most=MOST,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, cast, get_type_hints
+from typing import Annotated, Any, cast, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, create_model
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, WithJsonSchema, create_model
 
 from stimrig.api.schemas import component_name
+from stimrig.api.sessions.requests import SETTINGS
+from stimrig.rig.messages import StopEvidence
 
 
 class Document(BaseModel):
@@ -41,6 +43,23 @@ class Holder(Document):
     by: str
 
 
+class EntryOut(Document):
+    """Who did what."""
+
+    at_utc: str
+    who: str = Field(description="empty: the rig itself")
+    action: str
+    subject: str
+    detail: dict[str, JsonValue] = Field(description="what belongs to this action: reasons, limits, ids")
+
+
+class ChangeOut(Document):
+    """What was changed since something was seen."""
+
+    now: EntryOut
+    seen: EntryOut | None = Field(description="what was there when it was seen; null: nothing, or not known")
+
+
 class Problem(Document):
     """Why a request failed (RFC 9457)."""
 
@@ -52,6 +71,16 @@ class Problem(Document):
     errors: list[FieldProblem] = Field([], description="422: each field that does not hold")
     holder: Holder | None = Field(None, description="409 `rig-busy`: the test that holds the rig")
     reasons: dict[str, str] = Field({}, description="409 of effects: why each one was not added, by its id")
+    place: str | None = Field(None, description="422 of a file, a model or a reference: what of it does not hold")
+    fix: str | None = Field(None, description="with `place`: how to mend it")
+    changes: list[ChangeOut] = Field([], description="409 `changed-meanwhile`: each change, the newest last")
+    seen: str | None = Field(
+        None, description="409 `changed-meanwhile`: the version that was sent; null: of another kind"
+    )
+    latch: str = Field(
+        "", description="409 of a re-arm: names the stop of now; send it as `If-Match` once it was looked at"
+    )
+    evidence: StopEvidence | None = Field(None, description="503 `stop-not-confirmed`: what is known of the stop")
 
 
 class SegmentOut(Document):
@@ -59,7 +88,7 @@ class SegmentOut(Document):
 
     name: str
     sequence: str
-    settings: dict[str, JsonValue] = Field({}, description="as `GET /v1/sequences` describes them")
+    settings: Annotated[dict[str, JsonValue], WithJsonSchema(SETTINGS)] = {}
 
 
 class SchemasOut(Document):

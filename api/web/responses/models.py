@@ -103,7 +103,9 @@ class ComparisonOut(Document):
     """Measurement against the model's free run."""
 
     fit_percent: float | None
-    ceiling_percent: float | None
+    ceiling_percent: float | None = Field(
+        description="that the true system would reach on this noise; a fit follows a little of it, and may be above"
+    )
     rms_nm: float | None
     noise_sd_nm: float | None
     repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
@@ -145,11 +147,11 @@ class FiguresOut(Document):
     """How well a model fits."""
 
     fit_percent: float | None = Field(None, description="best-fit, %")
-    held_out_fit_percent: float | None = Field(None, description="best-fit of held-out rows, %")
+    held_out_fit_percent: float | None = Field(None, description="best-fit of held-out pulses, %")
     rms_nm: float | None = Field(None, description="N·m")
     held_out_rms_nm: float | None = Field(None, description="N·m")
     repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
-    unforeseen_nm: float | None = Field(None, description="of held-out rows, left out of predictions, N·m")
+    unforeseen_nm: float | None = Field(None, description="of held-out pulses, left out of predictions, N·m")
 
 
 class StepOut(FiguresOut):
@@ -245,9 +247,14 @@ class InversionOut(Document):
     unreachable: list[Unreachable]
     fit_percent: float | None = Field(description="where it can be reached, %; null where the reference is level")
     whole_fit_percent: float | None = Field(description="of all of it, %")
-    tolerance_nm: float = Field(description="a smaller difference counts as reached, N·m")
+    tolerance_nm: float = Field(
+        description="a smaller difference counts as reached: 2 % of the largest torque of the model there, N·m"
+    )
     max_pulse_width_us: float | None = Field(description="that was held to, µs")
     max_rise_us: float | None = Field(description="from pulse to pulse that was held to, µs")
+    shortest_pulse_us: float | None = Field(
+        description="the stimulator's, µs: a narrower one is not sent, so it is 0 here; null: not known"
+    )
     segments: list[SegmentOut] = Field(description="a rest, the trial, a rest: for `POST /v1/tests`, kind `sequence`")
 
 
@@ -343,6 +350,23 @@ class LevelsOut(Document):
     gain: LevelOut = Field(description="factor on the approved curve")
     threshold_shift_us: LevelOut = Field(description="by which the curve has moved to wider pulses, µs")
     time_scale: LevelOut = Field(description="factor on the approved time constant")
+
+
+class TrackedOut(Document):
+    """What a model that is asked for with `tracked` was moved by; missing in one that nothing has moved yet."""
+
+    approved_model_id: str
+    trial: int = Field(description="the trial that it was tracked to; 0: none")
+    test_id: str | None
+    at_utc: str
+    moved: list[str] | None = Field(description="the quantities by which the model was moved")
+    now: LevelsOut | None = Field(description="in that trial")
+    coming: LevelsOut | None = Field(description="expected in the next one: what the model holds")
+    effects: dict[str, dict[str, float]] | None = Field(description="as in a trial")
+    disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches to learn nothing from, s")
+    limits: TrackingLimits | None
+    outcome: str | None
+    ask: str | None = Field(description="null, or why a person has to look: then end")
 
 
 class TrialOut(Document):

@@ -9,7 +9,7 @@ from pydantic import Field, JsonValue
 from stimrig.api.client import documents
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.requests import NoteKind
-from stimrig.api.web.responses.base import Document, fields_of
+from stimrig.api.web.responses.base import Document, EntryOut, fields_of
 from stimrig.rig.messages import CalibrationStatus, RigState
 
 
@@ -42,6 +42,10 @@ class KeyOut(Document):
     prefix: str
     scopes: list[Scope]
     expires_utc: str
+    id: str | None = Field(None, description="of a key that plays trials: for `DELETE /v1/tokens/{id}`")
+    name: str | None = Field(None, description="under which its trials are kept")
+    participant: str | None = Field(None, description="the only one that it opens")
+    plan: dict[str, JsonValue] | None = Field(None, description="what trials it may play")
 
 
 class TokenOut(Document):
@@ -68,15 +72,10 @@ class ListedToken(Document):
     plan: dict[str, JsonValue] | None = Field(None, description="what trials that key may play")
 
 
-class AuditEntryOut(Document):
-    """Who did what."""
+class AuditEntryOut(EntryOut):
+    """An entry of the audit trail."""
 
     seq: int
-    at_utc: str
-    who: str
-    action: str
-    subject: str
-    detail: dict[str, JsonValue] = Field(description="what belongs to this action: reasons, limits, ids")
     previous_hash: str
     hash: str = Field(description="SHA-256 of the entry's canonical JSON without this field")
 

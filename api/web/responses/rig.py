@@ -9,13 +9,19 @@ from pydantic import Field
 from stimrig.api.client import documents
 from stimrig.api.web.responses.base import Document, Holder, SegmentOut, fields_of
 from stimrig.api.web.responses.models import SegmentSpan, VersionOut
-from stimrig.rig.messages import AngleStatus, Bound, CalibrationStatus, ProtocolInfo, RigState, StopEvidence
+from stimrig.rig.messages import AngleStatus, Bound, CalibrationStatus, LiveEvent, ProtocolInfo, RigState, StopEvidence
 
 
 class DeviceOut(Document):
     """A device of the rig: what it is and how it is connected."""
 
     device: str = ""
+
+
+class StimulatorOut(DeviceOut):
+    """The stimulator."""
+
+    shortest_us: float | None = Field(default=None, description="no narrower pulse is sent, µs")
 
 
 class RigHealth(Document):
@@ -31,13 +37,14 @@ class RigOut(RigHealth):
     """What is known of the rig, and how old it is."""
 
     reason: str = Field(description="why it is latched, uncertain or disconnected")
+    latch: str = Field("", description="names the last stop; a re-arm sends it as `If-Match`, as the `ETag` has it")
     holder: Holder | None = Field(description="the test that holds it")
     test_id: str | None = None
     participant: str | None = None
     segment: str | None = None
     elapsed_s: float = Field(0.0, description="of the test that runs, s")
     duration_s: float = Field(0.0, description="of the test that runs, s")
-    stimulator: DeviceOut = Field(DeviceOut(), description="device, id, firmware, port")
+    stimulator: StimulatorOut = Field(StimulatorOut(), description="device, id, firmware, port")
     load_cell: DeviceOut = Field(DeviceOut(), description="device, measured sample rate, bus")
     torque_nm: float | None = Field(None, description="newest torque, N·m")
     torque_age_s: float | None = Field(None, description="its age, s")
@@ -282,6 +289,11 @@ class DosesOut(Document):
     held: float = Field(description="of all held tests")
     moving: float
     total: float = Field(description="of the three guided tests together; never above `paper`")
+
+
+class LiveOut(LiveEvent):
+    """A message of the live channel of the type `live`; `type` stands in the place of `event`. Times from the begin of
+    the test, s: negative ones, at most 1 s, are before it."""
 
 
 class JointOut(Document):

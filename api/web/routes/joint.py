@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Response
 from pydantic import AfterValidator, Field, StrictBool, StringConstraints
 
 from stimrig.api.clock import local_day
@@ -23,7 +23,7 @@ from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import VersionOut
 from stimrig.api.web.responses.rig import AngleOut, JointOverviewOut
 from stimrig.api.web.routes import participants
-from stimrig.api.web.routes.criticism import LATER, later
+from stimrig.api.web.routes.criticism import LATER, Wait, later
 from stimrig.api.workers.jobs import FIT_TOGETHER, Job
 from stimrig.rig.messages import AngleStatus, Status
 from stimrig.rig.requests import AnglePoseRequest
@@ -137,9 +137,8 @@ async def overview(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
 
 @router.post("/participants/{code}/models", status_code=201, response_model=VersionOut, responses=LATER)
 async def fit_together(
-    context: Ctx, who: Tester, code: str, body: TogetherIn, response: Response,
-    wait: Annotated[bool, Query(description="false: answer 202 at once, with the job's address")] = True,
-) -> Any:  # fmt: skip
+    context: Ctx, who: Tester, code: str, body: TogetherIn, response: Response, wait: Wait = True
+) -> Any:
     """One model of several recordings, joined: isometric ones and those in which the joint was held or moved."""
     await asyncio.to_thread(participants.find, context, code)
     if not wait:

@@ -145,6 +145,10 @@ REST_S = 1.0
 RISE = "width_rise_us"
 Column = Annotated[list[FiniteFloat], Field(min_length=1, max_length=60_000)]
 WidthUs = Annotated[FiniteFloat, Field(ge=0, le=500)]
+ModelsRateHz = Annotated[
+    Annotated[FiniteFloat, Field(ge=1.0, le=100.0)] | None,
+    Field(description="null: the model's; more than a quarter off that is refused, Hz"),
+]
 Angles = Annotated[
     list[Annotated[FiniteFloat, Field(ge=-7, le=7)]],
     Field(
@@ -157,7 +161,7 @@ class WidthsIn(Body):
     """One pulse width for each pulse."""
 
     pulse_width_us: Annotated[list[WidthUs], Field(min_length=1, max_length=12_000, description="µs")]
-    pulse_rate_hz: Annotated[FiniteFloat, Field(ge=10, le=100)] = 40.0
+    pulse_rate_hz: ModelsRateHz = None
     angle_rad: Angles | None = None
 
     @model_validator(mode="after")
@@ -179,16 +183,16 @@ async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: Width
         pulse_rate_hz=body.pulse_rate_hz, angle_rad=body.angle_rad,
     )  # fmt: skip
     found = await call.result
-    return {"model_id": model_id, "pulse_rate_hz": body.pulse_rate_hz, **found}
+    return {"model_id": model_id, **found}
 
 
 class ReferenceIn(Body):
     """A torque to follow."""
 
     reference_torque_nm: Annotated[Column, Field(description="above rest, N·m; one for each pulse, without `time_s`")]
-    time_s: Annotated[Column, Field(description="times of the torques, s, rising; of any rate")] | None = None
+    time_s: Annotated[Column, Field(description="times of the torques, s, rising by at most 1 s")] | None = None
     angle_rad: Angles | None = None
-    pulse_rate_hz: FiniteFloat | None = Field(None, ge=10, le=100, description="None: the model's")
+    pulse_rate_hz: ModelsRateHz = None
     max_pulse_width_us: FiniteFloat | None = Field(None, gt=0, le=500, description="never above the participant's, µs")
     max_rise_us: FiniteFloat | None = Field(None, gt=0, le=500, description="from pulse to pulse, µs; None: the rig's")
     whole_us: StrictBool = Field(True, description="whole µs")
@@ -210,29 +214,22 @@ async def invert(
 ) -> dict[str, Any]:  # fmt: skip
     """What a worker makes of a reference, within the limits of participant and rig.
 
-    Parameters
-    ----------
-    given : dict
-        The reference, as the verb `invert` takes it.
-    width_us, rise_us : float, optional
-        Further limits.
+    `given`: the reference, as the verb `invert` takes it; `width_us`, `rise_us`: further limits.
     """
     text = await asyncio.to_thread(context.tracked.text_of, model_id)
     version = await asyncio.to_thread(context.tracked.version_of, model_id)
     participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
     largest_us = tighter(width_us, participant.profile.get("max_pulse_width_us"))
-    rise_us = tighter(rise_us, _rise_of_rig(context))
+    rig = context.rig.status
+    bound, shortest_us = (rig.limits.get(RISE), rig.stimulator.get("shortest_us")) if rig else (None, None)
+    rise_us = tighter(rise_us, bound and bound.hi)
     call = context.pool.submit(
-        "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=whole, **given
-    )
+        "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=whole,
+        shortest_us=shortest_us or 0.0, **given,
+    )  # fmt: skip
     found = await call.result
-    limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us}
+    limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us, "shortest_pulse_us": shortest_us}
     return {"model_id": model_id, **found, **limits, "segments": segments(found["pulse_width_us"])}
-
-
-def _rise_of_rig(context: Context) -> float | None:
-    bound = context.rig.status.limits.get(RISE) if context.rig.status else None
-    return bound.hi if bound else None
 
 
 def segments(pulse_width_us: list[float]) -> list[dict[str, Any]]:

@@ -30,6 +30,7 @@ from stimrig.api.web.responses.rig import TestOut
 from stimrig.rig.messages import Status
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
+MayVoid = Annotated[bool, Query(description="the change may void the calibration of the day")]
 
 
 def create(context: Context, body: ParticipantIn, by: str) -> Participant:
@@ -166,7 +167,7 @@ async def set_profile(
     code: str,
     body: ProfileIn,
     response: Response,
-    void_calibration: Annotated[bool, Query(description="the change may void the calibration of the day")] = False,
+    void_calibration: MayVoid = False,
 ) -> dict[str, Any]:
     """Change limits: those that are sent; the others keep their values, and so does what a calibration found.
 
@@ -182,8 +183,7 @@ async def set_profile(
 def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
     """A participant's tests, newest first."""
     find(context, code)
-    rows = context.store.all(Test, Test.participant == code, order=Test.requested_utc.desc())
-    return [context.runner.document(row) for row in rows]
+    return context.runner.documents(code, context.versions.of(code))
 
 
 def loses_calibration(row: Participant, body: MuscleIn) -> bool:
@@ -230,7 +230,7 @@ async def set_muscle(
     who: Tester,
     code: str,
     body: MuscleIn,
-    void_calibration: Annotated[bool, Query(description="the change may void the calibration of the day")] = False,
+    void_calibration: MayVoid = False,
 ) -> dict[str, Any]:
     """Say the site. Another one than before voids the calibration: 409, unless allowed.
 
@@ -317,14 +317,8 @@ class Listed:
 def matching(store: Store, q: str = "", archived: bool | None = None) -> list[tuple[Participant, str]]:
     """Participants whose code holds `q`, each with the time at which it was last tested, or made.
 
-    Parameters
-    ----------
-    store : Store
-        Holds them.
-    q : str
-        A part of the code, in any case; empty: all.
-    archived : bool or None
-        Only those that are archived, or that are not.
+    `store`: holds them. `q`: a part of the code, in any case; empty: all. `archived`: only those that are archived, or
+    that are not.
     """
     last = select(Test.participant, func.max(Test.requested_utc).label("utc")).group_by(Test.participant).subquery()
     newest = func.coalesce(last.c.utc, Participant.created_utc)

@@ -14,14 +14,18 @@ from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.outbox import receipts
 from stimrig.api.people import accounts
 from stimrig.api.people.auth import ROLES, Principal, Scope, unauthorized
+from stimrig.api.sessions import controllers
+from stimrig.api.sessions.controllers import KeyFor
+from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import TokenIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import AuditEntry, Token
-from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Context, Ctx, EvenLocked
+from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Approver, Context, Ctx, EvenLocked
 from stimrig.api.web.guards import local, same_origin, set_cookie
 from stimrig.api.web.openapi import TOO_MANY
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import AuditOut, KeyOut, ListedToken, ListedUser, SessionOut, TokenOut, UserOut
+from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 
@@ -174,10 +178,38 @@ def sign_out(context: Ctx, request: Request, _who: EvenLocked) -> None:
 
 @router.post("/controller-keys", status_code=201, **describe_answer(KeyOut, 201, "issued"))
 def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, Any]:
-    """A key for an ILC controller: reads models, nothing else, and expires. Its text is shown this once."""
+    """A key for an ILC controller that only reads models, of all participants. Its text is shown this once.
+
+    One that plays trials: `POST /v1/participants/{code}/keys`.
+    """
     expires_utc = utc_label(context.clock.unix_s() + 86400.0 * body.days)
     text = context.auth.issue(body.name, [Scope.READ_MODEL], who.name, expires_utc=expires_utc)
     return {"key": text, "prefix": text[:12], "scopes": [Scope.READ_MODEL], "expires_utc": expires_utc}
+
+
+@router.post("/participants/{code}/keys", status_code=201, **describe_answer(KeyOut, 201, "made"))
+def participant_key(context: Ctx, who: Approver, code: str, body: KeyFor) -> dict[str, Any]:
+    """A key with which a controller plays trials of one participant until the end of the day, within a plan.
+
+    Who makes it holds `run-test`, `read-live` and `read-model`, too, and answers for what it plays. Its text is shown
+    this once. The participant's page revokes it, and for an administrator `DELETE /v1/tokens/{id}`.
+    """
+    text, row = key_of(context, who, code, body)
+    told = {name: getattr(row, name) for name in ("name", "prefix", "scopes", "expires_utc", "participant", "plan")}
+    return {"key": text, "id": row.hash[:16], **told}
+
+
+def key_of(context: Context, who: Principal, code: str, body: KeyFor) -> tuple[str, Token]:
+    """The text and the row of a new key, for REST and page.
+
+    Raises ApiError: 403 who makes it lacks a scope; 409 archived, or changed since it was seen; 422 as `plan_within`.
+    """
+    row = participants.find(context, code)
+    controllers.refuse_maker_without(who)
+    refuse_archived(row)
+    context.store.refuse_changed(seen.participant(code), seen.decisions(code))
+    plan = controllers.plan_within(body, row)
+    return controllers.make_key(context.auth, body.name, code, plan, who.name, who.token_hash)
 
 
 token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)

@@ -28,12 +28,13 @@ from stimrig.identify.records import HDF5_MAGIC
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
-UPLOAD = {"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": {"type": "string"}}}}}
 BINARY = {"schema": {"type": "string", "format": "binary"}}
-CSV = {"description": "one row a sample", "content": {"text/csv": BINARY}}
+UPLOAD = {"requestBody": {"required": True, "content": {"application/octet-stream": BINARY}}}
+CSV = {"description": "one row a sample", "content": {"text/csv": {"schema": {"type": "string"}}}}
+RAW_KINDS = ("application/octet-stream", "application/x-hdf5", "text/csv", "application/x-matlab-data")
 RAW = {
     "description": "the file as it was sealed or sent in; `X-Content-SHA256` is its checksum",
-    "content": {"application/x-hdf5": BINARY, "text/csv": BINARY, "application/x-matlab-data": BINARY},
+    "content": dict.fromkeys(RAW_KINDS, BINARY),  # the first one for clients that know no other kind of bytes
 }
 GONE = problem("the file is not in its place any more")
 MOST_COLUMNS = 8

@@ -97,7 +97,7 @@ async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
         if error.code != "rig-latch-changed":
             raise
         status = await context.rig.fresh_status()
-        told = seen.ChangedError([{"seen": shown, "now": context.rig.latches[status.latch]}], None)
+        told = seen.ChangedError([{"seen": shown, "now": context.rig.latches[status.latch]}], None, error.detail)
         told.extra["latch"] = status.latch
         raise told from error
     await context.rig.fresh_status()

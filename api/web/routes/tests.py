@@ -97,8 +97,8 @@ async def enough(context: Ctx, who: Tester, test_id: str) -> dict[str, Any]:
 async def live(socket: WebSocket, test_id: str) -> None:
     """Live signals: `history` first, then `live` about 20 a second, `state`, `link`, and `test` at every turn.
 
-    The socket closes (1000) once the test has ended and its last `test` message was sent; it closes (4401, after a
-    `problem`) within two seconds once its session or token is no longer valid.
+    The socket closes (1000) once the test has ended and its last `test` message was sent; after a `problem` with 4000
+    and its status: 4401 within two seconds once its session or token is no longer valid, 4403, 4404.
     """
     context = context_of(socket)
     await socket.accept()
@@ -110,7 +110,7 @@ async def live(socket: WebSocket, test_id: str) -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
             async with asyncio.timeout(GOODBYE_S):
                 await socket.send_json({"type": "problem", "problem": error.body(socket.url.path)})
-                await socket.close(4404 if error.status == 404 else 4401, error.title)
+                await socket.close(4000 + error.status, error.title)
     except (WebSocketDisconnect, RuntimeError):
         pass
 

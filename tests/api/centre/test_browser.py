@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from stimrig.api.charts.trend_charts import WIDE
 from tests.api.browser import close, there, watched
 from tests.api.centre.conftest import AT, Centre, Teller
 from tests.api.conftest import TOKEN
@@ -73,7 +74,10 @@ def test_from_no_rig_to_a_download(page: Any, centre: Centre, told: Teller) -> N
         page.locator("article.session").first.get_by_role("link", name=re.compile(r"\d\d:\d\d")).click()
     with open(download.value.path(), "rb") as file:  # noqa: PTH123
         assert file.read() == data
-    page.locator("rect.column").first.click()
+    x = page.evaluate("JSON.parse(document.getElementById('told').textContent)[0][0]")
+    page.locator("svg.trend").first.scroll_into_view_if_needed()
+    box = page.locator("svg.trend").first.bounding_box()
+    page.mouse.click(box["x"] + x * box["width"] / WIDE, box["y"] + box["height"] / 2)
     page.wait_for_url(re.compile(r"before=2026-02-01"))
     assert page.errors == []
     assert {httpx.URL(url).host for url in page.requests if not url.startswith(("data:", "blob:"))} == {"127.0.0.1"}

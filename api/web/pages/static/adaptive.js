@@ -4,7 +4,6 @@ const knows = { told: null, dirty: true };
 
 function showAdaptive(told) {
   knows.told = told; knows.dirty = true;
-  const say = (name, text) => { const box = document.getElementById(name); if (box.textContent !== text) box.textContent = text; };
   if (told.words) say("known-words", told.words);
   if (told.least_known) say("least-known", words.least_known.replace("{width}", shown(told.least_known.pulse_width_us.toFixed(0))).replace("{time}", shown(told.least_known.time_s.toFixed(2))));
   const why = document.getElementById("fixed-why");
@@ -13,13 +12,8 @@ function showAdaptive(told) {
   showEnough(told.state === "choosing" || told.state === "fixed");
 }
 
-function showEnough(may) {
-  const form = document.getElementById("enough");
-  if (form) form.hidden = !may;
-}
-
 function showDose(torque_time_nm_s) {
-  document.getElementById("dose-used").textContent = shown(torque_time_nm_s.toFixed(1));
+  say("dose-used", shown(torque_time_nm_s.toFixed(1)));
   document.getElementById("dose-left").value = torque_time_nm_s;
 }
 
@@ -33,20 +27,8 @@ function drawKnown() {
 function band(name, curve, percent, title, xtitle, unit, largest) {
   const box = document.getElementById(name);
   const low = curve ? Math.min(0, ...curve.low) : 0, high = curve ? Math.max(...curve.high) : 1, last = curve ? curve.x[curve.x.length - 1] : largest;
-  const canvas = box.getContext("2d"), ratio = window.devicePixelRatio || 1, size = box.getBoundingClientRect();
-  box.width = Math.round(size.width * ratio); box.height = Math.round(size.height * ratio);
-  const pen = canvas, area = { left: 50, right: size.width - 16, top: 26, bottom: size.height - 36 };
-  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-  const x = (v) => area.left + (v / last) * (area.right - area.left), y = (v) => area.bottom - ((v - low) / ((high - low) * 1.04 || 1)) * (area.bottom - area.top);
-  pen.font = "12px " + FONT; pen.fillStyle = colours.dim; pen.strokeStyle = colours.grid; pen.lineWidth = 1;
-  const ystep = nice(high - low || 1, 4), xstep = nice(last, 5);
-  pen.textAlign = "right"; pen.textBaseline = "middle";
-  for (let v = Math.ceil(low / ystep) * ystep; v <= high + 1e-9; v += ystep) { pen.beginPath(); pen.moveTo(area.left, y(v)); pen.lineTo(area.right, y(v)); pen.stroke(); pen.fillText(shown(+v.toFixed(6)), area.left - 6, y(v)); }
-  pen.textAlign = "center"; pen.textBaseline = "top";
-  for (let v = 0; v <= last + 1e-9; v += xstep) pen.fillText(shown(+v.toFixed(6)), x(v), area.bottom + 4);
-  pen.textAlign = "right"; pen.fillText(xtitle, area.right, area.bottom + 20);
-  pen.textAlign = "left"; pen.fillStyle = colours.ink; pen.font = "600 13px " + FONT;
-  pen.fillText((curve ? title.replace("{percent}", shown(percent.toFixed(1))) : title.split(",")[0] + ": " + words.nothing_known) + (unit ? " (" + unit + ")" : ""), 4, 3);
+  const heading = curve ? title.replace("{percent}", shown(percent.toFixed(1))) : title.split(",")[0] + ": " + words.nothing_known;
+  const { pen, x, y } = frame(box, low, low + ((high - low) * 1.04 || 1), heading, unit, { last, words: xtitle });
   if (!curve) return;
   pen.fillStyle = colours["torque-band"]; pen.strokeStyle = colours.torque; pen.lineWidth = 1.8; pen.lineJoin = "round";
   pen.beginPath();

@@ -29,8 +29,7 @@ function showJoint(told) {
   const why = byId("alone-why");
   why.hidden = !told.problem; if (told.problem) say("alone-why", told.problem);
   if (told.coverage) { say("share-words", shown((100 * told.coverage.share).toFixed(0)) + " %"); byId("share-seen").value = told.coverage.share; }
-  const form = byId("enough");
-  if (form) form.hidden = !(told.state === "watching" || told.state === "alone");
+  showEnough(told.state === "watching" || told.state === "alone");
 }
 
 function showTorqueTime(torque_time_nm_s) { if (byId("dose-used")) say("dose-used", shown(torque_time_nm_s.toFixed(1)) + " N·m·s"); }
@@ -56,7 +55,8 @@ function trace(name, values, title, unit, lines) {
   let low = lines.length ? Math.min(...lines) : 0, high = Math.max(unit === "°" ? 10 : 60, ...lines);
   for (const value of values) { if (value < low) low = value; if (value > high) high = value; }
   if (unit !== "°") { high = Math.max(high, -low); low = -high; }
-  const room = 0.06 * (high - low), drawn = frame(byId(name), low - room, high + room, title, unit, false), { pen, x, y, area } = drawn;
+  const room = 0.06 * (high - low), drawn = frame(byId(name), low - room, high + room, title, unit, null), { pen, x, y, area } = drawn;
+  segments(drawn);
   if (low < 0) { pen.strokeStyle = colours.zero; pen.lineWidth = 1; pen.beginPath(); pen.moveTo(area.left, y(0)); pen.lineTo(area.right, y(0)); pen.stroke(); }
   pen.strokeStyle = colours.limit; pen.lineWidth = 1.5; pen.setLineDash([7, 5]);
   for (const line of lines) { pen.beginPath(); pen.moveTo(area.left, y(line)); pen.lineTo(area.right, y(line)); pen.stroke(); }

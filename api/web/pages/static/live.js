@@ -32,12 +32,16 @@ function take(message) {
     showJoint(message);
   } else if (message.type === "test") {
     showTest(message.test, message.words);
-    if (state.test.adaptive && message.test.state !== "running") showEnough(false);
-    if (state.test.joint && message.test.state !== "running" && byId("enough")) byId("enough").hidden = true;
+    if (message.test.state !== "running") showEnough(false);
   } else if (message.type === "link" || message.type === "idle") {
     state.connected = message.type === "link" ? message.connected : message.rig_connected;
   }
   state.dirty = true;
+}
+
+function showEnough(may) { // the button that ends a test well, where it has one
+  const form = byId("enough");
+  if (form) form.hidden = !may;
 }
 
 function addFrame(message) {
@@ -66,13 +70,11 @@ function showNumbers(message) {
   if (message.pulse_width_us.length) say("width", message.pulse_width_us[message.pulse_width_us.length - 1].toFixed(0) + " µs");
   if (message.test_id !== state.test.id) return;
   showSegment(message.segment);
-  say("dose", dose(message.charge_uc) + " · " + words.pulses.replace("{count}", message.sent_pulses));
+  say("dose", shown((message.charge_uc / 1000).toFixed(2)) + " mC" + " · " + words.pulses.replace("{count}", message.sent_pulses));
   say("left", Math.max(0, Math.ceil(message.duration_s - message.elapsed_s)) + " s");
   say("lost", String(message.lost_samples));
   byId("progress").value = message.duration_s ? message.elapsed_s / message.duration_s : 0;
 }
-
-function dose(charge_uc) { return charge_uc < 1000 ? shown(charge_uc.toFixed(0)) + " µC" : shown((charge_uc / 1000).toFixed(2)) + " mC"; }
 
 let segment = null;
 function showSegment(name) {
@@ -96,7 +98,7 @@ function showTest(test, told) {
   if (segment && test.state !== "running") { segment = null; tone.end(); }
   if (test.state === "identifying") {
     delete byId("live").dataset.stopKeys; // nothing is sent any more: Space is a key like any other
-    say("left", job && typeof job.time_left_s === "number" ? Math.ceil(job.time_left_s) + " s" : "–");
+    say("left", job && job.time_left_s ? Math.ceil(job.time_left_s) + " s" : "–");
     say("segment", words.identifying); byId("segment").title = told.work; byId("progress").value = job ? job.progress : 0;
   }
   const carrying = byId("keep-plain");
@@ -125,15 +127,16 @@ function nice(span, count) {
   return [1, 2, 5, 10].map((m) => m * power).find((step) => step >= rough);
 }
 
-function frame(canvas, low, high, title, unit, timed = true) {
+// `across`: where the chart ends on the right, and what is said there; null: another chart below says it.
+function frame(canvas, low, high, title, unit, across = { last: Math.max(state.duration, 1), words: words.time }) {
   const ratio = window.devicePixelRatio || 1, box = canvas.getBoundingClientRect();
   const w = Math.round(box.width * ratio), h = Math.round(box.height * ratio);
   if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
   const pen = canvas.getContext("2d");
   pen.reset(); pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, box.width, box.height);
-  const area = { left: 62, right: box.width - 10, top: 26, bottom: box.height - (timed ? 34 : 10) };
-  const span = Math.max(state.duration, 1);
+  const area = { left: 62, right: box.width - 10, top: 26, bottom: box.height - (across ? 34 : 10) };
+  const span = across ? across.last : Math.max(state.duration, 1);
   const x = (t) => area.left + (t / span) * (area.right - area.left);
   const y = (v) => area.bottom - ((v - low) / (high - low)) * (area.bottom - area.top);
   pen.font = "13px " + FONT; pen.fillStyle = colours.dim; pen.lineWidth = 1; pen.strokeStyle = colours.grid;
@@ -144,15 +147,14 @@ function frame(canvas, low, high, title, unit, timed = true) {
     pen.fillText(shown(+v.toFixed(6)), area.left - 8, y(v));
   }
   pen.textAlign = "center"; pen.textBaseline = "top";
-  for (let t = 0; timed && t <= span + 1e-9; t += xstep) pen.fillText(shown(+t.toFixed(6)), x(t), area.bottom + 5);
-  pen.textAlign = "right"; if (timed) pen.fillText(words.time, area.right, area.bottom + 20);
-  pen.textAlign = "left"; pen.fillStyle = colours.ink; pen.font = "600 13px " + FONT; pen.fillText(title + " (" + unit + ")", 4, 3);
-  segments(pen, area, x);
+  for (let t = 0; across && t <= span + 1e-9; t += xstep) pen.fillText(shown(+t.toFixed(6)), x(t), area.bottom + 5);
+  pen.textAlign = "right"; if (across) pen.fillText(across.words, area.right, area.bottom + 20);
+  pen.textAlign = "left"; pen.fillStyle = colours.ink; pen.font = "600 13px " + FONT; pen.fillText(title + (unit && " (" + unit + ")"), 4, 3);
   pen.beginPath(); pen.rect(area.left, 0, area.right - area.left + 2, area.bottom + 1); pen.clip();
   return { pen, x, y, area };
 }
 
-function segments(pen, area, x) {
+function segments({ pen, area, x }) {
   for (const part of parts()) {
     if (part.name !== "validate") continue;
     pen.fillStyle = colours["held-out"];
@@ -176,6 +178,7 @@ function drawTorque() {
   const room = (high - low) * 0.06;
   const drawn = frame(byId("torque-chart"), low - (low < 0 ? room : 0), high + room, words.torque, "N·m");
   const { pen, x, y, area } = drawn;
+  segments(drawn);
   const columns = new Map(); // one envelope a pixel: min and max, so that no peak is lost
   for (let i = 0; i < state.time.length; i++) {
     const column = Math.round(x(state.time[i])), known = columns.get(column);
@@ -203,6 +206,7 @@ function drawWidth() {
   for (const value of state.width) if (value > high) high = value;
   const drawn = frame(byId("width-chart"), 0, high * 1.08, words.width, "µs");
   const { pen, x, y, area } = drawn;
+  segments(drawn);
   stairs(pen, x, y, data.planned_us.map((_, i) => i / data.pulse_rate_hz), data.planned_us, colours.plan, 1.2);
   stairs(pen, x, y, state.pulseTime, state.width, colours.width, 1.8);
   if (limit) limitLine(drawn, limit, words.comfort);
@@ -242,7 +246,7 @@ function draw() {
 
 // ---- the line to the service -------------------------------------------------------------------
 
-const REFUSED = 4401; // the session has ended, or is locked: somebody may sign in again in another tab
+const REFUSED = [4401, 4403]; // the session has ended, is locked or may no longer: somebody may sign in again in another tab
 let open = false, refused = false;
 function connect() {
   const socket = new WebSocket(location.origin.replace(/^http/, "ws") + "/v1/tests/" + data.test.id + "/live");
@@ -252,7 +256,7 @@ function connect() {
     open = true; refused = false;
     take(message);
   };
-  socket.onclose = (event) => { open = false; refused = event.code === REFUSED; if (!state.test.done) setTimeout(connect, refused ? 2000 : 500); };
+  socket.onclose = (event) => { open = false; refused = REFUSED.includes(event.code); if (!state.test.done) setTimeout(connect, refused ? 2000 : 500); };
 }
 
 // ---- colours and the window --------------------------------------------------------------------

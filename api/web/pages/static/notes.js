@@ -12,10 +12,14 @@
     try {
       const answer = await fetch(form.action, { method: "POST", body: given, headers: { Accept: "text/html" } });
       const page = new DOMParser().parseFromString(await answer.text(), "text/html");
-      const found = page.getElementById("notes-written") || page.querySelector("[role=alert]");
+      const found = page.getElementById("notes-written") || page.querySelector("section [role=alert]");
       if (found) document.getElementById("notes-written").replaceChildren(...(answer.ok ? found.childNodes : [found]));
       if (answer.ok) form.querySelector("[name=text]").value = "";
-    } catch { form.submit(); }
+    } catch { // what was typed stays, and so does the page
+      const box = document.createElement("p");
+      box.className = "notice bad"; box.setAttribute("role", "alert"); box.textContent = JSON.parse(document.getElementById("rig-words").textContent).not_written;
+      document.getElementById("notes-written").replaceChildren(box);
+    }
   }
 
   if (form) form.addEventListener("submit", write);

@@ -3,12 +3,14 @@
 "use strict";
 {
   const words = JSON.parse(document.getElementById("rig-words").textContent);
-  const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, TORQUE_OLD_S = 1.0, READ_MS = 2000;
+  const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000;
   const clock = () => [performance.now(), Date.now()]; // the first stands still while a machine sleeps, the second may be set
   const since = (then) => Math.max(performance.now() - then[0], Date.now() - then[1]);
   const pill = document.getElementById("rig-state"), notice = document.getElementById("rig-notice");
+  const live = document.getElementById("live"), said = document.getElementById("page-old"), person = document.querySelector(".who");
   const boxes = (name) => document.querySelectorAll(`[data-now="${name}"]`);
   const begun = clock();
+  let heard = said.dataset.at, lost = "", stopped = ""; // when the page last heard of the service; why what it shows is old
   let known = null, asked = null, last = null, busy = false, fetching = "";
   const unread = document.querySelector(".read-first");
   let shown = { latch: document.querySelector("[name=latch]")?.value, since: unread ? performance.now() : -READ_MS };
@@ -29,13 +31,37 @@
     const moment = last = clock();
     try {
       const answer = await get("/rig/now");
-      if (answer.ok) { known = await answer.json(); asked = moment; dispatchEvent(new CustomEvent("rig-now", { detail: known })); }
+      if (answer.ok) { known = await answer.json(); touch(known); asked = moment; dispatchEvent(new CustomEvent("rig-now", { detail: known })); }
     } catch { /* what is shown grows old, and says so */ }
     busy = false;
     show();
   }
 
+  function touch(now) { // what was not heard of for long stays in doubt until the page is read anew
+    if (person && now.signed_in === false && !now.locked) lost = "signed_out";
+    else if (since(asked || begun) > LONG_MS) lost = "out_of_touch";
+    else if (lost === "signed_out") lost = "out_of_touch"; // signed in again, in another tab: perhaps somebody else
+    if (!lost) heard = now.at;
+  }
+
+  function doubt(why) {
+    said.hidden = !why;
+    if (!why) return;
+    const text = words[why].replace("{time}", heard), [box, door, anew] = said.children;
+    if (box.textContent !== text) box.textContent = text;
+    door.hidden = why !== "signed_out"; anew.hidden = why !== "out_of_touch";
+  }
+
+  async function stop(form) { // a browser would leave the page, its stop button with it, for a page of its own
+    stopped = "stopping"; show();
+    try {
+      const answer = await fetch(form.action, { method: "POST", body: new URLSearchParams(new FormData(form)), headers: { Accept: "text/html" } });
+      if (answer.redirected) location.assign(answer.url); else form.submit();
+    } catch { stopped = "not_stopped"; show(); }
+  }
+
   function show() {
+    doubt(stopped || (live ? "" : old() ? "no_answer" : lost)); // a running test's page says it itself
     if (old()) return bar("unknown", words.unknown, words.silent, false);
     if (!known) return; // what the service wrote into the page stands, with its time
     bar(known.state, known.flow, known.more, known.ready);
@@ -108,6 +134,12 @@
   }
   const now = () => { show(); if (!document.hidden) ask(); };
   setInterval(look, 250);
+  said.lastElementChild.addEventListener("click", () => location.reload());
+  addEventListener("submit", (event) => {
+    if (event.target.id !== "stop-form" || !old()) return; // the service answers: the form by itself, as without scripts
+    event.preventDefault();
+    stop(event.target);
+  });
   addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); else now(); }); // kept by Back: all of it is old
   document.addEventListener("visibilitychange", now);
   addEventListener("online", now);

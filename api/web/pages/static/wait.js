@@ -4,15 +4,16 @@ const said = JSON.parse(document.getElementById("rig-words").textContent);
 for (const box of document.querySelectorAll("[data-job]")) follow(box);
 for (const box of document.querySelectorAll("[data-next]")) watch(box);
 
-// The line that says what is next: asked for again when the rig does something else, and while a model is being made.
+// The line that says what is next: asked for again when the rig does something else, and every few seconds.
 function watch(box) {
+  const every_ms = box.dataset.next.startsWith("identifying") ? 1000 : 5000;
   let seen = null, asking = false;
   async function ask() {
     if (asking) return;
     asking = true;
     try {
       const answer = await fetch(box.dataset.from, { cache: "no-store" });
-      if (answer.ok && (await answer.json()).key !== box.dataset.next) arrive(box.querySelector("[data-words]"), box.querySelector("[data-left]"));
+      if (answer.ok && (await answer.json()).key !== box.dataset.next && !answering()) arrive(box.querySelector("[data-words]"), box.querySelector("[data-left]"));
     } catch { /* asked again */ }
     asking = false;
   }
@@ -21,7 +22,7 @@ function watch(box) {
     if (now !== seen) ask();
     seen = now;
   });
-  if (box.dataset.next.startsWith("identifying")) setInterval(ask, 1000);
+  setInterval(() => { if (!document.hidden) ask(); }, every_ms);
 }
 
 async function follow(box) {
@@ -31,15 +32,27 @@ async function follow(box) {
     let job;
     try {
       const answer = await fetch("/jobs/now/" + box.dataset.job, { headers: { Accept: "application/json" } });
+      if (answer.status >= 500) continue;
+      if (!answer.ok && answering()) continue;
       if (!answer.ok) { arrive(words, left); return; }
       job = await answer.json();
     } catch { continue; } // the service may be starting again
     bar.value = job.progress;
     if (job.text) words.textContent = job.text;
-    left.textContent = job.time_left_s === null ? "" : job.time_left_s < 1 ? said.nearly : said.left.replace("{seconds}", Math.ceil(job.time_left_s));
+    if (job.done && answering()) continue;
     if (job.done) { arrive(words, left); return; } // the page says what comes next
+    left.textContent = job.time_left_s === null ? "" : job.time_left_s === 0 ? said.longer : said.left.replace("{seconds}", Math.ceil(job.time_left_s));
   }
 }
+
+const ANSWER_MS = 30000; // by then the answer to what was pressed is here, or it was a download
+let pressed = -ANSWER_MS; // a form was sent (the stop by rig.js, where the page is old), or a link followed
+addEventListener("submit", (event) => { if (!event.defaultPrevented || event.target.id === "stop-form") pressed = performance.now(); });
+addEventListener("beforeunload", () => { pressed = performance.now(); });
+addEventListener("pageshow", (event) => { if (event.persisted) pressed = -ANSWER_MS; });
+
+// Meanwhile the page is not loaded anew. It is asked again later: only a service that answers can give another page.
+const answering = () => performance.now() - pressed < ANSWER_MS;
 
 // What somebody has begun to write is not taken away: then they say when the page is read anew.
 function arrive(words, left) {

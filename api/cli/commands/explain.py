@@ -1,0 +1,100 @@
+"""`stimrig explain`: compare, see where it fails, learn what is missing, add it, watch the error fall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from stimrig import identify
+from stimrig.api.cli.result_files import story_page, told
+from stimrig.api.cli.terminal import (
+    ColumnMap,
+    HeldModel,
+    Json,
+    LastModel,
+    SeveralData,
+    load_held,
+    number,
+    say,
+    say_json,
+    short,
+    write,
+    write_model,
+)
+from stimrig.api.progress_bar import progress_bar
+
+
+def explain(
+    data: SeveralData,
+    model_json: HeldModel = None,
+    html: Annotated[Path | None, typer.Option(help="write the story with its figures here, one file")] = None,
+    figures: Annotated[Path | None, typer.Option(help="write each figure as SVG and PDF into this folder")] = None,
+    output: LastModel = None,
+    columns: ColumnMap = None,
+    as_json: Json = False,
+) -> None:
+    """How far a model goes, step by step: where it fails, what is missing, how the error falls with it, what is left.
+
+    Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o no model is kept.
+    """
+    record, model, structure = load_held(model_json, data, columns)
+    with progress_bar() as progress:
+        explained = identify.explain(record, progress, model)
+    shown = told(record, explained, structure)
+    if output is not None:
+        write_model(output, explained.improvement.models[-1])
+    if html is not None:
+        write(html, story_page(shown, short(data)))
+    if figures is not None:
+        _write_figures(figures, shown)
+    if as_json:
+        say_json({"structure": structure, **explained.to_dict()})
+        return
+    say(*story_lines(shown))
+    say(*[f"written to     {path}" for path in (output, html, figures) if path is not None])
+
+
+def _write_figures(folder: Path, shown: dict[str, Any]) -> None:
+    from stimrig.api.charts.pdf import paper
+    from stimrig.api.charts.story_charts import story_figures
+
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = story_figures(shown["story"], shown["before"], shown["after"])
+    for name in figures:
+        for kind in ("svg", "pdf"):
+            write(folder / f"{name}.{kind}", paper(figures, name, kind))
+
+
+def story_lines(shown: dict[str, Any]) -> list[str]:
+    """The story for people at a terminal."""
+    made, changed = shown["story"], len(shown["story"]["rows"]) > 1
+    first, last = made["rows"][0], made["rows"][-1]
+    lines = [
+        f"{made['title']}; the noise is {number(made['noise_sd_nm'], 4)} N·m.",
+        "",
+        f"1 compare      fit {number(first['fit_percent'])} %, error {number(first['rms_nm'], 4)} N·m; held out fit "
+        f"{number(first['held_out_fit_percent'])} %, error {number(first['held_out_rms_nm'], 4)} N·m",
+    ]
+    lines += _numbered("2 fails in", [place["text"] for place in made["places"]] or ["no place stands out"])
+    why = made["why"]
+    lines += _numbered("3 missing", [f"{why['title']}.", *[f"{one['id']}: {one['plain']}" for one in why["missing"]],
+                                     *[f"{one['id']}: {one['words']}" for one in why["free"]]])  # fmt: skip
+    if changed:
+        errors = [(number(one["before_nm"], 4), number(one["held_out_rms_nm"], 4)) for one in made["steps"]]
+        added = zip(made["steps"], errors, strict=True)
+        lines += _numbered("4 added", [f"{one['label']}: held-out error {a} -> {b} N·m" for one, (a, b) in added])
+        healed = [f"{place['text'].partition(':')[0]}: {place['became']}" for place in made["places"]]
+        lines += _numbered("  healed", healed)
+        lines.append(f"  now          fit {number(last['fit_percent'])} %, error {number(last['rms_nm'], 4)} N·m")
+    lines += _numbered(f"{4 + changed} ended", [made["ended"]])
+    experiment = made["then"]["experiment"]
+    if experiment:
+        lines += _numbered("  next", [experiment["text"], "`stimrig test --decide DATA` plays it, judges both."])
+    return lines
+
+
+def _numbered(label: str, texts: Sequence[str]) -> list[str]:
+    return [f"{label if not row else '':15}{text}" for row, text in enumerate(texts)]

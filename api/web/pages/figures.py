@@ -1,0 +1,78 @@
+"""A page's charts, each by itself: a still for the page, the same to keep or print, and the lines to look closer."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import hashlib
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import Response
+
+from stimrig.api.charts.figure import PAGE_CONFIG
+from stimrig.api.charts.pdf import paper
+from stimrig.api.charts.svg import Figures
+from stimrig.api.errors import NotFoundError
+from stimrig.api.language import decimal
+from stimrig.api.web.dependencies import Ctx, ModelReader, Version
+from stimrig.api.web.middleware import entity_tags
+from stimrig.api.web.pages import model_view, trend_view
+from stimrig.api.web.pages.environment import in_words
+
+router = APIRouter(include_in_schema=False)
+KINDS = {"html": "text/html; charset=utf-8", "svg": "image/svg+xml", "json": "application/json",
+         "pdf": "application/pdf"}  # fmt: skip
+Width = Annotated[int, Query(ge=240, le=2400)]
+
+
+@router.get("/models/{model_id}/figures/{name}")
+async def of_model(
+    request: Request, context: Ctx, _who: ModelReader, row: Version, name: str, width: Width = 720
+) -> Response:
+    """One of the charts of a model's page, its kind at the end of its name."""
+    figures = await model_view.figures_of(context, row)
+    return await asyncio.to_thread(answer, request, figures, name, width)
+
+
+@router.get("/compare/figures/{name}")
+async def compared(
+    request: Request, context: Ctx, _who: ModelReader, name: str,
+    model: Annotated[list[str] | None, Query()] = None, width: Width = 720,
+) -> Response:  # fmt: skip
+    """One of the charts of models side by side."""
+    rows = await trend_view.chosen(context, model)
+    figures = await trend_view.figures_of(context, rows)
+    return await asyncio.to_thread(answer, request, figures, name, width)
+
+
+def answer(request: Request, figures: Figures, name: str, width: int) -> Response:
+    """A figure as `name` asks for it: a part of a page, a picture of its own, or what the plot library takes."""
+    stem, _dot, kind = name.rpartition(".")
+    if stem not in figures or kind not in KINDS:
+        raise NotFoundError("chart", name)
+    if kind == "json":
+        body = json.dumps(
+            lines(figures[stem], f"{request.path_params.get('model_id', 'compare')}-{stem}"), default=in_words
+        ).encode()
+    else:
+        body = figures.still(stem, width).encode() if kind == "html" else paper(figures, stem, kind, width)
+    return to_keep(request, body, KINDS[kind])
+
+
+def lines(figure: dict[str, Any], file_name: str) -> dict[str, Any]:
+    """A figure as the plot library takes it, with the decimal sign of the page's language."""
+    config = {**PAGE_CONFIG, "toImageButtonOptions": {"filename": file_name, "scale": 2}}
+    return {**figure, "layout": {**figure["layout"], "separators": f"{decimal()} "}, "config": config}
+
+
+def to_keep(request: Request, body: bytes, kind: str) -> Response:
+    """An answer that browsers keep, and ask about each time."""
+    tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
+    headers = {"Cache-Control": "private, no-cache", "ETag": tag, "Vary": "Accept-Encoding"}
+    if tag in entity_tags(request.headers.get("if-none-match", "")):
+        return Response(status_code=304, headers=headers)
+    if "gzip" in request.headers.get("accept-encoding", ""):  # nothing that anybody typed is in it beside a secret
+        body, headers["Content-Encoding"] = gzip.compress(body, 5, mtime=0), "gzip"
+    return Response(body, media_type=kind, headers=headers)

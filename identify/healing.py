@@ -1,0 +1,49 @@
+"""The places where a first model fails, and what a later one leaves there; from comparisons as they are kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+HEALED = 1.3
+"""Error at a place over the noise up to which nothing is left to be seen there."""
+
+
+def healed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The worst places of a comparison, each with the error there before and after.
+
+    Parameters
+    ----------
+    before, after : Mapping
+        The keys of `compare --json`, of two models and the same record; the series may be thinned.
+
+    Returns
+    -------
+    list of dict
+        The keys of `where`, and `before_nm`, `after_nm` (rms of measured minus model, N·m), `noise_nm`, and `healed`:
+        whether the error left there is not larger than the noise explains.
+    """
+    noise_nm = max(before["noise_sd_nm"], after["noise_sd_nm"])
+    rows = []
+    for place in before.get("where") or []:
+        errors = [_rms_within(found["series"], place["start_s"], place["end_s"]) for found in (before, after)]
+        healed = errors[1] <= HEALED * noise_nm
+        rows.append({**place, "before_nm": errors[0], "after_nm": errors[1], "noise_nm": noise_nm, "healed": healed})
+    return rows
+
+
+def place_words(place: Mapping[str, Any]) -> str:
+    """What became of the error at a place."""
+    before, after, noise = (f"{place[name]:.3g}" for name in ("before_nm", "after_nm", "noise_nm"))
+    if place["healed"]:
+        return f"the error there fell from {before} to {after} N·m; the noise is {noise} N·m."
+    if place["after_nm"] < place["before_nm"]:
+        return f"the error there fell from {before} to {after} N·m, which is more than the noise of {noise} N·m."
+    return f"the error there is {after} N·m, as before; the noise is {noise} N·m."
+
+
+def _rms_within(series: Mapping[str, Any], start_s: float, end_s: float) -> float:
+    pairs = zip(series["time_s"], series["residual_nm"], strict=True)
+    found = [value for time_s, value in pairs if start_s <= time_s <= end_s and value is not None]
+    return math.sqrt(sum(value * value for value in found) / len(found)) if found else 0.0

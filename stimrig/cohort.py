@@ -1,0 +1,52 @@
+"""`stimrig cohort`: one verb over many recordings, two runs compared, figures (docs/cohorts.md).
+
+`options` are those of the command line: `select`, `method`, `effects`, `scheduler`, `workers`, `memory`, `limit`, …
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from stimrig.verbs import Report
+
+__all__ = ["changed", "diagnose", "figures", "fit", "improve"]
+
+
+def _run(verb: str, data: Sequence[str | Path], output: str | Path, options: dict[str, Any]) -> Report:
+    from stimrig.api.cli.commands.cohort import computed
+
+    return Report(f"cohort {verb}", computed(verb, [str(place) for place in data], Path(output), **options))
+
+
+def fit(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
+    """Fit a model to every selected record; one row each in Parquet."""
+    return _run("fit", data, output, options)
+
+
+def diagnose(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
+    """What is missing in the plain structure, for every selected record; one row each in Parquet."""
+    return _run("diagnose", data, output, options)
+
+
+def improve(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
+    """Add effects as long as the evidence lasts, for every selected record; one row each in Parquet."""
+    return _run("improve", data, output, options)
+
+
+def changed(old: str | Path, new: str | Path) -> Report:
+    """Whose results differ between two runs, and why."""
+    from stimrig.api.cli.commands.cohort import need_extra
+
+    need_extra()
+    from stimrig.api.cohort.changed import compared
+
+    return Report("cohort changed", compared(Path(old), Path(new)).to_dict())
+
+
+def figures(results: str | Path, html: str | Path) -> Report:
+    """Draw a cohort into an HTML file: effects by prevalence, parameters over sessions, errors by reason."""
+    from stimrig.api.cli.commands.cohort import drawn
+
+    return Report("cohort figures", drawn(Path(results), Path(html)))

@@ -1,0 +1,1 @@
+"""Clients that generators make of our OpenAPI document, on a controller's whole day."""

@@ -1,0 +1,170 @@
+"""A whole day by keys alone, from signing in to the comparison; and how many presses it takes to an approved model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.api.browser import NAME, PASSWORD, chart, expected, open_tab, settled
+from tests.api.conftest import Service, shared_service
+
+pytestmark = pytest.mark.browser
+service = shared_service(speed=4.0)
+SEEN = """() => { const e = document.activeElement, s = getComputedStyle(e), b = e.getBoundingClientRect();
+  const label = e.labels && e.labels.length ? e.labels[0].textContent : e.getAttribute('aria-label') || e.textContent;
+  return {names: [e.id, label.trim()], ring: s.outlineStyle !== 'none' && parseFloat(s.outlineWidth) >= 1,
+          there: b.bottom > 0 && b.top < innerHeight, top: e === document.body}; }"""
+
+
+class Hand:
+    """A person without a mouse. Counted: keys that do something, fields; neither Tab, nor a calibration's keys."""
+
+    def __init__(self, page: Any) -> None:
+        self.page, self.count = page, 0
+
+    def to(self, name: str) -> None:
+        """By Tab to what has this id or name; on the way every stop is seen, and none holds the focus."""
+        settled(self.page)
+        stops = self.page.locator("a, button, input, select, textarea, summary, [tabindex]").count() + 2
+        for _ in range(stops):
+            self.page.keyboard.press("Tab")
+            at = self.page.evaluate(SEEN)
+            assert at["top"] or (at["ring"] and at["there"]), at
+            if any(text == name or text.startswith(f"{name}:") for text in at["names"]):
+                return
+        raise AssertionError(f"{name} cannot be reached by Tab")
+
+    def press(self, name: str) -> None:
+        self.to(name)
+        self.page.keyboard.press("Enter")
+        self.count += 1
+
+    def type(self, name: str, text: str) -> None:
+        self.to(name)
+        self.page.keyboard.type(text)
+        self.count += 1
+
+    def enter(self) -> None:
+        self.page.keyboard.press("Enter")
+        self.count += 1
+
+
+@pytest.fixture
+def hand(browser: Any, service: Service) -> Iterator[Hand]:
+    with service.client() as http:
+        http.post("/v1/users", json={"name": NAME, "password": PASSWORD})
+    for tab in open_tab(browser, service, signed_in=False):
+        yield Hand(tab)
+
+
+def sign_in(hand: Hand, service: Service) -> None:
+    hand.page.goto(service.url)
+    hand.page.locator("#name:focus").wait_for()  # it has the focus by itself
+    hand.page.keyboard.type(NAME)
+    hand.count += 1
+    hand.type("password", PASSWORD)
+    hand.enter()
+    hand.page.get_by_role("heading", name="Participants").wait_for()
+
+
+def calibrate(hand: Hand) -> None:
+    """Its keys are those of the page that says so."""
+    hand.press("Begin the calibration")
+    page = hand.page
+    page.locator("#step-up").wait_for()
+    page.wait_for_load_state()
+    for count in (1, 2, 3):
+        expected(page.locator("#step-up")).to_be_enabled()
+        page.keyboard.press("ArrowUp")
+        expected(page.locator("[aria-label=Trains] tbody tr")).to_have_count(count)
+        expected(page.locator("#mark-sensory")).to_be_enabled()
+        page.keyboard.press("m")
+        expected(page.locator(".marks b")).to_have_count(count)
+    page.keyboard.press("Enter")
+    page.get_by_text("Start the pre-session test").first.wait_for()
+
+
+def test_and_approve(hand: Hand) -> str:
+    """From the participant's page to an approved model; the model's page comes by itself."""
+    page = hand.page
+    hand.press("Start the pre-session test")
+    page.get_by_role("heading", name="Start the pre-session test of").wait_for()
+    hand.press("Start now")
+    page.wait_for_url("**/models/*")
+    hand.type("approve-password", PASSWORD)
+    hand.enter()
+    page.get_by_text(f"Approved by {NAME}").first.wait_for()
+    return page.url.rpartition("/")[2].partition("#")[0]
+
+
+test_and_approve.__test__ = False  # type: ignore[attr-defined]
+
+
+def test_from_signing_in_to_an_approved_model(hand: Hand, service: Service) -> None:
+    """At most 12 presses with a new participant, 9 with a known one; the trains and answers of a calibration apart."""
+    sign_in(hand, service)
+    hand.type("code", "D1")
+    hand.enter()
+    hand.page.get_by_role("heading", name="D1").wait_for()
+    calibrate(hand)
+    test_and_approve(hand)
+    assert hand.count == 10, "name, password, in; code, create; begin; start, now; password, approve"
+    hand.press("Sign out")
+    hand.page.get_by_role("heading", name="Sign in").wait_for()
+    hand.count = 0
+    sign_in(hand, service)
+    hand.press("D1")
+    hand.page.get_by_role("heading", name="D1").wait_for()
+    hand.press("Calibrate")  # it holds for today; the next day the line begins it, as above
+    hand.page.get_by_role("heading", name="Begin").wait_for()
+    hand.page.go_back()
+    test_and_approve(hand)
+    assert hand.count <= 9, "the one that looks at the calibration stands for the one that begins it"
+
+
+def test_what_else_a_day_has(hand: Hand, service: Service) -> None:
+    page = hand.page
+    sign_in(hand, service)
+    hand.type("code", "D2")
+    hand.enter()
+    page.get_by_role("heading", name="D2").wait_for()
+    service.rig.speed = 0.5
+    hand.press("Start the pre-session test")
+    page.get_by_role("heading", name="Start the pre-session test of").wait_for()
+    hand.press("Start now")
+    page.locator("#age", has_text="ms").wait_for()
+    page.keyboard.press("Escape")
+    page.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    hand.press("To the participants")
+    page.get_by_role("button", name="I have checked: re-arm").wait_for()
+    expected(page.get_by_role("button", name="I have checked: re-arm")).to_be_enabled()
+    hand.press("I have checked: re-arm")
+    page.get_by_text("stays stopped").wait_for(state="detached")
+    service.rig.speed = 4.0
+    first = service.play_test("D2")["model_id"]
+    page.goto(f"{service.url}/models/{first}")
+    page.get_by_role("button", name="Add this effect").first.wait_for()
+    chart(page, "overview")
+    hand.press("Add this effect")
+    page.locator("#versions").wait_for()
+    assert first not in page.url
+    hand.type("undo-password", PASSWORD)
+    hand.enter()
+    page.wait_for_url(f"**/models/{first}*")
+    hand.press("see that version")
+    page.wait_for_url(lambda now: "/models/" in now and first not in now)
+    hand.press("Step by step")
+    page.wait_for_url(lambda now: now.endswith("/story") and first not in now)
+    hand.press("To the model: approve it, or look at the details")
+    page.wait_for_url(lambda now: "/models/" in now and not now.endswith("/story"))
+    hand.press("Report")
+    page.wait_for_url("**/report")
+    page.goto(service.url + "/participants/D2")
+    for box in page.get_by_role("checkbox", name="Compare the model").all()[:2]:
+        hand.to(box.get_attribute("aria-label"))
+        if not box.is_checked():
+            page.keyboard.press("Space")
+    hand.press("Compare the ticked ones")
+    page.wait_for_url("**/compare?model=*&model=*")

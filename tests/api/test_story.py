@@ -1,0 +1,71 @@
+"""The story of a model on its page: where it failed, what was added, how the error fell, and why that ended."""
+
+from __future__ import annotations
+
+import httpx
+import pytest
+
+from stimrig.api.charts.story_charts import side_by_side
+from stimrig.identify.healing import healed_places, place_words
+from tests.api import stub_worker
+from tests.api.conftest import Service, run_test, signed_in
+
+
+@pytest.fixture
+def model(client: httpx.Client, participant: str) -> str:
+    """The model of a test."""
+    return run_test(client, participant)["model_id"]
+
+
+def test_story_begins_with_what_is_missing_and_ends_with_the_falling_error(
+    service: Service, client: httpx.Client, model: str
+) -> None:
+    client.get(f"/v1/models/{model}/diagnosis")
+    with signed_in(service) as page:
+        first = page.get(f"/models/{model}/story").text
+        assert (
+            "What is missing" in first and "Improve: add what is missing" in first and "The held-out error is" in first
+        )
+        assert "To decide between" in first and "Run it now" in first
+        last = client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"]
+        client.get(f"/v1/models/{last}/diagnosis")
+        told = page.get(f"/models/{last}/story").text
+        assert (
+            "The held-out error fell from" in told and "What was missing" in told and told.count('class="still"') == 3
+        )
+        file = page.get(f"/models/{last}/story.html")
+        assert file.headers["content-disposition"] == "attachment" and "The held-out error fell from" in file.text
+        for kind, start in (("svg", b"<svg"), ("pdf", b"%PDF")):
+            assert page.get(f"/models/{last}/story/figures/falling.{kind}").content.startswith(start)
+        for name in ("falling.exe", "nothing.svg"):
+            assert page.get(f"/models/{last}/story/figures/{name}").status_code == 404
+
+
+def test_the_improvement_that_a_diagnosis_found_is_not_searched_again(
+    service: Service, client: httpx.Client, model: str
+) -> None:
+    client.get(f"/v1/models/{model}/diagnosis")
+    slow = service.data / "recordings" / "slow"
+    slow.write_text("0.5")  # a search that began now would stand still
+    assert client.post(f"/v1/models/{model}/improve", timeout=30).status_code == 201
+
+
+def test_the_curve_of_a_single_model_is_not_called_the_last_one() -> None:
+    before, after = ({"curves": stub_worker.curves(), "comparison": stub_worker.comparison()} for _ in range(2))
+    names = [[line["name"] for line in side_by_side(before, last, [])["data"]] for last in (before, after)]
+    assert names == [["measured", "model", "residual"],
+                     ["measured", "model at first", "model at last", "left at first", "left at last"]]  # fmt: skip
+    assert side_by_side(before, after, [])["layout"]["yaxis2"]["title"]["text"] == "Residual (N·m)"
+
+
+def test_a_place_is_healed_where_only_noise_is_left_there() -> None:
+    times, place = [0.0, 0.5, 1.0, 1.5], {"start_s": 0.0, "end_s": 0.6, "text": "ramp"}
+
+    def comparison(*residual_nm: float) -> dict:
+        return {"noise_sd_nm": 0.1, "where": [place], "series": {"time_s": times, "residual_nm": list(residual_nm)}}
+
+    first = comparison(1.0, -1.0, 0.0, 0.0)
+    for left_nm, healed, words in ((0.1, True, "fell"), (0.5, False, "more than the noise"), (1.0, False, "as before")):
+        (found,) = healed_places(first, comparison(left_nm, -left_nm, 9.0, 9.0))
+        assert (found["before_nm"], found["after_nm"], found["healed"]) == (1.0, left_nm, healed)
+        assert words in place_words(found)

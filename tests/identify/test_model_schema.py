@@ -1,0 +1,175 @@
+"""The published schema of MODEL.json is what models are read by: the reader and a full validator say the same."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import jsonschema_rs
+import numpy as np
+import pytest
+
+from stimrig import identify
+from stimrig.identify.model_schema import LARGEST, LONGEST, SCHEMA, check, check_model
+from tests.identify import hidden_muscles
+
+READ = {
+    "type", "enum", "const", "minimum", "maximum", "minItems", "maxItems", "items", "properties",
+    "additionalProperties", "$ref", "if", "then", "else", "required", "x-needed", "x-also", "x-rising", "x-mend",
+}  # fmt: skip
+SAID = {"$schema", "$id", "$defs", "title", "description"}
+SPOILED = (None, True, "x", -1, 0.5, 1e7, [], {}, [1.0, "x"], {"value": None})
+
+
+def schemas(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """A schema and all within it."""
+    yield node
+    for key in ("properties", "$defs"):
+        for part in node.get(key, {}).values():
+            yield from schemas(part)
+    for key in ("items", "additionalProperties", "if", "then", "else"):
+        if isinstance(node.get(key), dict):
+            yield from schemas(node[key])
+
+
+def places(node: Any, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """The way to each value of a document; of a list to its first and last."""
+    yield way
+    if isinstance(node, dict):
+        for name, part in node.items():
+            yield from places(part, (*way, name))
+    elif isinstance(node, list) and node:
+        for index in {0, len(node) - 1}:
+            yield from places(node[index], (*way, index))
+
+
+def changed(document: dict[str, Any], way: tuple[str | int, ...], value: Any) -> dict[str, Any]:
+    found = copy.deepcopy(document)
+    inner: Any = found
+    for step in way[:-1]:
+        inner = inner[step]
+    inner[way[-1]] = value
+    return found
+
+
+def refused(document: dict[str, Any]) -> str:
+    try:
+        check(document, SCHEMA, "")
+    except identify.BadModel as error:
+        return str(error)
+    return ""
+
+
+@pytest.fixture(scope="module")
+def document() -> dict[str, Any]:
+    """Of a fit with an effect, with short tables, so that there are not too many places."""
+    found = identify.fit(hidden_muscles.record(rate_hz=100), effects=["fatigue"]).to_dict()
+    joint = {"reference_angle_rad": 0.1, "angle_rad": [0.0, 1.0], "velocity_rad_s": [0.0], "g": [[1.0], [1.0]]}
+    joint |= {"h_nm": [[0.0], [0.0]], "inertia_nm_s2_per_rad": 0.0, "seen_g": [[1], [2]], "seen_h": [[1], [2]]}
+    return json.loads(json.dumps(found | {"joint": joint}))
+
+
+def test_the_reader_knows_each_word_of_the_schema() -> None:
+    told = [part for part in schemas(SCHEMA) if not part.keys() <= READ | SAID]
+    assert told == []
+    assert all("else" in part and "then" in part for part in schemas(SCHEMA) if "if" in part)
+    assert all("items" in part for part in schemas(SCHEMA) if "array" in part.get("type", ()))
+
+
+def as_read(node: Any) -> Any:
+    """The schema with the reader's own words said in those of every validator."""
+    if isinstance(node, list):
+        return [as_read(part) for part in node]
+    if not isinstance(node, dict):
+        return node
+    found = {key: as_read(part) for key, part in node.items() if not key.startswith("x-")}
+    needed, also = node.get("x-needed", []), node.get("x-also", [])
+    if "required" in node or needed:
+        found["required"] = node["required"] if needed is True else needed
+    return {"anyOf": [found, *({"type": kind} for kind in also)]} if also else found
+
+
+def test_the_reader_and_a_full_validator_refuse_the_same(document: dict[str, Any]) -> None:
+    strict, full = jsonschema_rs.validator_for(SCHEMA), jsonschema_rs.validator_for(as_read(SCHEMA))
+    assert strict.is_valid(document) and refused(document) == ""
+    tried, looser, differ = 0, 0, []
+    for way in places(document):
+        for value in SPOILED if way else ():
+            spoiled = changed(document, way, value)
+            tried += 1
+            said, valid = refused(spoiled), full.is_valid(spoiled)
+            looser += valid and not strict.is_valid(spoiled)
+            if valid != (said == "" or "not strictly rising" in said):
+                differ.append((way, value, said))
+    assert tried > 1000 and looser > 10
+    assert differ == []
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 10 * LARGEST, -math.inf, 10**400])
+def test_numbers_without_bounds_are_finite(document: dict[str, Any], value: float) -> None:
+    for way in (("baseline_nm",), ("recruitment", "torque_nm", 0), ("linear", "delay_samples"), ("fit", "rms_nm")):
+        place = ".".join(map(str, way))
+        assert refused(changed(document, way, value)).startswith(f"{place}: "), way
+
+
+def test_lists_and_texts_without_bounds_have_an_end(document: dict[str, Any]) -> None:
+    for way, value in (
+        (("recruitment", "torque_nm"), [0.0] * (LONGEST + 1)),
+        (("reasons",), ["x"] * (LONGEST + 1)),
+        (("method",), "x" * (LONGEST + 1)),
+    ):
+        assert refused(changed(document, way, value)).startswith(f"{'.'.join(way)}: ")
+
+
+def test_what_is_only_told_may_be_unknown(document: dict[str, Any]) -> None:
+    """A number that was not finite is written as null: the model is read again all the same."""
+    table = ("recruitment", "torque_nm", 0)
+    band = ("uncertainty", "bands", "recruitment", "lower", 0)
+    one_number = ("valid_for", "pulse_width_us")
+    for way in (table, band, (*one_number, 1), one_number, ("data", "recording_id"), ("fit", "segments", 0, "end_s")):
+        assert refused(changed(document, way, None)) == "", way
+    assert refused(changed(document, one_number, 300.0)) == ""
+    assert identify.Model.from_dict(changed(document, band, None)).bands["recruitment"]["lower"][0] is None
+    for way in (("linear", "damping"), ("recruitment", "basis", "coefficients_nm", 0), ("baseline_nm",)):
+        assert refused(changed(document, way, None)).startswith(f"{'.'.join(map(str, way))}: None is not a number")
+
+
+def test_a_model_of_an_older_version_is_read(document: dict[str, Any]) -> None:
+    """It has the keys without which nothing can be predicted, and parameters may be numbers alone."""
+    basis, linear = document["recruitment"]["basis"], document["linear"]
+    numbers = {name: found["value"] for name, found in document["effects"][0]["parameters"].items()}
+    effect = {"id": "fatigue", "form": document["effects"][0]["form"], "parameters": numbers}
+    discrete = {name: linear[name] for name in ("b", "a", "delay_samples")} | {"step_s": 0.025}
+    seconds = {name: linear[name] for name in ("kind", "time_constant_s", "damping")}
+    for block in (discrete, seconds):
+        old = {name: document[name] for name in SCHEMA["x-needed"]} | {"recruitment": {"basis": basis}}
+        old |= {"linear": block, "effects": [effect], "joint": {}, "uncertainty": None}
+        assert identify.Model.from_dict(old).effects == (effect,)
+        for name in [name for name in block if name != "kind"]:
+            less = {key: value for key, value in block.items() if key != name}
+            with pytest.raises(identify.BadModel, match=rf"linear\.{name}: the key is missing"):
+                check_model(old | {"linear": less})
+
+
+def test_what_the_schema_cannot_say_is_checked(document: dict[str, Any]) -> None:
+    for way, value, says in (
+        (("joint", "g"), [[1.0]], r"joint\.g: not 2 rows of 1"),
+        (("joint", "angle_rad"), [1.0, 1.0], r"joint\.angle_rad: the values are not strictly rising"),
+        (("effects", 0, "parameters", "depth", "value"), None, r"effects\.0\.parameters\.depth: None is not a number"),
+        (
+            ("effects", 0, "settings", "angle_range_rad"),
+            [1.0, 0.0],
+            r"settings\.angle_range_rad: .*not strictly rising",
+        ),
+    ):
+        with pytest.raises(identify.BadModel, match=says):
+            check_model(changed(document, way, value))
+
+
+def test_tables_of_a_model_are_numbers(document: dict[str, Any]) -> None:
+    torque_nm = np.asarray(document["recruitment"]["torque_nm"]).tolist()
+    with pytest.raises(identify.BadModel, match=r"^recruitment\.torque_nm\.3: 'x' is not a number"):
+        check_model(changed(document, ("recruitment", "torque_nm"), [*torque_nm[:3], "x"]))

@@ -1,0 +1,229 @@
+"""Every verb of the command line has its function: the table of docs/python.md is true, and each row of it runs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import stimrig
+from stimrig.api.cli import main
+from stimrig.errors import BadRecord, BadRequest, InputError
+from tests.api.conftest import PATIENCE_S, TOKEN, Service
+from tests.api.test_worker import made_up_csv
+from tests.frozen.rig_records import of_kind
+from tests.harness import few_effects
+from tests.stimrig.verbs_table import COMMAND_ONLY, PAGE, function_of, page, verbs
+
+EFFECTS = ("threshold_drift", "fatigue")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A record, its model and a torque that is wanted."""
+    folder = tmp_path_factory.mktemp("verbs")
+    model = stimrig.fit(stimrig.read(made_up_csv(folder / "record.csv")))
+    stimrig.save(model, folder / "MODEL.json")
+    (folder / "torque.csv").write_text("time_s,torque_nm\n0,0\n1,1\n2,2\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def record(folder: Path) -> stimrig.Record:
+    return stimrig.read(folder / "record.csv")
+
+
+@pytest.fixture(scope="module")
+def model(folder: Path) -> stimrig.Model:
+    return stimrig.Model.from_json((folder / "MODEL.json").read_text())
+
+
+def test_the_tables_of_the_page_are_those_of_the_code() -> None:
+    text = PAGE.read_text("utf-8")
+    assert page(text) == text, "python -m tests.stimrig.verbs_table"
+    assert all(f"`{verb}`" in text for verb in verbs()) and "`approve`" in text
+    assert page(text.replace("| `approve` |", "| `aprove` |")) == text, "it would be noticed"
+
+
+# ---- a verb and its function: one record, the same answer
+
+
+SAME: dict[str, tuple[str, Callable[[Any, Any, Path], Any]]] = {
+    "fit": ("{0}/record.csv", lambda record, _model, _at: stimrig.fit(record)),
+    "compare": ("{0}/MODEL.json {0}/record.csv", lambda record, model, _at: stimrig.compare(model, record)),
+    "diagnose": ("{0}/record.csv", lambda record, _model, _at: stimrig.diagnose(record)),
+    "improve": ("{0}/record.csv", lambda record, _model, _at: stimrig.improve(record)),
+    "explain": ("{0}/record.csv", lambda record, _model, _at: stimrig.explain(record)),
+    "invert": ("{0}/MODEL.json {0}/torque.csv -o {1}/widths.csv",
+               lambda _record, model, at: stimrig.invert(model, at / "torque.csv")),
+    "table1": ("--trials 1", lambda *_: stimrig.table1(1)),
+}  # fmt: skip
+DRAWN = ("model_id", "created")
+"""What no two fits have in common."""
+
+
+@pytest.mark.parametrize("verb", SAME)
+def test_a_function_gives_what_the_verb_prints(
+    verb: str, folder: Path, record: Any, model: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words, function = SAME[verb]
+    with few_effects.only(*EFFECTS):
+        assert main.run([verb, *words.format(folder, tmp_path).split(), "--json"]) == 0
+        found = function(record, model, folder)
+    printed, given = json.loads(capsys.readouterr().out), json.loads(json.dumps(found.to_dict()))
+    assert set(printed) - set(given) <= {"structure", "output"}, "which say what the verb was given"
+    assert set(given) - set(printed) <= {"models"}
+    for key in set(given) & set(printed) - set(DRAWN):
+        assert without_names(given[key]) == without_names(printed[key]), key
+    assert 2 <= len(str(found).splitlines()) <= 20
+    assert found._repr_html_().startswith("<table>") and repr(found).startswith("<")
+
+
+def without_names(value: Any) -> Any:
+    """A value without what is drawn for each model."""
+    if isinstance(value, dict):
+        return {key: without_names(one) for key, one in value.items() if key not in DRAWN}
+    return [without_names(one) for one in value] if isinstance(value, list) else value
+
+
+# ---- the rest of the verbs
+
+
+def predicts(at: Path, _new: Path) -> None:
+    record, model = stimrig.read(at / "record.csv"), stimrig.Model.from_json((at / "MODEL.json").read_text())
+    assert main.run(["predict", str(at / "MODEL.json"), str(at / "record.csv"), "-o", str(_new / "p.csv")]) == 0
+    rows = (_new / "p.csv").read_text().splitlines()[1:]
+    assert [float(row.split(",")[2]) for row in rows] == pytest.approx(list(stimrig.predict(model, record)), abs=1e-6)
+
+
+def recovers(_at: Path, new: Path) -> None:
+    (data,) = (data for name, data in of_kind("journal").items() if name.endswith(".journal"))
+    (new / "t.journal").write_bytes(data)
+    sealed = stimrig.recover(new / "t.journal", new)
+    assert stimrig.read(sealed["recording"]).time_s.size and "recording_id" in str(sealed)
+    with pytest.raises(InputError, match="nowhere"):
+        stimrig.recover(new / "nowhere")
+
+
+def cohort_runs(verb: str) -> Callable[[Path, Path], None]:
+    def runs(at: Path, new: Path) -> None:
+        found = getattr(stimrig.cohort, verb)([at / "record.csv"], new / "results.parquet", workers=1)
+        assert (found["ok"], found["errors"]) == (1, 0), found
+        if verb == "fit":
+            assert stimrig.cohort.changed(new / "results.parquet", new / "results.parquet")["unchanged"] == 1
+            assert stimrig.cohort.figures(new / "results.parquet", new / "cohort.html")["records"] == 1
+            assert "<html" in (new / "cohort.html").read_text()
+
+    return runs
+
+
+def exports(at: Path, new: Path) -> None:
+    assert stimrig.export([at / "record.csv"], parquet=new / "parquet")["written"] == 1
+    assert stimrig.export([at / "record.csv"], bids=new / "bids")["written"] == 1
+    with pytest.raises(InputError, match="one of them"):
+        stimrig.export([at / "record.csv"])
+
+
+def emulates(_at: Path, new: Path) -> None:
+    with pytest.MonkeyPatch.context() as environment, contextlib.ExitStack() as stack:
+        environment.setenv("STIMRIG_RIG_FILE", "/a/rig/that/has/devices.toml")
+        client = stack.enter_context(stimrig.emulate("--patient calcium", data=new))
+        assert client.health() and client.make_participant("P017")["code"] == "P017"
+        assert client.preview("P017")["duration_s"] > 10
+    with pytest.raises(stimrig.errors.Unreachable), stimrig.Client(client.url) as gone:
+        gone.health()
+
+
+REST: dict[str, Callable[[Path, Path], Any]] = {
+    "predict": predicts,
+    "recover": recovers,
+    "export": exports,
+    "cohort fit": cohort_runs("fit"),
+    "cohort diagnose": cohort_runs("diagnose"),
+    "cohort improve": cohort_runs("improve"),
+    "emulate": emulates,
+    "effects": lambda *_: stimrig.effects()[0]["equation"],
+    "schema": lambda *_: stimrig.schema("invert")["properties"]["pulse_width_us"],
+}
+ELSEWHERE = {"cohort changed": "cohort fit", "cohort figures": "cohort fit", "test": "a_test"}
+"""Run by another one of these tests."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", REST)
+def test_the_function_of_each_other_verb_runs(verb: str, folder: Path, tmp_path: Path) -> None:
+    REST[verb](folder, tmp_path)
+
+
+def test_the_function_of_a_test_runs_it(service: Service) -> None:
+    with stimrig.Client(service.url, TOKEN, PATIENCE_S) as client:
+        client.make_participant("P017")
+        assert function_of("test")[1](client, "P017")["state"] == "completed"
+
+
+def test_no_verb_lacks_its_function_or_its_reason_and_its_test() -> None:
+    assert set(verbs()) - set(COMMAND_ONLY) == {*SAME, *REST, *ELSEWHERE}
+    assert all(callable(function_of(verb)[1]) for verb in set(verbs()) - set(COMMAND_ONLY))
+
+
+# ---- what has no verb of its own: files, joined records, trials
+
+
+def test_what_is_saved_is_read_again(folder: Path, record: Any, model: Any, tmp_path: Path) -> None:
+    again = stimrig.Model.from_json(stimrig.save(model, tmp_path / "M.json").read_text())
+    assert again.to_dict() == model.to_dict()
+    assert stimrig.save(model, tmp_path / "M.mat").read_bytes().startswith(b"MATLAB 5.0")
+    kept = stimrig.read(stimrig.save(record, tmp_path / "record.csv"))
+    assert list(kept.torque_nm) == list(record.torque_nm) and list(kept.segment) == list(record.segment)
+    plan = stimrig.invert(model, [0.0, 1.0, 2.0], time_s=[0.0, 1.0, 2.0])
+    assert stimrig.save(plan, tmp_path / "w.csv").read_text().startswith("time_s,pulse_width_us,")
+    assert list(plan.pulse_width_us) == list(stimrig.invert(model, folder / "torque.csv").pulse_width_us)
+    for what, name in ((record, "r.mat"), (model, "m.csv"), (plan, "p.html"), (model, "without_record.html")):
+        with pytest.raises(BadRequest):
+            stimrig.save(what, tmp_path / name)
+
+
+def test_a_report_is_the_one_of_the_verb(folder: Path, record: Any, model: Any, tmp_path: Path) -> None:
+    ours, theirs = tmp_path / "record.csv.html", tmp_path / "theirs.html"
+    stimrig.save(model, ours, record)
+    assert main.run(["compare", str(folder / "MODEL.json"), str(folder / "record.csv"), "--html", str(theirs)]) == 0
+    assert ours.read_text() == theirs.read_text()
+    with few_effects.only(*EFFECTS):
+        explained = stimrig.explain(record)
+    assert "record.csv" in stimrig.save(explained, ours, record).read_text()
+
+
+def test_several_records_are_joined(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.csv"
+    head, *rows = (folder / "record.csv").read_text().splitlines()
+    cells = (row.split(",") for row in rows)
+    other.write_text("\n".join([head, *(f"{t},{u},{float(m) * 1.1:.6f},{s}" for t, u, m, s in cells)]) + "\n")
+    joined = stimrig.join([folder / "record.csv", other])
+    assert len(joined.parts) == 2
+    assert len(stimrig.read(stimrig.save(joined, tmp_path / "joined.csv")).parts) == 2
+    with pytest.raises(BadRecord, match=r"nowhere\.csv"):
+        stimrig.join([other, "nowhere.csv"])
+
+
+def test_a_model_is_tracked_over_trials(record: Any, model: Any) -> None:
+    weaker = record.with_torque(0.9 * record.torque_nm)
+    tracked = stimrig.track(model, [record, weaker, weaker])
+    gains = [trial["now"]["gain"]["value"] for trial in tracked.to_dict()["trials"]]
+    assert gains[0] == pytest.approx(1.0, abs=0.02) and gains[2] < 0.97
+    assert str(tracked).count("trial ") >= 3 and "gain" in tracked._repr_html_()
+    assert max(tracked.model.predict(record)) < 0.97 * max(model.predict(record))
+    assert tracked.approved is model
+    with pytest.raises(BadRequest, match="no trial"):
+        stimrig.track(model, [])
+
+
+def test_the_whole_module_is_there_without_a_first_look() -> None:
+    code = "import stimrig; print(stimrig.cohort.fit.__name__, all(getattr(stimrig, n) for n in stimrig.__all__))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "fit True\n"
