@@ -55,7 +55,7 @@ def conclude(found: Mapping[str, Any]) -> Conclusion:
         further = "Play the next experiment: it is planned to decide." if plan else "Record a longer test."
         return Conclusion("unsure", UNTOLD, doubt, further)
     words = "No effect of the library explains more than noise would."
-    return Conclusion("nothing", NOTHING, _with_error(words, found), "Nothing to add: use this model.")
+    return Conclusion("nothing", NOTHING, _with_error(words, found), "Nothing to add.")
 
 
 def why_ended(found: Mapping[str, Any]) -> str:

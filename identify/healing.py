@@ -1,4 +1,4 @@
-"""The places where a first model fails, and what a later one leaves there; from comparisons as they are kept."""
+"""Where a model fails, and what a later one leaves there; from comparisons as they are kept."""
 
 from __future__ import annotations
 
@@ -8,6 +8,21 @@ from typing import Any
 
 HEALED = 1.3
 """Error at a place over the noise up to which nothing is left to be seen there."""
+
+
+def stands_out(comparison: Mapping[str, Any]) -> bool:
+    """Whether more is left of held-out pulses (of all where none are) than noise leaves; else its places are noise's.
+
+    `comparison`: the keys of `compare --json`.
+    """
+    error_nm = (comparison.get("held_out") or comparison).get("rms_nm")
+    return error_nm is not None and error_nm > HEALED * comparison["noise_sd_nm"]
+
+
+def looks_like_noise(comparison: Mapping[str, Any]) -> bool:
+    """Whether nothing stands out and no correlation of the residual does."""
+    tests = (comparison.get("tests") or {}).get("tests") or []
+    return not stands_out(comparison) and all(test["passed"] for test in tests)
 
 
 def healed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from stimrig.identify.conclusion import Conclusion, conclude, why_ended
-from stimrig.identify.healing import healed_places, place_words
+from stimrig.identify.healing import healed_places, looks_like_noise, place_words, stands_out
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
 from stimrig.identify.summary import (
@@ -86,8 +86,9 @@ class Comparison(Result):
             ("repetition", repetition_words(vars(self))),
             ("residual", f"not noise: correlated with {', '.join(alarms)}" if alarms else "looks like noise"),
         ]
-        rows += _listed("worst place", [row["text"] for row in self.where[:FEW]])
-        rows += [(f"by {kind}", _shares(self.by[kind])) for kind in ("segment", "direction") if self.by.get(kind)]
+        if not looks_like_noise(vars(self)):
+            rows += _listed("worst place", [row["text"] for row in self.where[:FEW]])
+            rows += [(f"by {kind}", _shares(self.by[kind])) for kind in ("segment", "direction") if self.by.get(kind)]
         reached, most = quantity(self.fit_percent, "%"), quantity(self.ceiling_percent, "%")
         return Sheet(f"Comparison: fit {reached} where the noise allows {most}", tuple(rows))
 
@@ -219,11 +220,10 @@ class Explanation(Result):
         }
 
     def _sheet(self) -> Sheet:
-        rows = [("at first", self.diagnosis.conclusion.title)]
-        rows += [
-            ("failed in", f"{place['text']}: {place_words(place)}")
-            for place in healed_places(self.before.to_dict(), self.after.to_dict())
-        ]
+        rows, before = [("at first", self.diagnosis.conclusion.title)], self.before.to_dict()
+        if self.diagnosis.conclusion.kind != "nothing" or stands_out(before):
+            places = healed_places(before, self.after.to_dict())
+            rows += [("failed in", f"{place['text']}: {place_words(place)}") for place in places]
         improved = self.improvement._sheet()
         rows += [*improved.rows, ("ended", why_ended(vars(self.left)))]
         return Sheet(f"Explanation: {improved.title.partition(': ')[2]}", tuple(rows))

@@ -9,6 +9,7 @@ from stimrig.api.charts.figure import INK, MEASURED, MODEL, TOOLBAR_PX, axis, bo
 from stimrig.api.charts.model_charts import segment_marks
 from stimrig.api.language import _, localised, plain
 from stimrig.api.models import explanation
+from stimrig.identify.healing import looks_like_noise
 from stimrig.identify.yardstick import floor_nm
 
 MARK, MARK_LINE, FLOOR = role("worst-band"), role("worst"), role("limit")
@@ -41,6 +42,8 @@ def pictures(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """The worst places before a diagnosis is there."""
+    if not comparison or looks_like_noise(comparison):
+        return []
     return [explanation.place(entry, number) for number, entry in enumerate(comparison.get("where") or [], start=1)]
 
 

@@ -49,6 +49,7 @@ class Version(TypedDict):
     carried: dict[str, Any] | None
     method: str
     effects: list[str]
+    without_evidence: Annotated[list[str], "those of them that a person added without evidence"]
     fit_percent: float | None
     ceiling_percent: Annotated[float | None, "what the noise allows, %"]
     held_out_fit_percent: Annotated[float | None, "null: nothing is held out, or the torque is level there"]

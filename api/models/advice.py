@@ -114,6 +114,12 @@ GATES: dict[str, Gate] = {
         lazy("Not usable: record again while the joint moves."),
         lazy("At another angle the torque that the controller expects is a guess."),
     ),
+    "evidence": Gate(
+        lazy("It holds an effect that was added without evidence."),
+        lazy("Usable with care: the recording does not ask for an effect in it. Compare it with the version before."),
+        lazy("Not usable: go back to the version before."),
+        lazy("The controller would rely on an effect of which the recording gives no evidence."),
+    ),
     "sensor": Gate(
         lazy("The load cell shows the same torque again and again: it clips, or it is not connected."),
         lazy("Usable with care: look at the highest torques in the chart first; the load cell clips."),
@@ -122,7 +128,7 @@ GATES: dict[str, Gate] = {
              "show it."),
     ),
 }  # fmt: skip
-"""Each check of `stimrig.identify.estimation.quality`."""
+"""Each check of `stimrig.identify.estimation.quality`, and `stored_model.without_evidence`."""
 
 
 BESIDE: dict[str, Any] = {
@@ -195,5 +201,5 @@ def fit_sentence(fit: dict[str, Any]) -> str:
     fit_is = _("%(where)s the fit is %(reached)s %%", where=found.where, reached=reached)
     if found.ceiling_percent is None:
         return f"{fit_is}."
-    limit = _("the noise allows %(ceiling)s %%", ceiling=localised(f"{found.ceiling_percent:.1f}"))
+    limit = _("the noise allows about %(ceiling)s %%", ceiling=localised(f"{found.ceiling_percent:.1f}"))
     return f"{fit_is}; {limit}."

@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import json
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 from stimrig.api.clock import Clock
@@ -99,6 +100,12 @@ class Analyses:
         place, kind, _ = self._criticised(model)
         found = self.known(place.id, kind)
         return found and explanation.remaining(found, model.effects, model.fit)
+
+    def experiment_before(self, model: Model) -> dict[str, Any] | None:
+        """The next experiment of the diagnosis that the first model of a joined recording was made to go on from."""
+        first = self.versions.ancestry(model)[0]
+        before = self.known_diagnosis(self.versions.get(first.parent_id)) if first.parent_id else None
+        return (before or {}).get("experiment")
 
     async def diagnose_ahead(self, model: Model) -> None:
         """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
@@ -209,7 +216,11 @@ class Analyses:
             detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
             raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
         free: dict[str, str] = {}
-        if not force:
+        forced: list[str] = []
+        if force:
+            known = await asyncio.to_thread(self.known_diagnosis, model)
+            forced = [one for one in added if known is None or explanation.refusal(known, model.effects, one)]
+        else:
             diagnosis = await self.diagnosis(model, on_call)
             explanation.require_evidence(diagnosis, model.effects, added)
             free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in diagnosis.get("free") or []}
@@ -217,7 +228,7 @@ class Analyses:
         held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
         asked = [held.get(effect, free.get(effect, effect)) for effect in effects]
         found = await self.asked("fit", on_call, data=path, method=model.method, effects=asked)
-        return await asyncio.to_thread(self._store_added, found["json"], model, added, by, force, reason)
+        return await asyncio.to_thread(self._store_added, found["json"], model, added, by, forced, reason)
 
     async def check_known(self, effects: list[str]) -> None:
         """Refuse effects that are not in the library."""
@@ -229,12 +240,12 @@ class Analyses:
             detail = f"There is no effect {', '.join(unknown)}. Take one of {', '.join(self._ids)}."
             raise ApiError(422, "unknown-effect", "No such effect", detail)
 
-    def _store_added(self, model_json: str, model: Model, added: list[str], by: str, force: bool, reason: str) -> Model:
-        row = self.versions.add(
-            model_json, model.participant, model.recording_id, by, parent_id=model.id, added_effect=",".join(added)
-        )
-        if force or reason:
-            action = "force effect" if force else "add effect"
+    def _store_added(
+        self, model_json: str, model: Model, added: list[str], by: str, forced: list[str], reason: str
+    ) -> Model:
+        row = self._child(model, added, json.loads(model_json), by, forced)
+        if forced or reason:
+            action = "force effect" if forced else "add effect"
             self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
         return row
 
@@ -263,14 +274,20 @@ class Analyses:
         rows = [first]
         for step, document in zip(found["steps"], found["models"], strict=True):
             if step["added"] is not None:
-                rows.append(self._child(rows[-1], step["added"], document, by))
+                rows.append(self._child(rows[-1], [step["added"]], document, by))
             step["model_id"] = rows[-1].id
         return rows
 
-    def _child(self, parent: Model, added: str, document: dict[str, Any], by: str) -> Model:
-        """The version with one effect more than its parent; made of the document where there is none."""
-        same = self.versions.child_with(parent, [*parent.effects, added])
+    def _child(
+        self, parent: Model, added: list[str], document: dict[str, Any], by: str, forced: Sequence[str] = ()
+    ) -> Model:
+        """The version with effects more than its parent; made of the document where there is none."""
+        same = self.versions.child_with(parent, [*parent.effects, *added])
         if same is not None:
             return same
+        stored_model.mark_without_evidence(
+            document, [*stored_model.without_evidence(stored_model.read(parent)), *forced]
+        )
         document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
-        return self.versions.add(json.dumps(document), parent.participant, parent.recording_id, by, parent.id, added)
+        of = (parent.participant, parent.recording_id)
+        return self.versions.add(json.dumps(document), *of, by, parent.id, ",".join(added))

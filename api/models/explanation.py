@@ -12,7 +12,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised, plain, translated
 from stimrig.api.structure import worded
 from stimrig.identify.conclusion import asked_for, conclude, in_order, is_likely
-from stimrig.identify.healing import HEALED
+from stimrig.identify.healing import stands_out
 from stimrig.identify.summary import probability, sure
 
 SPLITS: dict[str, Any] = {
@@ -47,11 +47,12 @@ def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: 
     missing, free = in_order({**diagnosis, **left}), left["free"]
     wanted = asked_for(diagnosis)
     asked = [entry for entry in [*missing, *free] if entry["effect"] in wanted]
-    places = (comparison or {}).get("where") or diagnosis.get("where") or []
     experiment = diagnosis.get("experiment")
     if experiment and experiment["effect"] in effects:
         experiment = None
     said = conclude({**diagnosis, "missing": missing})
+    noise = said.kind == "nothing" and not (comparison and stands_out(comparison))
+    places = [] if noise else (comparison or {}).get("where") or diagnosis.get("where") or []
     return {
         "kind": said.kind,
         "title": translated(said.title),
@@ -63,6 +64,7 @@ def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: 
         "likely": [name_of(entry["effect"], library) for entry in asked if is_likely(entry)],
         "structure": effects_words(diagnosis.get("structure") or []) or _("plain"),
         "places": [place(entry, number) for number, entry in enumerate(places, start=1)],
+        "splits": [] if noise else splits(comparison or {}),
         "tests": ((comparison or {}).get("tests") or {}).get("tests") or [],
         "experiment": experiment and tidy_experiment(experiment, library),
         "others": others(diagnosis, effects, library),
@@ -92,6 +94,26 @@ def remaining(diagnosis: dict[str, Any], effects: Sequence[str], fit: Mapping[st
     return {**found, "structure": structure, **told}
 
 
+def decided(experiment: dict[str, Any] | None, diagnosis: dict[str, Any], effects: Sequence[str]) -> str:
+    """What a further test says of the effects between which it was to decide; empty where it was not to.
+
+    `experiment`: of the diagnosis before the test; `diagnosis`: of the recordings joined; `effects`: that the model
+    holds already, one of which may have been added by what the test said.
+    """
+    rivals = (experiment or {}).get("rivals") or []
+    if len(rivals) < 2 or not set(rivals).isdisjoint(effects):
+        return ""
+    library = diagnosis.get("library") or {}
+    named = [row for row in diagnosis["missing"] if row["effect"] in rivals]
+    between = {"rivals": _(" and ").join(_in_a_sentence(rival, library) for rival in rivals)}
+    if not named:
+        return _("The further test was to decide between %(rivals)s: with it, none of them is asked for.", **between)
+    if len(named) > 1 or not set(named[0].get("confused_with") or []).isdisjoint(rivals):
+        return _("The further test was to decide between %(rivals)s: it has not told them apart.", **between)
+    found = _in_a_sentence(named[0]["effect"], library)
+    return _("The further test was to decide between %(rivals)s: it is %(found)s.", **between, found=found)
+
+
 def _without(diagnosis: dict[str, Any], held: Collection[str]) -> dict[str, list[dict[str, Any]]]:
     """The effects that a diagnosis names, `missing` and `free`, but for those that a model holds."""
     return {
@@ -103,14 +125,6 @@ def _mostly_here(places: Sequence[dict[str, Any]]) -> str:
     if not places:
         return ""
     return " " + _("It sits mostly here: %(place)s.", place=place(places[0], 1)["words"])
-
-
-def times_noise(comparison: dict[str, Any] | None) -> float | None:
-    """Held-out error (the whole error where nothing is held out) over the noise."""
-    if not comparison or not comparison.get("noise_sd_nm"):
-        return None
-    rows = comparison.get("held_out") or comparison
-    return None if rows.get("rms_nm") is None else rows["rms_nm"] / comparison["noise_sd_nm"]
 
 
 def name_of(effect: str, library: dict[str, Any]) -> str:
@@ -219,9 +233,9 @@ def place(entry: dict[str, Any], number: int) -> dict[str, Any]:
     }
 
 
-def splits(comparison: dict[str, Any] | None) -> list[dict[str, Any]]:
+def splits(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """The error in classes, each class with its share of what is left above the noise."""
-    by = (comparison or {}).get("by") or {}
+    by = comparison.get("by") or {}
     found = []
     for kind, title in SPLITS.items():
         say = segment_words if kind == "segment" else plain
@@ -287,7 +301,11 @@ def versions(rows: Sequence[dict[str, Any]], current: str) -> list[dict[str, Any
 def label(row: dict[str, Any]) -> str:
     """What a version is, beside the one that it was made from."""
     if row["added_effect"]:
-        return f"+ {effects_words(row['added_effect'].split(','))}"
+        added = row["added_effect"].split(",")
+        words = f"+ {effects_words(added)}"
+        if set(added).isdisjoint(row.get("without_evidence") or ()):
+            return words
+        return _("%(effects)s (without evidence)", effects=words)
     begun_with = effects_words(row.get("effects") or [])
     return _("with %(effects)s", effects=begun_with) if begun_with else _("base model")
 
@@ -299,12 +317,6 @@ def step_versions(found: dict[str, Any]) -> list[dict[str, Any]]:
         for number, step in enumerate(found["steps"])
     ]
     return versions(steps, "")
-
-
-def noisy(comparison: dict[str, Any]) -> bool:
-    """Whether more is left than noise would leave."""
-    times = times_noise(comparison)
-    return times is not None and times > HEALED
 
 
 # ---- effects that the recording does not ask for --------------------------------------------------------------------

@@ -107,6 +107,7 @@ class Versions:
                 **stored_model.figures(document),
                 **stored_model.quality(document),
                 "figures": stored_model.muscle_figures(document),
+                "without_evidence": stored_model.without_evidence(document),
             },
             document=body,
             etag=hashlib.sha256(body).hexdigest(),
@@ -361,6 +362,7 @@ class Versions:
         return {
             "model_id": row.id,
             **{name: getattr(row, name) for name in COLUMNS},
+            "without_evidence": [],  # of versions from before it was kept
             **row.fit,
             **self.quality(row),
             "decision": None if decision is None else ("approved" if decision.approved else "rejected"),

@@ -10,7 +10,7 @@ import cmath
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +101,22 @@ def quality(document: dict[str, Any]) -> dict[str, Any]:
     words = stored.get("words") if worse == verdict else None
     first = f"{reasons[0][:1].upper()}{reasons[0][1:].rstrip('.')}." if reasons else DEFAULTS[worse]
     return {"verdict": worse, "words": words or first, "reasons": reasons}
+
+
+def without_evidence(document: Mapping[str, Any]) -> list[str]:
+    """The effects of a model that a person added although the recording did not ask for them."""
+    gates = (document.get("quality") or {}).get("gates") or {}
+    return (gates.get("evidence") or {}).get("effects") or []
+
+
+def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> None:
+    """Judge a new version that holds such effects: it is used with care at best, and says why."""
+    if not effects:
+        return
+    judged, says = document["quality"], f"added without evidence: {', '.join(effects)}"
+    judged["gates"]["evidence"] = {"passed": False, "severity": "care", "says": says, "effects": list(effects)}
+    judged["reasons"] = [*judged["reasons"], says]
+    document["quality"] |= quality(document)
 
 
 @dataclass(frozen=True)

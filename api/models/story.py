@@ -26,15 +26,17 @@ def story(
     `rows`: the versions on the way, as `explanation.versions` gives them; `before`, `after`: the first and the last
     model compared with the recording; `diagnosis`, `last`: those of the first model and of the last one.
     """
+    why = diagnosis and explanation.view(diagnosis, before, [])
+    healed = healed_places(before, after) if why is None or why["places"] else []
     places = [
         {**place(found, number), **found, "became": translated(place_words(found))}
-        for number, found in enumerate(healed_places(before, after), start=1)
+        for number, found in enumerate(healed, start=1)
     ]
     return {
         "title": _title(rows),
         "rows": rows,
         "places": places,
-        "why": diagnosis and explanation.view(diagnosis, before, []),
+        "why": why,
         "steps": [_step(row, previous) for previous, row in pairwise(rows)],
         "ended": last and translated(why_ended(last)),
         "then": last and explanation.view(last, after, rows[-1].get("effects") or []),

@@ -141,9 +141,7 @@ def _plain(
 ) -> list[str]:
     noise = f"the noise of {noise_sd_nm:.3g} N·m"
     if np.isfinite(whole["fit_percent"]):
-        lines = [
-            f"The model fits {whole['fit_percent']:.1f} %; {noise} allows {whole['ceiling_percent']:.1f} % at most."
-        ]
+        lines = [f"The model fits {whole['fit_percent']:.1f} %; {noise} allows about {whole['ceiling_percent']:.1f} %."]
     else:
         lines = [f"The error of the model is {whole['rms_nm']:.3g} N·m, with {noise}; its fit is {UNDEFINED}."]
     if held_out is not None:

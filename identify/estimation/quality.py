@@ -142,7 +142,7 @@ def _words(model: Model, bad: bool, reasons: list[str]) -> str:
     if reasons:
         return f"{'Do not use this model' if bad else 'Check this before use'}: {reasons[0]}."
     reached, ceiling, where = _reach(model)[:3]
-    return f"The model fits {reached:.1f} % on {where}; the noise allows {ceiling:.1f} % at most."
+    return f"The model fits {reached:.1f} % on {where}; the noise allows about {ceiling:.1f} %."
 
 
 def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:

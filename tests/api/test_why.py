@@ -84,7 +84,9 @@ def test_job_leads_to_its_result(client: httpx.Client, model: str) -> None:
 # ---- effects ------------------------------------------------------------------------------------------------
 
 
-def test_effect_that_is_not_there_is_refused_with_the_reason(client: httpx.Client, model: str) -> None:
+def test_effect_that_is_not_there_is_refused_with_the_reason(
+    service: Service, client: httpx.Client, model: str
+) -> None:
     refused = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"]})
     assert refused.status_code == 409 and refused.json()["type"] == "/problems/effect-not-there"
     assert "log evidence -4.0" in refused.json()["reasons"]["tremor"]
@@ -95,6 +97,17 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(client: httpx.Clien
     assert forced.status_code == 201 and forced.json()["effects"] == ["tremor"]
     entries = [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "force effect"]
     assert [entry["detail"]["reason"] for entry in entries] == ["seen with the eye"]
+    assert forced.json()["without_evidence"] == ["tremor"] and forced.json()["verdict"] == "usable with care"
+    stored = client.get(f"/v1/models/{forced.json()['id']}").json()["model"]["quality"]
+    assert stored["verdict"] == "usable with care" and not stored["gates"]["evidence"]["passed"]
+    with signed_in(service) as page:
+        html = page.get(f"/models/{forced.json()['id']}").text
+    assert "It holds an effect that was added without evidence" in html and "(without evidence)" in html
+    body |= {"effects": ["fatigue"]}  # the recording asks for it: to force it changes nothing
+    asked = client.post(f"/v1/models/{model}/effects", json=body)
+    assert asked.json()["without_evidence"] == []
+    both = client.post(f"/v1/models/{forced.json()['id']}/effects", json=body)
+    assert both.json()["without_evidence"][0] == "tremor", "a later version still holds it"
 
 
 def test_improve_makes_a_version_a_step_and_undo_goes_back(client: httpx.Client, model: str) -> None:
@@ -318,10 +331,31 @@ def test_a_free_effect_that_is_left_to_add_is_no_nothing() -> None:
 def test_where_something_is_left_its_places_are_shown() -> None:
     """The verdict sent the reader to where the error sits, and there no place stood out."""
     found = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": [PLACE]}
-    comparison = {"noise_sd_nm": 0.04, "rms_nm": 0.04, "where": [PLACE]}
+    rows = [{"label": "ramp", "share_of_excess": 1.0}]
+    comparison = {"noise_sd_nm": 0.04, "rms_nm": 0.04, "where": [PLACE], "by": {"segment": rows}}
     for check, count in ((True, 0), (False, 1)):
         view = explanation.view({**found, "residual_check": check}, comparison, [])
-        assert len(missing_parts(view, comparison)["places"]) == count
+        shown = missing_parts(view, comparison)
+        assert len(shown["places"]) == len(shown["splits"]) == count
+    for passed, count in ((True, 0), (False, 1)):  # before a diagnosis is there
+        tests = {"tests": [{"passed": passed}]}
+        assert len(missing_parts(None, {**comparison, "tests": tests})["places"]) == count
+
+
+def test_a_further_test_is_told_what_it_decided() -> None:
+    missing = {"effect": "fatigue", "confused_with": []}
+    experiment = {"rivals": ["fatigue", "potentiation"]}
+
+    def said(*rows: dict[str, Any], held: tuple[str, ...] = (), asked: dict[str, Any] | None = experiment) -> str:
+        return explanation.decided(asked, {"missing": list(rows)}, held).partition(": ")[2]
+
+    assert said(missing) == "it is fatigue."
+    assert said({**missing, "confused_with": ["potentiation"]}) == "it has not told them apart."
+    assert said(missing, {**missing, "effect": "potentiation"}) == "it has not told them apart."
+    assert said({**missing, "effect": "tremor"}) == "with it, none of them is asked for."
+    assert (
+        said(missing, held=("potentiation",)) == said(missing, asked=None) == said(missing, asked={"rivals": []}) == ""
+    )
 
 
 def test_a_parameter_is_told_by_the_words_of_its_own_form() -> None:

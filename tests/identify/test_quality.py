@@ -84,7 +84,7 @@ def test_the_gap_on_rows_not_seen_is_in_the_verdict(
 
 
 def test_a_residual_that_is_not_noise_asks_for_care_alone(record: identify.Record, model: identify.Model) -> None:
-    assert model.quality["verdict"] == "usable" and model.quality["words"].endswith("% at most.")
+    assert model.quality["verdict"] == "usable" and model.quality["words"].endswith(" %.")
     grid = make_grid(record)
     alarmed = model.with_(residual_tests={"whiteness": {"passed": False}})
     found = quality(alarmed, grid, grid.fitted)

@@ -21,6 +21,7 @@ from stimrig.api.cli.terminal import (
     short,
     write,
 )
+from stimrig.identify.healing import looks_like_noise
 
 
 def compare(
@@ -51,9 +52,11 @@ def compare(
 
 def comparison_lines(found: dict[str, Any]) -> list[str]:
     """The comparison in words, the worst places, and where the error above the noise sits."""
-    places = [place["text"] for place in found.get("where") or []]
+    places = [place["text"] for place in found["where"]]
     named_below = {f"{text}." for text in places}
-    lines = [line for line in found.get("plain") or [] if line not in named_below]
+    lines = [line for line in found["plain"] if line not in named_below]
+    if looks_like_noise(found):
+        return [*lines, "No place stands out."]
     if places:
         lines += ["", "worst places", *[f"  {text}" for text in places]]
     for kind in ("segment", "level", "direction", "frequency"):

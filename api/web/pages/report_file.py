@@ -56,7 +56,7 @@ def comparison_html(
         ),
         plain=(comparison or {}).get("plain") or [],
         places=diagnosis_charts.places_of(comparison or {}),
-        splits=explanation.splits(comparison),
+        splits=explanation.splits(comparison or {}),
         tests=((comparison or {}).get("tests") or {}).get("tests") or [],
     )
 
@@ -89,15 +89,13 @@ def diagnosis_html(
 
 
 def missing_parts(view: dict[str, Any] | None, comparison: dict[str, Any] | None) -> dict[str, Any]:
-    """What `missing.html` shows, on the page and in a file; where all is noise, no place of it."""
-    if view is not None and view["kind"] == "nothing" and not explanation.noisy(comparison or {}):
-        view["places"] = []
+    """What `missing.html` shows, on the page and in a file."""
+    if view is not None:
+        return {"why": view, **{key: view[key] for key in ("places", "splits", "tests")}}
+    alone = comparison or {}
     return {
-        "why": view,
-        "places": view["places"] if view else diagnosis_charts.places_of(comparison or {}),
-        "splits": explanation.splits(comparison),
-        "tests": view["tests"] if view else [],
-    }
+        "why": None, "places": diagnosis_charts.places_of(alone), "splits": explanation.splits(alone), "tests": [],
+    }  # fmt: skip
 
 
 def story_html(
