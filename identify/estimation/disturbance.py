@@ -15,6 +15,7 @@ from stimrig.identify.effects.base import Form, Parameter
 from stimrig.identify.estimation.averaged import averaged
 from stimrig.identify.estimation.joint import Fitted, gram
 from stimrig.identify.estimation.short_record import Short
+from stimrig.identify.estimation.uncertainty import square_root
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.simulation.problem import Problem
 
@@ -60,9 +61,8 @@ def unsure(short: Short, beside: Fitted) -> Short:
     muscle = np.arange(at.stop)
     whole = np.linalg.inv(beside.hessian)[np.ix_(known, known)]
     alone = np.linalg.inv(beside.hessian[np.ix_(muscle, muscle)])[np.ix_(known, known)]
-    size, directions = np.linalg.eigh(whole - alone)
     normal = np.random.default_rng(len(short.dynamics)).standard_normal((len(short.dynamics), known.size))
-    moved = (normal * np.sqrt(np.maximum(size, 0.0))) @ directions.T
+    moved = normal @ square_root(whole - alone)
     dynamics = short.dynamics * np.c_[np.exp(moved[:, :2]), np.ones(len(moved))]
     dynamics[:, 2] = np.clip(dynamics[:, 2] + moved[:, 2], *short.grid.delay_bounds_s)
     return replace(short, dynamics=dynamics, coefficients_nm=short.coefficients_nm + moved[:, -own:])

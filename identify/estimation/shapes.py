@@ -10,6 +10,7 @@ import numpy as np
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Form, Shape
 from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.uncertainty import square_root
 
 DRAWS = 200
 PERCENTILES = 2.5, 97.5
@@ -41,7 +42,8 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
     values = fitted.physical[places]
     names = [p.name for p in chosen.parameters]
     found = shape(chosen.form, dict(zip(names, values.tolist(), strict=True)))
-    drawn = np.random.default_rng(0).multivariate_normal(values, matrix[np.ix_(places, places)], DRAWS, method="svd")
+    normal = np.random.default_rng(0).standard_normal((DRAWS, len(places)))
+    drawn = values + normal @ square_root(matrix[np.ix_(places, places)])
     bounds = np.array([(p.lower, p.upper) for p in chosen.parameters]).T
     every = [_lines(shape, chosen.form, names, row) for row in np.clip(drawn, *bounds)]
     lines = {}

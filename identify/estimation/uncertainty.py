@@ -233,10 +233,18 @@ def whole_factor(matrix: np.ndarray, sd: np.ndarray) -> float:
     if not known.any():
         return POINTWISE
     scaled = matrix[np.ix_(known, known)] / sd[known][:, None] / sd[known][None, :]
-    values, vectors = np.linalg.eigh(scaled)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    farthest = np.sort(np.max(np.abs(_draws(root.shape[1]) @ root.T), axis=1))
+    farthest = np.sort(np.max(np.abs(_draws(len(scaled)) @ square_root(scaled)), axis=1))
     return float(np.interp(0.95 * (DRAWS - 1), np.arange(DRAWS), farthest))
+
+
+def square_root(covariance: np.ndarray) -> np.ndarray:
+    """The root that is itself symmetric: there is one, so that draws made with it are the same on every computer.
+
+    Eigenvectors alone are not: their signs, and all of those that belong to no eigenvalue above rounding, are as the
+    processor's linear algebra has them.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 @cache

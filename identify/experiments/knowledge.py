@@ -148,6 +148,9 @@ class Foresight:
         mean = draws.mean(axis=0)
         scale = np.r_[np.full(short.basis.size, short.plateau_nm), 1.0, 1.0, 0.02]
         _, size, right = np.linalg.svd((draws - mean) / scale, full_matrices=False)
+        right *= np.sign(
+            np.take_along_axis(right, np.abs(right).argmax(axis=1)[:, None], 1)
+        )  # the same on any computer
         kept = min(DIRECTIONS, int(np.sum(size > 1e-9 * size[0])))
         moved = mean + (size[:kept, None] / np.sqrt(len(draws))) * right[:kept] * scale
         rows = np.vstack([mean, moved])

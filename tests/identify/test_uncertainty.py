@@ -12,7 +12,7 @@ from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.projection import ar1_or_white, best_ar1
 from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p, correlation_slopes
-from stimrig.identify.estimation.uncertainty import prediction_band
+from stimrig.identify.estimation.uncertainty import prediction_band, whole_factor
 from stimrig.identify.noise import NoiseLevel
 from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
@@ -173,3 +173,20 @@ def test_starting_is_cheap():
         " if m in sys.modules]; assert not slow, slow"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_draws_do_not_depend_on_the_signs_of_eigenvectors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another processor's linear algebra gave bands that were wider by 2 %."""
+    slopes = np.random.default_rng(3).standard_normal((12, 4))
+    matrix = slopes @ slopes.T  # of rank 4: most directions are rounding
+    sd, real = np.sqrt(np.diag(matrix)), np.linalg.eigh
+
+    def turned(of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values, vectors = real(of)
+        vectors[:, :8] = vectors[:, :8] @ np.linalg.qr(np.random.default_rng(4).standard_normal((8, 8)))[0]
+        return values, vectors * np.where(np.arange(len(of)) % 2, -1.0, 1.0)
+
+    usual = whole_factor(matrix, sd)
+    monkeypatch.setattr(np.linalg, "eigh", turned)
+    assert whole_factor(matrix, sd) == pytest.approx(usual, rel=1e-5)
+    assert 2.0 < usual < 3.5
