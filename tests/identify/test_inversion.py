@@ -174,7 +174,7 @@ def test_a_rise_begins_with_the_shortest_pulse_that_is_sent():
 @pytest.mark.parametrize(
     ("given", "place"),
     [
-        ({"rise_us": 15.0}, "rise_us: at most 15 µs"), ({"rise_us": 20.4, "largest_us": 300.0}, "rise_us: at most 20.4"),
+        ({"rise_us": 15.0}, "rise_us: at most 15 µs"), ({"rise_us": 20.4, "largest_us": 300.0}, "rise_us: at most 20"),
         ({"largest_us": 20.0}, "largest_us: at most 20 µs"),
     ],
 )  # fmt: skip
