@@ -12,6 +12,7 @@ from stimrig.api.client.documents import SessionTest
 from stimrig.api.client.errors import Unreachable
 from stimrig.api.client.rest import Client
 from stimrig.api.clinical_words import label_rows, words
+from stimrig.api.models.changes import dose_words
 
 
 def run_test(
@@ -109,7 +110,7 @@ def report_lines(test: Mapping[str, Any], model: dict[str, Any] | None) -> list[
         f"{part['name']} {part['end_s'] - part['start_s']:g} s" for part in planned.get("segments") or []
     )
     torque_time = planned.get("torque_time_nms")
-    dose = f"{number(summary.get('charge_uc'), 0)} µC a phase over the test"
+    dose = f"{dose_words(summary.get('charge_uc'))} a phase over the test"
     if torque_time is not None:
         dose += f", {number(torque_time, 0)} N·m·s planned"
     return [

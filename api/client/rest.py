@@ -16,6 +16,8 @@ POLL_S = 0.1
 Progress = Callable[[float, str], None]
 OUTLOOK_S = 300.0
 """So long a busy service may take to say what an adaptive test can reach; usually it takes a few seconds."""
+UPLOAD_S = 3600.0
+"""So long an upload's answer may take: it waits for the fit. The service ends one that takes too long, and says so."""
 
 
 class Client(Connection):
@@ -224,7 +226,7 @@ class Client(Connection):
     def upload(self, participant: str, data: bytes | Path) -> dict[str, Any]:
         """Send a recording of another tool (CSV or HDF5). Returns `recording_id`, its new `model`, and `warnings`."""
         content = data if isinstance(data, bytes) else data.read_bytes()
-        return self.post(f"/v1/participants/{participant}/recordings", content=content)
+        return self.post(f"/v1/participants/{participant}/recordings", content=content, timeout=UPLOAD_S)
 
     # ---- models
 
@@ -345,7 +347,7 @@ class Client(Connection):
         """The model against its own recording, or against another one."""
         return self.get(f"/v1/models/{model_id}/comparison", params={"recording": recording_id} if recording_id else {})
 
-    # ---- long work: with `progress` as a job that is followed and can be cancelled
+    # ---- long work: a job that is followed, however long it takes, and cancelled where it is interrupted
 
     def diagnosis(self, model_id: str, progress: Progress | None = None) -> dict[str, Any]:
         """What is missing in the model. `progress` as in `add_effects`."""
@@ -384,8 +386,7 @@ class Client(Connection):
 
     def improve(self, model_id: str, progress: Progress | None = None) -> Version:
         """Add effects one by one while the evidence asks for them; returns the last version. `progress` as above."""
-        found = self._long("POST", f"/v1/models/{model_id}/improve", progress)
-        return found["versions"][-1] if "versions" in found else found
+        return self._long("POST", f"/v1/models/{model_id}/improve", progress)
 
     def job(self, job_id: str) -> Job:
         """Long work as it is now."""
@@ -396,10 +397,9 @@ class Client(Connection):
         return self.request("DELETE", f"/v1/jobs/{job_id}").json()
 
     def _long(self, method: str, path: str, progress: Progress | None, **more: Any) -> Any:
-        if progress is None:
-            return self.request(method, path, **more).json()
         answer = self.request(method, path, params={"wait": False}, **more)
-        return self._result(answer.json(), progress) if answer.status_code == 202 else answer.json()
+        found = answer.json()
+        return self._result(found, progress or (lambda *_: None)) if answer.status_code == 202 else found
 
     def _result(self, job: Job, progress: Progress) -> Any:
         try:

@@ -18,6 +18,7 @@ from stimrig.api.cohort.export_state import State
 from stimrig.api.cohort.record import describe
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import Entry, Source, SourceError
+from stimrig.api.cohort.tally import Tally, Tell, counting
 from stimrig.api.cohort.tasks import CutOffError
 from stimrig.api.cohort.whole_record import WholeRecord, read_whole
 from stimrig.api.whole_file import whole_file
@@ -109,17 +110,6 @@ UNKNOWN = "unknown"
 
 
 @dataclass
-class Tally:
-    """How far an export is."""
-
-    written: int = 0
-    before: int = 0
-    failed: int = 0
-    left_out: int = 0
-    copies: int = 0
-
-
-@dataclass
 class Export:
     """One export."""
 
@@ -129,7 +119,7 @@ class Export:
     writer: Writer  # the format
     days: Days  # what becomes of dates
     columns: Sequence[str] = ()  # `--map` for tables of other tools
-    tell: Callable[[Tally], None] = lambda _: None  # called with the tally after every record
+    tell: Tell = lambda _: None  # called with the tally after every record
     tally: Tally = field(default_factory=Tally)
 
     def __post_init__(self) -> None:
@@ -144,10 +134,11 @@ class Export:
         for source in self.sources:
             source.check()
         with tempfile.TemporaryDirectory(prefix="stimrig-export-") as folder, self._on_the_disk():
-            for source in self.sources:
-                for entry in source.entries(self.selection):
-                    self._one(source, entry, Path(folder))
-                    self.tell(self.tally)
+            with counting(self.tally, self.sources, self.selection):
+                for source in self.sources:
+                    for entry in source.entries(self.selection):
+                        self._one(source, entry, Path(folder))
+                        self.tell(self.tally)
             self.writer.finish(self.state, self.put)
             with self.put(ERRORS) as file:
                 rows = chain([("address", "kind", "reason")], self.state.failures())
@@ -214,7 +205,7 @@ class Export:
         self.state.done(entry.address, entry.stamp, sha256, (who.participant, who.session), row)
         for place in set(before) - set(self._places):  # of the record as it was
             (self.state.folder / place).unlink(missing_ok=True)
-        self.tally.written += 1
+        self.tally.ok += 1
 
     def _who(self, record: WholeRecord) -> Who:
         code = record.about.get("participant") or UNKNOWN
@@ -228,7 +219,7 @@ class Export:
         return Who(code, label, session, record.about.get("record_id") or key, key, begun)
 
     def _fail(self, entry: Entry, kind: str, reason: str) -> None:
-        self.tally.failed += 1
+        self.tally.error += 1
         self.state.failed(entry.address, kind, reason)
 
     @contextmanager

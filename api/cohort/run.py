@@ -5,7 +5,6 @@ Records travel in parcels, come back as rows, and are sent again where a worker 
 
 from __future__ import annotations
 
-import threading
 import time
 import uuid
 from asyncio import CancelledError
@@ -23,6 +22,7 @@ from stimrig.api.cohort.computing import COPY, LEFT_OUT, Bounds, Done, Record, c
 from stimrig.api.cohort.results import Results
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import Source
+from stimrig.api.cohort.tally import Tally, Tell, counting
 from stimrig.api.cohort.tasks import GOES_ON, SCHEDULER_GONE, CohortError, CutOffError, Task
 
 TRIES = 3
@@ -130,34 +130,6 @@ FLUSH_S = 10.0
 """What is lost at most, of the work done, when the run is killed."""
 LANES_S = 5.0
 
-Tell = Callable[["Tally"], None]
-
-
-@dataclass
-class Tally:
-    """How far a run is."""
-
-    total: int | None = None
-    """Records that may be meant; None until they are counted."""
-    before: int = 0
-    """Done by an earlier run."""
-    ok: int = 0
-    error: int = 0
-    left_out: int = 0
-    copies: int = 0
-    left_open: str = ""
-    """What the workers' computing processes could not be shut in from; empty: nothing."""
-
-    @property
-    def now(self) -> int:
-        """Records that came back in this run."""
-        return self.ok + self.error + self.left_out + self.copies
-
-    @property
-    def handled(self) -> int:
-        """Records that need nothing more."""
-        return self.now + self.before
-
 
 @dataclass(eq=False)
 class Run:
@@ -175,7 +147,6 @@ class Run:
     def __post_init__(self) -> None:
         self.selection = Selection(self.task.select)
         self.parcels = Parcels(self.client, self.task, self.bounds)
-        self._ended = threading.Event()
 
     def go(self, keep: bool = False) -> Tally:
         """Do every record that is not done; then the results are whole, but not joined yet.
@@ -183,12 +154,10 @@ class Run:
         `keep`: leave the workers' computing processes for another run. Raises CohortError: a source is not there, or a
         worker has another version.
         """
-        counting = threading.Thread(target=self._count, daemon=True)
-        counting.start()
         try:
-            self._loop()
+            with counting(self.tally, self.sources, self.selection):
+                self._loop()
         finally:
-            self._ended.set()
             self.results.flush()
             self.parcels.cancel()
         if not keep:
@@ -238,16 +207,3 @@ class Run:
         name = {LEFT_OUT: "left_out", COPY: "copies"}.get(status, status)
         setattr(self.tally, name, getattr(self.tally, name) + 1)
         self.tell(self.tally)
-
-    def _count(self) -> None:
-        """Count what may be meant, beside the run, so that there is a time left to tell."""
-        count = 0
-        try:
-            for source in self.sources:
-                for entry in source.entries(self.selection):
-                    if self._ended.is_set():
-                        return
-                    count += self.selection(entry.known) is not False
-        except Exception:  # the run itself meets it, and says so
-            return
-        self.tally.total = count

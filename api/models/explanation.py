@@ -286,7 +286,7 @@ def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str,
 
 VERSION = (
     "id", "rms_nm", "held_out_rms_nm", "noise_sd_nm", "fit_percent", "held_out_fit_percent", "decision", "served",
-    "decision_reason", "created_utc", "added_effect", "effects", "repetition", "reason",
+    "undone", "decision_reason", "created_utc", "added_effect", "effects", "repetition", "reason",
 )  # fmt: skip
 """What is shown of a version."""
 

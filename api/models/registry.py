@@ -187,12 +187,12 @@ class Versions:
             if (decision := self.decision(model_id)) is not None and not decision.approved:
                 detail = f"{model_id} is the first version, and it is rejected. Approve it anew to use it all the same."
             raise ApiError(409, "nothing-to-undo", "There is no version before this one", detail)
-        words = ": ".join(part for part in (stored_model.UNDONE, reason) if part)
+        words = f"undone: {reason}" if reason else "undone"
         parent = self.get(row.parent_id)
         with self.store.write() as session:
             seen.check(session, seen.decisions(row.participant))
             holding = self.approved(row.participant)
-            self._decide(session, row, False, by, words)
+            self._decide(session, row, False, by, words).undone = True
             usable = self.quality(parent)["verdict"] not in POOR
             if holding is not None and holding.model_id == row.id and usable:
                 self._decide(session, parent, True, by, words, holding.tracking)
@@ -368,6 +368,7 @@ class Versions:
             "decision": None if decision is None else ("approved" if decision.approved else "rejected"),
             "decided_by": decision.by if decision else None,
             "decided_utc": decision.at_utc if decision else None,
+            "undone": bool(decision and decision.undone),
             "decision_reason": decision.reason if decision else None,
             "expires_utc": decision.expires_utc if decision else None,
             "tracking": decision.tracking if decision else None,

@@ -145,16 +145,6 @@ def followed(fit: Mapping[str, Any]) -> Followed:
     return Followed(fit["held_out_fit_percent"], fit.get("held_out_ceiling_percent"), where)
 
 
-UNDONE = "undone"
-"""How the reason begins of a rejection that was an undo."""
-
-
-def was_undone(version: Mapping[str, Any]) -> bool:
-    """Whether the decision on a version is an undo."""
-    reason = version.get("decision_reason") or ""
-    return version.get("decision") == "rejected" and reason.partition(":")[0] == UNDONE
-
-
 # ---- curve and dynamics -------------------------------------------------------------------------------------------
 
 THRESHOLD_SHARE = 0.05

@@ -173,7 +173,7 @@ def telling(row: Table) -> Telling | None:
         body = {"seq": row.seq, "hash": row.hash, "previous_hash": row.previous_hash, "at_utc": row.at_utc}
         return Telling("audit", str(row.seq), body)
     if isinstance(row, Approval):
-        return Telling("decision", str(row.id), _bounded(_without(row, "reason", "site")))
+        return Telling("decision", str(row.id), _bounded(_without(row, "reason", "site", "undone")))
     if isinstance(row, Participant):
         return Telling("participant", row.code, _bounded(_without(row, "placement")))
     return None

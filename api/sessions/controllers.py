@@ -65,7 +65,7 @@ async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: 
     as `Runner.start`.
     """
     if who.participant is None:
-        if len(seen.sent.get()) == MODEL_TAG:  # it would be played within the participant's limits: those were not seen
+        if len(seen.sent.get()) >= MODEL_TAG:  # it would be played within the participant's limits: those were not seen
             raise seen.another_document(f"/v1/participants/{body.participant}")
         return await runner.start(body, who.name, holder=who.token_hash)
     seen.shown.set(await asyncio.to_thread(store.seen, runner.clock))
@@ -87,7 +87,7 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
     """The test with the plan's limits, where the plan allows it."""
     plan = who.plan or {}
     await asyncio.to_thread(_refuse_other_rate, runner, body)
-    await asyncio.to_thread(_refuse_other_model, runner, body.participant)
+    seen.sent.set(await asyncio.to_thread(_model_sent, runner, body.participant))
     begun = (Test.requested_by == who.name, Test.state != "refused")  # what the rig refused was no trial
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
         raise beyond(f"All {plan['trials']} trials of this key are played. A person can make another key")
@@ -125,11 +125,17 @@ def _refuse_kind(who: Principal, body: TestIn) -> None:
         raise beyond(f"A key sends no {wrong[0]}. Leave it out")
 
 
-def _refuse_other_model(runner: Runner, participant: str) -> None:
-    """The trial was computed with the model that is served now: the approved one, or what was tracked from it."""
+def _model_sent(runner: Runner, participant: str) -> str:
+    """The tag, of those that were sent, of the model that is served now: the approved one, or what was tracked from it.
+
+    Raises ApiError: 409 none of them is.
+    """
     served = [runner.versions.served(participant), runner.trials.tracked.served(participant)]
-    if seen.sent.get() not in [one.etag.strip('"') for one in served if one is not None]:
-        raise trial_overtaken()
+    sent = seen.sent.get().split(", ")
+    for one in served:
+        if one is not None and (tag := one.etag.strip('"')) in sent:
+            return tag
+    raise trial_overtaken()
 
 
 def _refuse_other_rate(runner: Runner, body: TestIn) -> None:

@@ -337,6 +337,14 @@ def _0013(op: Operations) -> None:
             connection.execute(of_person.values(site=[side, muscle, None]))
 
 
+def _0014(op: Operations) -> None:
+    """Whether a rejection was an undo; of what is there, its reason tells."""
+    _add(op, "approvals", "undone boolean?")
+    rows = sa.table("approvals", sa.column("approved"), sa.column("reason"), sa.column("undone", sa.Boolean))
+    said = sa.or_(rows.c.reason == "undone", rows.c.reason.like("undone: %"))
+    op.get_bind().execute(sa.update(rows).values(undone=sa.and_(sa.not_(rows.c.approved), said)))
+
+
 STEPS: dict[str, Callable[[Operations], None]] = {
     name[1:]: step for name, step in globals().items() if re.fullmatch("_[0-9]{4}", name)
 }

@@ -119,6 +119,8 @@ class Approval(Table):
     model_id: Mapped[str] = mapped_column(ForeignKey("models.id"), index=True)
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
     approved: Mapped[bool] = mapped_column(Boolean)
+    undone: Mapped[bool | None] = mapped_column(Boolean, default=False)
+    """Whether a rejection was an undo; no typed reason says so."""
     reason: Mapped[str] = mapped_column(Text, default="")
     by: Mapped[str] = mapped_column(String)
     at_utc: Mapped[str] = mapped_column(String)

@@ -219,12 +219,13 @@ async def note_version(request: Request) -> None:
     if not decision.needed and request.url.path.startswith("/v1/") and "if-match" not in request.headers:
         return
     seen.today.set(lambda: local_day(request.app.state.context.clock.utc()))
-    by_tag = decision.path == "/v1/tests" and re.fullmatch(rf"[0-9a-f]{{{MODEL_TAG}}}", text)
-    outside = decision.field in OF_RIG or by_tag  # of what the rig keeps, and of models: the trail has no such place
-    if not (re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII) if outside else seen.written_as_version(text)):
+    by_tag = decision.path == "/v1/tests" and all(map(_of_model, text.split(", ")))
+    of_rig = decision.field in OF_RIG
+    readable = re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII) if of_rig else seen.written_as_version(text)
+    if not (by_tag or readable):
         raise version_missing(document)
     seen.sent.set(text)
-    if outside:
+    if by_tag or of_rig:  # the trail has no such place
         return
     place = seen.read(text, *marks)
     if place is None:
@@ -249,16 +250,22 @@ async def _names(request: Request, decision: Decision) -> dict[str, str]:
 async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, tuple[str, ...]]:
     """The version, as `If-Match` or the form's field has it, and the marks that it may have: a page's has none.
 
-    Of several the newest of this document.
+    Of several the newest of this document. A controller's key is told nothing of which is the newer: its model's, all.
     """
     fields = request.headers.getlist("if-match")
     if fields:
         tags = [tag.strip('"') for field in fields for tag in entity_tags(field)][:MOST_TAGS]
+        if request.state.who.participant is not None and (models := list(filter(_of_model, tags))):
+            return ", ".join(models), (mark,)
         places = {place.entry: tag for tag in tags if (place := seen.read(tag, mark))}
         return places[max(places)] if places else max(tags, key=lambda tag: bool(seen.written_as_version(tag))), (mark,)
     if "form" not in request.headers.get("content-type", ""):
         return "", (mark,)
     return str((await request.form()).get(decision.field) or ""), ("", mark)
+
+
+def _of_model(tag: str) -> re.Match[str] | None:
+    return re.fullmatch(rf"[0-9a-f]{{{MODEL_TAG}}}", tag)
 
 
 def old_rig() -> ApiError:

@@ -16,8 +16,10 @@ from stimrig.hardware_sim.hidden.kernels import (
     CONTEXT_SIZE,
     COUNT,
     LARGEST_NM,
+    LINGERING,
     PAUSE_S,
     PULSE,
+    RECRUITED,
     ROW,
     SINCE_S,
     SLOTS,
@@ -39,8 +41,9 @@ _REPLACED = ("recruitment", "dynamics")
 
 @nb.njit(cache=True)
 def _run(
-    addresses: Any, p: Any, s: Any, c: Any, x_in: Any, pulse: Any, angle: Any, velocity: Any, first: Any, out: Any
-):
+    addresses: Any, recruiting: Any, p: Any, s: Any, c: Any, x_in: Any, pulse: Any, angle: Any, velocity: Any,
+    first: Any, out: Any,
+):  # fmt: skip
     c_address = c.ctypes.data
     for k in range(x_in.size):
         c[TIME_S] = (first + k) * c[STEP_S]
@@ -58,6 +61,9 @@ def _run(
             c[SINCE_S] = 0.0
         x = x_in[k]
         for i in range(addresses.size):
+            if i == recruiting:
+                c[RECRUITED] = x
+                x += c[LINGERING]
             x = _call(addresses[i], x, p[i].ctypes.data, s[i].ctypes.data, c_address)
         out[k] = x
 
@@ -77,35 +83,47 @@ class Chain:
 
     def __init__(self, stages: list[Stage], largest_nm: float, step_s: float) -> None:
         ordered = sorted(stages, key=lambda stage: SLOTS.index(stage.slot))
-        self._addresses = np.array([stage.kernel.compiled.address for stage in ordered], dtype=np.int64)
+        addresses = np.array([stage.kernel.compiled.address for stage in ordered], dtype=np.int64)
+        recruiting = sum(SLOTS.index(stage.slot) <= SLOTS.index("recruitment") for stage in ordered)
         rows = [stage.rows() for stage in ordered]
-        self._p = np.array([p for p, _ in rows]).reshape(-1, ROW)
+        parameters = np.array([p for p, _ in rows]).reshape(-1, ROW)
         self._s = np.array([s for _, s in rows]).reshape(-1, ROW)
         self._c = np.zeros(CONTEXT_SIZE)
         self._c[STEP_S] = step_s
         self._c[SINCE_S] = 10.0
         self._c[LARGEST_NM] = largest_nm
+        self._stages = (addresses, recruiting, parameters, self._s, self._c)
         self._steps = 0.0
         self._one = np.zeros((5, 1))
 
     def run(self, x: Floats, pulse: Floats, angle_rad: Floats, velocity_rad_s: Floats) -> Floats:
         """Advance by as many steps as `x` has entries; the last stage's output after each step."""
         out = np.empty(x.size)
-        _run(self._addresses, self._p, self._s, self._c, x, pulse, angle_rad, velocity_rad_s, self._steps, out)
+        _run(*self._stages, x, pulse, angle_rad, velocity_rad_s, self._steps, out)
         self._steps += x.size
         return out
 
     def step(
-        self, x: float, pulse: float, at_step: float | None = None, joint: tuple[float, float] = (0.0, 0.0)
-    ) -> float:
-        """One step with the joint at this angle, rad, and velocity, rad/s; `at_step` sets the time, in steps."""
+        self, x: float, pulse: float, at_step: float | None = None, joint: tuple[float, float] = (0.0, 0.0),
+        lingering: float = 0.0,
+    ) -> float:  # fmt: skip
+        """One step with the joint at this angle, rad, and velocity, rad/s; `at_step` sets the time, in steps.
+
+        `lingering` is added to what `x` recruits.
+        """
         one = self._one
         one[0, 0], one[1, 0], one[2, 0], one[3, 0] = x, pulse, *joint
         if at_step is not None:
             self._steps = at_step
-        _run(self._addresses, self._p, self._s, self._c, one[0], one[1], one[2], one[3], self._steps, one[4])
+        self._c[LINGERING] = lingering
+        _run(*self._stages, one[0], one[1], one[2], one[3], self._steps, one[4])
         self._steps += 1.0
         return float(one[4, 0])
+
+    @property
+    def recruited(self) -> float:
+        """What the width of the last step recruited."""
+        return float(self._c[RECRUITED])
 
     def save(self) -> tuple[Floats, Floats, float]:
         """The state as it is now."""

@@ -39,6 +39,8 @@ ACTIVATION = 9  # recruited share, 0 to 1, before any gain
 FORCE = 10  # output of the dynamics one step before, as a share of the largest torque
 SPEED = 11  # factor on the rates of the dynamics; 1 unless an earlier stage changes it
 LARGEST_NM = 12
+RECRUITED = 13  # what comes out of recruitment
+LINGERING = 14  # what earlier pulses still recruit besides
 CONTEXT_SIZE = 16
 
 SLOTS = (

@@ -6,12 +6,12 @@ import math
 from typing import Protocol
 
 from stimrig.hardware_sim.hidden.base import Base
-from stimrig.hardware_sim.hidden.chain import Chain, split
+from stimrig.hardware_sim.hidden.chain import TRAIN_GAP_S, Chain, split
 from stimrig.hardware_sim.hidden.kernels import Floats, Stage
 
 STEPS_PER_S = 1600.0
-PULSE_PERIOD_S = 0.025
-LATE_S = 0.005
+PERIOD_STEPS = 0.025 * STEPS_PER_S
+LATE_STEPS = 0.005 * STEPS_PER_S
 NOMINAL_CURRENT_MA = 20.0
 REMEMBERED_STEPS = 64
 """More than the latest pulse can go back: 5 ms and a delivery."""
@@ -36,7 +36,8 @@ class HiddenMuscle:
     """A muscle made of stages; it implements the `Muscle` protocol. Its joint is still unless a limb tells it.
 
     A pulse's width is held for 25 ms. Jitter leaves gaps between two holds; a gap of up to 5 ms is closed by going back
-    to its beginning. Another current than 20 mA scales the width by charge.
+    to its beginning. A longer one stays: the pulse after it is late, and acts for its 25 ms besides the next one, as
+    two twitches add up. Another current than 20 mA scales the width by charge.
 
     Parameters
     ----------
@@ -55,6 +56,8 @@ class HiddenMuscle:
         self._width_us = 0.0
         self._arrivals: list[float] = []
         self._hold_end = -math.inf
+        self._late = 0.0  # of the last pulse, in steps, where a gap before it stays open
+        self._lingering: list[tuple[float, float, float]] = []  # begin and end in steps, what a late pulse recruits
         self._at_hold_end: tuple[_Saved, int, tuple[float, float], float] | None = None
         self._joint = (0.0, 0.0)
         self._joints = [self._joint] * REMEMBERED_STEPS  # by step, for going back; known up to and with `_joints_known`
@@ -69,15 +72,23 @@ class HiddenMuscle:
         at = time_s * STEPS_PER_S
         width = width_us * current_ma / NOMINAL_CURRENT_MA
         self._run_to(math.floor(at + 1e-6))
-        late = at - self._hold_end
-        if 0.0 < late <= LATE_S * STEPS_PER_S:
-            self._close_gap(at)
+        gap = at - self._hold_end
+        if gap < 0.0:
+            self._linger(at, min(-gap, self._late))
+        else:
+            late = (self._late + gap) % PERIOD_STEPS  # a multiple of the period is a pulse that was left out
+            if gap > TRAIN_GAP_S * STEPS_PER_S or late > PERIOD_STEPS - LATE_STEPS:
+                self._late = 0.0
+            elif gap > LATE_STEPS:
+                self._late = late
+            if 0.0 < gap <= LATE_STEPS:
+                self._close_gap(at)
         self._at_hold_end = None
         self._edges = [edge for edge in self._edges if edge[0] < at]
-        self._edges += [(at, width), (at + PULSE_PERIOD_S * STEPS_PER_S, 0.0)]
+        self._edges += [(at, width), (at + PERIOD_STEPS, 0.0)]
         if width > 0.0:
             self._arrivals.append(at)
-        self._hold_end = at + PULSE_PERIOD_S * STEPS_PER_S
+        self._hold_end = at + PERIOD_STEPS
 
     def torque_nm(self, time_s: float) -> float:
         """Advance to `time_s` and return the torque on the load cell, N·m, without noise and converter."""
@@ -103,11 +114,23 @@ class HiddenMuscle:
         self._at_hold_end = None
         self._run_to(reached)
 
+    def _linger(self, at: float, steps: float) -> None:
+        """Let the last pulse, cut at `at`, act on for these steps besides the new one.
+
+        It begins after the step of the new pulse: from that one a muscle takes what the new pulse alone recruits.
+        """
+        self._late -= steps
+        begin = math.ceil(at - 1e-6) + 1.0
+        self._lingering = [one for one in self._lingering if one[1] > self._done - REMEMBERED_STEPS]
+        self._lingering.append((begin, begin + steps, self._muscle.recruited))
+
     def _run_to(self, step: int) -> None:
         while self._done < step:
             width, pulse = self._input()
             self._done += 1
-            torque_nm = self._muscle.step(width, pulse, float(self._done), self._joint_at(self._done))
+            now = float(self._done)
+            more = sum(what * max(min(end, now) - max(begin, now - 1.0), 0.0) for begin, end, what in self._lingering)
+            torque_nm = self._muscle.step(width, pulse, now, self._joint_at(self._done), more)
             self._values = (self._values[1], torque_nm)
 
     def _joint_at(self, step: int) -> tuple[float, float]:

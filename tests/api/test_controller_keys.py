@@ -133,6 +133,25 @@ def test_whoever_does_not_say_with_which_model_is_told_of_a_document_that_the_ke
             assert told == ["/v1/participants/P1/model"] and key.get(told[0]).status_code == 200
 
 
+def test_of_several_tags_one_that_matches_is_enough(
+    shared: Service, one_key: str, done: dict[str, Any], admin: httpx.Client
+) -> None:
+    """RFC 9110, section 13.1.1: a list."""
+    other = admin.get("/v1/participants/P2/model").headers["etag"]
+    bearer = {"Authorization": f"Bearer {one_key}"}
+    with httpx.Client(base_url=shared.url, headers=bearer) as key:
+        own = key.get("/v1/participants/P1/model").headers["etag"]
+        for tags, status in (
+            ('"abc", "def"', 428), ("*", 428), (f'"abc", {other}', 409), (f'{other}, W/"abc",{own}', 202)
+        ):  # fmt: skip
+            answer = key.post("/v1/tests", json=TRIAL, headers={"If-Match": tags})
+            assert answer.status_code == status, (tags, answer.text)
+    wait_done(admin, answer.json()["id"])
+    begun = shared.context.store.all(AuditEntry, AuditEntry.subject == answer.json()["id"], order=AuditEntry.seq)[0]
+    assert begun.detail["seen"] == own.strip('"'), "the trail names the one that counted"
+    assert admin.post("/v1/tests", json=TRIAL, headers={"If-Match": f"{own}, {other}"}).status_code in (409, 428)
+
+
 def test_what_is_anothers_is_refused_as_what_is_not_there(key: httpx.Client, done: dict[str, dict[str, Any]]) -> None:
     other = done["P2"]
     tried = {

@@ -121,7 +121,7 @@ def test_an_export(tmp_path: Path) -> None:
     for number, text in enumerate(HOSTILE):
         write(data / f"{number}.h5", Session(f"{text}{number}", seed=number, kind=text))
     (data / "=broken.csv").write_text("a,b\n=1,2\n")
-    assert main.run(["export", str(data), "--bids", str(tmp_path / "out"), "--json"]) == 0
+    assert main.run(["export", str(data), "--bids", str(tmp_path / "out"), "--json"]) == 1
     tables = sorted((tmp_path / "out").rglob("*.tsv"))
     assert len(tables) > len(HOSTILE)
     for path in tables:

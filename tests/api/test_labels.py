@@ -68,7 +68,10 @@ def test_a_person_types_it_and_reads_it_on_every_page(service: Service) -> None:
         started = browser.post(question, data={"csrf": csrf(browser)}).headers["location"]
         test = wait_done(http, started.rpartition("/")[2])
         model = http.get(f"/v1/models/{test['model_id']}/file").json()
-        assert "posture        next-experiment" in report_lines(test, model)
+        told = report_lines(test, model)
+        assert "posture        next-experiment" in told
+        dose = re.search(r"<dt>Dose</dt><dd>(\S+ mC)", browser.get(started).text.replace("\u00a0", " "))
+        assert dose and f"dose           {dose[1]} a phase" in "\n".join(told).replace("\u00a0", " "), "in one unit"
         for page, words in (
             (started, '<dt>Posture</dt><dd translate="no">next-experiment</dd>'),
             ("/participants/L1", '<span class="dim" title="Posture" translate="no">next-experiment</span>'),

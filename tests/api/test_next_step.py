@@ -197,6 +197,10 @@ def test_an_undo_is_called_so_and_says_how_to_have_it_back(
     assert ">undone</span>" in after and "not plausible" in after
     client.post(f"/v1/models/{better}/approve")
     assert "was undone" not in pages.get(f"/models/{model}").text
+    client.post(f"/v1/models/{better}/reject", json={"reason": "undone: by hand, with a typed reason"})
+    assert "was undone" not in pages.get(f"/models/{model}").text
+    typed = pages.get(f"/models/{better}").text
+    assert "Rejected by" in typed and "undone: by hand, with a typed reason" in typed and "Undone by" not in typed
 
 
 def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Service, participant: str) -> None:

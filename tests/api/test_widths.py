@@ -98,8 +98,10 @@ def test_the_participants_limit_holds_and_what_is_beyond_is_named(client: httpx.
     assert "above-plateau" in {one["reason"] for one in found["unreachable"]}
     narrow = client.post(ask, json={"reference_torque_nm": wanted, "max_pulse_width_us": 180.0}).json()
     assert max(narrow["pulse_width_us"]) == 180.0
-    slow = client.post(ask, json={"reference_torque_nm": wanted, "max_rise_us": 5.0}).json()
-    assert np.max(np.diff(slow["pulse_width_us"], prepend=0.0)) <= 5.0
+    slow = client.post(ask, json={"reference_torque_nm": wanted, "max_rise_us": 46.0}).json()
+    assert 45.0 <= np.max(np.diff(slow["pulse_width_us"], prepend=0.0)) <= 46.0
+    stuck = client.post(ask, json={"reference_torque_nm": wanted, "max_rise_us": 44.0})
+    assert stuck.status_code == 422 and "no pulse below 45 µs. Allow more" in stuck.json()["detail"]
 
 
 SENSELESS: list[tuple[dict[str, object], str]] = [

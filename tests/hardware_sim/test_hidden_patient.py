@@ -83,6 +83,20 @@ def test_jitter_delays_but_tears_no_holes() -> None:
     assert jittered.max() == pytest.approx(steady.max(), rel=0.01)
 
 
+@pytest.mark.parametrize("late_ms", [7.0, 12.0, 18.0])
+def test_a_late_pulse_acts_whole_and_so_does_the_next(late_ms: float) -> None:
+    """What the pulses drive is the same in the end; the next one cut a late one, which looked like an effort."""
+    scenario = draw_scenario((), "middle", 401)
+    width_us = np.maximum(scenario.design.width_us, 0.5 * scenario.base.largest_width_us)  # a train without rests
+    scenario = replace(scenario, design=replace(scenario.design, width_us=width_us))
+    late = np.zeros(width_us.size)
+    late[[100, 110, 111, 130]] = late_ms / 1e3  # twice alone, twice in a row
+    steady, moved = (play(HiddenMuscle(scenario), scenario, one) for one in (0.0, late))
+    drive = float(steady.mean()) * 0.025  # of one pulse, N·m·s
+    assert np.abs(moved - steady).max() > 0.001 * scenario.base.largest_nm
+    assert abs(float(np.sum(moved - steady)) / RATE_HZ) < 0.1 * drive
+
+
 def test_going_back_for_a_late_pulse_finds_the_joint_where_it_was() -> None:
     scenario = draw_scenario(("torque_velocity",), "strong", 401)
     assert np.abs(play_moving(scenario, 0.004) - play_moving(scenario)).max() < 0.06 * scenario.base.largest_nm

@@ -171,6 +171,20 @@ def test_a_rise_begins_with_the_shortest_pulse_that_is_sent():
     assert found.pulse_width_us[first] == 30.0 and first < 20 and found.pulse_width_us[first + 1] > 50.0
 
 
+@pytest.mark.parametrize(
+    ("given", "place"),
+    [
+        ({"rise_us": 15.0}, "rise_us: at most 15 µs"), ({"rise_us": 20.4, "largest_us": 300.0}, "rise_us: at most 20"),
+        ({"largest_us": 20.0}, "largest_us: at most 20 µs"),
+    ],
+)  # fmt: skip
+def test_limits_under_which_nothing_can_be_sent_are_named_instead_of_the_torque(given: dict[str, float], place: str):
+    """All widths were 0, and the muscle was said to be too slow."""
+    with pytest.raises(BadRequest, match=f"{place}.* no pulse below 20.5 µs. Allow more"):
+        invert(muscle(), Reference.of(smooth(3.0)), shortest_us=20.5, **given)
+    assert np.any(invert(muscle(), Reference.of(smooth(3.0)), rise_us=21.0, shortest_us=20.5).pulse_width_us)
+
+
 @pytest.mark.parametrize("shortest_us", [float("nan"), float("inf"), -5.0])
 def test_a_shortest_pulse_that_is_no_width_is_refused(shortest_us: float):
     with pytest.raises(BadRequest, match="shortest_us"):

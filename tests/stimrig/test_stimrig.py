@@ -22,6 +22,7 @@ from stimrig.api.progress_bar import in_notebook
 from stimrig.api.web.responses.models import JobOut, VersionOut
 from stimrig.api.web.responses.people import ParticipantOut
 from stimrig.api.web.responses.rig import TestOut
+from stimrig.api.workers import process
 from stimrig.errors import BadRequest
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
 from tests.api.test_worker import made_up_csv
@@ -204,6 +205,33 @@ def test_adding_an_effect_as_a_job_and_at_once(client: Client) -> None:
     with pytest.raises(errors.Conflict, match=r"in the model"):
         client.add_effects(child["id"], ["fatigue"], progress=lambda *_: None)
     assert client.improve(model_id)["parent_id"]
+
+
+def test_long_work_may_last_longer_than_an_answer(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each asks for a job and follows it: an answer that waits for the work would come after `timeout_s`."""
+    model_id = client.run_test("P017")["model_id"]
+    ways: list[tuple[str, str]] = []
+    request = client.request
+
+    def watched(method: str, path: str, **more: Any) -> Any:
+        ways.append((path.rpartition("/")[2], str(more.get("params"))))
+        return request(method, path, **more)
+
+    monkeypatch.setattr(client, "request", watched)
+    client.improve(model_id)
+    client.diagnosis(model_id)
+    client.add_effects(model_id, ["fatigue"])
+    begun = [one for one in ways if one[0] in ("improve", "diagnosis", "effects") and one[1] != "None"]
+    assert begun == [(name, "{'wait': False}") for name in ("improve", "diagnosis", "effects")]
+    assert any(name.startswith("J") for name, _ in ways), "and the job is asked after"
+
+
+def test_an_upload_waits_as_long_as_the_service_works_on_it(client: Client) -> None:
+    waits: list[Any] = []
+    client.http.event_hooks = {"request": [lambda request: waits.append(request.extensions.get("timeout"))]}
+    with pytest.raises(errors.Invalid):
+        client.upload("P017", b"")
+    assert waits[-1]["read"] >= process.WALL_FACTOR * (process.PROCESSOR_S["fit"] + process.PROCESSOR_S["carry"])
 
 
 def test_what_progress_raises_cancels_the_job(client: Client) -> None:

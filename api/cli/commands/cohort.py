@@ -22,7 +22,7 @@ from stimrig.api.cli.terminal import Json, names, say, say_json, table, write
 from stimrig.api.progress_bar import in_notebook, progress_bar
 
 if TYPE_CHECKING:
-    from stimrig.api.cohort.run import Tally
+    from stimrig.api.cohort.tally import Tally
 
 NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
 
@@ -122,7 +122,7 @@ def run(
     given = {name: value for name, value in locals().items() if name != "as_json"}
     found = computed(**given)
     say_json(found) if as_json else say(*run_lines(found))
-    refuse_nothing(found["ok"], found["errors"], f"{output} says of each why")
+    refuse_undone(found["ok"], found["errors"], f"{output} says of each why")
 
 
 def computed(
@@ -178,11 +178,13 @@ def computed(
     }
 
 
-def refuse_nothing(done: int, failed: int, where: str) -> None:
-    """End with an exit code where nothing of what was asked for was done. Raises CommandError, after the report."""
-    if not done:
-        why = f"none of {failed} records gave a result: {where}." if failed else "no record was selected."
-        raise CommandError(f"nothing was done: {why}")
+def refuse_undone(done: int, failed: int, where: str) -> None:
+    """End with an exit code where not all of what was asked for was done. Raises CommandError, after the report."""
+    nothing = "" if done else "nothing was done: "
+    if failed:
+        raise CommandError(f"{nothing}{failed} of {done + failed} records gave no result: {where}.")
+    if nothing:
+        raise CommandError(f"{nothing}no record was selected.")
 
 
 def changed(

@@ -9,7 +9,16 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.commands.cohort import Columns, Given, Select, Token, need_extra, passed_over, refuse_nothing
+from stimrig.api.cli.commands.cohort import (
+    Columns,
+    Given,
+    Select,
+    Token,
+    need_extra,
+    passed_over,
+    refuse_undone,
+    telling,
+)
 from stimrig.api.cli.errors import CommandError, InputError
 from stimrig.api.cli.terminal import Json, say, say_json
 
@@ -29,7 +38,7 @@ def export(
     given = {name: value for name, value in locals().items() if name != "as_json"}
     found = exported(**given)
     say_json(found) if as_json else say(*report(found))
-    refuse_nothing(found["records"], found["errors"], f"{found['errors_file']} says of each why")
+    refuse_undone(found["records"], found["errors"], f"{found['errors_file']} says of each why")
 
 
 def exported(
@@ -49,7 +58,6 @@ def exported(
     from stimrig.api.cohort.select import Selection
     from stimrig.api.cohort.sources import sources_of
     from stimrig.api.cohort.tasks import CutOffError
-    from stimrig.api.progress_bar import progress_bar
 
     selection, sources, mapped = Selection(select), sources_of(data, token), columns or []
     writer = bids_files if parquet is None else parquet_files
@@ -58,22 +66,17 @@ def exported(
     for source in sources:
         source.check()
     options = {"format": writer.NAME, "hide": no_dates, "shift_days": shift_days, "columns": mapped}
-    with closing(State(folder, options)) as state, progress_bar() as bar:
+    with closing(State(folder, options)) as state, telling() as tell:
         days = Days(no_dates, shift_days)
         try:
-            told = Export(sources, selection, state, writer, days, mapped, lambda t: bar(0.0, _words(t))).go()
+            told = Export(sources, selection, state, writer, days, mapped, tell).go()
         except CutOffError as error:
             raise CommandError(f"{error}") from error
         return {
             "output": str(folder), "format": writer.NAME, "records": state.count("done"),
-            "errors": state.count("failed"), "written": told.written, "done_before": told.before,
+            "errors": state.count("failed"), "written": told.ok, "done_before": told.before,
             "left_out": told.left_out, "copies": told.copies, "errors_file": str(folder / ERRORS),
         }  # fmt: skip
-
-
-def _words(tally: Any) -> str:
-    failed = f", {tally.failed} failed" if tally.failed else ""
-    return f"{tally.written + tally.before} records{failed}"
 
 
 def report(found: dict[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from jinja2.runtime import Context
 
 from stimrig.api import clinical_words, effect_words, language
 from stimrig.api.models.changes import dose_words
-from stimrig.api.models.stored_model import followed, was_undone
+from stimrig.api.models.stored_model import followed
 from stimrig.rig.messages import LABEL_TITLES
 
 HERE = Path(__file__).parent
@@ -69,7 +69,7 @@ def in_its_language(words: Callable[..., Any]) -> Callable[..., Any]:
 
 environment.filters.update({name: in_its_language(words_of) for name, words_of in {
     "number": number, "followed": followed, "figures": figures, "when": language.when, "clock": language.clock,
-    "was_undone": was_undone, "day": language.day, "until": language.until,
+    "day": language.day, "until": language.until,
     "translated": language.translated, "plain_words": language.plain, "localised": language.localised,
     "words": clinical_words.words, "segment_words": clinical_words.segment_words, "degrees": clinical_words.degrees,
     "effect_words": effect_words.effect_words, "effects_words": effect_words.effects_words,

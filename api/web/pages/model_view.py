@@ -147,7 +147,7 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
         "job": job.document() if job and not found and job.state in ("running", "completed") else None,
         "why_problem": job.problem if job and job.state == "failed" else None,
         "versions": rows,
-        "undone": next((each for each in later[:1] if stored_model.was_undone(each)), None),
+        "undone": next((each for each in later[:1] if each["undone"]), None),
         "decided": explanation.decided(context.analyses.experiment_before(row), found, row.effects) if found else "",
         "added": {effect: each["id"] for each in later for effect in (each["added_effect"] or "").split(",")},
         "carried": carried_structure.carried_context(context.versions, row, found),

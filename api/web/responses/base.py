@@ -60,6 +60,18 @@ class ChangeOut(Document):
     seen: EntryOut | None = Field(description="what was there when it was seen; null: nothing, or not known")
 
 
+class ReachOut(Document):
+    """What was said of an adaptive test's target before the first pulse."""
+
+    reachable: bool
+    curve_percent: float | None = Field(description="half-width of the curve's band at the end, %; null: none at all")
+    step_percent: float | None = Field(description="of the step response, %")
+    seconds: float = Field(description="what the test would take, s")
+    torque_time_nm_s: float = Field(description="what it would cost, N·m·s")
+    words: str
+    known: bool = Field(False, description="whether a model of an earlier session helps")
+
+
 class Problem(Document):
     """Why a request failed (RFC 9457)."""
 
@@ -80,6 +92,11 @@ class Problem(Document):
     latch: str = Field(
         "", description="409 of a re-arm: names the stop of now; send it as `If-Match` once it was looked at"
     )
+    of: str | None = Field(None, description="409 `other-participant`: whose recording it is; send it as `of`")
+    reach: ReachOut | None = Field(None, description="422 `out-of-reach`: what the adaptive test will probably reach")
+    have_bytes: int | None = Field(None, description="409 `other-offset`: what a centre has of the file; go on there")
+    seq: int | None = Field(None, description="409 `out-of-order`: the last item that a centre has; go on after it")
+    hash: str | None = Field(None, description="409 `out-of-order`: its hash")
     evidence: StopEvidence | None = Field(None, description="503 `stop-not-confirmed`: what is known of the stop")
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from stimrig.api.client import documents
-from stimrig.api.web.responses.base import Document, Holder, SegmentOut, fields_of
+from stimrig.api.web.responses.base import Document, Holder, ReachOut, SegmentOut, fields_of
 from stimrig.api.web.responses.models import SegmentSpan, VersionOut
 from stimrig.rig.messages import AngleStatus, Bound, CalibrationStatus, LiveEvent, ProtocolInfo, RigState, StopEvidence
 
@@ -103,18 +103,6 @@ class PlannedOut(Document):
     charge_uc: float = Field(0.0, description="charge of one phase, summed over the pulses, µC")
     torque_time_nms: float | None = Field(None, description="estimated torque-time, N·m·s; null without a model")
     segments: list[SegmentSpan] = Field([])
-
-
-class ReachOut(Document):
-    """What was said of an adaptive test's target before the first pulse."""
-
-    reachable: bool
-    curve_percent: float | None = Field(description="half-width of the curve's band at the end, %; null: none at all")
-    step_percent: float | None = Field(description="of the step response, %")
-    seconds: float = Field(description="what the test would take, s")
-    torque_time_nm_s: float = Field(description="what it would cost, N·m·s")
-    words: str
-    known: bool = Field(False, description="whether a model of an earlier session helps")
 
 
 class PreviewOut(PlannedOut):

@@ -8,6 +8,9 @@ import json
 import math
 import shutil
 import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +22,14 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.cli import main
+from stimrig.api.cli.commands import export as export_verb
 from stimrig.api.cohort import parquet as parquet_files
-from stimrig.api.cohort.export import Days, Export, Writer
+from stimrig.api.cohort.export import ERRORS, Days, Export, Writer
 from stimrig.api.cohort.export_state import FOLDER, State
 from stimrig.api.cohort.parquet import STATUS
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import sources_of
+from stimrig.api.cohort.tally import Tell
 from stimrig.api.cohort.tasks import CohortError, CutOffError
 from stimrig.rig import archive, assembly, journal
 from tests.api.test_schemas import unmet
@@ -58,7 +63,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def exported(data: Path, folder: Path, kind: str, *options: str) -> None:
-    assert main.run(["export", str(data), f"--{kind}", str(folder), "--json", *options]) == 0
+    """Export what is there; exit code 1 if, and only if, something of it could not be."""
+    code = main.run(["export", str(data), f"--{kind}", str(folder), "--json", *options])
+    with (folder / ERRORS).open() as file:
+        assert code == bool(list(csv.DictReader(file)))
 
 
 def sealed_files(data: Path) -> dict[str, Path]:
@@ -248,12 +256,12 @@ def test_one_that_is_cut_off_goes_on_and_ends_as_if_it_had_not_been(data: Path, 
     (tmp_path / "cut" / FOLDER / "1234.part").write_bytes(b"left by a kill")
     assert not (tmp_path / "cut" / "samples" / "half.parquet").exists()
     again = run(tmp_path / "cut", parquet_files)
-    assert (again.tally.before, again.tally.written) == (2, 3)
+    assert (again.tally.before, again.tally.ok) == (2, 3)
     run(tmp_path / "whole", parquet_files)
     assert content(tmp_path / "cut") == content(tmp_path / "whole")
     assert list((tmp_path / "cut" / FOLDER).glob("*.part")) == []
     third = run(tmp_path / "cut", parquet_files)
-    assert (third.tally.before, third.tally.written) == (5, 0)
+    assert (third.tally.before, third.tally.ok) == (5, 0)
 
 
 def test_a_record_that_changed_takes_the_place_of_what_it_was(tmp_path: Path) -> None:
@@ -327,6 +335,28 @@ def test_a_folder_of_something_else_is_left_alone(data: Path, tmp_path: Path, ca
     assert "other options" in capsys.readouterr().err
     assert main.run(["export", str(tmp_path / "nowhere"), "--bids", str(tmp_path / "new")]) == 2
     assert not (tmp_path / "new").exists()
+
+
+def test_one_of_several_that_fails_is_told_and_the_others_are_done(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A shell script goes on after an exit code 0: it believed that all was exported."""
+    shown: list[tuple[int, int | None]] = []
+
+    @contextmanager
+    def telling() -> Iterator[Tell]:
+        yield lambda tally: shown.append((tally.handled, tally.total))
+
+    monkeypatch.setattr(export_verb, "telling", telling)
+    monkeypatch.setattr(threading.Thread, "start", threading.Thread.run)  # counted before the first is written
+    bad = tmp_path / "bad.h5"
+    bad.write_bytes(b"no recording")
+    given = [str(data / "session-0.h5"), str(bad), str(data / "session-2.h5")]
+    assert main.run(["export", *given, "--bids", str(tmp_path / "out"), "--json"]) == 1
+    out, err = capsys.readouterr()
+    assert (json.loads(out)["records"], json.loads(out)["errors"]) == (2, 1)
+    assert err.count("\n") == 1 and "1 of 3 records gave no result" in err and str(tmp_path / "out" / ERRORS) in err
+    assert shown == [(1, 3), (2, 3), (3, 3)], "the bar knows of how many"
 
 
 def test_records_are_read_from_a_bucket_too(data: Path, tmp_path: Path) -> None:

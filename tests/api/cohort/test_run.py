@@ -21,9 +21,10 @@ from stimrig.api.cohort import computing, run
 from stimrig.api.cohort.cluster import check_versions
 from stimrig.api.cohort.computing import close_all
 from stimrig.api.cohort.results import Results
-from stimrig.api.cohort.run import AHEAD, LARGEST_PARCEL, Parcels, Run, Tally
+from stimrig.api.cohort.run import AHEAD, LARGEST_PARCEL, Parcels, Run
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import Entry, Source, sources_of
+from stimrig.api.cohort.tally import Tally
 from stimrig.api.cohort.tasks import CohortError, CutOffError, Task, checked
 from stimrig.api.version import software_version
 from tests.harness.cohort_records import broken, cohort
