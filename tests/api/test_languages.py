@@ -23,6 +23,8 @@ from stimrig.api.language import best, extract, translated
 from stimrig.api.language.translated import PERSON, of
 from stimrig.api.models import advice
 from stimrig.api.store.tables import Model
+from stimrig.identify.effects import find_effect
+from stimrig.rig.limits import HARD_LIMITS
 from tests.api.conftest import STUB, Service, csrf, run_service, run_test, signed_in
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
@@ -150,6 +152,14 @@ def forms_of(text: Any) -> tuple[str, ...]:
 def test_every_message_has_its_translation(code: str) -> None:
     """`python -m stimrig.api.language.extract --check` says the same; `make words` renews the catalogues."""
     assert extract.missing(code) == []
+
+
+def test_no_page_takes_the_muscle_for_one_of_the_arm() -> None:
+    """But for where a number of the rig's limits comes from, and a sentence that is stored with diagnoses."""
+    elbows = {text for limit in HARD_LIMITS.values() for text in (limit.reason, limit.source)}
+    elbows.add(find_effect("torque_angle").plain)
+    joint = re.compile(r"(?<!re-)(?<!lever )(?<!moment )\b(?:arms?|forearms?|elbows?)\b", re.IGNORECASE)
+    assert {text for text in map(language.first, extract.messages()) if joint.search(text)} <= elbows
 
 
 @pytest.mark.parametrize("code", LANGUAGES)

@@ -25,7 +25,7 @@ from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment, number
 from stimrig.api.web.routes import participants
 
-NOBODY = lazy("today nobody has tested which pulse widths are felt, move the arm and are comfortable")
+NOBODY = lazy("today nobody has tested which pulse widths are felt, move the limb and are comfortable")
 
 
 @dataclass(frozen=True)
