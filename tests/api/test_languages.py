@@ -410,6 +410,34 @@ def test_every_text_of_a_page_is_a_message(page: str, browser: httpx.Client, ids
     assert untranslated(answer.text) == [], "\n".join(untranslated(answer.text))
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_has_one_first_button_at_most(page: str, browser: httpx.Client, ids: dict[str, str]) -> None:
+    assert len(first_buttons(browser.get(page.format(**ids)).text)) <= 1
+
+
+def test_with_nobody_but_a_token_the_first_button_is_the_tokens(browser: httpx.Client) -> None:
+    (first,) = first_buttons(browser.get("/sign-in").text)
+    assert "token" in first
+
+
+def test_in_a_calibration_and_beside_a_running_test_there_is_one_first_button(
+    service: Service, browser: httpx.Client, ids: dict[str, str]
+) -> None:
+    page = browser.get("/participants/X2").text
+    form = {"csrf": csrf(browser), "seen": re.findall(r'name="seen" value="([^"]+)"', page)[0]}
+    begun = browser.post("/participants/X2/calibration", data=form)
+    calibrating = browser.get(begun.headers["location"]).text
+    refused = browser.post("/participants/X1/calibration", data=form)
+    assert [refused.status_code, len(first_buttons(calibrating)), len(first_buttons(refused.text))] == [409, 1, 1]
+    (version,) = set(re.findall(r'name="calibration" value="([^"]+)"', calibrating))
+    ended = browser.post("/participants/X2/calibration/discard", data={**form, "calibration": version})
+    assert ended.status_code == 303, ended.text
+
+
+def first_buttons(html: str) -> list[str]:
+    return re.findall(r'<(?:a|button)[^>]*class="[^"]*\bprimary\b[^>]*>([^<]*)<', html)
+
+
 def test_the_question_before_a_test_is_translated(browser: httpx.Client, ids: dict[str, str]) -> None:
     seen = re.findall(r'name="seen" value="([^"]+)"', browser.get("/participants/X1").text)[0]
     form = {"csrf": csrf(browser), "seen": seen}
