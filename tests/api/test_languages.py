@@ -326,6 +326,19 @@ def test_who_stopped_may_have_a_name_of_several_words(who: str):
     assert of("de", f"stop pressed on the page (by {who}).") == f"Stopp auf der Seite gedrückt (durch {who})."
 
 
+@pytest.mark.parametrize(("english", "german"), [
+    ("1 acknowledgement came late, 40 ms after the pulse was sent; this pulse may have been felt that late; 1 pulse "
+     "that came due meanwhile was dropped",
+     "1 Bestätigung kam verspätet, 40 ms nach dem Senden des Pulses; dieser Puls kann so viel später gespürt "
+     "worden sein; 1 inzwischen fälliger Puls wurde ausgelassen"),
+    ("2 acknowledgements came late, up to 40 ms after the pulse was sent; these pulses may have been felt that late; 0 "
+     "pulses that came due meanwhile were dropped", "2 Bestätigungen kamen verspätet, bis zu 40 ms nach dem Senden des "
+     "Pulses; diese Pulse können so viel später gespürt worden sein; 0 inzwischen fällige Pulse wurden ausgelassen"),
+])  # fmt: skip
+def test_one_of_a_kind_is_told_as_one_in_german(english: str, german: str):
+    assert of("de", f"stimulator: {english}") == f"Stimulator: {german}"
+
+
 def test_what_confirms_a_stop_is_told_in_german():
     told = of("de", "device: not initialised; torque fell from 9 to 4 N·m")
     assert told == "Gerät: gibt keine Pulse ab (nicht initialisiert); das Drehmoment fiel von 9 auf 4 N·m"
