@@ -179,6 +179,7 @@ def test_nobody_and_no_session(service: Service, client: httpx.Client) -> None:
     assert "No session with a model yet." in page.text and '<svg class="trend"' not in page.text
     made(service, "FIRST", three()[:1])
     first = client.get("/participants/FIRST/trend").text
+    assert "A delay may be below zero by up to one sample" in first
     assert "The trend begins with the second one." in first and first.count('<svg class="trend"') == 9
 
 
@@ -222,6 +223,7 @@ def compared(client: httpx.Client, days: list[str], **more: str) -> str:
 
 def test_six_models_with_their_differences_to_the_oldest(client: httpx.Client, days: list[str]) -> None:
     page = compared(client, days[5:0:-1] + days[:1])
+    assert "A delay may be below zero by up to one sample" in page
     found = cells(page, "Plateau")
     assert len(found) == 6 and found[0][1] == ""
     values = [float(value.split(" ±")[0]) for value, _ in found]
