@@ -131,7 +131,7 @@ def test_a_dose_is_told_in_one_unit_and_says_what_it_counts(client: httpx.Client
     assert changes.dose_words(12_345.6) == "12.35\u00a0mC" and changes.dose_words(None) == "–"
     page = compared(client, days[:2])
     assert "Dose of the day" in page and "behind a difference that of both values together" in page
-    assert "over all pulses of all 1 tests of that day, stopped ones, too" in page
+    assert "over all pulses of that day&#39;s tests (1), stopped ones, too" in page
 
 
 def test_models_from_before_the_figures_are_read_once(tmp_path: Path, short_dir: Path) -> None:
