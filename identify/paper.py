@@ -13,7 +13,7 @@ import numpy as np
 
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.fitting import fit
-from stimrig.identify.records.record import Record
+from stimrig.identify.records.record import HELD_OUT, Record
 from stimrig.identify.simulation.predict import predict
 
 A1_NM, A2_PER_US, A3 = 6.8994, 0.0410, 2389.7
@@ -70,7 +70,7 @@ def protocol() -> tuple[np.ndarray, list[str]]:
         ("rest", np.zeros(200)),
         ("ramp", ramp()),
         ("rest", np.zeros(120)),
-        ("validate", multilevel()),
+        (HELD_OUT, multilevel()),
         ("rest", np.zeros(40)),
     ]
     return np.concatenate([part for _, part in parts]), [name for name, part in parts for _ in part]
@@ -101,7 +101,7 @@ def score(record: Record, clean_nm: np.ndarray, method: str, **options: Any) -> 
     """Best-fit rates of one fit, %: noisy ramp, clean ramp, unseen input (clean), and the ceiling set by the noise."""
     predicted = predict(fit(record, method=method, **options), record)
     names = np.array(record.segment_names)[record.segment]
-    ramp, unseen = names == "ramp", names == "validate"
+    ramp, unseen = names == "ramp", names == HELD_OUT
     return {
         "noisy": best_fit_percent(record.torque_nm[ramp], predicted[ramp]),
         "ceiling": best_fit_percent(record.torque_nm[ramp], clean_nm[ramp]),

@@ -247,7 +247,11 @@ class _Pulses:
         silent = sent & ~np.isfinite(self._acked_s)
         self._status[silent] = PulseStatus.UNACKNOWLEDGED
         self._as_planned(sent)
-        notes.append(f"{int(sent.sum())} pulses were sent whose intents are lost: their planned values are used")
+        notes.append(
+            "1 pulse was sent whose intent is lost: its planned value is used"
+            if sent.sum() == 1
+            else f"{int(sent.sum())} pulses were sent whose intents are lost: their planned values are used"
+        )
         if unknown := int(np.sum(sent & (self._planned == 0))):
             notes.append(f"the width of {unknown} of them is unknown")
 

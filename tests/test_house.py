@@ -96,6 +96,18 @@ def test_no_private_name_crosses_modules_of_identify() -> None:
     assert offenders == []
 
 
+def test_the_segment_that_is_held_out_has_its_name_from_one_place() -> None:
+    """Beside its constant it stands in the table of words for pages only, whose keys are names of segments."""
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for package in ("identify", "api")
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value == "validate"
+    }
+    assert found == {"identify/records/record.py", "api/clinical_words.py"}
+
+
 def test_tests_import_nothing_from_the_benches() -> None:
     """What both need is in tests/harness."""
     pattern = re.compile(r"""^\s*(?:from|import)\s+bench\b|import_module\(["']bench\b""", re.M)

@@ -10,6 +10,7 @@ from typing import Any
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import INK, MEASURED, MODEL, STIMULUS, TOOLBAR_PX, axis, band, band_of, box, line, role
 from stimrig.api.language import _, localised
+from stimrig.identify.records.record import HELD_OUT
 
 SHOWN_BEYOND = 1.5
 """Of the plan that was not played so much is drawn, in parts of what was."""
@@ -131,7 +132,7 @@ def segment_marks(segments: list[dict[str, Any]]) -> tuple[list[dict[str, Any]],
         name, start_s, end_s = segment["name"], segment["start_s"], segment["end_s"]
         if name == "rest":
             continue
-        shapes.append(box(start_s, end_s, role("held-out" if name == "validate" else "segment")))
+        shapes.append(box(start_s, end_s, role("held-out" if name == HELD_OUT else "segment")))
         text, middle_s = fig.segment_name(name), (start_s + end_s) / 2
         half_s = letter_s * len(text) / 2
         if middle_s - half_s < free_s:

@@ -50,13 +50,13 @@ GATES: dict[str, Gate] = {
     "stable": Gate(
         lazy("The dynamics are unstable: in the model the torque grows without end."),
         lazy("Usable with care: look at the step response first."),
-        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("Not usable: test again with the limb held still and relaxed."),
         lazy("The controller would expect torque that grows without end, and may switch between no and full pulses."),
     ),
     "converged": Gate(
         lazy("The search for the muscle's speed did not come to its end."),
         lazy("Usable with care: look at the step response first."),
-        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("Not usable: test again with the limb held still and relaxed."),
         lazy("The speed of the muscle is not certain: the controller may react too early or too late."),
     ),
     "torque": Gate(
@@ -80,32 +80,32 @@ GATES: dict[str, Gate] = {
     "ceiling": Gate(
         lazy("The fit is less than the noise would allow."),
         lazy("Usable with care: look at where the error sits first."),
-        lazy("Not usable: test again with electrodes checked and the arm relaxed: the torque hardly follows."),
+        lazy("Not usable: test again with electrodes checked and the limb relaxed: the torque hardly follows."),
         lazy("The model does not follow the torque: the controller's pulses would be too wide at one time and too "
              "narrow at another."),
     ),
     "held_out": Gate(
         lazy("The error on held-out pulses is clearly larger than on the others."),
         lazy("Usable with care: look at the check in the chart first."),
-        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("Not usable: test again with the limb held still and relaxed."),
         lazy("On other pulses the controller would be further off than the fit says."),
     ),
     "gap": Gate(
         lazy("The fit on held-out pulses is less than the noise would allow."),
         lazy("Usable with care: look at where the error sits first."),
-        lazy("Not usable: test again with the arm held still and relaxed, or add what is missing."),
+        lazy("Not usable: test again with the limb held still and relaxed, or add what is missing."),
         lazy("The controller works with pulses that the model has not seen: its torque there would be far off."),
     ),
     "residual": Gate(
         lazy("What the model leaves over is not only noise."),
         lazy("Usable with care: look at where the error sits first."),
-        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("Not usable: test again with the limb held still and relaxed."),
         lazy("The error follows a pattern, and the controller repeats it in each trial."),
     ),
     "joint": Gate(
         lazy("The joint moved during the test, and the model does not know of it."),
         lazy("Usable with care: hold the joint still and test again, or add what depends on the joint."),
-        lazy("Not usable: test again with the arm held still and relaxed."),
+        lazy("Not usable: test again with the limb held still and relaxed."),
         lazy("At another angle the muscle is stronger or weaker: the controller's pulses would not fit."),
     ),
     "joint_seen": Gate(

@@ -89,7 +89,7 @@ class Session:
         one = {"value": found.percent, "sd": None, "uncertainty": None, "unit": "%", "where": found.where}
         kept = {name: figure for name, figure in document["figures"].items() if not name.endswith("fit_percent")}
         kept["charge_uc"]["where"] = _(
-            "charge of one phase, over all pulses of all %(count)s tests of that day, stopped ones, too",
+            "charge of one phase, over all pulses of that day's tests (%(count)s), stopped ones, too",
             count=len(self.test_ids),
         )
         at = {"at_utc": self.model.created_utc}  # as the participant's page and the model's own name the model

@@ -24,6 +24,7 @@ from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Participant, Test
 from stimrig.api.workers.pool import Adviser
+from stimrig.identify.records.record import HELD_OUT
 from stimrig.rig.messages import SAFE_END_S, AdaptivePlan, FinishedEvent, SegmentPlan, TestPlan
 from stimrig.rig.requests import PreviewRequest
 
@@ -146,7 +147,7 @@ class AdaptiveTests(Watched):
         """
         ended = (row.summary.get("adaptive") or {}).get("ended")
         planned = [segment["name"] for segment in (row.plan.get("preview") or {}).get("segments") or []]
-        if ended == "fixed-rest" and "validate" in planned:
+        if ended == "fixed-rest" and HELD_OUT in planned:
             return {}
         return {"recruitment": "near-sigmoid", "models": self._models(row.participant, place_of(row))}
 

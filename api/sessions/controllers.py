@@ -90,7 +90,7 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
     seen.sent.set(await asyncio.to_thread(_model_sent, runner, body.participant))
     begun = (Test.requested_by == who.name, Test.state != "refused")  # what the rig refused was no trial
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
-        raise beyond(f"All {plan['trials']} trials of this key are played. A person can make another key")
+        raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
     participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
     limits: dict[str, Any] = {}
     for name in ("current_ma", "max_pulse_width_us"):

@@ -20,7 +20,7 @@ from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.model import Model
-from stimrig.identify.records.record import Record
+from stimrig.identify.records.record import HELD_OUT, Record
 from stimrig.identify.results import Diagnosis, Explanation, Improvement
 
 COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent", "repetition", "unforeseen_nm")
@@ -162,7 +162,7 @@ def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str
 
 def _rising(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
     """What is said where the error on held-out pulses rises and does not speak against the effect."""
-    rises = before["held_out_by"] == "validate" and after["held_out_rms_nm"] > RISE * before["held_out_rms_nm"]
+    rises = before["held_out_by"] == HELD_OUT and after["held_out_rms_nm"] > RISE * before["held_out_rms_nm"]
     return ["On held-out pulses the error rises, but not by more than its standard error."] if rises else []
 
 

@@ -13,6 +13,7 @@ from stimrig.identify.estimation.repetition import repetition
 from stimrig.identify.estimation.samples import block_means
 from stimrig.identify.noise import whitened
 from stimrig.identify.records.readings import contrasts
+from stimrig.identify.records.record import HELD_OUT
 
 CONSTANT = 1e-9
 """Torque whose standard deviation is below this (N·m, or share of its size) is constant, but for rounding."""
@@ -142,7 +143,7 @@ def fit_statistics(
         "held_out_samples": int(held.sum()),
         "segments": segment_statistics(grid, np.where(record.held_out, foreseen, predicted_nm), sd_nm),
     }
-    left_out, by = foreseen, "validate"
+    left_out, by = foreseen, HELD_OUT
     if held_out_change is not None:
         left_out = foreseen + held_out_change[grid.interval]
         held, by = (held, by) if held.any() else (used, "cross-validation")

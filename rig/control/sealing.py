@@ -98,9 +98,12 @@ def summary_of(recording: Recording, counted: dict[str, Any]) -> dict[str, Any]:
     """Part of a finished test's summary; `counted`: what is known without the recording."""
     alignment, dose = recording.alignment, []
     if counted.get("dose_is_bound"):
+        pulses = counted["doubtful_pulses"]
         dose.append(
-            f"dose: of {counted['doubtful_pulses']} pulses it is not known whether they were felt; they are counted, "
-            "so the true dose may be lower"
+            "dose: of 1 pulse it is not known whether it was felt; it is counted, so the true dose may be lower"
+            if pulses == 1
+            else f"dose: of {pulses} pulses it is not known whether they were felt; they are counted, so the true dose "
+            "may be lower"
         )
     return {
         **({"angle": counted.get("angle", {}) | _angle_summary(recording)} if recording.angle else {}),
@@ -198,21 +201,30 @@ def _disturbed_line(recording: Recording) -> list[str]:
     found = []
     if unasked := named.count("unasked_ack"):
         found.append(
-            f"stimulator: it acknowledged {unasked} pulses that were not sent; they may have been felt and are not in "
-            "this recording"
+            "stimulator: it acknowledged 1 pulse that was not sent; it may have been felt and is not in this recording"
+            if unasked == 1
+            else f"stimulator: it acknowledged {unasked} pulses that were not sent; they may have been felt and are "
+            "not in this recording"
         )
     if late_s:
+        dropped, most_ms = named.count("dropped"), f"{max(late_s) * 1e3:.0f}"
+        pulses = (
+            "1 pulse that came due meanwhile was" if dropped == 1 else f"{dropped} pulses that came due meanwhile were"
+        )
         found.append(
-            f"stimulator: {len(late_s)} acknowledgements came late, up to {max(late_s) * 1e3:.0f} ms after the pulse "
-            f"was sent; these pulses may have been felt that late; {named.count('dropped')} pulses that came due "
-            "meanwhile were dropped"
+            f"stimulator: 1 acknowledgement came late, {most_ms} ms after the pulse was sent; this pulse may have been "
+            f"felt that late; {pulses} dropped"
+            if len(late_s) == 1
+            else f"stimulator: {len(late_s)} acknowledgements came late, up to {most_ms} ms after the pulse was sent; "
+            f"these pulses may have been felt that late; {pulses} dropped"
         )
     planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
     narrower = (planned_us - sent_us > ROUNDED_US) & (sent_us > 0)  # one below the shortest pulse is not sent at all
     if weaker := int(np.count_nonzero(narrower & ~_climbing(recording, pauses))):
+        pulses = "1 pulse was" if weaker == 1 else f"{weaker} pulses were"
         found.append(
-            f"stimulator: {weaker} pulses were narrower than planned, since after a pulse that was dropped, or too "
-            "short to be sent, the width climbs no faster than its limit"
+            f"stimulator: {pulses} narrower than planned, since after a pulse that was dropped, or too short to be "
+            "sent, the width climbs no faster than its limit"
         )
     return found
 

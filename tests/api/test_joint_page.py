@@ -176,6 +176,7 @@ def test_movement_under_stimulation_and_one_model_of_all(tab: Any, sensor: Servi
     after_the_end(tab, "/participants/X1/joint", "Back to the joint")
     tab.locator("input[name=recording]:checked").wait_for()
     tab.get_by_text("Not recorded today: passive movement, held-angle test.").wait_for()
+    expected(tab.locator("main .primary")).to_have_count(1)  # the passive movement comes before the model
     tab.get_by_role("button", name="Fit one model to the ticked ones").click()
     tab.wait_for_url("**/models/M-*", timeout=60_000)
     assert tab.errors == []

@@ -23,6 +23,8 @@ from stimrig.api.language import best, extract, translated
 from stimrig.api.language.translated import PERSON, of
 from stimrig.api.models import advice
 from stimrig.api.store.tables import Model
+from stimrig.identify.effects import find_effect
+from stimrig.rig.limits import HARD_LIMITS
 from tests.api.conftest import STUB, Service, csrf, run_service, run_test, signed_in
 
 PLACE = re.compile(r"%\((\w+)\)s|(?<!%)%(?![%(])|\{\w+\}")
@@ -150,6 +152,14 @@ def forms_of(text: Any) -> tuple[str, ...]:
 def test_every_message_has_its_translation(code: str) -> None:
     """`python -m stimrig.api.language.extract --check` says the same; `make words` renews the catalogues."""
     assert extract.missing(code) == []
+
+
+def test_no_page_takes_the_muscle_for_one_of_the_arm() -> None:
+    """But for where a number of the rig's limits comes from, and a sentence that is stored with diagnoses."""
+    elbows = {text for limit in HARD_LIMITS.values() for text in (limit.reason, limit.source)}
+    elbows.add(find_effect("torque_angle").plain)
+    joint = re.compile(r"(?<!re-)(?<!lever )(?<!moment )\b(?:arms?|forearms?|elbows?)\b", re.IGNORECASE)
+    assert {text for text in map(language.first, extract.messages()) if joint.search(text)} <= elbows
 
 
 @pytest.mark.parametrize("code", LANGUAGES)
@@ -316,6 +326,19 @@ def test_who_stopped_may_have_a_name_of_several_words(who: str):
     assert of("de", f"stop pressed on the page (by {who}).") == f"Stopp auf der Seite gedrückt (durch {who})."
 
 
+@pytest.mark.parametrize(("english", "german"), [
+    ("1 acknowledgement came late, 40 ms after the pulse was sent; this pulse may have been felt that late; 1 pulse "
+     "that came due meanwhile was dropped",
+     "1 Bestätigung kam verspätet, 40 ms nach dem Senden des Pulses; dieser Puls kann so viel später gespürt "
+     "worden sein; 1 inzwischen fälliger Puls wurde ausgelassen"),
+    ("2 acknowledgements came late, up to 40 ms after the pulse was sent; these pulses may have been felt that late; 0 "
+     "pulses that came due meanwhile were dropped", "2 Bestätigungen kamen verspätet, bis zu 40 ms nach dem Senden des "
+     "Pulses; diese Pulse können so viel später gespürt worden sein; 0 inzwischen fällige Pulse wurden ausgelassen"),
+])  # fmt: skip
+def test_one_of_a_kind_is_told_as_one_in_german(english: str, german: str):
+    assert of("de", f"stimulator: {english}") == f"Stimulator: {german}"
+
+
 def test_what_confirms_a_stop_is_told_in_german():
     told = of("de", "device: not initialised; torque fell from 9 to 4 N·m")
     assert told == "Gerät: gibt keine Pulse ab (nicht initialisiert); das Drehmoment fiel von 9 auf 4 N·m"
@@ -398,6 +421,34 @@ def test_every_text_of_a_page_is_a_message(page: str, browser: httpx.Client, ids
     answer = browser.get(page.format(**ids), headers={"Accept": "text/html"})
     assert answer.headers["content-language"] == MADE_UP and answer.status_code in (200, 404, 409, 422)
     assert untranslated(answer.text) == [], "\n".join(untranslated(answer.text))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_has_one_first_button_at_most(page: str, browser: httpx.Client, ids: dict[str, str]) -> None:
+    assert len(first_buttons(browser.get(page.format(**ids)).text)) <= 1
+
+
+def test_with_nobody_but_a_token_the_first_button_is_the_tokens(browser: httpx.Client) -> None:
+    (first,) = first_buttons(browser.get("/sign-in").text)
+    assert "token" in first
+
+
+def test_in_a_calibration_and_beside_a_running_test_there_is_one_first_button(
+    service: Service, browser: httpx.Client, ids: dict[str, str]
+) -> None:
+    page = browser.get("/participants/X2").text
+    form = {"csrf": csrf(browser), "seen": re.findall(r'name="seen" value="([^"]+)"', page)[0]}
+    begun = browser.post("/participants/X2/calibration", data=form)
+    calibrating = browser.get(begun.headers["location"]).text
+    refused = browser.post("/participants/X1/calibration", data=form)
+    assert [refused.status_code, len(first_buttons(calibrating)), len(first_buttons(refused.text))] == [409, 1, 1]
+    (version,) = set(re.findall(r'name="calibration" value="([^"]+)"', calibrating))
+    ended = browser.post("/participants/X2/calibration/discard", data={**form, "calibration": version})
+    assert ended.status_code == 303, ended.text
+
+
+def first_buttons(html: str) -> list[str]:
+    return re.findall(r'<(?:a|button)[^>]*class="[^"]*\bprimary\b[^>]*>([^<]*)<', html)
 
 
 def test_the_question_before_a_test_is_translated(browser: httpx.Client, ids: dict[str, str]) -> None:

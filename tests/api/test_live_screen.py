@@ -78,7 +78,7 @@ def test_what_flows_is_told_in_numbers_and_a_clinicians_words(running: Any, serv
     assert running.locator("#segment").get_attribute("title") == "prbs"
     assert running.locator("#current").inner_text() == "20.0 mA"
     expected(running.locator("#dose")).not_to_have_text(re.compile("^0.00 mC"))
-    charge_mc, pulses = map(float, re.findall(r"([\d.]+) mC · (\d+) pulses", running.locator("#dose").inner_text())[0])
+    charge_mc, pulses = map(float, re.findall(r"([\d.]+) mC · pulses: (\d+)", running.locator("#dose").inner_text())[0])
     assert charge_mc == pytest.approx(0.006 * pulses, abs=0.005), "300 µs at 20 mA are 6 µC"
     assert "Check (not used for fitting)" in running.locator("#track").inner_text()
     for chart in ("torque-chart", "width-chart"):

@@ -152,6 +152,14 @@ KEYLESS_NOW = ("done", "Today's model is approved until 23:59, but no controller
 DONE_NOW = ("done", "Done. The controller has today's model until 23:59.")
 
 
+def test_the_first_page_leaves_it_to_the_line_what_comes_next(service: Service, pages: httpx.Client) -> None:
+    """To somebody who has made nobody yet, it named the test; the line then named the calibration."""
+    first = pages.get("/").text
+    assert "The line at the top of its page says what comes next." in first
+    buttons = {next_step(Situation("P1", **so)).button for so, *_ in TABLE} - {""}
+    assert not [words for words in (*buttons, "pre-session test", "alibrat") if words in first]
+
+
 def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service, participant: str) -> None:
     assert shown(service)[0] == "calibrate"
     model = run_test(client, participant)["model_id"]

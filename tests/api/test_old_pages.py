@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from stimrig.api.web.pages import static
 from tests.api.browser import PASSWORD, expected, open_tab, participant, start
 from tests.api.conftest import Service, play_test, shared_service, soon
 from tests.api.test_axe import examined
@@ -70,7 +72,7 @@ def test_the_stop_button_stays_and_says_that_it_did_not_get_through(paced: Any, 
     paced.clock.fast_forward(3_000)
     expected(doubt(paced)).to_contain_text("has not answered")
     paced.get_by_role("button", name="Stop stimulation").click()
-    expected(doubt(paced)).to_contain_text("Stop did not reach the service. Use the emergency switch")
+    expected(doubt(paced)).to_contain_text("No answer to stop came. Use the emergency switch")
     examined(paced, "a stop that did not get through")
     assert service.rig.state == "ready"
     paced.context.set_offline(False)
@@ -93,6 +95,27 @@ def test_a_stop_gets_through_where_only_the_state_is_not_heard_of(tab: Any, serv
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
     assert service.rig.state == "latched"
     service.rig.speed = 30.0
+
+
+def test_a_stop_without_an_answer_says_so_in_time_and_can_be_pressed_again(paced: Any, service: Service) -> None:
+    paced.goto(service.url + "/participants/O2")
+    heard_of(paced)
+    held: list[Any] = []
+    paced.route("**/v1/stop", lambda route: held.append(route))  # and no answer ever
+    paced.route("**/rig/now", lambda route: route.abort())
+    paced.clock.fast_forward(3_000)
+    expected(doubt(paced)).to_contain_text("has not answered")
+    stop = paced.get_by_role("button", name="Stop stimulation")
+    for press in (1, 2):
+        stop.click()
+        expected(doubt(paced)).to_contain_text("Stop is being sent")
+        while len(held) < press:
+            paced.wait_for_timeout(20)
+        paced.clock.fast_forward(6_000)
+        expected(doubt(paced)).to_contain_text("No answer to stop came. Use the emergency switch on the stimulator.")
+    paced.unroute("**/v1/stop")
+    stop.click()
+    paced.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
 
 def test_after_an_hour_of_sleep_the_page_says_how_old_it_is(paced: Any, service: Service, ids: dict[str, str]) -> None:
@@ -122,6 +145,19 @@ def test_a_test_that_went_on_or_ended_while_the_laptop_slept(paced: Any, service
     paced.context.set_offline(False)
     paced.clock.fast_forward(3_000)
     paced.wait_for_url("**/models/*")
+
+
+def test_one_script_knows_that_a_form_was_sent_and_the_live_page_asks_it(tab: Any, service: Service) -> None:
+    scripts = {path.name: path.read_text("utf-8") for path in Path(static.__file__).parent.glob("static/*.js")}
+    assert [name for name, text in scripts.items() if "defaultPrevented" in text] == ["wait.js"]
+    service.rig.speed = 0.5
+    participant(tab, service, "O5")
+    start(tab)
+    tab.locator("#age", has_text="ms").wait_for()
+    assert tab.evaluate("answering()") is False
+    tab.get_by_role("button", name="Stop stimulation").click()
+    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    service.rig.speed = 30.0
 
 
 def test_a_session_that_ended_is_told_with_the_way_back(tab: Any, service: Service) -> None:

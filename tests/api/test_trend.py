@@ -131,7 +131,7 @@ def test_a_dose_is_told_in_one_unit_and_says_what_it_counts(client: httpx.Client
     assert changes.dose_words(12_345.6) == "12.35\u00a0mC" and changes.dose_words(None) == "–"
     page = compared(client, days[:2])
     assert "Dose of the day" in page and "behind a difference that of both values together" in page
-    assert "over all pulses of all 1 tests of that day, stopped ones, too" in page
+    assert "over all pulses of that day&#39;s tests (1), stopped ones, too" in page
 
 
 def test_models_from_before_the_figures_are_read_once(tmp_path: Path, short_dir: Path) -> None:
@@ -179,6 +179,7 @@ def test_nobody_and_no_session(service: Service, client: httpx.Client) -> None:
     assert "No session with a model yet." in page.text and '<svg class="trend"' not in page.text
     made(service, "FIRST", three()[:1])
     first = client.get("/participants/FIRST/trend").text
+    assert "A delay may be below zero by up to one sample" in first
     assert "The trend begins with the second one." in first and first.count('<svg class="trend"') == 9
 
 
@@ -222,6 +223,7 @@ def compared(client: httpx.Client, days: list[str], **more: str) -> str:
 
 def test_six_models_with_their_differences_to_the_oldest(client: httpx.Client, days: list[str]) -> None:
     page = compared(client, days[5:0:-1] + days[:1])
+    assert "A delay may be below zero by up to one sample" in page
     found = cells(page, "Plateau")
     assert len(found) == 6 and found[0][1] == ""
     values = [float(value.split(" ±")[0]) for value, _ in found]

@@ -468,7 +468,7 @@ def test_a_key_is_made_on_what_was_seen_also_when_its_check_is_overtaken(
     key = {"name": "ilc", "current_ma": "8", "max_pulse_width_us": "200", "max_duration_s": "60", "trials": "3"}
     refused = client.post(f"{PAGE}/keys", data={**key, "seen": version}, headers=HTML, auth=None)
     assert refused.status_code == 409 and approved
-    assert "ilc" in refused.text and "3 trials of at most 60 s, 8 mA, 200 µs" in refused.text
+    assert "ilc" in refused.text and "trials: 3 of at most 60 s, 8 mA, 200 µs" in refused.text
     assert not [token for token in client.get("/v1/tokens").json() if token["name"].startswith("ilc")]
     begun = client.post("/v1/tests", json={"participant": participant}, headers={"If-Match": old})
     assert begun.status_code == 409 and service.rig.starts == 1, "in the intent's own transaction, too"

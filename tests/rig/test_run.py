@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -154,9 +155,30 @@ def test_pulses_too_short_to_be_sent_are_none_that_were_narrowed(tmp_path: Path)
     assert not [line for line in warnings(recording) if "narrower" in line]
     sent_us[np.argmax(planned_us)] -= 20.0
     assert [line.split(":")[1] for line in warnings(recording) if "narrower" in line] == [
-        " 1 pulses were narrower than planned, since after a pulse that was dropped, or too short to be sent, the "
+        " 1 pulse was narrower than planned, since after a pulse that was dropped, or too short to be sent, the "
         "width climbs no faster than its limit"
     ]
+
+
+def test_one_of_a_kind_is_told_as_one(tmp_path: Path):
+    rig = VirtualRig(tmp_path, [SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 2.0, "down_s": 1.0})])
+    rig.execute()
+    recording = rig.recording()
+    of_one = [{"event": "unasked_ack", "time_s": 1.0}, {"event": "late_ack", "time_s": 1.0, "delay_s": 0.04},
+              {"event": "dropped", "time_s": 1.0}]  # fmt: skip
+    for times, words in (
+        (1, ("1 pulse that was", "1 acknowledgement came late, 40 ms", "1 pulse that came due meanwhile was dropped")),
+        (
+            2,
+            (
+                "2 pulses that were",
+                "2 acknowledgements came late, up to 40 ms",
+                "2 pulses that came due meanwhile were",
+            ),
+        ),
+    ):
+        told = " ".join(warnings(replace(recording, events=of_one * times)))
+        assert [part for part in words if part not in told] == [], told
 
 
 def test_after_a_rest_the_width_climbs_from_nothing(tmp_path: Path):

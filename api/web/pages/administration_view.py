@@ -9,6 +9,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
+from stimrig.api import language
 from stimrig.api.language import lazy
 from stimrig.api.outbox import receipts, status
 from stimrig.api.people.auth import ROLES
@@ -125,6 +126,8 @@ def detail_words(detail: dict[str, Any]) -> str:
             value = detail_words(value)
         elif isinstance(value, list):
             value = ", ".join(str(item) for item in value)
+        elif name == "until":
+            value = language.until(value)
         text = str(value)
         short = f"{text[:12]}…" if len(text) == 64 and " " not in text else text
         parts.append(f"{name.replace('_', ' ')} {short}")

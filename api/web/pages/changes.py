@@ -160,6 +160,9 @@ def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[st
     if action == "keys":
         plan = {name: f"{texts.get(field, '')} {unit}" for name, (field, unit) in PLAN.items()}
         plan["trials"] = texts.get("trials", "")
-        return [texts.get("name", ""), _("%(trials)s trials of at most %(duration)s, %(current)s, %(width)s", **plan)]
+        return [
+            texts.get("name", ""),
+            _("trials: %(trials)s of at most %(duration)s, %(current)s, %(width)s", **plan),
+        ]
     return [f"{plain(limit.label)} {texts[name]}" for name, limit in profiles.LIMITS.items()
             if name in texts and texts[name] != texts.get(f"seen_{name}")]  # fmt: skip

@@ -128,7 +128,7 @@ def angle_fields(status: Status | None) -> list[dict[str, str]]:
     if status is None or not status.angle.present:
         return []
     within = "" if status.angle.range_rad is None else f"within {profiles.range_words(status.angle.range_rad)} (rig)"
-    help_of = {ANGLES[0]: "0° is a straight arm", ANGLES[1]: within}
+    help_of = {ANGLES[0]: "0° is the straight limb", ANGLES[1]: within}
     return [{"name": name, "label": ANGLE_LABELS[name], "help": help_of[name]} for name in ANGLES]
 
 

@@ -201,7 +201,7 @@ def _test_waits(now: Situation) -> Step:
     """Calibrate, then test; with what came of today's last test."""
     before = _before(now)
     if now.calibration != "valid":
-        words = _("Calibrate for today: find the pulse widths that are felt, move the arm and are comfortable.")
+        words = _("Calibrate for today: find the pulse widths that are felt, move the limb and are comfortable.")
         if now.calibration == "expired":
             words = _("The last calibration was for another day. Calibrate for today.")
         button = _("Begin the calibration: %(current)s", current=now.current)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from stimrig.api.clinical_words import degrees, label_rows, words
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _, lazy, localised, translated, until, when
+from stimrig.api.language import _, lazy, localised, ngettext, translated, until, when
 from stimrig.api.models.changes import dose_words
 from stimrig.api.models.places import Site, site_of
 from stimrig.api.people.auth import Principal
@@ -25,7 +25,7 @@ from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment, number
 from stimrig.api.web.routes import participants
 
-NOBODY = lazy("today nobody has tested which pulse widths are felt, move the arm and are comfortable")
+NOBODY = lazy("today nobody has tested which pulse widths are felt, move the limb and are comfortable")
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,10 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
     """What a person has to know before saying yes."""
     pulses = sum(width > 0 for width in preview["pulse_width_us"])
     torque_time = preview.get("torque_time_nms")
-    dose = _(
-        "%(pulses)s pulses, %(charge)s (charge of one phase, all pulses together)",
-        pulses=pulses, charge=dose_words(preview["charge_uc"]),
+    dose = ngettext(
+        "%(num)s pulse, %(charge)s (charge of one phase)",
+        "%(num)s pulses, %(charge)s (charge of one phase, all pulses together)",
+        pulses, charge=dose_words(preview["charge_uc"]),
     )  # fmt: skip
     if torque_time is not None:
         dose += _(", about %(effort)s of torque", effort=number(torque_time, 0, "N·m·s"))

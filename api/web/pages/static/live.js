@@ -84,10 +84,6 @@ function showSegment(name) {
   segment = name;
 }
 
-let leaving = false;  // a form was sent, be it the stop: its answer is what comes next, not this page's own
-addEventListener("submit", (event) => { leaving = leaving || !event.defaultPrevented; }); // a note is sent by a script: no answer comes
-addEventListener("pageshow", () => { leaving = false; });
-
 function showTest(test, told) {
   const wasOpen = !state.test.done;
   state.test = test;
@@ -105,7 +101,7 @@ function showTest(test, told) {
   if (carrying) carrying.hidden = !(test.state === "identifying" && job && job.verb === "carry");
   if (test.reason) { say("reason", told.reason); byId("reason").hidden = false; }
   const next = test.model_id ? "/models/" + test.model_id : test.joint && test.state === "completed" ? "/participants/" + test.participant + "/joint" : location.pathname;
-  if (test.done && wasOpen && !leaving) location.replace(next);
+  if (test.done && wasOpen && !answering()) location.replace(next);
 }
 
 function age() {

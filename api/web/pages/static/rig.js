@@ -3,14 +3,14 @@
 "use strict";
 {
   const words = JSON.parse(document.getElementById("rig-words").textContent);
-  const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000;
+  const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000;
   const clock = () => [performance.now(), Date.now()]; // the first stands still while a machine sleeps, the second may be set
   const since = (then) => Math.max(performance.now() - then[0], Date.now() - then[1]);
   const pill = document.getElementById("rig-state"), notice = document.getElementById("rig-notice");
   const live = document.getElementById("live"), said = document.getElementById("page-old"), person = document.querySelector(".who");
   const boxes = (name) => document.querySelectorAll(`[data-now="${name}"]`);
   const begun = clock();
-  let heard = said.dataset.at, lost = "", stopped = ""; // when the page last heard of the service; why what it shows is old
+  let heard = said.dataset.at, lost = "", stopped = "", late = 0; // when the page last heard of the service; why what it shows is old
   let known = null, asked = null, last = null, busy = false, fetching = "";
   const unread = document.querySelector(".read-first");
   let shown = { latch: document.querySelector("[name=latch]")?.value, since: unread ? performance.now() : -READ_MS };
@@ -54,11 +54,14 @@
 
   async function stop(form) { // a browser would leave the page, its stop button with it, for a page of its own
     stopped = "stopping"; show();
-    try {
+    try { // not given up: it may still stop, late
       const answer = await fetch(form.action, { method: "POST", body: new URLSearchParams(new FormData(form)), headers: { Accept: "text/html" } });
+      clearTimeout(late);
       if (answer.redirected) location.assign(answer.url); else form.submit();
-    } catch { stopped = "not_stopped"; show(); }
+    } catch { notStopped(); }
   }
+
+  function notStopped() { stopped = "not_stopped"; show(); }
 
   function show() {
     doubt(stopped || (live ? "" : old() ? "no_answer" : lost)); // a running test's page says it itself
@@ -136,7 +139,10 @@
   setInterval(look, 250);
   said.lastElementChild.addEventListener("click", () => location.reload());
   addEventListener("submit", (event) => {
-    if (event.target.id !== "stop-form" || !old()) return; // the service answers: the form by itself, as without scripts
+    if (event.target.id !== "stop-form") return;
+    clearTimeout(late);
+    late = setTimeout(notStopped, STOP_MS);
+    if (!old()) return; // the service answers: the form by itself, as without scripts
     event.preventDefault();
     stop(event.target);
   });

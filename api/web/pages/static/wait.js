@@ -46,12 +46,12 @@ async function follow(box) {
 }
 
 const ANSWER_MS = 30000; // by then the answer to what was pressed is here, or it was a download
-let pressed = -ANSWER_MS; // a form was sent (the stop by rig.js, where the page is old), or a link followed
+let pressed = -ANSWER_MS; // a form was sent (the stop by rig.js, where the page is old; a note, by a script, brings no answer), or a link followed
 addEventListener("submit", (event) => { if (!event.defaultPrevented || event.target.id === "stop-form") pressed = performance.now(); });
 addEventListener("beforeunload", () => { pressed = performance.now(); });
 addEventListener("pageshow", (event) => { if (event.persisted) pressed = -ANSWER_MS; });
 
-// Meanwhile the page is not loaded anew. It is asked again later: only a service that answers can give another page.
+// Meanwhile the page is not loaded anew, by live.js neither. It is asked again later: only a service that answers can give another page.
 const answering = () => performance.now() - pressed < ANSWER_MS;
 
 // What somebody has begun to write is not taken away: then they say when the page is read anew.
