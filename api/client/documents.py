@@ -61,6 +61,7 @@ class Version(TypedDict):
     words: Annotated[str, "the verdict in one sentence"]
     reasons: Annotated[list[str], "what speaks against the model, worst first"]
     decision: Literal["approved", "rejected"] | None
+    undone: Annotated[bool, "the decision is an undo"]
     tracking: dict[str, float] | None
     served: Annotated[bool, "the controller gets this one"]
     created_utc: str
