@@ -151,7 +151,7 @@ def test_one_script_knows_that_a_form_was_sent_and_the_live_page_asks_it(tab: An
     scripts = {path.name: path.read_text("utf-8") for path in Path(static.__file__).parent.glob("static/*.js")}
     assert [name for name, text in scripts.items() if "defaultPrevented" in text] == ["wait.js"]
     service.rig.speed = 0.5
-    participant(tab, service, "O5")
+    participant(tab, service, "O7")
     start(tab)
     tab.locator("#age", has_text="ms").wait_for()
     assert tab.evaluate("answering()") is False
