@@ -13,6 +13,9 @@ from stimrig.api.models.explanation import place
 from stimrig.identify.conclusion import why_ended
 from stimrig.identify.healing import healed_places, place_words
 
+SAME = 0.995
+"""An error that is larger than this share of the one before has not fallen."""
+
 
 def story(
     rows: Sequence[dict[str, Any]],
@@ -34,6 +37,7 @@ def story(
     ]
     return {
         "title": _title(rows),
+        "fell": _fell(rows),
         "rows": rows,
         "places": places,
         "why": why,
@@ -45,14 +49,26 @@ def story(
 
 
 def _title(rows: Sequence[dict[str, Any]]) -> str:
-    held_out = rows[0]["held_out_rms_nm"] is not None
-    error = "held_out_rms_nm" if held_out else "rms_nm"
+    error = _error_of(rows)
     first, now = (localised(f"{row[error]:.3g}") for row in (rows[0], rows[-1]))
-    if len(rows) > 1:
-        if held_out:
-            return _("The held-out error fell from %(first)s to %(now)s N·m", first=first, now=now)
-        return _("The error fell from %(first)s to %(now)s N·m", first=first, now=now)
-    return _("The held-out error is %(now)s N·m", now=now) if held_out else _("The error is %(now)s N·m", now=now)
+    held_out = error.startswith("held_out")
+    if len(rows) == 1:
+        return _("The held-out error is %(now)s N·m", now=now) if held_out else _("The error is %(now)s N·m", now=now)
+    given = {"first": first, "now": now}
+    if _fell(rows):
+        fell = _("The held-out error fell from %(first)s to %(now)s N·m", **given)
+        return fell if held_out else _("The error fell from %(first)s to %(now)s N·m", **given)
+    stays = _("The held-out error did not fall: %(first)s, then %(now)s N·m", **given)
+    return stays if held_out else _("The error did not fall: %(first)s, then %(now)s N·m", **given)
+
+
+def _fell(rows: Sequence[dict[str, Any]]) -> bool:
+    error = _error_of(rows)
+    return rows[-1][error] < SAME * rows[0][error]
+
+
+def _error_of(rows: Sequence[dict[str, Any]]) -> str:
+    return "held_out_rms_nm" if rows[0]["held_out_rms_nm"] is not None else "rms_nm"
 
 
 def _step(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import httpx
 import pytest
 
 from stimrig.api.charts.story_charts import side_by_side
+from stimrig.api.models.story import _title
 from stimrig.identify.healing import healed_places, place_words
 from tests.api import stub_worker
 from tests.api.conftest import Service, run_test, signed_in
@@ -31,10 +32,12 @@ def test_story_begins_with_what_is_missing_and_ends_with_the_falling_error(
         client.get(f"/v1/models/{last}/diagnosis")
         told = page.get(f"/models/{last}/story").text
         assert (
-            "The held-out error fell from" in told and "What was missing" in told and told.count('class="still"') == 3
+            "The held-out error did not fall" in told
+            and "What was missing" in told
+            and told.count('class="still"') == 3
         )
         file = page.get(f"/models/{last}/story.html")
-        assert file.headers["content-disposition"] == "attachment" and "The held-out error fell from" in file.text
+        assert file.headers["content-disposition"] == "attachment" and "The held-out error did not fall" in file.text
         for kind, start in (("svg", b"<svg"), ("pdf", b"%PDF")):
             assert page.get(f"/models/{last}/story/figures/falling.{kind}").content.startswith(start)
         for name in ("falling.exe", "nothing.svg"):
@@ -69,3 +72,13 @@ def test_a_place_is_healed_where_only_noise_is_left_there() -> None:
         (found,) = healed_places(first, comparison(left_nm, -left_nm, 9.0, 9.0))
         assert (found["before_nm"], found["after_nm"], found["healed"]) == (1.0, left_nm, healed)
         assert words in place_words(found)
+
+
+def test_an_error_that_does_not_fall_is_not_said_to_fall() -> None:
+    def said(*errors_nm: float) -> str:
+        return _title([{"held_out_rms_nm": error_nm} for error_nm in errors_nm])
+
+    assert said(0.05) == "The held-out error is 0.05 N·m"
+    assert said(0.1, 0.05) == "The held-out error fell from 0.1 to 0.05 N·m"
+    for now_nm in (0.0499, 0.06):  # added without evidence
+        assert said(0.05, now_nm) == f"The held-out error did not fall: 0.05, then {now_nm} N·m"
