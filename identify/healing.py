@@ -51,11 +51,13 @@ def healed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[d
 def place_words(place: Mapping[str, Any]) -> str:
     """What became of the error at a place."""
     before, after, noise = (f"{place[name]:.3g}" for name in ("before_nm", "after_nm", "noise_nm"))
+    if before == after:
+        return f"the error there is {after} N·m, as before; the noise is {noise} N·m."
+    if place["after_nm"] > place["before_nm"]:
+        return f"the error there rose from {before} to {after} N·m; the noise is {noise} N·m."
     if place["healed"]:
         return f"the error there fell from {before} to {after} N·m; the noise is {noise} N·m."
-    if place["after_nm"] < place["before_nm"]:
-        return f"the error there fell from {before} to {after} N·m, which is more than the noise of {noise} N·m."
-    return f"the error there is {after} N·m, as before; the noise is {noise} N·m."
+    return f"the error there fell from {before} to {after} N·m, which is more than the noise of {noise} N·m."
 
 
 def _rms_within(series: Mapping[str, Any], start_s: float, end_s: float) -> float:

@@ -142,7 +142,7 @@ def findings(document: dict[str, Any]) -> list[Finding]:
     """The checks that failed, those that make a model not usable first; empty for models without stored checks."""
     gates = (document.get("quality") or {}).get("gates") or {}
     failed = [(name, gate) for name, gate in gates.items() if not gate.get("passed", True)]
-    failed.sort(key=lambda pair: pair[1].get("severity") != "refuse")
+    failed.sort(key=lambda pair: (pair[1].get("severity") != "refuse", pair[0] != "evidence"))
     return [
         Finding(name, str(known.found), str(known.risk), gate.get("says", ""), gate.get("severity") == "refuse")
         for name, gate in failed

@@ -170,7 +170,7 @@ def test_a_story_at_the_terminal_names_segments_as_the_file_does() -> None:
     why = {"title": "", "missing": [], "free": []}
     lines = story_lines({"story": {**made, "why": why, "then": {"experiment": None}}})
     assert f"2 fails in     {text}" in lines
-    assert "  healed       falling validate, 0-300 µs: the error there fell" in lines
+    assert "  there        falling validate, 0-300 µs: the error there fell" in lines
 
 
 def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

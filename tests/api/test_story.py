@@ -68,7 +68,10 @@ def test_a_place_is_healed_where_only_noise_is_left_there() -> None:
         return {"noise_sd_nm": 0.1, "where": [place], "series": {"time_s": times, "residual_nm": list(residual_nm)}}
 
     first = comparison(1.0, -1.0, 0.0, 0.0)
-    for left_nm, healed, words in ((0.1, True, "fell"), (0.5, False, "more than the noise"), (1.0, False, "as before")):
+    for left_nm, healed, words in (
+        (0.1, True, "fell"), (0.5, False, "more than the noise"), (1.0, False, "as before"),
+        (1.1, False, "rose from 1 to 1.1"), (0.9999, False, "is 1 N·m, as before"),
+    ):  # fmt: skip
         (found,) = healed_places(first, comparison(left_nm, -left_nm, 9.0, 9.0))
         assert (found["before_nm"], found["after_nm"], found["healed"]) == (1.0, left_nm, healed)
         assert words in place_words(found)

@@ -241,7 +241,7 @@ def found(*gates: tuple[str, str]) -> list[advice.Finding]:
         ("usable", [], ["Fatigue", "Tremor"], "improve", "“Fatigue” and “Tremor”: add that first."),
         ("usable with care", [("ceiling", "care")], [], "approve", "look at where the error sits first"),
         ("usable with care", [("sensor", "care")], [], "approve", "look at the highest torques"),
-        ("usable with care", [("evidence", "care")], [], "look", "Compare it with the version before"),
+        ("usable with care", [("gap", "care"), ("evidence", "care")], [], "look", "Compare it with the version before"),
         ("usable with care", [("gap", "care")], ["Fatigue"], "add", "add “Fatigue” first"),
         ("usable with care", [], [], "approve", "look at where the error sits first"),
         ("not usable", [("torque", "refuse")], [], "test", "test again with electrodes, current and load cell"),

@@ -87,7 +87,7 @@ def story_lines(shown: dict[str, Any]) -> list[str]:
         added = zip(made["steps"], errors, strict=True)
         lines += _numbered("4 added", [f"{one['label']}: held-out error {a} -> {b} N·m" for one, (a, b) in added])
         healed = [f"{place['text'].partition(':')[0]}: {place['became']}" for place in made["places"]]
-        lines += _numbered("  healed", healed)
+        lines += _numbered("  there", healed)
         lines.append(f"  now          fit {number(last['fit_percent'])} %, error {number(last['rms_nm'], 4)} N·m")
     lines += _numbered(f"{4 + changed} ended", [made["ended"]])
     experiment = made["then"]["experiment"]
