@@ -101,7 +101,11 @@ function showTest(test, told) {
   if (carrying) carrying.hidden = !(test.state === "identifying" && job && job.verb === "carry");
   if (test.reason) { say("reason", told.reason); byId("reason").hidden = false; }
   const next = test.model_id ? "/models/" + test.model_id : test.joint && test.state === "completed" ? "/participants/" + test.participant + "/joint" : location.pathname;
-  if (test.done && wasOpen && !answering()) location.replace(next);
+  if (test.done && wasOpen) leave(next);
+}
+
+function leave(next) { // not before the answer to what was pressed
+  if (answering()) setTimeout(() => leave(next), 1000); else location.replace(next);
 }
 
 function age() {

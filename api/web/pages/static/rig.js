@@ -56,12 +56,12 @@
     stopped = "stopping"; show();
     try { // not given up: it may still stop, late
       const answer = await fetch(form.action, { method: "POST", body: new URLSearchParams(new FormData(form)), headers: { Accept: "text/html" } });
-      clearTimeout(late);
+      clearTimeout(late); late = 0;
       if (answer.redirected) location.assign(answer.url); else form.submit();
     } catch { notStopped(); }
   }
 
-  function notStopped() { stopped = "not_stopped"; show(); }
+  function notStopped() { clearTimeout(late); late = 0; stopped = "not_stopped"; show(); }
 
   function show() {
     doubt(stopped || (live ? "" : old() ? "no_answer" : lost)); // a running test's page says it itself
@@ -140,8 +140,7 @@
   said.lastElementChild.addEventListener("click", () => location.reload());
   addEventListener("submit", (event) => {
     if (event.target.id !== "stop-form") return;
-    clearTimeout(late);
-    late = setTimeout(notStopped, STOP_MS);
+    late = late || setTimeout(notStopped, STOP_MS); // counted from the first press: who presses on must not wait longer
     if (!old()) return; // the service answers: the form by itself, as without scripts
     event.preventDefault();
     stop(event.target);
