@@ -15,8 +15,8 @@ def stands_out(comparison: Mapping[str, Any]) -> bool:
 
     `comparison`: the keys of `compare --json`.
     """
-    error_nm = (comparison.get("held_out") or comparison).get("rms_nm")
-    return error_nm is not None and error_nm > HEALED * comparison["noise_sd_nm"]
+    error_nm, noise_nm = (comparison.get("held_out") or comparison).get("rms_nm"), comparison.get("noise_sd_nm")
+    return error_nm is not None and noise_nm is not None and error_nm > HEALED * noise_nm
 
 
 def looks_like_noise(comparison: Mapping[str, Any]) -> bool:

@@ -203,13 +203,14 @@ class Analyses:
         Raises ApiError: 409 an effect is in it already, or the recording does not ask for it and nobody forces it; 422
         no such effect, or the data do not allow the fit.
         """
+        added = list(dict.fromkeys(added))
         twice = [effect for effect in added if effect in model.effects]
         if twice:
             detail = f"{', '.join(twice)} is in {model.id} already. Name effects it does not hold."
             raise ApiError(409, "effect-present", "The effect is in the model", detail)
         await self.check_known(added)
-        effects = list(dict.fromkeys([*model.effects, *added]))
-        same = await asyncio.to_thread(self.versions.child_with, model, effects)
+        effects = [*model.effects, *added]
+        same = await asyncio.to_thread(self.versions.child_with, model, effects, [] if force else added)
         if same is not None:
             return same
         if force and not reason.strip():
@@ -282,7 +283,7 @@ class Analyses:
         self, parent: Model, added: list[str], document: dict[str, Any], by: str, forced: Sequence[str] = ()
     ) -> Model:
         """The version with effects more than its parent; made of the document where there is none."""
-        same = self.versions.child_with(parent, [*parent.effects, *added])
+        same = self.versions.child_with(parent, [*parent.effects, *added], set(added) - set(forced))
         if same is not None:
             return same
         stored_model.mark_without_evidence(

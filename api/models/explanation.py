@@ -108,8 +108,10 @@ def decided(experiment: dict[str, Any] | None, diagnosis: dict[str, Any], effect
     between = {"rivals": _(" and ").join(_in_a_sentence(rival, library) for rival in rivals)}
     if not named:
         return _("The further test was to decide between %(rivals)s: with it, none of them is asked for.", **between)
-    if len(named) > 1 or not set(named[0].get("confused_with") or []).isdisjoint(rivals):
+    if any(not set(row.get("confused_with") or []).isdisjoint(rivals) for row in named):
         return _("The further test was to decide between %(rivals)s: it has not told them apart.", **between)
+    if len(named) > 1:
+        return _("The further test was to decide between %(rivals)s: it asks for more than one of them.", **between)
     found = _in_a_sentence(named[0]["effect"], library)
     return _("The further test was to decide between %(rivals)s: it is %(found)s.", **between, found=found)
 

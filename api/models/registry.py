@@ -153,10 +153,16 @@ class Versions:
         rows = [row if "verdict" in row.fit else self.get(row.id) for row in rows]
         return [self._document(row, newest.get(row.id), holding) for row in rows]
 
-    def child_with(self, parent: Model, effects: list[str]) -> Model | None:
-        """A version of the same recording, made from `parent`, that holds exactly these effects."""
+    def child_with(self, parent: Model, effects: list[str], with_evidence: Collection[str] = ()) -> Model | None:
+        """A version of the same recording, made from `parent`, that holds exactly these effects.
+
+        One that holds any of `with_evidence` without evidence is passed over: it was made before anybody had looked.
+        """
         rows = self.store.all(Model, Model.parent_id == parent.id, Model.recording_id == parent.recording_id)
-        return next((row for row in rows if sorted(row.effects) == sorted(effects)), None)
+        return next((
+            row for row in rows if sorted(row.effects) == sorted(effects)
+            and set(with_evidence).isdisjoint(row.fit.get("without_evidence") or ())
+        ), None)  # fmt: skip
 
     def lineage(self, model: Model) -> list[Model]:
         """The versions from the first one of the recording to this one, then its newest descendants."""

@@ -341,7 +341,7 @@ def _0014(op: Operations) -> None:
     """Whether a rejection was an undo; of what is there, its reason tells."""
     _add(op, "approvals", "undone boolean?")
     rows = sa.table("approvals", sa.column("approved"), sa.column("reason"), sa.column("undone", sa.Boolean))
-    said = sa.or_(rows.c.reason == "undone", rows.c.reason.like("undone: %"))
+    said = sa.or_(rows.c.reason == "undone", sa.func.substr(rows.c.reason, 1, 8) == "undone: ")
     op.get_bind().execute(sa.update(rows).values(undone=sa.and_(sa.not_(rows.c.approved), said)))
 
 

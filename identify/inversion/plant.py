@@ -60,9 +60,10 @@ class Plant:
         if not 0.0 <= shortest_us < np.inf:
             raise BadRequest(f"{shortest_us:g} µs", place="shortest_us", fix="Give 0, or a positive number.")
         sign, width_us, level_nm = _curve(model, largest_us, whole)
+        least_us = max(shortest_us, float(whole))
         for name, most_us in (("largest_us", float(width_us[-1])), ("rise_us", rise_us)):
-            if most_us is not None and not ((np.floor(most_us) if whole else most_us) >= shortest_us):
-                message = f"at most {most_us:g} µs, and the stimulator sends no pulse below {shortest_us:g} µs"
+            if most_us is not None and not ((np.floor(most_us) if whole else most_us) >= least_us):
+                message = f"at most {most_us:g} µs, and the stimulator sends no pulse below {least_us:g} µs"
                 raise BadRequest(message, place=name, fix="Allow more: with these limits nothing would be sent.")
         top = np.maximum.accumulate(np.maximum(level_nm, 0.0))
         first = np.r_[True, top[1:] > top[:-1]]

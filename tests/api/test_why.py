@@ -110,6 +110,20 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(
     assert both.json()["without_evidence"][0] == "tremor", "a later version still holds it"
 
 
+def test_an_effect_added_before_anybody_had_looked_is_not_marked_for_good(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    marker = make_slow(service)
+    model = run_test(client, participant)["model_id"]
+    body = {"effects": ["fatigue", "fatigue"], "force": True, "reason": "seen with the eye"}
+    hasty = client.post(f"/v1/models/{model}/effects", json=body).json()
+    assert hasty["without_evidence"] == ["fatigue"] and hasty["added_effect"] == "fatigue"
+    marker.unlink()
+    asked = client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
+    assert asked["id"] != hasty["id"] and asked["without_evidence"] == []
+    assert client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"] == asked["id"]
+
+
 def test_improve_makes_a_version_a_step_and_undo_goes_back(client: httpx.Client, model: str) -> None:
     done = client.post(f"/v1/models/{model}/improve")
     assert done.status_code == 201, done.text
@@ -351,7 +365,7 @@ def test_a_further_test_is_told_what_it_decided() -> None:
 
     assert said(missing) == "it is fatigue."
     assert said({**missing, "confused_with": ["potentiation"]}) == "it has not told them apart."
-    assert said(missing, {**missing, "effect": "potentiation"}) == "it has not told them apart."
+    assert said(missing, {**missing, "effect": "potentiation"}) == "it asks for more than one of them."
     assert said({**missing, "effect": "tremor"}) == "with it, none of them is asked for."
     assert (
         said(missing, held=("potentiation",)) == said(missing, asked=None) == said(missing, asked={"rivals": []}) == ""

@@ -185,6 +185,12 @@ def test_limits_under_which_nothing_can_be_sent_are_named_instead_of_the_torque(
     assert np.any(invert(muscle(), Reference.of(smooth(3.0)), rise_us=21.0, shortest_us=20.5).pulse_width_us)
 
 
+def test_a_rise_below_a_whole_microsecond_is_named():
+    with pytest.raises(BadRequest, match=r"rise_us.* no pulse below 1 µs"):
+        invert(muscle(), Reference.of(smooth(3.0)), rise_us=0.5, whole=True)
+    assert np.any(invert(muscle(), Reference.of(smooth(3.0)), rise_us=0.5, whole=False).pulse_width_us)
+
+
 @pytest.mark.parametrize("shortest_us", [float("nan"), float("inf"), -5.0])
 def test_a_shortest_pulse_that_is_no_width_is_refused(shortest_us: float):
     with pytest.raises(BadRequest, match="shortest_us"):

@@ -74,7 +74,7 @@ def exported(
             raise CommandError(f"{error}") from error
         return {
             "output": str(folder), "format": writer.NAME, "records": state.count("done"),
-            "errors": state.count("failed"), "written": told.ok, "done_before": told.before,
+            "errors": told.error, "written": told.ok, "done_before": told.before,
             "left_out": told.left_out, "copies": told.copies, "errors_file": str(folder / ERRORS),
         }  # fmt: skip
 

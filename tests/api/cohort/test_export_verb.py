@@ -357,6 +357,9 @@ def test_one_of_several_that_fails_is_told_and_the_others_are_done(
     assert (json.loads(out)["records"], json.loads(out)["errors"]) == (2, 1)
     assert err.count("\n") == 1 and "1 of 3 records gave no result" in err and str(tmp_path / "out" / ERRORS) in err
     assert shown == [(1, 3), (2, 3), (3, 3)], "the bar knows of how many"
+    bad.unlink()
+    del given[1]
+    assert main.run(["export", *given, "--bids", str(tmp_path / "out")]) == 0, "what is no longer asked for"
 
 
 def test_records_are_read_from_a_bucket_too(data: Path, tmp_path: Path) -> None:
