@@ -42,7 +42,7 @@ def pictures(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """The worst places before a diagnosis is there."""
-    if not comparison or looks_like_noise(comparison):
+    if looks_like_noise(comparison):
         return []
     return [explanation.place(entry, number) for number, entry in enumerate(comparison.get("where") or [], start=1)]
 

@@ -81,8 +81,7 @@ def _within(found: dict[str, Any], name: str, start_s: float, end_s: float) -> t
 def captions(told: dict[str, Any]) -> dict[str, str]:
     """What stands below each figure, with its numbers."""
     rows, noise = told["rows"], localised(f"{told['noise_sd_nm']:.3g}")
-    error = "held_out_rms_nm" if rows[0]["held_out_rms_nm"] is not None else "rms_nm"
-    first, last = (localised(f"{row[error]:.3g}") for row in (rows[0], rows[-1]))
+    first, last = (localised(f"{row[told['error']]:.3g}") for row in (rows[0], rows[-1]))
     found = {
         "story-torque": _("Torque measured and predicted in free run from the pulse widths (top), and measured minus "
                           "predicted (bottom); grey band: 95 %% of the noise of %(noise)s N·m. Error %(first)s N·m.",

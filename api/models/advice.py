@@ -171,8 +171,8 @@ def advice(
         if missing:
             return Advice(add, _("Usable with care: add %(effects)s first.", effects=effects))
         look = str(first.look) if first else _("Usable with care: look at where the error sits first.")
-        asked_for = all(finding.gate != "evidence" for finding in found)
-        return Advice("approve" if kind in ("nothing", "unsure") and asked_for else "look", look)
+        forced = bool(found) and found[0].gate == "evidence"
+        return Advice("approve" if kind in ("nothing", "unsure") and not forced else "look", look)
     if verdict == "not usable":
         if missing and all(finding.gate in ("gap", "ceiling") for finding in found if finding.severe):
             return Advice(add, _("Not usable as it is: add %(effects)s, or test again.", effects=effects))

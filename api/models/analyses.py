@@ -101,9 +101,8 @@ class Analyses:
         found = self.known(place.id, kind)
         return found and explanation.remaining(found, model.effects, model.fit)
 
-    def experiment_before(self, model: Model) -> dict[str, Any] | None:
+    def experiment_before(self, first: Model) -> dict[str, Any] | None:
         """The next experiment of the diagnosis that the first model of a joined recording was made to go on from."""
-        first = self.versions.ancestry(model)[0]
         before = self.known_diagnosis(self.versions.get(first.parent_id)) if first.parent_id else None
         return (before or {}).get("experiment")
 
@@ -220,7 +219,7 @@ class Analyses:
         forced: list[str] = []
         if force:
             known = await asyncio.to_thread(self.known_diagnosis, model)
-            forced = [one for one in added if known is None or explanation.refusal(known, model.effects, one)]
+            forced = added if known is None else list(explanation.refusals(known, model.effects, added))
         else:
             diagnosis = await self.diagnosis(model, on_call)
             explanation.require_evidence(diagnosis, model.effects, added)
@@ -286,9 +285,7 @@ class Analyses:
         same = self.versions.child_with(parent, [*parent.effects, *added], set(added) - set(forced))
         if same is not None:
             return same
-        stored_model.mark_without_evidence(
-            document, [*stored_model.without_evidence(stored_model.read(parent)), *forced]
-        )
+        stored_model.mark_without_evidence(document, [*(parent.fit.get("without_evidence") or ()), *forced])
         document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
         of = (parent.participant, parent.recording_id)
         return self.versions.add(json.dumps(document), *of, by, parent.id, ",".join(added))

@@ -288,7 +288,7 @@ def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str,
 
 VERSION = (
     "id", "rms_nm", "held_out_rms_nm", "noise_sd_nm", "fit_percent", "held_out_fit_percent", "decision", "served",
-    "undone", "decision_reason", "created_utc", "added_effect", "effects", "repetition", "reason",
+    "undone", "added_effect", "effects", "repetition", "reason",
 )  # fmt: skip
 """What is shown of a version."""
 
@@ -326,14 +326,18 @@ def step_versions(found: dict[str, Any]) -> list[dict[str, Any]]:
 
 def require_evidence(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[str]) -> None:
     """Refuse effects that the recording does not ask for. Raises ApiError: 409, with the reason for each effect."""
-    found = {effect: reason for effect in added if (reason := refusal(diagnosis, present, effect))}
-    if found:
+    if found := refusals(diagnosis, present, added):
         detail = " ".join(f"{effect}: {reason}" for effect, reason in found.items())
         detail += (
             " To add it against the evidence, send `force` and a reason; the held-out error then shows its effect."
         )
         title = "The recording gives no evidence for this effect"
         raise ApiError(409, "effect-not-there", title, detail, reasons=found)
+
+
+def refusals(diagnosis: dict[str, Any], present: Sequence[str], added: Sequence[str]) -> dict[str, str]:
+    """The reason of each effect that the recording does not ask for."""
+    return {effect: reason for effect in added if (reason := refusal(diagnosis, present, effect))}
 
 
 def refusal(diagnosis: dict[str, Any], present: Sequence[str], effect: str) -> str | None:

@@ -29,6 +29,8 @@ def story(
     `rows`: the versions on the way, as `explanation.versions` gives them; `before`, `after`: the first and the last
     model compared with the recording; `diagnosis`, `last`: those of the first model and of the last one.
     """
+    error = "held_out_rms_nm" if rows[0]["held_out_rms_nm"] is not None else "rms_nm"
+    fell = rows[-1][error] < SAME * rows[0][error]
     why = diagnosis and explanation.view(diagnosis, before, [])
     healed = healed_places(before, after) if why is None or why["places"] else []
     places = [
@@ -36,43 +38,34 @@ def story(
         for number, found in enumerate(healed, start=1)
     ]
     return {
-        "title": _title(rows),
-        "fell": _fell(rows),
+        "title": _title(rows, error, fell),
+        "fell": fell,
+        "error": error,
         "rows": rows,
         "places": places,
         "why": why,
-        "steps": [_step(row, previous) for previous, row in pairwise(rows)],
+        "steps": [_step(row, previous, error) for previous, row in pairwise(rows)],
         "ended": last and translated(why_ended(last)),
         "then": last and explanation.view(last, after, rows[-1].get("effects") or []),
         "noise_sd_nm": after.get("noise_sd_nm"),
     }
 
 
-def _title(rows: Sequence[dict[str, Any]]) -> str:
-    error = _error_of(rows)
+def _title(rows: Sequence[dict[str, Any]], error: str, fell: bool) -> str:
     first, now = (localised(f"{row[error]:.3g}") for row in (rows[0], rows[-1]))
     held_out = error.startswith("held_out")
     if len(rows) == 1:
         return _("The held-out error is %(now)s N·m", now=now) if held_out else _("The error is %(now)s N·m", now=now)
     given = {"first": first, "now": now}
-    if _fell(rows):
-        fell = _("The held-out error fell from %(first)s to %(now)s N·m", **given)
-        return fell if held_out else _("The error fell from %(first)s to %(now)s N·m", **given)
+    if fell:
+        falls = _("The held-out error fell from %(first)s to %(now)s N·m", **given)
+        return falls if held_out else _("The error fell from %(first)s to %(now)s N·m", **given)
     stays = _("The held-out error did not fall: %(first)s, then %(now)s N·m", **given)
     return stays if held_out else _("The error did not fall: %(first)s, then %(now)s N·m", **given)
 
 
-def _fell(rows: Sequence[dict[str, Any]]) -> bool:
-    error = _error_of(rows)
-    return rows[-1][error] < SAME * rows[0][error]
-
-
-def _error_of(rows: Sequence[dict[str, Any]]) -> str:
-    return "held_out_rms_nm" if rows[0]["held_out_rms_nm"] is not None else "rms_nm"
-
-
-def _step(row: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+def _step(row: dict[str, Any], before: dict[str, Any], error: str) -> dict[str, Any]:
     """What a version added, in plain words, and what that did to the error."""
     added = (row.get("added_effect") or "").split(",")
     plain = " ".join(translated(fact_of(effect, "plain", "")) for effect in added)
-    return {**row, "plain": plain, "before_nm": before["held_out_rms_nm"], "before_fit_nm": before["rms_nm"]}
+    return {**row, "plain": plain, "before_nm": before[error], "after_nm": row[error]}

@@ -166,7 +166,15 @@ def test_a_story_at_the_terminal_names_segments_as_the_file_does() -> None:
     found = {"segment": "validate", "pulse_width_us": [0.0, 300.0], "direction": "falling", "share_of_excess": 0.2}
     row = dict.fromkeys(("fit_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm"), 1.0)
     places = [{**place({**found, "text": text}, 1), "became": "the error there fell"}]
-    made = {"title": "", "noise_sd_nm": 0.1, "rows": [row, row], "places": places, "steps": [], "ended": ""}
+    made = {
+        "title": "",
+        "noise_sd_nm": 0.1,
+        "rows": [row, row],
+        "places": places,
+        "steps": [],
+        "ended": "",
+        "error": "rms_nm",
+    }
     why = {"title": "", "missing": [], "free": []}
     lines = story_lines({"story": {**made, "why": why, "then": {"experiment": None}}})
     assert f"2 fails in     {text}" in lines

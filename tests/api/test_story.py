@@ -6,7 +6,7 @@ import httpx
 import pytest
 
 from stimrig.api.charts.story_charts import side_by_side
-from stimrig.api.models.story import _title
+from stimrig.api.models.story import story
 from stimrig.identify.healing import healed_places, place_words
 from tests.api import stub_worker
 from tests.api.conftest import Service, run_test, signed_in
@@ -78,8 +78,11 @@ def test_a_place_is_healed_where_only_noise_is_left_there() -> None:
 
 
 def test_an_error_that_does_not_fall_is_not_said_to_fall() -> None:
+    nowhere = {"noise_sd_nm": 0.05}
+
     def said(*errors_nm: float) -> str:
-        return _title([{"held_out_rms_nm": error_nm} for error_nm in errors_nm])
+        rows = [{"held_out_rms_nm": error_nm} for error_nm in errors_nm]
+        return story(rows, nowhere, nowhere, None, None)["title"]
 
     assert said(0.05) == "The held-out error is 0.05 N·m"
     assert said(0.1, 0.05) == "The held-out error fell from 0.1 to 0.05 N·m"

@@ -96,7 +96,7 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
 def _command(found: dict[str, Any], kind: str) -> str:
     """The commands that do what is advised."""
     if kind == "nothing":
-        return "It is that of `stimrig fit DATA -o MODEL.json`."
+        return "The model is that of `stimrig fit DATA -o MODEL.json`."
     plays = "`stimrig test --decide DATA` plays the next experiment." if found.get("deciding_experiment") else ""
     adds = "`stimrig explain DATA -o MODEL.json` adds, and shows how the error falls." if found.get("add") else ""
     own = "An effect of your own: docs/add-an-effect.md." if kind == "unexplained" and not adds else ""

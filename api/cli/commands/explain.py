@@ -83,9 +83,10 @@ def story_lines(shown: dict[str, Any]) -> list[str]:
     lines += _numbered("3 missing", [f"{why['title']}.", *[f"{one['id']}: {one['plain']}" for one in why["missing"]],
                                      *[f"{one['id']}: {one['words']}" for one in why["free"]]])  # fmt: skip
     if changed:
-        errors = [(number(one["before_nm"], 4), number(one["held_out_rms_nm"], 4)) for one in made["steps"]]
+        error = "held-out error" if made["error"] == "held_out_rms_nm" else "error"
+        errors = [(number(one["before_nm"], 4), number(one["after_nm"], 4)) for one in made["steps"]]
         added = zip(made["steps"], errors, strict=True)
-        lines += _numbered("4 added", [f"{one['label']}: held-out error {a} -> {b} N·m" for one, (a, b) in added])
+        lines += _numbered("4 added", [f"{one['label']}: {error} {a} -> {b} N·m" for one, (a, b) in added])
         healed = [f"{place['text'].partition(':')[0]}: {place['became']}" for place in made["places"]]
         lines += _numbered("  there", healed)
         lines.append(f"  now          fit {number(last['fit_percent'])} %, error {number(last['rms_nm'], 4)} N·m")

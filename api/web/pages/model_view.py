@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -69,8 +70,9 @@ async def figures_of(context: Context, row: Model) -> Figures:
     measured = await measurement(context, row)
 
     def draw() -> Figures:
-        known = {"found": context.analyses.known_diagnosis(row), "job": None}
-        return gather(context, row, measured, known)["figures"]
+        found = context.analyses.known_diagnosis(row)
+        view = explanation.view(found, measured["comparison"], row.effects) if found else None
+        return _figures(row, measured, found, view, versions_of(context, row))
 
     return await asyncio.to_thread(draw)
 
@@ -137,9 +139,8 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
     """What is missing, and where the error sits."""
     found, comparison, job = diagnosis["found"], measured["comparison"], diagnosis["job"]
     view = explanation.view(found, comparison, row.effects) if found else None
-    rows = versions_of(context, row)
-    segments = (measured["curves"] or {}).get("segments") or []
-    signatures = (found or {}).get("signatures") or {}
+    lineage = context.versions.lineage(row)
+    rows = versions_of(context, row, lineage)
     later = rows[[each["id"] for each in rows].index(row.id) + 1 :]
     return {
         **missing_parts(view, comparison),
@@ -148,21 +149,32 @@ def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: di
         "why_problem": job.problem if job and job.state == "failed" else None,
         "versions": rows,
         "undone": next((each for each in later[:1] if each["undone"]), None),
-        "decided": explanation.decided(context.analyses.experiment_before(row), found, row.effects) if found else "",
+        "decided": explanation.decided(context.analyses.experiment_before(lineage[0]), found, row.effects)
+        if found
+        else "",
         "added": {effect: each["id"] for each in later for effect in (each["added_effect"] or "").split(",")},
         "carried": carried_structure.carried_context(context.versions, row, found),
-        "figures": Figures(
-            draw_own(stored_model.read(row), measured)
-            | diagnosis_charts.diagnosis_figures(comparison, segments, view, signatures, rows),
-            f"/models/{row.id}/figures/{{}}",
-        ),
+        "figures": _figures(row, measured, found, view, rows),
     }
 
 
-def versions_of(context: Context, row: Model) -> list[dict[str, Any]]:
-    """The versions of the model's recording, as its page and its report show them."""
-    lineage = context.versions.lineage(row)
-    return explanation.versions([context.versions.document(version) for version in lineage], row.id)
+def _figures(
+    row: Model, measured: dict[str, Any], found: dict[str, Any] | None, view: dict[str, Any] | None,
+    rows: list[dict[str, Any]],
+) -> Figures:  # fmt: skip
+    segments = (measured["curves"] or {}).get("segments") or []
+    signatures = (found or {}).get("signatures") or {}
+    return Figures(
+        draw_own(stored_model.read(row), measured)
+        | diagnosis_charts.diagnosis_figures(measured["comparison"], segments, view, signatures, rows),
+        f"/models/{row.id}/figures/{{}}",
+    )
+
+
+def versions_of(context: Context, row: Model, lineage: Sequence[Model] = ()) -> list[dict[str, Any]]:
+    """The versions of the model's recording, as its page and its report show them; `lineage`: where it is known."""
+    known = lineage or context.versions.lineage(row)
+    return explanation.versions([context.versions.document(version) for version in known], row.id)
 
 
 @router.post("/models/{model_id}/diagnosis/cancel")

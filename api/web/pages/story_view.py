@@ -82,4 +82,5 @@ def _known(context: Context, path: list[Model]) -> tuple[list[dict[str, Any]], l
     documents = [context.versions.document(version) for version in path]
     documents[-1]["repetition"] = stored_model.repetition(stored_model.read(path[-1]))
     rows = explanation.versions(documents, path[-1].id)
-    return rows, [context.analyses.known_diagnosis(version) for version in (path[0], path[-1])]
+    last = context.analyses.known_diagnosis(path[-1])
+    return rows, [last if len(path) == 1 else context.analyses.known_diagnosis(path[0]), last]
