@@ -29,7 +29,7 @@ def model(client: httpx.Client, participant: str) -> str:
 
 
 def make_slow(service: Service, progress: float = 0.5) -> Path:
-    """Diagnoses stand still for a minute from now on, this far."""
+    """Diagnoses stand still for a minute from now on, this far; who asks waits for those that are half done."""
     marker = service.data / "recordings" / "slow"
     marker.parent.mkdir(parents=True, exist_ok=True)
     marker.write_text(str(progress))
@@ -113,7 +113,7 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(
 def test_an_effect_added_before_anybody_had_looked_is_not_marked_for_good(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    marker = make_slow(service)
+    marker = make_slow(service, 0.2)  # not half done: who asks later does not wait for it
     model = run_test(client, participant)["model_id"]
     body = {"effects": ["fatigue", "fatigue"], "force": True, "reason": "seen with the eye"}
     hasty = client.post(f"/v1/models/{model}/effects", json=body).json()
