@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -59,9 +59,14 @@ def within(effect: str) -> str:
     return words[:1].lower() + words[1:] if language.code() == language.DEFAULT else words
 
 
-def effects_words(effects: Iterable[str]) -> str:
-    """Titles, one after the other; of an effect's form (`fatigue:fitness`) people are told nothing."""
-    return ", ".join(within(effect.partition(":")[0]) for effect in effects)
+def effects_words(effects: Iterable[str], without_evidence: Collection[str] = ()) -> str:
+    """Titles, one after the other, those added without evidence marked; of an effect's form (`fatigue:fitness`) people
+    are told nothing."""
+    named = ((effect, within(effect.partition(":")[0])) for effect in effects)
+    return ", ".join(
+        language._("%(effects)s (without evidence)", effects=words) if effect in without_evidence else words
+        for effect, words in named
+    )
 
 
 def without_unit(parameter: str) -> str:

@@ -20,6 +20,7 @@ SURE, LIKELY = 0.9, 0.6
 """Probabilities above which the words are "very probably" and "probably"."""
 
 STRUCTURE_LEFT = "The error has structure that no effect of the library explains"
+PART_EXPLAINED = "Effects of the library explain a part of the error only"
 UNTOLD = "This record cannot tell whether something is missing"
 NOTHING = "Nothing is missing: what is left is noise"
 
@@ -45,7 +46,8 @@ def conclude(found: Mapping[str, Any]) -> Conclusion:
     missing = list(found.get("missing") or [])
     if found["verdict"] == "unexplained_structure" or (found.get("free") and not missing):
         words = "The error depends on what the muscle does, so it is not measurement noise."
-        return Conclusion("unexplained", STRUCTURE_LEFT, _with_error(words, found), _what_describes(found))
+        title = PART_EXPLAINED if missing else STRUCTURE_LEFT
+        return Conclusion("unexplained", title, _with_error(words, found), _what_describes(found))
     if missing:
         words = f"The record gives evidence for: {join_names(missing)}."
         return Conclusion("missing", _how_many(missing), _with_error(words, found), _what_to_add(found, missing))
@@ -61,7 +63,7 @@ def conclude(found: Mapping[str, Any]) -> Conclusion:
 def why_ended(found: Mapping[str, Any]) -> str:
     """Why nothing more is learnt from a record whose last model's diagnosis this is; or what still is."""
     said = conclude(found)
-    if said.kind == "missing" and asked_for(found):
+    if said.kind in ("missing", "unexplained") and asked_for(found):
         return f"More can be learnt from this record. {said.title}. {said.advice}"
     if said.kind == "nothing":
         return f"Nothing more can be learnt from this record. {said.title}. {said.words}"
@@ -115,10 +117,14 @@ def _what_to_add(found: Mapping[str, Any], missing: Sequence[Mapping[str, Any]])
 
 
 def _what_describes(found: Mapping[str, Any]) -> str:
+    wanted = asked_for(found)
+    parts = [f"Add {join_names([row])}: it explains a part." for row in in_order(found) if row["effect"] in wanted]
     if found.get("free"):
-        first = f"Add {join_names(found['free'])}: it describes what is left, and names no cause."
-        return f"{first} The next experiment teaches most about it." if found.get("deciding_experiment") else first
-    if found.get("deciding_experiment"):
+        parts.append(f"Add {join_names(found['free'])}: it describes what is left, and names no cause.")
+    planned = found.get("deciding_experiment")
+    if parts:
+        return " ".join([*parts, *(["The next experiment teaches most about it."] if planned else [])])
+    if planned:
         return "Play the next experiment: it teaches most about what is left."
     return "Look at the worst places and at electrodes, load cell and fixture, and record again."
 

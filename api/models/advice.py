@@ -133,9 +133,10 @@ GATES: dict[str, Gate] = {
 
 BESIDE: dict[str, Any] = {
     "unsure": lazy("Usable: approve it. Whether something is missing, this recording cannot tell."),
-    "unexplained": lazy("Usable: approve it. Some error is left that no effect explains."),
+    "unexplained": lazy("Usable: approve it. Some error is left that is not explained."),
+    "missing": lazy("Usable: approve it. An effect is possibly missing."),
 }
-"""What to do with a usable model whose diagnosis is not that nothing is missing."""
+"""What to do with a usable model whose diagnosis is not that nothing is missing, and names no likely effect."""
 
 
 def findings(document: dict[str, Any]) -> list[Finding]:

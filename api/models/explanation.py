@@ -302,13 +302,10 @@ def versions(rows: Sequence[dict[str, Any]], current: str) -> list[dict[str, Any
 
 def label(row: dict[str, Any]) -> str:
     """What a version is, beside the one that it was made from."""
+    forced = row.get("without_evidence") or ()
     if row["added_effect"]:
-        added = row["added_effect"].split(",")
-        words = f"+ {effects_words(added)}"
-        if set(added).isdisjoint(row.get("without_evidence") or ()):
-            return words
-        return _("%(effects)s (without evidence)", effects=words)
-    begun_with = effects_words(row.get("effects") or [])
+        return f"+ {effects_words(row['added_effect'].split(','), forced)}"
+    begun_with = effects_words(row.get("effects") or [], forced)
     return _("with %(effects)s", effects=begun_with) if begun_with else _("base model")
 
 

@@ -92,8 +92,9 @@ class Session:
             "charge of one phase, over all pulses of that day's tests (%(count)s), stopped ones, too",
             count=len(self.test_ids),
         )
-        at = {"at_utc": self.model.created_utc}  # as the participant's page and the model's own name the model
-        return {**document, **at, "figures": {**kept, "follows_percent": one}}
+        # as the participant's page and the model's own name the model
+        own = {"at_utc": self.model.created_utc, "without_evidence": self.model.fit.get("without_evidence") or []}
+        return {**document, **own, "figures": {**kept, "follows_percent": one}}
 
 
 class Trend:

@@ -218,10 +218,11 @@ class Difference:
     @property
     def words(self) -> str:
         """What the error on left-out parts says of an effect."""
-        percent, errors = 100.0 * abs(1.0 - np.exp(-self.gain)), abs(self.errors)
+        change, errors = 100.0 * abs(1.0 - np.exp(-self.gain)), abs(self.errors)
+        percent = f"{change:.0f}" if change >= 0.5 else f"{change:.1g}"  # not "rises by 0 %: it must not rise"
         if self.gain < 0.0:
-            return f"On parts left out of the fit the error rises by {percent:.0f} % ({errors:.1f} standard errors)."
-        return f"On parts left out of the fit the error falls by {percent:.0f} % ({errors:.1f} standard errors)."
+            return f"On parts left out of the fit the error rises by {percent} % ({errors:.1f} standard errors)."
+        return f"On parts left out of the fit the error falls by {percent} % ({errors:.1f} standard errors)."
 
     @property
     def words_of_choice(self) -> str:

@@ -106,6 +106,11 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(
     body |= {"effects": ["fatigue"]}  # the recording asks for it: to force it changes nothing
     asked = client.post(f"/v1/models/{model}/effects", json=body)
     assert asked.json()["without_evidence"] == []
+    with signed_in(service) as page:
+        client.post(f"/v1/models/{forced.json()['id']}/approve")
+        beside = f"/compare?model={model}&model={forced.json()['id']}"
+        for path in ("/participants/P017", "/participants/P017/trend", beside):
+            assert "tremor (without evidence)" in page.get(path).text, path
     both = client.post(f"/v1/models/{forced.json()['id']}/effects", json=body)
     assert both.json()["without_evidence"][0] == "tremor", "a later version still holds it"
 
@@ -309,6 +314,22 @@ def test_effects_are_advised_in_the_order_in_which_improve_adds_them() -> None:
     said = explanation.view(nothing, None, [])["advice"]
     assert said.startswith("Add nothing yet") and said.endswith("The ramp again.")
     assert why_ended(nothing).startswith("Nothing more can be learnt"), "there is nothing to be done with this record"
+
+
+def test_an_effect_that_explains_a_part_is_advised_and_not_denied() -> None:
+    """The title told that no effect explains the error, beside one that lowered it by 78 % and was to be added."""
+    part = {"verdict": "unexplained_structure", "missing": [{**FATIGUE, "probability": 0.45}], "noise_sd_nm": 0.04}
+    said = conclude(part | {"add": ["fatigue"]})
+    assert said.title == "Effects of the library explain a part of the error only"
+    assert said.advice == "Add “Fatigue”: it explains a part."
+    assert why_ended(part | {"add": ["fatigue"]}).startswith("More can be learnt from this record.")
+    free = {"effect": "free_level", "name": "Free level"}
+    both = conclude(part | {"add": ["fatigue", "free_level"], "free": [free], "deciding_experiment": {"text": "x"}})
+    assert both.advice.startswith("Add “Fatigue”: it explains a part. Add “Free level”: it describes what is left")
+    assert both.advice.endswith("The next experiment teaches most about it.")
+    refused = part | {"add": []}
+    assert conclude(refused).advice.startswith("Look at the worst places")
+    assert why_ended(refused).startswith("Nothing more can be learnt from this record alone.")
 
 
 def test_what_is_left_to_add_is_said_by_the_diagnosis_that_named_it(
