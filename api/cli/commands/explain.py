@@ -80,7 +80,7 @@ def story_lines(shown: dict[str, Any]) -> list[str]:
     ]
     lines += _numbered("2 fails in", [place["text"] for place in made["places"]] or ["no place stands out"])
     why = made["why"]
-    lines += _numbered("3 missing", [f"{why['title']}.", *[f"{one['id']}: {one['plain']}" for one in why["missing"]],
+    lines += _numbered("3 missing", [f"{why['title']}.", *[_named(one) for one in why["missing"]],
                                      *[f"{one['id']}: {one['words']}" for one in why["free"]]])  # fmt: skip
     if changed:
         error = "held-out error" if made["error"] == "held_out_rms_nm" else "error"
@@ -95,6 +95,12 @@ def story_lines(shown: dict[str, Any]) -> list[str]:
     if experiment:
         lines += _numbered("  next", [experiment["text"], "`stimrig test --decide DATA` plays it, judges both."])
     return lines
+
+
+def _named(one: dict[str, Any]) -> str:
+    """An effect that is missing, how sure that is, and what it is."""
+    sure = f" ({one['sure_words']})" if one["sure_words"] else ""
+    return f"{one['id']}{sure}: {one['plain']}"
 
 
 def _numbered(label: str, texts: Sequence[str]) -> list[str]:
