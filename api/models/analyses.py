@@ -215,15 +215,15 @@ class Analyses:
         if force and not reason.strip():
             detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
             raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
-        free: dict[str, str] = {}
         forced: list[str] = []
         if force:
-            known = await asyncio.to_thread(self.known_diagnosis, model)
-            forced = added if known is None else list(explanation.refusals(known, model.effects, added))
+            diagnosis = await asyncio.to_thread(self.known_diagnosis, model)
+            forced = added if diagnosis is None else list(explanation.refusals(diagnosis, model.effects, added))
         else:
             diagnosis = await self.diagnosis(model, on_call)
             explanation.require_evidence(diagnosis, model.effects, added)
-            free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in diagnosis.get("free") or []}
+        found_free = (diagnosis or {}).get("free") or []
+        free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in found_free}
         path = await asyncio.to_thread(self.path, model.recording_id)
         held = {effect.partition(":")[0]: effect for effect in structure_of(model)}
         asked = [held.get(effect, free.get(effect, effect)) for effect in effects]

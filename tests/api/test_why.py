@@ -354,6 +354,23 @@ def test_what_is_left_to_add_is_said_by_the_diagnosis_that_named_it(
     assert told["conclusion"]["kind"] == "missing" and not searched
 
 
+def test_a_free_effect_that_is_forced_and_asked_for_has_the_form_that_was_found(
+    client: httpx.Client, service: Service, model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = soon(lambda: service.context.analyses.known(model, "diagnosis"))
+    free = {"effect": "fatigue", "form": "fitness", "name": "Fatigue", "words": "", "parameters": {}}
+    service.context.analyses._keep(model, "diagnosis", {**found, "missing": [], "free": [free], "add": ["fatigue"]})
+    submit, asked = service.context.pool.submit, []
+    monkeypatch.setattr(
+        service.context.pool,
+        "submit",
+        lambda verb, **given: (asked.append(given.get("effects")), submit(verb, **given))[1],
+    )
+    body = {"effects": ["fatigue"], "force": True, "reason": "seen with the eye"}
+    assert client.post(f"/v1/models/{model}/effects", json=body).json()["without_evidence"] == []
+    assert ["fatigue:fitness"] in asked
+
+
 def test_a_free_effect_that_is_left_to_add_is_no_nothing() -> None:
     """Once the named effect was added the same document said "nothing to add" and asked for the free one."""
     free = {"effect": "free_level", "name": "Free level", "words": "", "parameters": {}}
