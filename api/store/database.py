@@ -122,8 +122,10 @@ def _why(error: Exception, shown: str) -> str:
 WRITER_KEY = 0x5354494D52494701
 """PostgreSQL's advisory lock of whoever writes: "STIMRIG" and 1."""
 CONNECT_S, POOL_S = 3, 5
+OTHER_WRITER_MS = 10_000
+"""How long one waits for another writer."""
 SERVER_SETTINGS = {
-    "lock_timeout": 10_000,  # for another writer, ms
+    "lock_timeout": OTHER_WRITER_MS,
     "statement_timeout": 30_000,
     "idle_in_transaction_session_timeout": 30_000,  # a writer that was stopped in the middle lets go
     "tcp_keepalives_idle": 10,  # s; a machine that is gone lets go, too
@@ -175,7 +177,8 @@ def _postgresql(url: URL) -> Engine:
 def _durable_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # `_begin_sqlite` begins transactions, not the driver
     cursor = connection.cursor()
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=5000"):
+    waits = f"busy_timeout={OTHER_WRITER_MS}"  # SQLite knows no queue: of eight writers one may wait long
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", waits):
         cursor.execute(f"PRAGMA {pragma}")
     cursor.close()
 
