@@ -26,7 +26,7 @@ from stimrig.api.workers.pool import WORKER, Pool
 from stimrig.api.workers.process import Places
 from tests.api.conftest import STUB, Service, run_service, serving, soon
 from tests.api.test_problems import problem
-from tests.api.test_worker import made_up_csv, with_pool
+from tests.api.test_worker import with_pool
 from tests.harness import hostile_files, hostile_shapes
 
 pytestmark = pytest.mark.slow
@@ -168,13 +168,13 @@ def test_a_recording_in_a_folder_not_known_yet_is_read_by_a_fresh_worker(tmp_pat
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
         folder.mkdir()
-        made_up_csv(folder / "good.csv")
+        (folder / "good.h5").write_bytes(hostile_shapes.good())
 
     async def run() -> list[int]:
         pool, pids = Pool(1, places=Places([first])), []
         try:
             for folder in (first, second, first):
-                await pool.submit("fit", data=str(folder / "good.csv")).result
+                await pool.submit("recorded", data=str(folder / "good.h5")).result
                 process = pool.workers[0].process
                 assert process is not None
                 pids.append(process.pid)
@@ -198,7 +198,7 @@ def test_hostile_files_through_a_worker() -> None:
 
     def some(folder: Path) -> Iterator[hostile_shapes.Hostile]:
         rng = random.Random(3)
-        yield from (each for each in hostile_shapes.all_files(folder, seed=3, count=0) if each.name in picked)
+        yield from hostile_shapes.all_files(folder, seed=3, count=0, only=picked)
         yield from (hostile_shapes.spoiled(rng, number) for number in range(12))
 
     tally = asyncio.run(hostile_files.run(some))
@@ -224,7 +224,7 @@ def test_an_upload_that_a_worker_dies_of_is_refused_in_one_line(deadly: Service)
 
 
 def test_no_path_of_this_machine_is_told_of_an_upload(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, WORKER):
+    for service in run_service(tmp_path, short_dir, WORKER, workers=1):
         with service.client() as client:
             client.timeout = None  # a worker gives way to every other process
             client.post("/v1/participants", json={"code": "P017"})

@@ -6,7 +6,7 @@ import io
 import json
 import random
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from operator import setitem
 from pathlib import Path
@@ -32,17 +32,19 @@ class Hostile:
 Change = Callable[[h5py.File, Path], Any]
 
 
-def all_files(folder: Path, seed: int, count: int) -> Iterator[Hostile]:
+def all_files(folder: Path, seed: int, count: int, only: Collection[str] | None = None) -> Iterator[Hostile]:
     """At least `count` files: every shape once, then good files with bytes changed, and cut, by the seed.
 
-    `folder` holds what some of them point to: a secret, and a recording that nobody gave.
+    `folder` holds what some of them point to: a secret, and a recording that nobody gave. `only`: the names of the
+    shapes wanted.
     """
     (folder / "secret.txt").write_bytes(SECRET)
     (folder / "other.h5").write_bytes(good())
     made = 0
-    for hostile in (*hdf5_shapes(folder), *csv_shapes(), *model_shapes()):
-        made += 1
-        yield hostile
+    for hostile in (*hdf5_shapes(folder, only), *csv_shapes(), *model_shapes()):
+        if only is None or hostile.name in only:
+            made += 1
+            yield hostile
     rng = random.Random(seed)
     for number in range(max(0, count - made)):
         yield spoiled(rng, number)
@@ -153,8 +155,8 @@ def deep(file: h5py.File, _folder: Path) -> None:
     file["torque/again"] = file["torque"]
 
 
-def hdf5_shapes(folder: Path) -> Iterator[Hostile]:
-    """Each way in which a recording may be something else."""
+def hdf5_shapes(folder: Path, only: Collection[str] | None = None) -> Iterator[Hostile]:
+    """Each way in which a recording may be something else; of most of them `only` the named ones."""
     many = 10**12
     values = columns()
     torque, times = "torque/torque_nm", "torque/time_s"
@@ -223,7 +225,8 @@ def hdf5_shapes(folder: Path) -> Iterator[Hostile]:
         for value in (np.inf, -1e300):
             shapes[f"{value} in {path}"] = cell(path, index, value)
     for name, change in shapes.items():
-        yield Hostile(name, ".h5", good(change, folder))
+        if only is None or name in only:
+            yield Hostile(name, ".h5", good(change, folder))
     yield Hostile("deep and round", ".h5", good(deep, folder), refused=False)
     yield Hostile("sound", ".h5", good(), refused=False)
     yield Hostile("sound, newest layout", ".h5", good(libver="latest"), refused=False)
