@@ -24,10 +24,9 @@ from stimrig.api.charts.svg import svg
 from stimrig.api.language import using
 from stimrig.api.sessions import joint_plan
 from stimrig.api.workers.curves import curves
-from stimrig.api.workers.pool import WORKER
 from tests.api import made_up_joint
 from tests.api.browser import look_closer, open_tab
-from tests.api.conftest import Service, play_test, run_test, serving, shared_service
+from tests.api.conftest import REAL, Service, play_test, run_test, serving, shared_service
 from tests.api.fake_rig import default_widths, muscle
 from tests.api.test_axe import examined
 from tests.api.test_chart_boxes import COVERED, LAPTOP
@@ -37,9 +36,9 @@ Done = tuple[httpx.Client, dict[str, Any], Path]
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Done]:
-    """A test's recording and model, by real workers."""
+    """A test's recording and model, by what a real worker does."""
     folder = tmp_path_factory.mktemp("export")
-    with serving(folder, short_dir, WORKER) as (_, client):
+    with serving(folder, short_dir, REAL) as (_, client):
         client.timeout = 120
         client.post("/v1/participants", json={"code": "P1"})
         yield client, run_test(client, "P1", 120.0), folder

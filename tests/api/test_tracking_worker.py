@@ -18,10 +18,9 @@ from stimrig import identify
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store.tables import Recording
 from stimrig.api.workers import tracking_verbs
-from stimrig.api.workers.pool import WORKER
 from stimrig.identify import tracking
 from stimrig.rig import messages as m
-from tests.api.conftest import Service, run_test, serving, soon, wait_done
+from tests.api.conftest import REAL, Service, run_test, serving, soon, wait_done
 from tests.api.fake_rig import PATIENT, write_recording
 from tests.api.test_tracked import play, say
 from tests.harness.sessions import Planned, record
@@ -246,7 +245,7 @@ BODY = {"participant": "P1", "kind": "sequence", "segments": TRIAL}
 
 
 def test_a_muscle_that_stays_is_followed_through_the_service(tmp_path: Path, short_dir: Path) -> None:
-    with serving(tmp_path, short_dir, WORKER) as (_, client):
+    with serving(tmp_path, short_dir, REAL) as (_, client):
         client.timeout = 300
         client.post("/v1/participants", json={"code": "P1"})
         test = run_test(client, "P1", 300)

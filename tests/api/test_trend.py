@@ -20,8 +20,7 @@ from stimrig.api.charts.trend_charts import WIDE
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.store.tables import Analysis, Model
-from stimrig.api.workers.pool import WORKER
-from tests.api.conftest import Service, serving, shared_service
+from tests.api.conftest import REAL, Service, serving, shared_service
 from tests.harness import sessions
 from tests.harness.muscle import Patient
 from tests.harness.sessions import Planned
@@ -135,7 +134,7 @@ def test_a_dose_is_told_in_one_unit_and_says_what_it_counts(client: httpx.Client
 
 
 def test_models_from_before_the_figures_are_read_once(tmp_path: Path, short_dir: Path) -> None:
-    with serving(tmp_path, short_dir, WORKER) as (service, client):
+    with serving(tmp_path, short_dir, REAL) as (service, client):
         _read_once(service, client)
 
 
