@@ -20,7 +20,7 @@ from sqlalchemy import inspect
 
 from stimrig.api.errors import ApiError
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, audit, holds
+from stimrig.api.store import Store, audit, database, holds
 from stimrig.api.store.holds import Among
 from stimrig.api.store.tables import AuditEntry, Model, Test
 from stimrig.api.web.app import create_app
@@ -157,7 +157,9 @@ def test_what_a_living_service_follows_is_left_to_it(tmp_path: Path, short_dir: 
 
 
 @pytest.mark.slow
-def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, address: str) -> None:
+def test_a_turn_is_had_by_one_and_given_back_by_the_dead(
+    cluster: Cluster, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     taking = (
         "import asyncio, sys\nfrom stimrig.api.store import Store, holds\n"
         "async def main():\n"
@@ -165,6 +167,7 @@ def test_a_turn_is_had_by_one_and_given_back_by_the_dead(cluster: Cluster, addre
         "        print('had', flush=True)\n        await asyncio.sleep(600)\n"
         "asyncio.run(main())\n"
     )
+    monkeypatch.setitem(database.SERVER_SETTINGS, "lock_timeout", 1000)  # it is always waited out
     store = Store(address)
     held = holds.open_holds(store)
     assert isinstance(held, holds.Among)
