@@ -18,6 +18,7 @@ from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Pulses
 from tests.harness import few_effects
+from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 
 HIDDEN = ("", "fatigue", "asymmetric_relaxation", "electromechanical_delay", "output_saturation", "threshold_drift")
@@ -82,12 +83,12 @@ def record_of(hidden: str) -> Record:
     return hidden_muscles.record(hidden, seed=SEED, rate_hz=RATE_HZ)
 
 
-@cache
-def plain_fit(hidden: str) -> Model:
-    return fit(record_of(hidden))
+@made_once
+def fitted(hidden: str, *effects: str) -> Model:
+    return fit(record_of(hidden), effects=effects)
 
 
-@cache
+@made_once
 def answer(hidden: str) -> tuple[str, str, float]:
     return said(record_of(hidden))
 
@@ -118,7 +119,7 @@ def moved(model: Model, base: Model, factor: float = 1.0) -> dict[str, float]:
 @pytest.mark.parametrize("hidden", HIDDEN)
 def test_fit_does_not_depend_on_how_torque_and_time_are_counted(hidden, relation):
     change, factor, offset_nm = COUNTING[relation]
-    record, base = change(record_of(hidden)), plain_fit(hidden)
+    record, base = change(record_of(hidden)), fitted(hidden)
     model = fit(record)
     found = moved(model, base, factor)
     found["baseline"] = abs(model.baseline_nm - factor * base.baseline_nm - offset_nm)
@@ -146,7 +147,7 @@ def _fits() -> list:
 
 @pytest.mark.parametrize(("hidden", "relation"), _fits())
 def test_fit_hardly_depends_on_which_samples_show_the_muscle(hidden, relation):
-    found = moved(fit(SAMPLING[relation](record_of(hidden))), plain_fit(hidden))
+    found = moved(fit(SAMPLING[relation](record_of(hidden))), fitted(hidden))
     allowed = {"time_constant": 0.005, "damping": 0.005, "delay_s": 5e-4, "curve": 0.003}
     if hidden:  # the plain structure is wrong then, and which wrong one is best depends on the rows
         allowed = {"time_constant": 0.015, "damping": 0.025, "delay_s": 1e-3, "curve": 0.03}
@@ -159,7 +160,7 @@ def test_fit_hardly_depends_on_which_samples_show_the_muscle(hidden, relation):
 def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
     """Its dynamics keep to 1 %; the form may be another of the same effect, and its curve then stands a little else."""
     record = record_of(hidden)
-    base = fit(record, effects=[hidden])
+    base = fitted(hidden, hidden)
     found = moved(fit(SAMPLING[relation](record), effects=[hidden]), base)
     # The curve is that of the muscle at the record's begin: after 2.3 s of PRBS at half duty 3.4 % of it is tired.
     curve = 0.04 if (hidden, relation) == ("fatigue", "begun in the PRBS") else 0.03

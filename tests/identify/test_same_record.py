@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.harness.answers import IMPROVED, answers, answers_elsewhere, records
+from tests.harness.made_once import made_once
 
 NUDGE = 1.0 + 1e-9
 MOST = 0.01
@@ -17,14 +18,21 @@ MOST = 0.01
 Answers = dict[str, dict[str, Any]]
 
 
-@pytest.fixture(scope="module")
+@made_once
+def answered(where: str) -> Answers:
+    if where == "another processor":
+        return answers_elsewhere()
+    return json.loads(json.dumps(answers(NUDGE if where == "nudged" else 1.0)))
+
+
+@pytest.fixture
 def here() -> Answers:
-    return json.loads(json.dumps(answers()))
+    return answered("here")
 
 
-@pytest.fixture(scope="module", params=["nudged", "another processor"])
+@pytest.fixture(params=["nudged", "another processor"])
 def again(request: pytest.FixtureRequest) -> Answers:
-    return answers(NUDGE) if request.param == "nudged" else answers_elsewhere()
+    return answered(request.param)
 
 
 def test_the_plain_fit_stays(here: Answers, again: Answers) -> None:
