@@ -18,6 +18,7 @@ from stimrig.identify.conclusion import conclude
 from stimrig.identify.records.record import Record
 from tests.harness import few_effects
 from tests.harness.carried_sessions import SESSIONS, as_record, fine_session, muscle, session
+from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 
 
@@ -123,7 +124,7 @@ def said(record: Record, *effects: tuple[str, str]) -> Answer:
     return found.offered, set(found.still_needed), set(found.no_longer_needed), set(found.undecided)
 
 
-@cache
+@made_once
 def unchanged() -> Answer:
     return said(second_session(), WEAK, STRONG)
 

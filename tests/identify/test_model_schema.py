@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jsonschema_rs
@@ -46,12 +46,11 @@ def places(node: Any, way: tuple[str | int, ...] = ()) -> Iterator[tuple[str | i
             yield from places(node[index], (*way, index))
 
 
-def changed(document: dict[str, Any], way: tuple[str | int, ...], value: Any) -> dict[str, Any]:
-    found = copy.deepcopy(document)
-    inner: Any = found
-    for step in way[:-1]:
-        inner = inner[step]
-    inner[way[-1]] = value
+def changed(node: Any, way: Sequence[str | int], value: Any) -> Any:
+    """With another value there; what is not on the way to it is shared, not copied."""
+    first, *rest = way
+    found = copy.copy(node)
+    found[first] = changed(node[first], rest, value) if rest else value
     return found
 
 
