@@ -139,8 +139,7 @@ def test_held_out_rows_may_object_to_any_link_of_a_chain(monkeypatch: pytest.Mon
 def found() -> tuple[Diagnosis, Improvement]:
     """Of a muscle of Ding's calcium and bridges."""
     with few_effects.only(*TRIED):
-        record = as_record(record_of_physics("physics", 0))
-        return identify.diagnose(record), identify.improve(record)
+        return identify.diagnose_and_improve(as_record(record_of_physics("physics", 0)))
 
 
 def unseen_error(model: Model, made: dict) -> float:
