@@ -263,7 +263,8 @@ def test_verdict_and_diagnosis_are_one_sentence() -> None:
     before anybody had looked for what is missing."""
     unsure = advice.advice("usable", [], [], "unsure")
     assert unsure.act == "approve" and "this recording cannot tell" in unsure.words
-    assert "no effect explains" in advice.advice("usable", [], [], "unexplained").words
+    assert "that is not explained" in advice.advice("usable", [], [], "unexplained").words
+    assert "possibly missing" in advice.advice("usable", [], [], "missing").words
     for kind, act in (("unsure", "approve"), ("unexplained", "look"), (None, "look")):
         assert advice.advice("usable with care", [], [], kind).act == act
     for verdict in ("usable", "usable with care"):
