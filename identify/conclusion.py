@@ -46,7 +46,7 @@ def conclude(found: Mapping[str, Any]) -> Conclusion:
     missing = list(found.get("missing") or [])
     if found["verdict"] == "unexplained_structure" or (found.get("free") and not missing):
         words = "The error depends on what the muscle does, so it is not measurement noise."
-        title = PART_EXPLAINED if missing else STRUCTURE_LEFT
+        title = STRUCTURE_LEFT if asked_for(found).isdisjoint(row["effect"] for row in missing) else PART_EXPLAINED
         return Conclusion("unexplained", title, _with_error(words, found), _what_describes(found))
     if missing:
         words = f"The record gives evidence for: {join_names(missing)}."
@@ -121,12 +121,10 @@ def _what_describes(found: Mapping[str, Any]) -> str:
     parts = [f"Add {join_names([row])}: it explains a part." for row in in_order(found) if row["effect"] in wanted]
     if found.get("free"):
         parts.append(f"Add {join_names(found['free'])}: it describes what is left, and names no cause.")
-    planned = found.get("deciding_experiment")
-    if parts:
-        return " ".join([*parts, *(["The next experiment teaches most about it."] if planned else [])])
-    if planned:
-        return "Play the next experiment: it teaches most about what is left."
-    return "Look at the worst places and at electrodes, load cell and fixture, and record again."
+    if found.get("deciding_experiment"):
+        left = "Play the next experiment: it teaches most about what is left."
+        parts.append("The next experiment teaches most about it." if found.get("free") else left)
+    return " ".join(parts) or "Look at the worst places and at electrodes, load cell and fixture, and record again."
 
 
 def only_open(found: Mapping[str, Any]) -> Mapping[str, Any] | None:

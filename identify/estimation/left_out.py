@@ -219,7 +219,8 @@ class Difference:
     def words(self) -> str:
         """What the error on left-out parts says of an effect."""
         change, errors = 100.0 * abs(1.0 - np.exp(-self.gain)), abs(self.errors)
-        percent = f"{change:.0f}" if change >= 0.5 else f"{change:.1g}"  # not "rises by 0 %: it must not rise"
+        # not "rises by 0 %: it must not rise"
+        percent = f"{change:.0f}" if change >= 0.5 else f"{change:.2f}" if change >= 0.01 else "less than 0.01"
         if self.gain < 0.0:
             return f"On parts left out of the fit the error rises by {percent} % ({errors:.1f} standard errors)."
         return f"On parts left out of the fit the error falls by {percent} % ({errors:.1f} standard errors)."

@@ -111,6 +111,8 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(
         beside = f"/compare?model={model}&model={forced.json()['id']}"
         for path in ("/participants/P017", "/participants/P017/trend", beside):
             assert "tremor (without evidence)" in page.get(path).text, path
+        for path in (f"/models/{forced.json()['id']}", f"/models/{forced.json()['id']}/report"):
+            assert "with tremor (without evidence)" in page.get(path).text, path
     both = client.post(f"/v1/models/{forced.json()['id']}/effects", json=body)
     assert both.json()["without_evidence"][0] == "tremor", "a later version still holds it"
 
@@ -327,7 +329,10 @@ def test_an_effect_that_explains_a_part_is_advised_and_not_denied() -> None:
     both = conclude(part | {"add": ["fatigue", "free_level"], "free": [free], "deciding_experiment": {"text": "x"}})
     assert both.advice.startswith("Add “Fatigue”: it explains a part. Add “Free level”: it describes what is left")
     assert both.advice.endswith("The next experiment teaches most about it.")
+    planned = conclude(part | {"add": ["fatigue"], "deciding_experiment": {"text": "x"}})
+    assert planned.advice.endswith("it explains a part. Play the next experiment: it teaches most about what is left.")
     refused = part | {"add": []}
+    assert conclude(refused).title == "The error has structure that no effect of the library explains"
     assert conclude(refused).advice.startswith("Look at the worst places")
     assert why_ended(refused).startswith("Nothing more can be learnt from this record alone.")
 

@@ -20,7 +20,7 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation import left_out
 from stimrig.identify.estimation.candidates import alike_rows, words
 from stimrig.identify.estimation.effect_fit import Candidate, fitted_with
-from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, hold_out, leave_out
+from stimrig.identify.estimation.left_out import Difference, LeftOut, blocks, bouts, difference, hold_out, leave_out
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.records.join import join
@@ -174,3 +174,10 @@ def test_what_is_likely_and_does_not_predict_is_refused():
         result = identify.improve(record)
     assert [step["added"] for step in result.steps] == [None]
     assert any("parts left out of the fit" in row["reason"] for row in result.refused)
+
+
+@pytest.mark.parametrize(
+    ("gain", "says"), [(-3e-7, "rises by less than 0.01 %"), (0.003, "falls by 0.30 %"), (0.2, "falls by 18 %")]
+)
+def test_a_small_change_is_not_told_as_none(gain: float, says: str) -> None:
+    assert says in Difference(gain, 0.1, 9.0).words
