@@ -12,6 +12,7 @@ import os
 import resource
 import socket
 import sys
+from typing import Any
 
 import h11
 import uvicorn
@@ -55,16 +56,19 @@ def run(app: FastAPI, listener: socket.socket) -> None:
         asyncio.run(serve(uvicorn.Server(configuration(app)), listener, ready))
 
 
-def configuration(app: ASGIApp) -> uvicorn.Config:
+def configuration(app: ASGIApp, **more: Any) -> uvicorn.Config:
     """How uvicorn runs the service.
 
     `X-Forwarded-For` is believed of a proxy on this machine only: who signs in too often is told apart by address, and
-    anybody could write another one into the header.
+    anybody could write another one into the header. Each request begins with no context variable set: on a connection
+    that stays open it would else take over those of an earlier one, and so what that one was shown.
     """
-    return uvicorn.Config(
-        app, log_config=None, access_log=False, timeout_graceful_shutdown=2, ws_max_size=2**20, server_header=False,
-        http=protocol(), proxy_headers=True, forwarded_allow_ips=["127.0.0.1", "::1"],
-    )  # fmt: skip
+    usual: dict[str, Any] = {
+        "log_config": None, "access_log": False, "timeout_graceful_shutdown": 2, "ws_max_size": 2**20,
+        "server_header": False, "http": protocol(), "proxy_headers": True, "forwarded_allow_ips": ["127.0.0.1", "::1"],
+        "reset_contextvars": True,
+    }  # fmt: skip
+    return uvicorn.Config(app, **usual | more)
 
 
 def refuse_open_door(settings: ServerSettings) -> None:

@@ -32,7 +32,7 @@ from stimrig.api.people import accounts
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, database
 from stimrig.api.web.app import create_app
-from stimrig.api.web.server import protocol
+from stimrig.api.web.server import configuration
 from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness.late_answers import LateAnswers
@@ -163,11 +163,12 @@ def no_database_on_the_event_loop() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def answers_come_late(request: pytest.FixtureRequest) -> Iterator[None]:
-    """With `--late-answers SEED`: to browsers, from every service."""
+    """With `--late-answers SEED`: to browsers, from every service; and their pages ask often."""
     seed: int | None = request.config.getoption("--late-answers")
     with pytest.MonkeyPatch.context() as patch:
         if seed is not None:
             patch.setattr(Server, "behind", staticmethod(partial(LateAnswers, seed=seed)))
+            patch.setattr("tests.api.browser.ASKS_OFTEN", True)
         yield
 
 
@@ -275,9 +276,9 @@ class Server:
     """What stands between it and the application."""
 
     def __init__(self, app: Any, http: Any = None) -> None:
-        http, app = http or protocol(), self.behind(app)
+        more = {"http": http} if http else {}
         self.server = PromptServer(
-            uvicorn.Config(app, port=0, log_level="warning", ws_ping_interval=None, http=http, lifespan="on")
+            configuration(self.behind(app), port=0, log_level="warning", ws_ping_interval=None, lifespan="on", **more)
         )
 
     def __enter__(self) -> str:

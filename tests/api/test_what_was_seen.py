@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import re
+import socket
 from dataclasses import replace
+from functools import partial
 from typing import Any
 from unittest.mock import Mock
 
@@ -23,7 +25,7 @@ from stimrig.rig import messages as m
 from stimrig.rig.requests import WithdrawRequest
 from tests.api.conftest import HTML, TOKEN, Service, csrf, run_test, signed_in, soon
 from tests.api.fake_arm import still
-from tests.api.test_forms import fields
+from tests.api.test_forms import fields, inputs
 from tests.api.test_overtaken import TRIAL, key_of
 from tests.api.test_profiles import mark_all
 
@@ -505,3 +507,24 @@ def test_a_result_of_other_limits_is_not_offered_once_more(
     refused = pages.post(f"{PAGE}/calibration/finish", data={"csrf": csrf(pages), "calibration": version})
     assert refused.status_code == 409 and "12 N·m" in refused.text
     assert "all the same" not in refused.text
+
+
+def test_a_page_is_as_old_as_its_own_request_also_right_behind_another_on_its_connection(
+    pages: httpx.Client, participant: str
+) -> None:
+    """A browser asks on as soon as an answer has come, before it has ended here; the next request began within it."""
+    sent = inputs(pages.get(PAGE).text, f"{PAGE}/profile")
+    pages.headers["Accept-Encoding"] = "identity"
+    posted = pages.build_request("POST", f"{PAGE}/profile", data=sent | {"current_ma": "7"})
+    asked = pages.build_request("GET", PAGE, headers={"Connection": "close"})
+    with socket.create_connection((asked.url.host, asked.url.port), timeout=60) as line:
+        for request in (posted, asked):
+            lines = [
+                f"{request.method} {request.url.raw_path.decode()} HTTP/1.1",
+                *map(": ".join, request.headers.items()),
+            ]
+            line.sendall("\r\n".join([*lines, "", ""]).encode() + request.content)
+        answers = b"".join(iter(partial(line.recv, 65536), b"")).decode()
+    assert " 303 " in answers.partition("\r\n")[0]
+    before, shown = int(sent["seen"].partition(".")[0]), re.findall(r'name="seen" value="(\d+)', answers)
+    assert {int(entry) > before for entry in shown} == {True}, (before, shown)

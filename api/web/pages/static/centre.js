@@ -14,5 +14,6 @@
     } catch { /* the next time */ }
   }
 
-  if (live) setInterval(renew, 1000 * live.dataset.everyS);
+  let renewing = null; // one question at a time, also of a slow service
+  if (live) setInterval(() => { renewing ??= renew().finally(() => { renewing = null; }); }, 1000 * live.dataset.everyS);
 }

@@ -23,5 +23,6 @@
       shown = text;
     } catch { /* asked again */ }
   }
-  setInterval(renew, 2000);
+  let renewing = null; // one question at a time: more of them would keep a slow service from saying what the rig does
+  setInterval(() => { renewing ??= renew().finally(() => { renewing = null; }); }, 2000);
 }
