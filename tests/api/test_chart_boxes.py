@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.api.browser import chart, look_closer, open_tab
-from tests.api.conftest import Service, shared_service
+from tests.api.conftest import Service, shared_service, soon
 
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = {"width": 1366, "height": 768}, {"width": 820, "height": 1180}
@@ -198,7 +198,8 @@ def test_a_page_is_light_until_a_chart_is_taken_hold_of(tab: Any, service: Servi
     tab.set_viewport_size(LAPTOP)
     tab.goto(f"{service.url}/models/{model}?diagnose=0")
     chart(tab, "overview")
-    tab.wait_for_load_state("networkidle")
+    for _ in range(2):  # it is never quiet: it asks what the rig does
+        tab.wait_for_event("request", lambda request: request.url.endswith("/rig/now"))
     asked = [url for url in tab.requests if "/figures/" in url or PLOTLY in url]
     assert asked == [], "the first chart stands in the page, and the others are folded"
     size = tab.evaluate("performance.getEntriesByType('navigation')[0].transferSize")
@@ -278,8 +279,7 @@ def test_without_scripts_stills_are_pictures(browser: Any, service: Service, mod
         page.locator("#curves > summary").click()
         picture = page.locator("[data-figure=step] img.still")
         picture.scroll_into_view_if_needed()
-        page.wait_for_load_state("networkidle")
-        assert picture.evaluate("image => image.naturalWidth") > 100
+        soon(lambda picture=picture: picture.evaluate("image => image.naturalWidth") > 100)
         assert picture.get_attribute("alt") == "Share of the final torque over time in seconds"
 
 
