@@ -275,8 +275,7 @@ class Server:
     behind: Callable[[Any], Any] = staticmethod(lambda app: app)
     """What stands between it and the application."""
 
-    def __init__(self, app: Any, http: Any = None) -> None:
-        more = {"http": http} if http else {}
+    def __init__(self, app: Any, **more: Any) -> None:
         self.server = PromptServer(
             configuration(self.behind(app), port=0, log_level="warning", ws_ping_interval=None, lifespan="on", **more)
         )
