@@ -72,6 +72,8 @@ class Problem:
         for number in ["", *(f"_{state}" for state in range(2, states + 1))]:
             table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))
             table.append(Parameter(f"initial_rate{number}_nm_s", "N·m/s", -10 * span, 10 * span))
+        self.cores = np.arange(2)
+        """Where the time constant and the damping stand."""
         self.delay = range(2, 3)
         self.baselines = range(3, 3 + parts)
         self.initials = range(3 + parts, 3 + parts + 2 * states)

@@ -1,0 +1,1 @@
+"""Several muscles at one joint, from one test: identified together, criticised, inverted for a controller."""
