@@ -25,6 +25,8 @@ from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
 PILOT_TURNS, TURNS = 4, 2
+SLOW = 0.3
+"""Share of the noise, times the correlation of neighbours, from which a fit is begun again with white noise."""
 PINNED = 1e-6
 """Share of the torque within which the zero of a further muscle is held at 0: the joint has one zero."""
 Start = Mapping[str, Mapping[str, float]]
@@ -94,17 +96,26 @@ class JointFitted:
             hessian=0.5 * (hessian + hessian.T),
         )
 
-    def with_(self, effects: Sequence[Sequence[tuple[str, Form]]] | None = None, acting: Sequence[Acting] | None = None, start: Start | None = None, floor: float | None = None) -> JointFitted:
-        """With other effects of the muscles, or another interplay, from this solution; `start`: values of what is new.
-
-        `floor`: the fit stops where this log evidence is out of reach.
-        """
+    def with_(
+        self,
+        effects: Sequence[Sequence[tuple[str, Form]]] | None = None,
+        acting: Sequence[Acting] | None = None,
+        start: Start | None = None,
+    ) -> JointFitted:
+        """With other effects of the muscles, or another interplay, from this solution; `start`: values of what is new."""
         effects = tuple(tuple(one) for one in (self.effects if effects is None else effects))
         acting = self.acting if acting is None else tuple(acting)
         problem = assemble(self.setups, effects, acting)
         theta = _carried(problem, acting, self, start or {})
-        fitted = solve(problem, theta, self.fitted.noise, floor=floor)
+        fitted = solve(problem, theta, self.fitted.noise)
+        if _slow(fitted.noise):  # slow noise may hold what the structure left before
+            again = solve(problem, theta, NoiseLevel(0.0, 0.5, fitted.noise.sd_nm))
+            fitted = max(fitted, again, key=lambda one: one.log_evidence)
         return replace(self, effects=effects, acting=acting, fitted=fitted)
+
+
+def _slow(noise: NoiseLevel) -> bool:
+    return not noise.held and min(noise.share, 1.0) * noise.ar1 > SLOW
 
 
 def assemble(

@@ -57,8 +57,7 @@ def drive_form(acting: Acting, setups: Sequence[Setup]) -> Form:
     """The form of the stage "gain" by which one channel's pulses reach the other muscle."""
     assert acting.between is not None
     giving, taking = (setups[place].grid for place in acting.between)
-    width_us = giving.pulse_width_us
-    share = width_us / max(float(np.max(width_us)), 1e-9)
+    share = giving.pulse_width_us / max(setups[acting.between[0]].basis.largest_us, 1e-9)
     ahead = (taking.offset_s - giving.offset_s) / giving.step_s
     if ahead >= 0.0:
         other = Other((share, np.r_[share[1:], 0.0]), ahead)
