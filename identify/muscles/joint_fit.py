@@ -85,7 +85,9 @@ class JointFitted:
         crossed = whole.hessian[np.ix_(at, others)]
         doubt = whole.hessian[np.ix_(others, others)]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(doubt), 1e-300))
-        inner = scale[:, None] * np.linalg.solve(doubt * scale[:, None] * scale + 1e-12 * np.eye(scale.size), scale[:, None] * crossed.T)
+        inner = scale[:, None] * np.linalg.solve(
+            doubt * scale[:, None] * scale + 1e-12 * np.eye(scale.size), scale[:, None] * crossed.T
+        )
         hessian = whole.hessian[np.ix_(at, at)] - crossed @ inner
         return replace(
             whole,
@@ -106,7 +108,7 @@ class JointFitted:
         effects = tuple(tuple(one) for one in (self.effects if effects is None else effects))
         acting = self.acting if acting is None else tuple(acting)
         problem = assemble(self.setups, effects, acting)
-        theta = _carried(problem, acting, self, start or {})
+        theta = _carried(problem, self, start or {})
         fitted = solve(problem, theta, self.fitted.noise)
         if _slow(fitted.noise):  # slow noise may hold what the structure left before
             again = solve(problem, theta, NoiseLevel(0.0, 0.5, fitted.noise.sd_nm))
@@ -124,7 +126,9 @@ def assemble(
     """The problem of all muscles."""
     parts = []
     for place, (setup, own) in enumerate(zip(setups, effects, strict=True)):
-        reached = [(_cross_name(one), drive_form(one, setups)) for one in acting if one.between and one.between[1] == place]
+        reached = [
+            (_cross_name(one), drive_form(one, setups)) for one in acting if one.between and one.between[1] == place
+        ]
         parts.append(Problem(setup, [*reached, *own]))
     joint = [(one.interplay, one.interplay.form(one.form)) for one in acting if one.between is None]
     return JointProblem(parts, joint)
@@ -135,7 +139,9 @@ def _cross_name(acting: Acting) -> str:
     return f"{acting.interplay.id}:{acting.between[0]}"
 
 
-def named_values(problem: JointProblem, theta: np.ndarray, acting: Sequence[Acting]) -> list[dict[str, tuple[float, int]]]:
+def named_values(
+    problem: JointProblem, theta: np.ndarray, acting: Sequence[Acting]
+) -> list[dict[str, tuple[float, int]]]:
     """Of each interplay, its parameters by name: value, and place in `theta`."""
     found = []
     values = problem.physical(theta)
@@ -151,21 +157,25 @@ def named_values(problem: JointProblem, theta: np.ndarray, acting: Sequence[Acti
     return found
 
 
-def _carried(problem: JointProblem, acting: Sequence[Acting], before: JointFitted, start: Start) -> np.ndarray:
+def _carried(problem: JointProblem, before: JointFitted, start: Start) -> np.ndarray:
     """A start: the solution before, and starting values of what is new."""
     theta = np.zeros(problem.size)
     own = before.problem.split(before.fitted.theta)
     for place, (part, old, old_theta) in enumerate(zip(problem.parts, before.problem.parts, own, strict=True)):
         values = np.zeros(part.size)
         values[: part.coefficients.stop] = old.physical(old_theta)[: part.coefficients.stop]
-        known = {chosen.effect: old.physical(old_theta)[list(chosen.places)] for chosen in old.chosen if chosen.form.name}
+        known = {
+            chosen.effect: old.physical(old_theta)[list(chosen.places)] for chosen in old.chosen if chosen.form.name
+        }
         forms = {chosen.effect: chosen.form.name for chosen in old.chosen}
         for chosen in part.chosen:
             if chosen.effect in known and forms[chosen.effect] == chosen.form.name:
                 values[list(chosen.places)] = known[chosen.effect]
                 continue
             given = start.get(f"{place}.{chosen.effect}", {})
-            values[list(chosen.places)] = [np.clip(given.get(p.name, p.start[0]), p.lower, p.upper) for p in chosen.parameters]
+            values[list(chosen.places)] = [
+                np.clip(given.get(p.name, p.start[0]), p.lower, p.upper) for p in chosen.parameters
+            ]
         theta[problem.places[place]] = part.from_physical(values)
     old_joint = {one.effect: (one.form.name, before.fitted.theta[list(one.places)]) for one in before.problem.own}
     for one in problem.own:

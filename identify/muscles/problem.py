@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from stimrig.identify.effects.base import Form
+from stimrig.identify.errors import BadRequest
 from stimrig.identify.muscles.interplay import Interplay, JointForm, Other, find
 from stimrig.identify.simulation.problem import Chosen, Problem
 from stimrig.identify.simulation.setup import Setup
@@ -29,19 +31,21 @@ class Acting:
     @classmethod
     def of(cls, text: str, names: Sequence[str]) -> Acting:
         """From "id", "id:form", "id:from>to" or "id:from>to:form". Raises BadRequest: unknown, or no such channels."""
-        from stimrig.identify.errors import BadRequest
-
         identifier, *more = text.split(":")
         interplay = find(identifier)
         between = None
         if more and ">" in more[0]:
             ends = more.pop(0).split(">")
             if len(ends) != 2 or ends[0] == ends[1] or not set(ends) <= set(names):
-                raise BadRequest(f"{text!r}: no such channels", place="interplay", fix=f"Use two of {', '.join(names)}.")
+                raise BadRequest(
+                    f"{text!r}: no such channels", place="interplay", fix=f"Use two of {', '.join(names)}."
+                )
             between = names.index(ends[0]), names.index(ends[1])
         if interplay.directed != (between is not None):
             fix = f"Write {identifier}:{names[0]}>{names[1]}." if interplay.directed else f"Write {identifier} alone."
-            raise BadRequest(f"{text!r} {'names no' if interplay.directed else 'names'} channels", place="interplay", fix=fix)
+            raise BadRequest(
+                f"{text!r} {'names no' if interplay.directed else 'names'} channels", place="interplay", fix=fix
+            )
         form = more[0] if more else interplay.forms[0].name
         interplay.form(form)
         return cls(interplay, form, between)
@@ -84,7 +88,7 @@ class JointProblem:
         self.parts, self.joint = tuple(parts), tuple(joint)
         self.setup = parts[0].setup
         first = np.cumsum([0, *(part.size for part in parts)]).tolist()
-        self.places = [slice(a, b) for a, b in zip(first[:-1], first[1:], strict=True)]
+        self.places = [slice(a, b) for a, b in pairwise(first)]
         self.signs = np.array([part.setup.sign for part in parts])
         self.turned = self.signs * self.signs[0]
         self.scales_nm = np.array([part.setup.scale_nm for part in parts])
@@ -95,7 +99,9 @@ class JointProblem:
         ]
         own, at = [], first[-1]
         for interplay, form in joint:
-            own.append(Chosen(interplay.id, Form(form.name, "joint", form.equation, form.parameters), form.parameters, at))
+            own.append(
+                Chosen(interplay.id, Form(form.name, "joint", form.equation, form.parameters), form.parameters, at)
+            )
             at += len(form.parameters)
         self.chosen += own
         self.own, self.size = own, at
@@ -133,15 +139,16 @@ class JointProblem:
 
     def parameters(self, theta: np.ndarray) -> list[dict[str, float]]:
         """Of each form that acts on the joint, by name."""
-        return [
-            {p.name: float(theta[i]) for i, p in zip(one.places, one.parameters, strict=True)} for one in self.own
-        ]
+        return [{p.name: float(theta[i]) for i, p in zip(one.places, one.parameters, strict=True)} for one in self.own]
 
     def run(
         self, theta: np.ndarray, *, derivatives: bool = False, skip: frozenset[str] = frozenset()
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Predicted interval means, N·m, shape (K,), in the frame of the first muscle, and derivatives, shape (P, K)."""
-        ran = [part.run(one, derivatives=derivatives, skip=skip) for part, one in zip(self.parts, self.split(theta), strict=True)]
+        """Predicted interval means, N·m, shape (K,), in the first muscle's frame, and derivatives, shape (P, K)."""
+        ran = [
+            part.run(one, derivatives=derivatives, skip=skip)
+            for part, one in zip(self.parts, self.split(theta), strict=True)
+        ]
         levels = np.stack([self._level(place, theta, mean) for place, (mean, _) in enumerate(ran)])
         total = sum(turn * mean for turn, (mean, _) in zip(self.turned, ran, strict=True))
         total = total + self._interplay(levels, self.parameters(theta))
@@ -155,7 +162,9 @@ class JointProblem:
             if self.joint:
                 moved = levels.copy()
                 moved[place] += CHANGE
-                by = (self._interplay(moved, self.parameters(theta)) - self._interplay(levels, self.parameters(theta))) / CHANGE
+                by = (
+                    self._interplay(moved, self.parameters(theta)) - self._interplay(levels, self.parameters(theta))
+                ) / CHANGE
                 shown = slopes.copy()
                 shown[list(part.baselines)] = 0.0
                 own += by / self.scales_nm[place] * shown

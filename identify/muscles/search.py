@@ -7,7 +7,7 @@ with the others' torque taken away, and then judged on all at once.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
 from typing import Any
@@ -19,11 +19,8 @@ from stimrig.identify.diagnosis.search import Progress, silent
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.fit_statistics import rms
-from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.muscles.finish import finished, statistics_of
 from stimrig.identify.muscles.interplay import registry
 from stimrig.identify.muscles.joint_fit import JointFitted, fit_all
-from stimrig.identify.muscles.model import JointModel
 from stimrig.identify.muscles.problem import Acting
 from stimrig.identify.muscles.record import JointRecord
 
@@ -164,7 +161,9 @@ def _effects(found: JointSearch, say: Progress, number: int) -> list[Tried]:
         begin = 0.3 + 0.6 * (number + place / len(last.grids)) / MOST_EFFECTS
         step = 0.6 / MOST_EFFECTS / len(last.grids)
         tell = _within(say, begin, step, name)
-        raw = replace(last.raw, torque_nm=view.problem.setup.grid.record.torque_nm, hum=None, ceiling_nm=None, floor_nm=None)
+        raw = replace(
+            last.raw, torque_nm=view.problem.setup.grid.record.torque_nm, hum=None, ceiling_nm=None, floor_nm=None
+        )
         held = [f"{effect}:{form.name}" for effect, form in last.effects[place]]
         own, verdict = searched(view.problem.setup.grid, raw, tell, most=1, structure=held)
         if verdict.kind == "unexplained_structure":
@@ -233,21 +232,3 @@ def rivals_of(key: str) -> tuple[str, ...]:
     """Ids of interplay that a record often cannot separate from it."""
     identifier = key.partition(":")[0]
     return registry()[identifier].resembles if identifier in registry() else ()
-
-
-def models_of(found: JointSearch) -> Iterator[tuple[Tried | None, JointFitted, JointModel]]:
-    """Each step with its model."""
-    parent = ""
-    for step, fitted in zip([None, *found.added], found.chain, strict=False):
-        model = finished(fitted)
-        model = model.with_(data=model.data | ({"parent": parent} if parent else {}))
-        parent = model.model_id
-        yield step, fitted, model
-
-
-def statistics(found: JointFitted) -> dict[str, Any]:
-    """As `statistics_of`."""
-    return statistics_of(found)
-
-
-__all__ = ["Fitted", "JointSearch", "Tried", "search"]
