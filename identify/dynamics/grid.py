@@ -275,7 +275,9 @@ def runs(flags: np.ndarray) -> list[slice]:
 def make_grid(record: Record, phase_s: float | None = None) -> Grid:
     """Put a record on the grid of its pulses.
 
-    `phase_s`: time of the slots after the first sample, where it is known; else the changes of width tell it. Raises BadRecord: fewer than eight pulse intervals, or sampled more slowly than the pulses.
+    `phase_s`: time of the slots after the first sample, where it is known; else the changes of width tell it.
+
+    Raises BadRecord: fewer than eight pulse intervals, or sampled more slowly than the pulses.
     """
     check_arrays(record)
     step_s = 1.0 / record.pulse_rate_hz

@@ -104,7 +104,7 @@ class JointFitted:
         acting: Sequence[Acting] | None = None,
         start: Start | None = None,
     ) -> JointFitted:
-        """With other effects of the muscles, or another interplay, from this solution; `start`: values of what is new."""
+        """With other effects, or another interplay, from this solution; `start`: values of what is new."""
         effects = tuple(tuple(one) for one in (self.effects if effects is None else effects))
         acting = self.acting if acting is None else tuple(acting)
         problem = assemble(self.setups, effects, acting)

@@ -48,6 +48,6 @@ INTERPLAY = Interplay(
     resembles=("co_contraction",),
     separated_by="Pulses to one channel alone, at several widths, and the same while the other one holds a level.",
     plain="The electrode of one muscle also reaches the other. A part of the pull is lost to the wrong muscle, and "
-    "more stimulation helps less than expected. Moving the electrode away from the other muscle, or a smaller one, helps.",
+    "more stimulation helps less than expected. An electrode farther from the other muscle, or a smaller one, helps.",
     source="own form: of fibres that both electrodes reach none is counted twice",
 )
