@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from stimrig.identify.muscles.record import read as read
     from stimrig.identify.muscles.results import JointDiagnosis as JointDiagnosis
     from stimrig.identify.muscles.results import JointImprovement as JointImprovement
+    from stimrig.identify.muscles.verbs import compare as compare
     from stimrig.identify.muscles.verbs import diagnose as diagnose
     from stimrig.identify.muscles.verbs import fit as fit
     from stimrig.identify.muscles.verbs import improve as improve
@@ -29,7 +30,7 @@ _PLACES = {
         "model": ("JointModel", "is_joint_model", "parts", "predict"),
         "record": ("Channel", "JointRecord", "is_joint", "read"),
         "results": ("JointDiagnosis", "JointImprovement"),
-        "verbs": ("diagnose", "fit", "improve"),
+        "verbs": ("compare", "diagnose", "fit", "improve"),
     }.items()
     for name in names
 }

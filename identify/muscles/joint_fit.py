@@ -259,12 +259,20 @@ def _together(record: JointRecord, grids: tuple[Grid, ...], raw: Raw, fits: Sequ
         zeros = np.zeros(grid.begins.size)
         pinned = zeros, zeros + PINNED * setup.scale_nm
         target_nm = setup.sign * (grid.torque_nm - first.zero_nm)
-        setups.append(setup.with_(grid=grid, zero_nm=first.zero_nm, rests_nm=pinned, target_nm=target_nm))
+        own = {"zero_nm": first.zero_nm, "rests_nm": pinned, "target_nm": target_nm, "at_rest": _begins_at_rest(grid)}
+        setups.append(setup.with_(grid=grid, **own))
     nothing = tuple(() for _ in fits)
     problem = assemble(setups, nothing, ())
     theta = np.concatenate([fitted.theta for fitted in fits])
     for part, place in zip(problem.parts[1:], problem.places[1:], strict=True):
         theta[place.start + np.array(part.baselines)] = 0.0
+        if part.setup.at_rest:
+            theta[place.start + np.array(part.initials)] = 0.0
     noise = min((fitted.noise for fitted in fits), key=lambda one: one.sd_nm)
     start = NoiseLevel(noise.ar1, 0.5, noise.sd_nm) if not noise.held else noise
     return JointFitted(record, grids, raw, nothing, (), solve(problem, theta, start))
+
+
+def _begins_at_rest(grid: Grid) -> bool:
+    """Whether a further muscle begins without pulses: what torque there is then belongs to the first one."""
+    return not np.any(grid.pulse_width_us[grid.starts] > 0)

@@ -11,10 +11,11 @@ from stimrig.identify.diagnosis.search import Progress, silent
 from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.effect_fit import try_effect
-from stimrig.identify.muscles.finish import finished, statistics_of
+from stimrig.identify.estimation.fit_statistics import fit_statistics
+from stimrig.identify.muscles.finish import finished, held_out_errors, statistics_of
 from stimrig.identify.muscles.interplay import registry
-from stimrig.identify.muscles.joint_fit import JointFitted, fit_all
-from stimrig.identify.muscles.model import JointModel, key_of
+from stimrig.identify.muscles.joint_fit import JointFitted, fit_all, prepared
+from stimrig.identify.muscles.model import JointModel, key_of, predict
 from stimrig.identify.muscles.problem import Acting
 from stimrig.identify.muscles.record import JointRecord
 from stimrig.identify.muscles.results import JointDiagnosis, JointImprovement, conclude, name_of
@@ -187,6 +188,17 @@ def _refused(found: JointSearch) -> tuple[dict[str, Any], ...]:
 
 def _row(one: Tried, reason: str) -> dict[str, Any]:
     return {"effect": one.key, "name": name_of(one.key), "log_evidence_gain": one.gain, "reason": reason}
+
+
+def compare(model: JointModel, record: JointRecord) -> dict[str, Any]:
+    """The model's error on a record, by segment, and on held-out pulses of each muscle alone and of both.
+
+    Raises BadModel, BadRequest: as `predict`.
+    """
+    grids, raw = prepared(record)
+    predicted = predict(model, record)
+    told = fit_statistics(grids[0], grids[0].fitted, predicted, raw.noise_sd_nm)
+    return told | held_out_errors(record, predicted, grids[0].counted)
 
 
 def improve(record: JointRecord, model: JointModel | None = None, progress: Progress | None = None) -> JointImprovement:

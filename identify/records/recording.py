@@ -112,7 +112,7 @@ def read_recording(
     if (several := _channels(file)) and channel is None:
         names = ", ".join(one["name"] for one in several)
         message = f"it holds the pulses of several channels ({names})"
-        raise BadRecord(message, place=file.name, fix="Read it with stimrig.identify.muscles.read.")
+        raise BadRecord(message, place=file.name, fix="Give it to fit, predict, compare, diagnose or improve.")
     rate = file.number("pulse_rate_hz", 40.0) if pulse_rate_hz is None else pulse_rate_hz
     bounds.check_rate(rate, f"{file.name}, attribute pulse_rate_hz")
     time_s, torque = _samples(file)

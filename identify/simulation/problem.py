@@ -119,7 +119,8 @@ class Problem:
         scale = self.setup.scale_nm
         at = slice(self.baselines.start, self.baselines.stop)
         mean[at], sd[at] = self.setup.rests_nm or (0.0, 0.5 * scale)
-        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.grid.starts.size)
+        wide = 1e-6 if self.setup.at_rest else 1.0
+        sd[list(self.initials)] = np.tile([wide * scale, 5.0 * wide * scale], self.setup.grid.starts.size)
         mean[self.coefficients] = self.setup.curve_nm
         precision = np.diag(1.0 / sd**2)
         precision[self.coefficients, self.coefficients] = self.setup.penalty
