@@ -307,8 +307,9 @@ def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
 
     `angle_set_at_utc` is of the angle sensor's present calibration; None: it has none.
     """
-    profile = plan.profile
-    if plan.angle is None or profile.angle_range_rad is None or profile.angle_set_at_utc == angle_set_at_utc:
+    profiles = [plan.profile, *(channel.profile for channel in plan.channels or ())]
+    said = {profile.angle_set_at_utc for profile in profiles if profile.angle_range_rad is not None}
+    if plan.angle is None or said <= {angle_set_at_utc}:
         return
     if angle_set_at_utc is None:
         raise RefusedError(
@@ -317,6 +318,16 @@ def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
     raise RefusedError(
         f"profile.angle_range_rad: the angle sensor was calibrated anew at {angle_set_at_utc}; say the range again"
     )
+
+
+def check_profiles(plan: TestPlan, unix_s: float, required: bool, duration_s: float = 0.0) -> None:
+    """Check the profile of each channel that a test plays; see `check_profile`. Raises RefusedError."""
+    check_profile(plan.profile, unix_s, required, duration_s)
+    for channel in plan.channels or ():
+        try:
+            check_profile(channel.profile, unix_s, required, duration_s)
+        except RefusedError as error:
+            raise RefusedError(f"channel {channel.name}: {error}") from None
 
 
 def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: float = 0.0) -> None:
