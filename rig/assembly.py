@@ -158,8 +158,8 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
     first_s = [float(samples["host_time_s"][0]) for samples in torque[:1]]
     rate_hz = LIKELY_RATE_HZ
     of_one = [i for i in intents if i.channel == intents[0].channel]
-    if len(of_one) > 1 and of_one[-1].index > of_one[0].index:
-        pulses = (of_one[-1].index - of_one[0].index) / of_one[0].channels
+    if len(of_one) > 1 and of_one[-1].slot > of_one[0].slot:
+        pulses = (of_one[-1].slot - of_one[0].slot) / of_one[0].channels
         rate_hz = round(pulses / (of_one[-1].due_s - of_one[0].due_s), 6)
     else:
         notes.append(f"the pulse rate is unknown, {rate_hz:g} pulses/s were assumed")
@@ -194,15 +194,14 @@ def _channels_of(contents: JournalContents, intents: list[Intent], rate_hz: floa
     found, of_first_s = list[dict[str, Any]](), None
     for place in range(intents[0].channels):
         own = [intent for intent in intents if intent.channel == place]
-        started_s = [intent.due_s - intent.index // intent.channels / rate_hz for intent in own]
+        started_s = [intent.due_s - intent.slot // intent.channels / rate_hz for intent in own]
         offset_s = float(np.median(started_s)) if own else None
         of_first_s = offset_s if place == 0 else of_first_s
-        known = offset_s is not None and of_first_s is not None
         found.append(
             {
                 "name": f"output-{own[0].output + 1}" if own else f"unknown-{place + 1}",
                 "profile": {"current_ma": max((intent.current_ma for intent in own), default=0.0)},
-                "offset_s": round(offset_s - of_first_s, 6) if known else None,
+                "offset_s": None if offset_s is None or of_first_s is None else round(offset_s - of_first_s, 6),
                 "elements": [],
             }
         )
@@ -217,7 +216,7 @@ def _start(contents: JournalContents, header: dict[str, Any], train: Train) -> t
     intents = read_intents(contents)
     t0_s = float(header["time_s"])
     if intents:
-        t0_s = float(np.median([intent.due_s - train.due_s(intent.index) for intent in intents]))
+        t0_s = float(np.median([intent.due_s - train.due_s(intent.slot) for intent in intents]))
     return bool(intents), t0_s, float(header["unix_s"]) + t0_s - float(header["time_s"])
 
 
@@ -418,5 +417,5 @@ def _sent(contents: JournalContents) -> Floats:
     known += [intent[0] for intent in asked]
     widths_us = np.zeros(max(known, default=-1) + 1)
     for intent in asked:
-        widths_us[intent.index] = intent.pulse_width_us
+        widths_us[intent.slot] = intent.pulse_width_us
     return widths_us

@@ -263,7 +263,7 @@ def _first(error: ValidationError, model: type[BaseModel]) -> str:
     if first["type"] == "extra_forbidden":
         return f"{key}: unknown key (known here: {', '.join(model.model_fields)})"
     if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
+        return first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":
         return f"{key}: missing; see docs/rig-file.md"
     return f"{key}: {first['msg']}, not {first['input']!r}"

@@ -54,9 +54,9 @@ APART_BYTES = 8192
 
 
 class Intent(NamedTuple):
-    """A pulse that was to be sent; `index` is its slot."""
+    """A pulse that was to be sent."""
 
-    index: int
+    slot: int
     time_s: float
     due_s: float
     pulse_width_us: float

@@ -68,7 +68,7 @@ class Rig:
         self.store = RecordingStore(config, machine)
         self._result = Result(config.data_dir, machine)
         self.player = Player(self.state, self.pair, self.rest, self.store, machine, config.watch, publish)
-        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self._tell)
+        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self.channels, self._tell)
 
     @property
     def latch(self) -> str:
