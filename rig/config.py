@@ -16,10 +16,11 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
 from stimrig.rig import devices, limits
 from stimrig.rig.acquire.health import DEFAULT_WATCH, Watch
+from stimrig.rig.channels import RigChannel
 from stimrig.rig.devices import DeviceSettings, Kind
 from stimrig.rig.errors import ConfigError, RefusedError
 from stimrig.rig.limits import Limit
-from stimrig.rig.messages import Range
+from stimrig.rig.messages import Range, several
 
 
 class _Table(BaseModel):
@@ -71,6 +72,7 @@ class RigConfig(_Table):
     stimulator: DeviceSettings
     load_cell: DeviceSettings
     angle_sensor: DeviceSettings | None = None
+    switch: DeviceSettings | None = several(None, "relays between one channel and an array's elements")
     limits: LimitSettings = LimitSettings.model_validate({})
     watch: Watch = DEFAULT_WATCH
 
@@ -84,7 +86,30 @@ class RigConfig(_Table):
     def devices(self) -> dict[Kind, DeviceSettings]:
         """The settings of each device that this rig has, in the order in which they are opened."""
         found: dict[Kind, DeviceSettings] = {"stimulator": self.stimulator, "load_cell": self.load_cell}
-        return found if self.angle_sensor is None else {**found, "angle_sensor": self.angle_sensor}
+        if self.angle_sensor is not None:
+            found["angle_sensor"] = self.angle_sensor
+        return found if self.switch is None else {**found, "switch": self.switch}
+
+    def channels(self) -> tuple[RigChannel, ...]:
+        """The channels that have names; none where the rig has one without."""
+        switch = None if self.switch is None else self.switch.model_dump()
+        return tuple(
+            RigChannel(
+                **{name: one[name] for name in ("name", "muscle", "side", "electrode")},
+                limits={name: value for name, value in one["limits"].items() if value is not None},
+                elements=switch["elements"] if switch and switch["channel"] == one["name"] else 0,
+            )
+            for one in self.stimulator.model_dump().get("channels", [])
+        )
+
+    def table(self) -> dict[str, Limit]:
+        """The hard limits, narrowed by the rig file. Raises RefusedError."""
+        table, channels = self.limits.table(), self.channels()
+        if channels:
+            table = {**table, **limits.SUM_LIMITS}
+        for channel in channels:
+            limits.narrowed(table, channel.limits, f"{channel.name}")
+        return table
 
 
 EMULATOR_ONLY = "clock_speed"
@@ -202,15 +227,20 @@ def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
     content = {**content, **{key: value for key, value in overrides.items() if value is not None}}
     for kind in ("stimulator", "load_cell"):
         content[kind] = _device(kind, content.get(kind), place)
+    if content.get("switch") is not None:
+        content["switch"] = _device("switch", content["switch"], place)
     if content.get("angle_sensor") is not None:
         content["angle_sensor"] = _device("angle_sensor", content["angle_sensor"], place).beside(content["load_cell"])
     try:
         config = RigConfig.model_validate(content)
-        config.limits.table()
+        config.table()
     except ValidationError as error:
         raise ConfigError(f"{place}: {_first(error, RigConfig)}") from None
     except RefusedError as error:
         raise ConfigError(f"{place}: limits: {error}") from None
+    if config.switch is not None and not any(channel.elements for channel in config.channels()):
+        has = ", ".join(channel.name for channel in config.channels()) or "none: add [[stimulator.channels]]"
+        raise ConfigError(f"{place}: switch.channel: not one of the stimulator's channels ({has})")
     return config
 
 
@@ -232,6 +262,8 @@ def _first(error: ValidationError, model: type[BaseModel]) -> str:
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         return f"{key}: unknown key (known here: {', '.join(model.model_fields)})"
+    if first["type"] == "value_error":
+        return first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":
         return f"{key}: missing; see docs/rig-file.md"
     return f"{key}: {first['msg']}, not {first['input']!r}"

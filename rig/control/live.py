@@ -19,7 +19,8 @@ from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.run import TestRun
 from stimrig.rig.control.replies import to_line
 from stimrig.rig.gate import Done
-from stimrig.rig.messages import LaidSegment, LiveEvent, PulseOutcomes, TorqueSamples
+from stimrig.rig.messages import ChannelPulses, LaidSegment, LiveEvent, PulseOutcomes, TorqueSamples
+from stimrig.rig.train import Train
 
 log = logging.getLogger("rig.live")
 
@@ -37,7 +38,9 @@ class Taken(NamedTuple):
     angles: list[NDArray[Any]] | None  # None: the rig has no angle sensor
     done: list[Done]  # pulses of which it is known what became of them
     segments: tuple[tuple[Any, ...], ...] = ()  # of the test; of one that is not adaptive none
-    pulse_rate_hz: float = 1.0
+    train: Train = Train(1.0)
+    channels: tuple[tuple[str, dict[str, float]], ...] = ()
+    """Name and counts of each, where the test names its channels."""
 
 
 def take(
@@ -68,7 +71,9 @@ def take(
     done = run.gate.done[run.told_pulses :]
     run.told_pulses += len(done)
     segments = run.score.laid.segments if run.score.adaptive else ()  # they hold every pulse before
-    return Taken({**fields, **_of_run(run)}, origin_s, samples, blocks, angles, done, segments, run.plan.pulse_rate_hz)
+    channels = tuple(run.by_channel().items()) if run.plan.channels else ()
+    fields |= _of_run(run)
+    return Taken(fields, origin_s, samples, blocks, angles, done, segments, run.score.train, channels)
 
 
 def _emptied(queue: Any) -> list[NDArray[Any]]:
@@ -89,7 +94,7 @@ def _of_run(run: TestRun) -> dict[str, Any]:
         "charge_uc": run.gate.charge_uc,
         "torque_time_nms": float(np.nan_to_num(run.torque_time_nms)),
         "laid": run.score.decided,
-        "boundary_s": run.score.decided / run.plan.pulse_rate_hz,
+        "boundary_s": run.score.train.length_s(run.score.decided),
         "ended_by": run.ended_by,
         "pauses": run.pauses.all if run.pauses else [],
     }
@@ -97,7 +102,7 @@ def _of_run(run: TestRun) -> dict[str, Any]:
 
 def live_event(taken: Taken) -> LiveEvent:
     """The newest torque as minimum and maximum of bins of 10 ms, and the pulses."""
-    found, rate_hz = np.concatenate(taken.blocks), taken.pulse_rate_hz
+    found, train = np.concatenate(taken.blocks), taken.train
     bins = np.floor((found["host_time_s"] - taken.origin_s) / BIN_S)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(bins) > 0) + 1])
     return LiveEvent(
@@ -105,14 +110,15 @@ def live_event(taken: Taken) -> LiveEvent:
         time_s=np.round(bins[starts] * BIN_S, 4).tolist(),
         torque_min_nm=_finite(np.fmin.reduceat(found["torque_nm"], starts)),
         torque_max_nm=_finite(np.fmax.reduceat(found["torque_nm"], starts)),
-        pulse_time_s=[pulse.index / rate_hz for pulse in taken.done],
+        pulse_time_s=[train.due_s(pulse.index) for pulse in taken.done],
         pulse_width_us=[pulse.pulse_width_us for pulse in taken.done],
         laid_segments=[
-            LaidSegment(name=name, start_s=start / rate_hz, end_s=end / rate_hz, by=by)
+            LaidSegment(name=name, start_s=train.length_s(start), end_s=train.length_s(end), by=by)
             for name, start, end, by in taken.segments
         ],
         samples=_samples(found, taken.origin_s) if taken.samples else None,
-        outcomes=_outcomes(taken.done, taken.origin_s) if taken.samples else None,
+        outcomes=_outcomes(taken) if taken.samples else None,
+        channels=[_channel(taken, place) for place in range(len(taken.channels))] or None,
         angle=_rows(taken.angles, taken.origin_s) if taken.samples and taken.angles is not None else None,
     )
 
@@ -151,7 +157,22 @@ def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
     )
 
 
-def _outcomes(done: list[Done], origin_s: float) -> PulseOutcomes:
+def _channel(taken: Taken, place: int) -> ChannelPulses:
+    name, counts = taken.channels[place]
+    own = [pulse for pulse in taken.done if taken.train.channel(pulse.index) == place]
+    return ChannelPulses(
+        name=name,
+        pulse_time_s=[taken.train.due_s(pulse.index) for pulse in own],
+        pulse_width_us=[pulse.pulse_width_us for pulse in own],
+        sent_pulses=int(counts["pulses"]),
+        dropped_pulses=int(counts["dropped_pulses"]),
+        charge_uc=counts["charge_uc"],
+    )
+
+
+def _outcomes(taken: Taken) -> PulseOutcomes:
+    done, origin_s = taken.done, taken.origin_s
+
     def times(name: str) -> list[float | None]:
         return [finite(round(getattr(pulse, name) - origin_s, 6)) for pulse in done]
 
@@ -161,6 +182,7 @@ def _outcomes(done: list[Done], origin_s: float) -> PulseOutcomes:
         written_time_s=times("written_s"),
         acknowledged_time_s=times("acknowledged_s"),
         status=[int(pulse.status) for pulse in done],
+        channel=[taken.train.channel(pulse.index) for pulse in done] if taken.channels else None,
     )
 
 

@@ -86,7 +86,9 @@ class Player:
         except Exception:
             await self._not_begun(before)
             raise
-        self.run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, sensor)
+        self.run = TestRun(
+            test, table, journal, gate, receiver, self._machine, halt, self._watch, sensor, self.pair.relays
+        )
         self.run.on_evidence = self._take_evidence
         self.playing = self.tasks.spawn(self._execute(self.run), "test")
 
@@ -209,7 +211,7 @@ class Player:
         await state.settle()
         self.run = None
         if train and state.calibration is not None:
-            state.calibration.played(run.plan.profile.max_pulse_width_us, result.rise_nm, finished)
+            state.calibration.played(run.plan, result.rise_nm, finished)
         if not train:
             self.finished = finished
         state.change(state.phase.sealed())

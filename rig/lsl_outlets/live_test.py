@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stimrig.rig import align, journal
 from stimrig.rig.align import Array, Fit
+from stimrig.rig.assembly import train_of_plan
 from stimrig.rig.journal import Kind
 from stimrig.rig.signals import SAMPLE
 
@@ -37,12 +38,16 @@ MARGIN_S = 0.005
 
 @dataclass(slots=True)
 class Batch:
-    """What is to be sent: torque (N·m), pulses (width µs, current mA, index) and marks, with LSL times (s)."""
+    """What is to be sent, with LSL times (s): torque (N·m), pulses (width µs, current mA, index) and marks.
+
+    `channels`: of each pulse, as a place in the rig file.
+    """
 
     torque_s: Array = field(default_factory=lambda: np.empty(0))
     torque_nm: Array = field(default_factory=lambda: np.empty(0))
     pulse_s: list[float] = field(default_factory=list)
     pulses: list[tuple[float, float, int]] = field(default_factory=list)
+    channels: list[int] = field(default_factory=list)
     marks: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
 
 
@@ -50,6 +55,7 @@ class Batch:
 class _Pulse:
     width_us: float
     current_ma: float
+    channel: int
     written_s: float = np.nan
     acked_s: float = np.nan
 
@@ -175,10 +181,10 @@ class LiveTest:
     def _pulse(self, kind: Kind, payload: bytes) -> None:
         index = struct.unpack_from("<i", payload)[0]
         if kind == Kind.INTENT:
-            _, _, due_s, width_us, current_ma = journal.INTENT.unpack(payload)
-            self._pulses[index] = _Pulse(width_us, current_ma)
+            intent = journal.Intent.from_bytes(payload)
+            self._pulses[index] = _Pulse(intent.pulse_width_us, intent.current_ma, intent.output)
             if self._t0_s is None and self._header:  # the block of the start is damaged
-                self._t0_s = due_s - index / float(self._header["plan"]["pulse_rate_hz"])
+                self._t0_s = intent.due_s - train_of_plan(self._header["plan"]).due_s(index)
         elif kind == Kind.SKIPPED:
             self._pulses.pop(index, None)
         elif (pulse := self._pulses.get(index)) is None:
@@ -212,6 +218,7 @@ class LiveTest:
             if written_s >= self._since_s:
                 batch.pulse_s.append(self._lsl_s(written_s))
                 batch.pulses.append((pulse.width_us, pulse.current_ma, index))
+                batch.channels.append(pulse.channel)
                 self.sent_pulses += 1
 
     def _align(self, finish: bool) -> None:

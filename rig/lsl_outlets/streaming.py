@@ -163,13 +163,16 @@ class Outlets:
     the participant's code, begin and end) goes out as marks.
 
     `sample_rate_hz`: nominal rate of the cell in samples per real second; 0: not known. `devices`: load cell and
-    stimulator, as the rig file names them.
+    stimulator, as the rig file names them. `several`: whether each pulse tells its channel (its place in the rig file).
     """
 
-    def __init__(self, lsl: Any, sample_rate_hz: float, devices: dict[str, str], name: str = "stimrig") -> None:
-        self._lsl, self._name, self._devices = lsl, name, devices
+    def __init__(
+        self, lsl: Any, sample_rate_hz: float, devices: dict[str, str], name: str = "stimrig", several: bool = False
+    ) -> None:
+        self._lsl, self._name, self._devices, self._several = lsl, name, devices, several
+        of_pulses = (*PULSE_CHANNELS, ("channel", "1")) if several else PULSE_CHANNELS
         self._torque = self._open("torque", "Torque", sample_rate_hz, lsl.cf_double64, (("torque", "N·m"),))
-        self._pulses = self._open("pulses", "Stimulation", 0.0, lsl.cf_double64, PULSE_CHANNELS)
+        self._pulses = self._open("pulses", "Stimulation", 0.0, lsl.cf_double64, of_pulses)
         self._marks = self._open("tests", "Markers", 0.0, lsl.cf_string, (("mark", "JSON"),))
 
     @property
@@ -184,7 +187,10 @@ class Outlets:
         if len(batch.torque_s):
             self._torque.push_chunk(batch.torque_nm.reshape(-1, 1), batch.torque_s.tolist())
         if batch.pulses:
-            self._pulses.push_chunk(np.array(batch.pulses, np.float64), batch.pulse_s)
+            values = np.array(batch.pulses, np.float64)
+            if self._several:
+                values = np.column_stack([values, batch.channels])
+            self._pulses.push_chunk(values, batch.pulse_s)
         for time_s, mark in batch.marks:
             if mark["event"] != "start":
                 self._mark(time_s, mark)
@@ -345,12 +351,14 @@ def _stream(folder: Path, config: configuration.RigConfig | None, name: str) -> 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     lsl = library()
-    rate_hz, speed, devices = 0.0, 1.0, dict[str, str]()
+    rate_hz, speed, devices, channels = 0.0, 1.0, dict[str, str](), list[str]()
     if config is not None:
         rate_hz = float(config.load_cell.model_dump().get("sample_rate_hz", 0.0))
-        speed = config.clock_speed
+        speed, channels = config.clock_speed, [channel.name for channel in config.channels()]
         devices = {"load_cell": config.load_cell.device, "stimulator": config.stimulator.device}
-    streams = Outlets(lsl, rate_hz * speed, devices, name)
+        if len(channels) > 1:
+            devices["stimulator_channels"] = ", ".join(channels)
+    streams = Outlets(lsl, rate_hz * speed, devices, name, len(channels) > 1)
     streaming = Streaming(folder, streams, clock_offset_s(lsl), rate_hz, speed)
     print(json.dumps({"streams": streams.names}), flush=True)
     while not ended.is_set():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from stimrig.rig import assembly, journal
 from stimrig.rig.errors import RecordingError
 from stimrig.rig.journal import Kind
 from stimrig.rig.lsl_outlets.live_test import MARGIN_S, Batch, LiveTest
-from stimrig.rig.lsl_outlets.streaming import Journals, Streaming, Tail, refuse_locking
+from stimrig.rig.lsl_outlets.streaming import Journals, Outlets, Streaming, Tail, refuse_locking
 from stimrig.rig.signals import SAMPLE
 from tests.rig.fakes import VirtualRig, journal_at
+from tests.rig.test_channels import two
 
 RATE_HZ, PULSE_HZ, T0_S = 1600.0, 40.0, 100.0
 PLAN = {"test_id": "t", "participant": "P17", "kind": "sequence", "pulse_rate_hz": PULSE_HZ, "adaptive": None}
@@ -264,3 +266,38 @@ def test_where_a_reader_could_hold_up_the_writer_nothing_is_read(tmp_path: Path,
         refuse_locking(tmp_path)
     with pytest.raises(RecordingError, match="nowhere"):
         refuse_locking(tmp_path / "nowhere")
+
+
+def test_each_pulse_tells_its_channel(tmp_path: Path):
+    rig = two(tmp_path)
+    rig.execute()
+    test = LiveTest()
+    for kind, payload in journal.read(rig.path).blocks:
+        test.take(kind, payload)
+    batch = test.ready(finish=True)
+    assert len(batch.pulses) == 80
+    assert batch.channels == [0, 1] * 40
+    assert [pulse[1] for pulse in batch.pulses[:2]] == [20.0, 30.0]
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_the_stream_has_one_more_channel_where_there_are_several(several: bool):
+    pushed: list[np.ndarray] = []
+    labels: list[int] = []
+
+    class Outlet:
+        def __init__(self, info: object) -> None: ...
+
+        def push_chunk(self, values: np.ndarray, _times_s: list[float]) -> None:
+            pushed.append(values)
+
+    def info(_name: str, kind: str, count: int, *_: object) -> SimpleNamespace:
+        if kind == "Stimulation":
+            labels.append(count)
+        return SimpleNamespace(desc=Mock)
+
+    lsl = SimpleNamespace(cf_double64=0, cf_string=1, StreamInfo=info, StreamOutlet=Outlet)
+    streams = Outlets(lsl, 1000.0, {}, several=several)
+    streams.push(Batch(pulse_s=[1.0, 2.0], pulses=[(100.0, 20.0, 5), (90.0, 30.0, 6)], channels=[0, 1]))
+    assert labels == [4 if several else 3]
+    assert pushed[0].tolist() == ([[100, 20, 5, 0], [90, 30, 6, 1]] if several else [[100, 20, 5], [90, 30, 6]])
