@@ -76,6 +76,8 @@ def test_one_electrode_comes_off_or_all_do() -> None:
     for output, results in ((0.0, [ELECTRODE, ELECTRODE]), (1.0, [ELECTRODE, OK]), (2.0, [OK, ELECTRODE])):
         host.devices.faults.on("electrode_error", {"output": output})
         assert [fire(host, channel) for channel in (0, 1)] == results
+    with pytest.raises(HardwareSimError, match="0 to 8"):
+        host.devices.faults.on("electrode_error", {"output": 9.0})
     host.devices.faults.off("electrode_error")
     assert [fire(host, channel) for channel in (0, 1)] == [OK, OK]
 
