@@ -47,6 +47,8 @@ class Fields:
     """In the unit of the search."""
     gain: np.ndarray
     """The wanted muscle's largest torque in that unit, (rows, 1)."""
+    slope: np.ndarray
+    """By how much torque rises with the log of what is reached."""
     slight: np.ndarray
     """Probability of a spill-over that is slight at least."""
     strong: np.ndarray
@@ -55,7 +57,7 @@ class Fields:
 def fields(z: np.ndarray, reach: Reach, radius_mm: float) -> Fields:
     """Torque and spill-over of each row at each choice."""
     where = reach.where_mm[None]
-    gain, level = np.exp(0.4 + 0.6 * z[:, 0:1]), 0.6 + 0.8 * z[:, 1:2]
+    gain, level = np.exp(0.4 + 0.6 * z[:, 0:1]), 0.6 + 1.0 * z[:, 1:2]
     if reach.session:
         own = z[:, OWN + len(SESSION) * (reach.session - 1) :][:, : len(SESSION)] * SESSION
         where = where + own[:, None, :2]
@@ -65,15 +67,16 @@ def fields(z: np.ndarray, reach: Reach, radius_mm: float) -> Fields:
     spread = np.where(pair, np.exp(0.2 * z[:, 2:3]), 1.0)
     drive = spread * 0.5 * (reached[:, :, reach.ends[:, 0]] + reached[:, :, reach.ends[:, 1]]).transpose(1, 0, 2)
     levels = [level, level + 0.3 * z[:, 3:4], level + 0.6 * z[:, 4:5] - 0.3, level + 0.6 * z[:, 5:6] - 0.3]
-    steep = np.exp(0.9 + 0.35 * z[:, 6:7])
+    steep = np.exp(1.1 + 0.45 * z[:, 6:7])
     own, second, left, right = (_hill(each, one, steep) for each, one in zip(drive, levels, strict=True))
     share = 0.5 / (1.0 + np.exp(1.0 - 1.5 * z[:, 7:8]))
     against = 0.5 * np.exp(0.5 * z[:, 8:9])
     torque = gain * ((1.0 - share) * own + share * second - against * left)
+    slope = gain * steep * ((1.0 - share) * own * (1.0 - own) + share * second * (1.0 - second))
     spilled = np.log(left + right + 1e-3)
     first = -1.7 + 0.5 * z[:, 9:10]
     return Fields(
-        torque, gain,
+        torque, gain, slope,
         _logistic((spilled - first) / 0.25),
         _logistic((spilled - first - np.exp(0.1 + 0.3 * z[:, 10:11])) / 0.25),
     )  # fmt: skip
@@ -81,11 +84,11 @@ def fields(z: np.ndarray, reach: Reach, radius_mm: float) -> Fields:
 
 def _reached(z: np.ndarray, where: np.ndarray, radius_mm: float) -> np.ndarray:
     """How much of each source each element reaches, 1 above it, (rows, sources, elements)."""
-    first = 0.75 * radius_mm * z[:, 11:13]
+    first = 0.65 * radius_mm * z[:, 11:13]
     second = first + 0.8 * radius_mm * z[:, 13:15]
     left, right = 1.4 * radius_mm * z[:, 15:17], 1.4 * radius_mm * z[:, 17:19]
     centre = np.stack([first, second, left, right], axis=1)
-    width = 18.0 * np.exp(0.35 * z[:, [19, 19, 20, 21]])
+    width = 16.0 * np.exp(0.45 * z[:, [19, 19, 20, 21]])
     long = 0.35 * z[:, 22:24]
     size = np.hypot(*long.T) + 1e-9
     same, other = np.cosh(size)[:, None, None], (np.sinh(size) / size)[:, None, None]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from stimrig.identify.electrodes.anatomy import OWN, SESSION, Reach, fields
+from stimrig.identify.electrodes.anatomy import OWN, SESSION, Fields, Reach, fields
 
 ROWS = 600
 MOVES = 3
@@ -24,11 +24,12 @@ CARRIED = 0.8
 """Correlation of what is left over between two sessions of one person."""
 ALONE = 0.3
 """Share of it that belongs to one choice alone (contact, gel)."""
-FLOOR, MISFIT, NOISE = 0.02, 0.15, 0.4
-"""What is left over: in parts of the gain, and of the torque there; and what changes from repeat to repeat, in parts of it."""
-LAPSE = 0.03
-"""Probability that a spill-over is reported wrongly, in each other way."""
-COMFORT_SD = {"level": 1.5, "pair": 0.7, "session": 0.6, "field": 1.3, "report": 0.6}
+FLOOR, MISFIT, DRIVE, NOISE = 0.02, 0.08, 0.35, 0.2
+"""What is left over: in parts of the gain, of the torque there, and of its slope; and what changes from repeat to
+repeat, in parts of all that."""
+REPORTED = np.array([[0.88, 0.11, 0.01], [0.10, 0.85, 0.05], [0.01, 0.09, 0.90]])
+"""Probability of a report (column) where a spill-over is (row)."""
+COMFORT_SD = {"level": 1.5, "pair": 0.7, "session": 0.6, "field": 1.0, "report": 0.6}
 COMFORT_MEAN, COMFORT_PAIR = 6.5, 0.5
 
 
@@ -85,10 +86,8 @@ class Believed:
         for each in self.evidence:
             said = fields(z, each.reach, self.radius_mm)
             torque.append(said.torque)
-            scale.append(FLOOR * said.gain + MISFIT * np.abs(said.torque))
-            chance = np.where(each.spill == 0, 1 - said.slight, said.slight - said.strong)
-            chance = np.where(each.spill == 2, said.strong, chance)
-            log = log + np.log(LAPSE + (1 - 3 * LAPSE) * np.clip(chance, 0, 1)).sum(axis=1)
+            scale.append(_scale(said))
+            log = log + np.log(np.einsum("srk,sk->rk", _kinds(said), REPORTED[:, each.spill.astype(int)])).sum(axis=1)
         return np.hstack(torque), np.hstack(scale), log
 
     def _log_likelihood(self, z: np.ndarray) -> np.ndarray:
@@ -137,9 +136,9 @@ class Believed:
     def draws(self) -> Draws:
         """One draw of each quantity at each choice for each row; what is drawn of a choice is without report noise."""
         said = fields(self.z, self.today, self.radius_mm)
-        scale = FLOOR * said.gain + MISFIT * np.abs(said.torque)
+        scale = _scale(said)
         left = self._left_over(said.torque.shape)
-        return Draws(said.torque + scale * left, self._spill(said.slight, said.strong), self._comfort())
+        return Draws(said.torque + scale * left, self._spill(_kinds(said)), self._comfort())
 
     def _left_over(self, shape: tuple[int, ...]) -> np.ndarray:
         prior, mean = likeness(self.today, self.today), 0.0
@@ -155,16 +154,15 @@ class Believed:
         value, vector = np.linalg.eigh(covariance)
         return self.random.standard_normal(shape) @ (vector * np.sqrt(np.maximum(value, 0.0))).T
 
-    def _spill(self, slight: np.ndarray, strong: np.ndarray) -> np.ndarray:
+    def _spill(self, chance: np.ndarray) -> np.ndarray:
         """Kinds of spill-over; today's reports count at their choice."""
-        chance = np.stack([1 - slight, slight - strong, strong])
         for each in self.evidence:
             if each.reach.session == 0:
                 for ends, spill in zip(each.reach.ends, each.spill, strict=True):
                     at = np.flatnonzero((self.today.ends == ends).all(axis=1))
-                    chance[:, :, at] *= np.where(np.arange(3) == spill, 1 - 2 * LAPSE, LAPSE)[:, None, None]
-        chance = np.cumsum(np.clip(chance, 1e-9, None), axis=0)
-        picked = self.random.random(slight.shape) * chance[-1]
+                    chance[:, :, at] *= REPORTED[:, int(spill), None, None]
+        chance = np.cumsum(chance, axis=0)
+        picked = self.random.random(chance.shape[1:]) * chance[-1]
         return (picked > chance[0]).astype(int) + (picked > chance[1])
 
     def _comfort(self) -> np.ndarray:
@@ -192,3 +190,13 @@ class Believed:
 
 def _is_pair(reach: Reach) -> np.ndarray:
     return (reach.ends[:, 0] != reach.ends[:, 1]).astype(float)
+
+
+def _scale(said: Fields) -> np.ndarray:
+    """Standard deviation of what is left over."""
+    return FLOOR * said.gain + MISFIT * np.abs(said.torque) + DRIVE * said.slope
+
+
+def _kinds(said: Fields) -> np.ndarray:
+    """Probability of no, slight and strong spill-over, (3, rows, choices)."""
+    return np.clip(np.stack([1.0 - said.slight, said.slight - said.strong, said.strong]), 1e-9, 1.0)
