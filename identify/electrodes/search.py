@@ -17,9 +17,14 @@ from stimrig.identify.errors import BadRequest
 
 NEAR, FAR = 0.9, 0.8
 """A choice is as good as the best above the first share of its utility, and wrong below the second."""
-SURE = 0.8
-NONE_SURE = 0.9
-MOST = 30
+SURE = 0.95
+"""Probability not to be wrong that is enough to stop; chosen on emulated people that are not those of the bench."""
+NONE_SURE = 0.95
+"""Probability that no choice is of use that is enough to stop."""
+MOST = 20
+"""Stimuli of one search."""
+USUAL = 10.0
+"""A muscle's usual torque, in parts of the least that counts: assumed until more is seen."""
 QUANTITIES = ("torque_nm", "spill", "comfort", "utility")
 SCHEMA = 1
 
@@ -81,7 +86,7 @@ class Search:
     def _unit_nm(self) -> float:
         """Torque is counted in parts of the largest that was seen, so that its scale does not matter."""
         seen = [abs(each.torque_nm) for one in self._sessions() for _, each in one.seen]
-        return max([self.wish.least_nm, *seen])
+        return max([USUAL * self.wish.least_nm, *seen])
 
     def _reach(self, session: int, some: Sequence[Elements], charge: float) -> Reach:
         ends = np.array([(each[0] - 1, each[-1] - 1) for each in some], dtype=int).reshape(-1, 2)
@@ -119,26 +124,44 @@ class Search:
         utility, at = self._draws["utility"], self._best_index()
         known = np.zeros((len(utility), 1)) if at is None else utility[:, [at]]
         gain = np.maximum(utility - known, 0.0).mean(axis=0)
-        picked = int(np.argmax(gain))
+        picked = int(np.argmax(gain)) if np.any(gain > 0.0) else int(np.argmax(utility.mean(axis=0)))
         elements, mean, sd = self.choices[picked], float(utility[:, picked].mean()), float(utility[:, picked].std())
         better = float(np.mean(utility[:, picked] > known[:, 0]))
-        name = "Element " + str(elements[0]) if len(elements) == 1 else f"Elements {elements[0]} and {elements[1]}"
-        beaten = "is of use" if at is None else f"is better than the best so far ({self.choices[at]})"
-        return Proposal(elements, f"{name}: probability {better:.0%} that it {beaten}.", mean, sd)
+        return Proposal(elements, self._why(elements, at, better), mean, sd)
+
+    def _why(self, elements: Elements, at: int | None, better: float) -> str:
+        if at is None:
+            return f"{_name(elements)}: nothing of use is known yet; probability {better:.0%} that this is."
+        if elements == self.choices[at]:
+            return f"{_name(elements)}: the best so far; once more, to be sure of it."
+        again = " once more" if any(elements == each for each, _ in self.seen) else ""
+        return f"{_name(elements)}{again}: probability {better:.0%} to beat {_name(self.choices[at]).lower()}."
 
     def enough(self) -> Stop | None:
         """Whether to stop, and why; None: go on."""
         utility, at = self._draws["utility"], self._best_index()
         top = utility.max(axis=1)
         if at is None:
-            nothing = float(np.mean(top <= 0.0))
-            return Stop("No element moves the joint.", None, nothing) if nothing >= NONE_SURE else None
-        near = float(np.mean(utility[:, at] >= NEAR * top))
-        if near >= SURE:
-            return Stop("Best found.", self.choices[at], near)
+            return self._none_of_use(float(np.mean(top <= 0.0)))
+        best, near = utility[:, at], float(np.mean(utility[:, at] >= NEAR * top))
+        right = float(np.mean(best >= FAR * top))
+        name = _name(self.choices[at])
+        if right >= SURE:
+            return Stop(f"{name}: probability {near:.0%} to be within 10 % of the best.", self.choices[at], near)
         if len(self.seen) >= MOST:
-            return Stop("Most.", self.choices[at], near)
+            reason = f"{len(self.seen)} stimuli are enough for one search. {name} is the best so far; a better one may be left."
+            return Stop(reason, self.choices[at], near)
         return None
+
+    def _none_of_use(self, nothing: float) -> Stop | None:
+        """Where no choice that was stimulated is of use, and `nothing` is the probability that none is."""
+        if nothing < NONE_SURE and len(self.seen) < MOST:
+            return None
+        still = float(np.mean(self._draws["torque_nm"].max(axis=1) < self.wish.least_nm))
+        if max(each.torque_nm for _, each in self.seen) < self.wish.least_nm and still >= 0.5:
+            return Stop("No element moves the joint. Try more current, or another place.", None, nothing)
+        reason = "No element that was tried gives what is wished: each spills over, hurts, or gives no torque."
+        return Stop(reason, None, nothing)
 
     def map(self) -> list[dict[str, Any]]:
         """For each choice its elements, whether it was stimulated, and mean and sd of each quantity."""
@@ -174,3 +197,7 @@ class Search:
         except (KeyError, TypeError, ValueError) as error:
             raise BadRequest(f"not a search that was kept ({error})", place="electrodes") from error
         return made
+
+
+def _name(elements: Elements) -> str:
+    return f"Element {elements[0]}" if len(elements) == 1 else f"Elements {elements[0]} and {elements[1]}"
