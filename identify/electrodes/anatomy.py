@@ -19,7 +19,7 @@ SOURCES = 4
 """Two motor points of the wanted muscle, then two neighbours."""
 OWN = 24
 """Numbers of a person; then as many as `SESSION` for each earlier session."""
-SESSION = (4.0, 4.0, 0.2, 0.2)
+SESSION = (4.0, 4.0, 0.2, 0.15)
 """How far an array shifts from session to session (mm, mm), and by how much log gain and log drive change: one sd."""
 TAIL = 1.5
 """Power of the fall at a distance: between a Cauchy's and a Gaussian's."""
@@ -62,13 +62,14 @@ def fields(z: np.ndarray, reach: Reach, radius_mm: float) -> Fields:
         own = z[:, OWN + len(SESSION) * (reach.session - 1) :][:, : len(SESSION)] * SESSION
         where = where + own[:, None, :2]
         gain, level = gain * np.exp(own[:, 2:3]), level + own[:, 3:4] + reach.log_charge
-    reached = _reached(z, where, radius_mm)
+    used, ends = np.unique(reach.ends, return_inverse=True)
+    reached = _reached(z, where[:, used], radius_mm)[:, :, ends.reshape(reach.ends.shape)]
     pair = reach.ends[:, 0] != reach.ends[:, 1]
     spread = np.where(pair, np.exp(0.2 * z[:, 2:3]), 1.0)
-    drive = spread * 0.5 * (reached[:, :, reach.ends[:, 0]] + reached[:, :, reach.ends[:, 1]]).transpose(1, 0, 2)
+    drive = (0.5 * spread * (reached[..., 0] + reached[..., 1])).transpose(1, 0, 2)
     levels = [level, level + 0.3 * z[:, 3:4], level + 0.6 * z[:, 4:5] - 0.3, level + 0.6 * z[:, 5:6] - 0.3]
     steep = np.exp(1.1 + 0.45 * z[:, 6:7])
-    own, second, left, right = (_hill(each, one, steep) for each, one in zip(drive, levels, strict=True))
+    own, second, left, right = _logistic(steep * (np.log(drive) + np.stack(levels)))
     share = 0.5 / (1.0 + np.exp(1.0 - 1.5 * z[:, 7:8]))
     against = 0.5 * np.exp(0.5 * z[:, 8:9])
     torque = gain * ((1.0 - share) * own + share * second - against * left)
@@ -97,10 +98,6 @@ def _reached(z: np.ndarray, where: np.ndarray, radius_mm: float) -> np.ndarray:
     far = same * (dx * dx + dy * dy) + other * (a * (dx * dx - dy * dy) + 2.0 * b * dx * dy)
     power = 1.0 + far / (2.0 * TAIL * width[:, :, None] ** 2)
     return 1.0 / (power * np.sqrt(power))
-
-
-def _hill(drive: np.ndarray, level: np.ndarray, steep: np.ndarray) -> np.ndarray:
-    return _logistic(steep * (np.log(drive) + level))
 
 
 def _logistic(x: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ MOVES = 3
 """Steps of each row at each temperature."""
 LENGTH_MM = 22.0
 """Over which what is left over, and comfort, change."""
-CARRIED = 0.8
+CARRIED = 0.7
 """Correlation of what is left over between two sessions of one person."""
 ALONE = 0.1
 """Share of it that belongs to one choice alone (contact, gel)."""

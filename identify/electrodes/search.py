@@ -132,8 +132,6 @@ class Search:
     def _why(self, elements: Elements, at: int | None, better: float) -> str:
         if at is None:
             return f"{_name(elements)}: nothing of use is known yet; probability {better:.0%} that this is."
-        if elements == self.choices[at]:
-            return f"{_name(elements)}: the best so far; once more, to be sure of it."
         again = " once more" if any(elements == each for each, _ in self.seen) else ""
         return f"{_name(elements)}{again}: probability {better:.0%} to beat {_name(self.choices[at]).lower()}."
 
@@ -149,7 +147,7 @@ class Search:
         if right >= SURE:
             return Stop(f"{name}: probability {near:.0%} to be within 10 % of the best.", self.choices[at], near)
         if len(self.seen) >= MOST:
-            reason = f"{len(self.seen)} stimuli are enough for one search. {name} is the best so far; a better one may be left."
+            reason = f"{len(self.seen)} stimuli are enough. {name} is the best so far; a better one may be left."
             return Stop(reason, self.choices[at], near)
         return None
 
