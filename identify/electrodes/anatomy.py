@@ -66,7 +66,7 @@ def fields(z: np.ndarray, reach: Reach, radius_mm: float) -> Fields:
     reached = _reached(z, where[:, used], radius_mm)[:, :, ends.reshape(reach.ends.shape)]
     pair = reach.ends[:, 0] != reach.ends[:, 1]
     spread = np.where(pair, np.exp(0.2 * z[:, 2:3]), 1.0)
-    drive = (0.5 * spread * (reached[..., 0] + reached[..., 1])).transpose(1, 0, 2)
+    drive = 0.5 * spread * (reached[..., 0] + reached[..., 1]).transpose(1, 0, 2)
     levels = [level, level + 0.3 * z[:, 3:4], level + 0.6 * z[:, 4:5] - 0.3, level + 0.6 * z[:, 5:6] - 0.3]
     steep = np.exp(1.1 + 0.45 * z[:, 6:7])
     own, second, left, right = _logistic(steep * (np.log(drive) + np.stack(levels)))
