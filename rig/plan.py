@@ -105,8 +105,7 @@ def build(plan: TestPlan, table: dict[str, Limit], rig: Sequence[RigChannel] = (
     channels.check_train(train, table)
     chosen = plan.segments
     if chosen is None:
-        first = playing[0]
-        chosen = protocols.segments(plan.protocol, min(first.table["pulse_width_us"].hi, first.largest_us))
+        chosen = _by_protocol(plan, playing)
     if not chosen:
         raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
     if len(chosen) > MAX_SEGMENTS:
@@ -124,6 +123,15 @@ def build(plan: TestPlan, table: dict[str, Limit], rig: Sequence[RigChannel] = (
     places = zip(built, [0, *ends[:-1]], ends, strict=True)
     segments = tuple(Segment(piece.of.name, start, end, "plan") for piece, start, end in places)
     return PlannedTest(plan, widths_us, segments, built, longest_s, playing, train)
+
+
+def _by_protocol(plan: TestPlan, playing: Sequence[Channel]) -> list[SegmentPlan]:
+    """Segments of a plan that names none. Raises PlanError: a protocol of one channel was named for several."""
+    if len(playing) == 1:
+        return protocols.segments(plan.protocol, min(playing[0].table["pulse_width_us"].hi, playing[0].largest_us))
+    if plan.protocol != protocols.DEFAULT:
+        raise PlanError(f"plan.protocol: {plan.protocol!r} is for one channel; leave it out, or give segments")
+    return protocols.several([channel.name for channel in playing])
 
 
 def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:

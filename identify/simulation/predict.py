@@ -134,7 +134,10 @@ def unforeseen(model: Muscle) -> dict[str, tuple[float, float]]:
 
 
 def problem_of(
-    model: Muscle, grid: Grid, further: Sequence[tuple[Form, Sequence[float]]] = ()
+    model: Muscle,
+    grid: Grid,
+    further: Sequence[tuple[Form, Sequence[float]]] = (),
+    settings: Mapping[str, Any] | None = None,
 ) -> tuple[Problem, np.ndarray]:
     """The model as a `Problem` on a record, and its parameters there; on another record than its own without effects
     that cannot be foreseen.
@@ -148,6 +151,8 @@ def problem_of(
     further : sequence of (Form, sequence of float)
         Forms that act beside the model's effects, next to the curve (a gain before all others, what changes the widths
         after them), and the values of their parameters.
+    settings : Mapping, optional
+        The scale, sign and zero of the fitted record; by default as the model's effects say.
 
     Raises
     ------
@@ -156,7 +161,8 @@ def problem_of(
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
-    settings = model.effects[0].get("settings", {}) if model.effects else {}
+    if settings is None:
+        settings = model.effects[0].get("settings", {}) if model.effects else {}
     own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     setup = Setup(
         grid=grid,

@@ -72,6 +72,8 @@ class Problem:
         for number in ["", *(f"_{state}" for state in range(2, states + 1))]:
             table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))
             table.append(Parameter(f"initial_rate{number}_nm_s", "N·m/s", -10 * span, 10 * span))
+        self.cores = np.arange(2)
+        """Where the time constant and the damping stand."""
         self.delay = range(2, 3)
         self.baselines = range(3, 3 + parts)
         self.initials = range(3 + parts, 3 + parts + 2 * states)
@@ -117,7 +119,8 @@ class Problem:
         scale = self.setup.scale_nm
         at = slice(self.baselines.start, self.baselines.stop)
         mean[at], sd[at] = self.setup.rests_nm or (0.0, 0.5 * scale)
-        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.grid.starts.size)
+        wide = 1e-6 if self.setup.at_rest else 1.0
+        sd[list(self.initials)] = np.tile([wide * scale, 5.0 * wide * scale], self.setup.grid.starts.size)
         mean[self.coefficients] = self.setup.curve_nm
         precision = np.diag(1.0 / sd**2)
         precision[self.coefficients, self.coefficients] = self.setup.penalty

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from stimrig import identify
+from stimrig.api.cli import several
 from stimrig.api.cli.terminal import (
     ColumnMap,
     Data,
@@ -36,6 +37,9 @@ def predict(
 
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
 
+    if several.is_joint([data]):
+        several.predict(model_json, data, output, as_json, map=columns)
+        return
     model = load_model(model_json, "predict MODEL.json DATA -o FILE")
     record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))

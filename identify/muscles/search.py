@@ -1,0 +1,234 @@
+"""What a model of several muscles lacks: their interplay first, then the effects of each muscle.
+
+Interplay is tried on all muscles at once. An effect of one muscle is looked for as in a record of that muscle alone,
+with the others' torque taken away, and then judged on all at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+
+from stimrig.identify.diagnosis.free import searched
+from stimrig.identify.diagnosis.search import Progress, silent
+from stimrig.identify.effects import find_effect
+from stimrig.identify.effects.base import Form
+from stimrig.identify.estimation.fit_statistics import rms
+from stimrig.identify.muscles.interplay import registry
+from stimrig.identify.muscles.joint_fit import JointFitted, fit_all
+from stimrig.identify.muscles.problem import Acting
+from stimrig.identify.muscles.record import JointRecord
+
+MARGIN = 6.0
+"""Log evidence that an interplay or an effect must gain."""
+LEAST_SHARE = 0.004
+"""An interplay that changes the torque by less than this share of its spread where it acts is none: an inexact curve
+looks like it."""
+MOST_EFFECTS = 3
+RISE = 1.02
+"""The error on held-out pulses may rise by this factor with something that is added: chance alone."""
+JOINT_STAGES = {"additive"}
+"""An effect of these stages is of the joint, not of one muscle; it is kept with the first channel."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One thing that was tried beside a model."""
+
+    key: str  # "cross_talk:biceps>triceps", "co_contraction", "biceps.fatigue"
+    form: str
+    found: JointFitted  # with it
+    gain: float  # of log evidence, with its prior odds
+
+
+@dataclass
+class JointSearch:
+    """The models, each with one thing more, and what was tried beside each."""
+
+    record: JointRecord
+    chain: list[JointFitted]
+    added: list[Tried] = field(default_factory=list)
+    rounds: list[list[Tried]] = field(default_factory=list)
+    refused: list[tuple[Tried, str]] = field(default_factory=list)
+    unexplained: list[str] = field(default_factory=list)  # muscles whose own record keeps structure
+
+    @property
+    def last(self) -> JointFitted:
+        """The model with all that was found."""
+        return self.chain[-1]
+
+
+def search(record: JointRecord, progress: Progress | None = None, base: JointFitted | None = None) -> JointSearch:
+    """Add interplay and effects to the model of a record while the evidence asks for them.
+
+    Parameters
+    ----------
+    record : JointRecord
+        What was measured.
+    progress : callable or None
+        Called with the share done, 0 to 1, and a line of text; it may raise `Cancelled`.
+    base : JointFitted, optional
+        The model to start from; by default the plain structure of all muscles.
+    """
+    say = progress or silent
+    say(0.02, "fitting all muscles")
+    found = JointSearch(record, [base or fit_all(record)])
+    while (best := _best(found, _interplays(found.last))) is not None:
+        _append(found, best)
+        say(min(0.1 + 0.05 * len(found.added), 0.3), f"added {best.key}")
+    for number in range(MOST_EFFECTS):
+        best = _best(found, _effects(found, say, number))
+        if best is None:
+            break
+        _append(found, best)
+        while (more := _best(found, _interplays(found.last))) is not None:
+            _append(found, more)
+    _drop_idle(found)
+    return found
+
+
+def _append(found: JointSearch, best: Tried) -> None:
+    found.added.append(best)
+    found.chain.append(best.found)
+
+
+def _best(found: JointSearch, candidates: Sequence[Tried]) -> Tried | None:
+    """The likeliest of a round that held-out pulses do not speak against; None if none gains enough."""
+    ranked = sorted(candidates, key=lambda one: (-one.gain, one.key))
+    found.rounds.append(ranked)
+    before = held_out_rms(found.last)
+    for one in ranked:
+        if one.gain < MARGIN:
+            break
+        after = held_out_rms(one.found)
+        if before is not None and after is not None and after > RISE * before:
+            found.refused.append((one, f"The error on held-out pulses rises from {before:.3g} to {after:.3g} N·m."))
+            continue
+        return one
+    return None
+
+
+def _interplays(last: JointFitted) -> list[Tried]:
+    names = last.record.names
+    present = {acting.key(names) for acting in last.acting}
+    tried: list[Tried] = []
+    for interplay in registry().values():
+        ends: list[Any] = list(permutations(range(len(names)), 2)) if interplay.directed else [None]
+        for between in ends:
+            forms = [Acting(interplay, form.name, between) for form in interplay.forms]
+            if forms[0].key(names) in present or not _can_act(last, forms[0]):
+                continue
+            results = [_with_interplay(last, acting) for acting in forms]
+            best = max(results, key=lambda one: one.gain)
+            if _size(last, best.found) >= LEAST_SHARE:
+                tried.append(best)
+    return tried
+
+
+def _can_act(last: JointFitted, acting: Acting) -> bool:
+    """Co-contraction needs muscles that pull against each other."""
+    signs = last.problem.signs
+    return acting.between is not None or (np.any(signs > 0) and np.any(signs < 0))
+
+
+def _with_interplay(last: JointFitted, acting: Acting) -> Tried:
+    found = last.with_(acting=[*last.acting, acting])
+    gain = found.fitted.log_evidence - last.fitted.log_evidence + acting.interplay.log_odds
+    return Tried(acting.key(last.record.names), acting.form, found, gain)
+
+
+def _size(before: JointFitted, after: JointFitted) -> float:
+    """How much the prediction changes where several muscles are at work, as a share of the torque's spread there."""
+    moving = np.sum([one.pulse_width_us > 0 for one in before.grids], axis=0) > 1
+    rows = before.problem.setup.fitted & moving
+    if not rows.any():
+        return 0.0
+    change = before.fitted.residual_nm - after.fitted.residual_nm
+    return rms(change[rows]) / max(float(np.std(before.problem.setup.target_nm[rows])), 1e-9)
+
+
+def _effects(found: JointSearch, say: Progress, number: int) -> list[Tried]:
+    """What each muscle's own record asks for, fitted on all muscles at once."""
+    last, tried = found.last, []
+    found.unexplained.clear()
+    for place, name in enumerate(last.record.names):
+        view = last.views[place]
+        begin = 0.3 + 0.6 * (number + place / len(last.grids)) / MOST_EFFECTS
+        step = 0.6 / MOST_EFFECTS / len(last.grids)
+        tell = _within(say, begin, step, name)
+        raw = replace(
+            last.raw, torque_nm=view.problem.setup.grid.record.torque_nm, hum=None, ceiling_nm=None, floor_nm=None
+        )
+        held = [f"{effect}:{form.name}" for effect, form in last.effects[place]]
+        own, verdict = searched(view.problem.setup.grid, raw, tell, most=1, structure=held)
+        if verdict.kind == "unexplained_structure":
+            found.unexplained.append(name)
+        for effect in own.added:
+            if find_effect(effect).band:
+                continue
+            form = dict(own.last.effects)[effect]
+            values = own.last.parameters_of(effect)
+            tried.append(_with_effect(last, place, effect, form, values))
+    return tried
+
+
+def _within(say: Progress, begin: float, step: float, name: str) -> Progress:
+    return lambda share, text: say(begin + step * share, f"{name}: {text}")
+
+
+def _with_effect(last: JointFitted, place: int, effect: str, form: Form, values: dict[str, float]) -> Tried:
+    effects = [list(own) for own in last.effects]
+    effects[place].append((effect, form))
+    found = last.with_(effects=effects, start={f"{place}.{effect}": values})
+    gain = found.fitted.log_evidence - last.fitted.log_evidence + find_effect(effect).prior
+    whose = "joint" if form.stage in JOINT_STAGES else last.record.names[place]
+    return Tried(f"{whose}.{effect}", form.name, found, gain)
+
+
+def _drop_idle(found: JointSearch) -> None:
+    """Take away an interplay that later ones have made idle."""
+    names = found.record.names
+    for one in list(found.added[:-1]):
+        last = found.last
+        kept = [acting for acting in last.acting if acting.key(names) != one.key]
+        if len(kept) == len(last.acting):
+            continue
+        without = last.with_(acting=kept)
+        if last.fitted.log_evidence - without.fitted.log_evidence < MARGIN:
+            found.added.remove(one)
+            found.chain.append(without)
+
+
+def held_out_rms(found: JointFitted) -> float | None:
+    """On rows of `validate`, N·m; None without any."""
+    rows = found.record.held_out & found.grids[0].counted
+    return rms((found.record.torque_nm - found.predicted[0])[rows]) if rows.any() else None
+
+
+def probability(found: JointSearch, one: Tried) -> float:
+    """That this is there, and not one of its rivals, by the evidence: of models with and without it."""
+    names = found.record.names
+    last = found.last
+    if one.key in {acting.key(names) for acting in last.acting}:
+        without = last.with_(acting=[acting for acting in last.acting if acting.key(names) != one.key])
+    else:
+        place = 0 if one.key.startswith("joint.") else names.index(one.key.partition(".")[0])
+        effect = one.key.partition(".")[2]
+        effects = [[each for each in own if i != place or each[0] != effect] for i, own in enumerate(last.effects)]
+        without = last.with_(effects=effects)
+    rivals = [without.fitted.log_evidence]
+    for rival in rivals_of(one.key):
+        rivals += [each.found.fitted.log_evidence for each in _interplays(without) if each.key.startswith(rival)]
+    lost = [last.fitted.log_evidence - other for other in rivals]
+    return 1.0 / (1.0 + sum(math.exp(-min(max(each, -50.0), 50.0)) for each in lost))
+
+
+def rivals_of(key: str) -> tuple[str, ...]:
+    """Ids of interplay that a record often cannot separate from it."""
+    identifier = key.partition(":")[0]
+    return registry()[identifier].resembles if identifier in registry() else ()
