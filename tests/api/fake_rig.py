@@ -69,10 +69,10 @@ def rate(plan: m.TestPlan) -> float:
 def of_channels(plan: m.TestPlan, rig: list[str]) -> tuple[list[float], list[dict[str, Any]]]:
     """As the real rig lays them: a round has one slot of each channel."""
     from stimrig.rig.channels import RigChannel
-    from stimrig.rig.limits import HARD_LIMITS, for_plan
+    from stimrig.rig.limits import HARD_LIMITS, SUM_LIMITS, for_plan
     from stimrig.rig.plan import build
 
-    built = build(plan, for_plan(HARD_LIMITS, plan), [RigChannel(name, "", "", "") for name in rig])
+    built = build(plan, for_plan({**HARD_LIMITS, **SUM_LIMITS}, plan), [RigChannel(name, "", "", "") for name in rig])
     told = [
         {"name": s.name, "start_s": s.start / rate(plan), "end_s": s.end / rate(plan)} for s in built.segments
     ]  # fmt: skip

@@ -11,9 +11,8 @@ import h5py
 import httpx
 import pytest
 
-from stimrig.api.sessions import muscles
 from stimrig.rig.channels import RigChannel
-from stimrig.rig.limits import HARD_LIMITS, for_plan
+from stimrig.rig.limits import HARD_LIMITS, SUM_LIMITS, for_plan
 from stimrig.rig.messages import ChannelPlan, Profile, TestPlan
 from stimrig.rig.plan import build
 from tests.api.conftest import Service, csrf, own_service, signed_in, soon, wait_done
@@ -73,12 +72,12 @@ def test_a_further_channel_has_limits_and_a_site_of_its_own(two: httpx.Client) -
 def test_the_plan_is_one_that_the_rig_takes() -> None:
     """Each channel moves alone and with the other, in fitted and in held-out pulses; nothing is beyond its limits."""
     plan = TestPlan(
-        test_id="T1", participant="P1", kind="muscles", profile=Profile(**OWN), segments=muscles.segments(TWO),
+        test_id="T1", participant="P1", kind="muscles", profile=Profile(**OWN),
         channels=[ChannelPlan(name=name, profile=Profile(**{**OWN, "current_ma": 10.0 + k}))
                   for k, name in enumerate(TWO)],
     )  # fmt: skip
     plan.profile = plan.channels[0].profile
-    built = build(plan, for_plan(HARD_LIMITS, plan), [RigChannel(name, "", "", "") for name in TWO])
+    built = build(plan, for_plan({**HARD_LIMITS, **SUM_LIMITS}, plan), [RigChannel(name, "", "", "") for name in TWO])
     seen: set[tuple[str, bool, bool]] = set()
     for part in built.segments:
         rounds = built.pulse_width_us[part.start : part.end].reshape(-1, 2)

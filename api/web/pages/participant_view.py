@@ -18,9 +18,8 @@ from stimrig.api.models.places import site_of
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
 from stimrig.api.sessions import channels, controllers, profiles
-from stimrig.api.sessions.muscles import MUSCLES
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
-from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MuscleIn, NoteIn, TargetIn, TestIn
+from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MUSCLES, MuscleIn, NoteIn, TargetIn, TestIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant, Recording
 from stimrig.api.web.dependencies import Approver, Context, Ctx, Tester
