@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session, defer
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
+from stimrig.api.models.family import family_of
 from stimrig.api.models.places import Site, further_of, holds_at, in_words, place_of, site_of, site_of_recording
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, seen
@@ -101,8 +102,8 @@ class Versions:
             added_effect=added_effect,
             carried_from_id=carried_from_id,
             carried=carried,
-            method=str(document.get("method", "")),
-            effects=[str(effect["id"]) for effect in document.get("effects") or []],
+            method=str(document.get("method") or document.get("kind") or ""),
+            effects=list(stored_model.structure(document)),
             fit={
                 **stored_model.figures(document),
                 **stored_model.quality(document),
@@ -227,7 +228,8 @@ class Versions:
         with self.store.write() as session:
             if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
-            return self._decide(session, row, approved, by, reason, tracking.to_dict() if tracking else None)
+            followed = tracking if tracking and family_of(row).can("tracking") else None
+            return self._decide(session, row, approved, by, reason, followed.to_dict() if followed else None)
 
     def _brings_back(self, row: Model) -> bool:
         """Whether without this version another one is served; else a rejection only takes away."""
@@ -325,6 +327,7 @@ class Versions:
             for decision in decided
             if decision is newest[decision.model_id] and decision.approved
         ]
+        rows = [row for row in rows if family_of(row).can("carried")]
         return list({row.recording_id: row for row in reversed(rows)}.values())[::-1]
 
     def served(self, participant: str) -> Served | None:
@@ -351,7 +354,9 @@ class Versions:
             return None
         if served is None:
             return None
-        curve = json.loads(served.body)["recruitment"]
+        curve = json.loads(served.body).get("recruitment")
+        if curve is None:  # several muscles have one each
+            return None
         return {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
 
     def quality(self, row: Model) -> dict[str, Any]:

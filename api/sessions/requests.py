@@ -394,10 +394,17 @@ class ApprovalIn(DecisionIn):
     tracking: TrackingIn = Field(default=TrackingIn())
 
 
+EffectName = Annotated[
+    str,
+    StringConstraints(pattern=r"^([a-z0-9_-]{1,32}\.)?[a-z0-9_]{1,64}(:[a-z0-9_-]{1,32}>[a-z0-9_-]{1,32})?$"),
+    Field(description="`fatigue`; of several muscles `biceps.fatigue`, `co_contraction`, `cross_talk:biceps>triceps`"),
+]
+
+
 class EffectsIn(Body):
     """Effects to add to a model."""
 
-    effects: Annotated[list[Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]], Field(min_length=1)]
+    effects: Annotated[list[EffectName], Field(min_length=1)]
     reason: Annotated[str, StringConstraints(max_length=500)] = ""
     force: bool = Field(False, description="add it although the evidence is against it")
 

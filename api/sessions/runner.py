@@ -17,6 +17,7 @@ from stimrig.api.clock import Clock, asked_s
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.logs import current_test
 from stimrig.api.models.analyses import Analyses
+from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
@@ -217,6 +218,7 @@ class Runner(Playing):
     def _check_joins(self, joins: str, participant: Participant, plan: messages.TestPlan) -> None:
         """The model whose recording the new one is to be joined to is the participant's own, and of the same place."""
         model = self.versions.get(joins)
+        family_of(model).require("joined")
         if model.participant != participant.code:
             detail = f"{model.id} is a model of {model.participant}, the test is for {participant.code}."
             raise ApiError(422, "other-participant", "The model is another participant's", detail)
