@@ -37,6 +37,7 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "passive": lazy("passive movement"),
         "held": lazy("held-angle test"),
         "moving": lazy("movement under stimulation"),
+        "muscles": lazy("test of both muscles"),
     },
     "title": {
         "pre-session": lazy("Pre-session test"),
@@ -46,6 +47,7 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "passive": lazy("Passive movement"),
         "held": lazy("Held angle"),
         "moving": lazy("Movement under stimulation"),
+        "muscles": lazy("Test of both muscles"),
     },
     "end": {
         "known-enough": lazy("Enough is known"),

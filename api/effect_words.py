@@ -23,13 +23,23 @@ def library() -> dict[str, dict[str, Any]]:
 
     The files are read and not loaded: the web process does without their physics, and the centre has no worker to ask.
     """
-    spec = find_spec("stimrig.identify.effects")
+    return _read("stimrig.identify.effects", "EFFECT")
+
+
+@cache
+def interplay() -> dict[str, dict[str, Any]]:
+    """The same of what several muscles do to each other."""
+    return _read("stimrig.identify.muscles.interplay", "INTERPLAY")
+
+
+def _read(package: str, called: str) -> dict[str, dict[str, Any]]:
+    spec = find_spec(package)
     assert spec is not None and spec.origin is not None
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(Path(spec.origin).parent.glob("*.py")):
         for line in ast.parse(path.read_text(encoding="utf-8")).body:
             match line:
-                case ast.Assign(targets=[ast.Name("EFFECT")], value=ast.Call(keywords=given)):
+                case ast.Assign(targets=[ast.Name(name)], value=ast.Call(keywords=given)) if name == called:
                     plain = [part for part in given if isinstance(part.value, ast.Constant | ast.Dict)]
                     said = {str(part.arg): ast.literal_eval(part.value) for part in plain}
                     found[said["id"]] = said
@@ -48,8 +58,15 @@ def _short_names() -> dict[str, str]:
 
 
 def effect_words(effect: str) -> str:
-    """An effect's title; the id of a person's own effect as words."""
-    title = fact_of(effect, "name", "")
+    """An effect's title; the id of a person's own effect as words. Of several muscles it says whose it is."""
+    muscle, dot, own = effect.partition(".")
+    if dot:
+        return language._("%(effect)s of %(muscle)s", effect=effect_words(own), muscle=muscle)
+    known, _colon, ends = effect.partition(":")
+    giving, _to, taking = ends.partition(">")
+    title = fact_of(effect, "name", interplay().get(known, {}).get("name", ""))
+    if taking:
+        return language._("%(effect)s from %(one)s to %(other)s", effect=language._(title), one=giving, other=taking)
     return language._(title) if title else effect.replace("_", " ").capitalize()
 
 
@@ -62,7 +79,7 @@ def within(effect: str) -> str:
 def effects_words(effects: Iterable[str], without_evidence: Collection[str] = ()) -> str:
     """Titles, one after the other, those added without evidence marked; of an effect's form (`fatigue:fitness`) people
     are told nothing."""
-    named = ((effect, within(effect.partition(":")[0])) for effect in effects)
+    named = ((effect, within(effect if ">" in effect else effect.partition(":")[0])) for effect in effects)
     return ", ".join(
         language._("%(effects)s (without evidence)", effects=words) if effect in without_evidence else words
         for effect, words in named

@@ -136,17 +136,22 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     if abs(record.pulse_rate_hz - 40.0) > 1e-6:
         message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
         raise identify.BadRecord(message, fix="Take the HDF5 file.")
-    names = ["time_s", "pulse_width_us", "torque_nm"]
+    progress(0.7, "writing")
+    columns = {"pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
+    return write_table(record, columns, Path(out))
+
+
+def write_table(record: Any, columns: dict[str, Any], out: Path) -> dict[str, Any]:
+    """Write times, these columns, the segments' names and the record's further columns; how many rows."""
     also = record.columns()
-    columns = [column.tolist() for column in (*(getattr(record, name) for name in names), *also.values())]
     told = [quoted(name) for name in record.segment_names]
     segments = [told[index] for index in record.segment.tolist()]
-    progress(0.7, "writing")
-    with Path(out).open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join([*names, "segment", *also]) + "\n")
-        for seconds, *values, segment in zip(*columns, segments, strict=True):
-            width, torque, *more = [f"{value:.8g}" for value in values]
-            file.write(",".join([f"{seconds:.6f}", width, torque, segment, *more]) + "\n")
+    values = [column.tolist() for column in (record.time_s, *columns.values(), *also.values())]
+    with out.open("w", encoding="utf-8", newline="") as file:
+        file.write(",".join(["time_s", *columns, "segment", *also]) + "\n")
+        for seconds, *row, segment in zip(*values, segments, strict=True):
+            cells = [f"{value:.8g}" for value in row]
+            file.write(",".join([f"{seconds:.6f}", *cells[: len(columns)], segment, *cells[len(columns) :]]) + "\n")
     return {"rows": len(segments)}
 
 

@@ -29,7 +29,7 @@ SENTENCES = (
     "identify/fitting.py", "identify/dynamics/grid.py", "identify/estimation/plain.py",
     "identify/estimation/candidates.py", "identify/estimation/effect_fit.py", "identify/estimation/samples.py",
     "identify/estimation/averaged.py", "identify/estimation/left_out.py", "identify/estimation/joint_sensor.py",
-    "identify/methods/**/*.py", "identify/yardstick.py",
+    "identify/methods/**/*.py", "identify/muscles/*.py", "identify/muscles/interplay/*.py", "identify/yardstick.py",
     "identify/simulation/joint_surface.py", "identify/simulation/predict.py",
     "rig/acquire/*.py", "rig/adapters/*.py", "rig/control/*.py", "rig/devices/*.py", "rig/assembly.py", "rig/gate.py",
     "rig/journal.py", "rig/limits.py", "rig/messages.py", "rig/plan.py", "rig/protocols.py", "rig/score.py",
@@ -43,7 +43,7 @@ FOR_PROGRAMMERS = {
     "confinement.py", "child.py", "_can.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
-NAMED = {"Effect": ("name", "main"), "Parameter": ("about",), "Field": ("title",)}
+NAMED = {"Effect": ("name", "main"), "Interplay": ("name",), "Parameter": ("about",), "Field": ("title",)}
 """Calls with arguments (of a dictionary its values) that pages show although they may be a single word."""
 NOT_SHOWN = {
     "Field",

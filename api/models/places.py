@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from stimrig.api.store.tables import Participant, Recording, Test
 
 Site = tuple[str | None, str | None, str | None]
@@ -10,9 +12,23 @@ Place = tuple[str | None, str | None, str | None, float | None]
 """A site, and the current, mA; None: not known."""
 
 
-def site_of(row: Participant) -> Site:
-    """Where a participant is stimulated now."""
-    return row.side, row.muscle, row.placement
+def site_of(row: Participant, channel: str = "") -> Site:
+    """Where a participant is stimulated now; on a further channel by its name."""
+    if not channel:
+        return row.side, row.muscle, row.placement
+    own = (row.channels or {}).get(channel) or {}
+    return own.get("side"), own.get("muscle"), own.get("placement")
+
+
+def further_of(test: Test | None) -> dict[str, Any]:
+    """Where the further channels of a test stimulated, by their names."""
+    return (test.plan.get("sites") or {}) if test is not None else {}
+
+
+def holds_at(site: list[Any] | None, row: Participant) -> bool:
+    """Whether all is still where it was when this was written down: the further channels, too."""
+    further = site[3] if site is not None and len(site) > 3 else {}
+    return kept(site) == site_of(row) and all(tuple(own) == site_of(row, name) for name, own in further.items())
 
 
 def site_of_recording(recording: Recording, test: Test | None) -> Site | None:
@@ -22,7 +38,7 @@ def site_of_recording(recording: Recording, test: Test | None) -> Site | None:
     return kept(recording.site)
 
 
-def kept(site: list[str | None] | None) -> Site | None:
+def kept(site: list[Any] | None) -> Site | None:
     """A site as it was written down."""
     return None if site is None else (site[0], site[1], site[2])
 

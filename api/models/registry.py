@@ -16,7 +16,8 @@ from sqlalchemy.orm import Session, defer
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
-from stimrig.api.models.places import Site, in_words, kept, place_of, site_of, site_of_recording
+from stimrig.api.models.family import family_of
+from stimrig.api.models.places import Site, further_of, holds_at, in_words, place_of, site_of, site_of_recording
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
@@ -101,8 +102,8 @@ class Versions:
             added_effect=added_effect,
             carried_from_id=carried_from_id,
             carried=carried,
-            method=str(document.get("method", "")),
-            effects=[str(effect["id"]) for effect in document.get("effects") or []],
+            method=str(document.get("method") or document.get("kind") or ""),
+            effects=list(stored_model.structure(document)),
             fit={
                 **stored_model.figures(document),
                 **stored_model.quality(document),
@@ -227,7 +228,8 @@ class Versions:
         with self.store.write() as session:
             if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
-            return self._decide(session, row, approved, by, reason, tracking.to_dict() if tracking else None)
+            followed = tracking if tracking and family_of(row).can("tracking") else None
+            return self._decide(session, row, approved, by, reason, followed.to_dict() if followed else None)
 
     def _brings_back(self, row: Model) -> bool:
         """Whether without this version another one is served; else a rejection only takes away."""
@@ -243,7 +245,7 @@ class Versions:
         now = self.clock.utc()
         decision = Approval(model_id=row.id, participant=row.participant, approved=approved, reason=reason)
         decision.by, decision.at_utc = by, now
-        decision.site = list(self._site(session, row, approved))
+        decision.site = self._site(session, row, approved)
         decision.expires_utc = self.clock.end_of_day_utc() if approved else None
         decision.tracking = tracking if approved else None
         session.add(decision)
@@ -261,20 +263,25 @@ class Versions:
             test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
             return site_of_recording(recording, test), None if test is None else place_of(test)[3]
 
-    def _site(self, session: Session, row: Model, approved: bool) -> Site:
-        """The participant's site; 409 where a model is to be approved that was measured at another one."""
+    def _site(self, session: Session, row: Model, approved: bool) -> list[Any]:
+        """The participant's site, and of several muscles each further one's; 409 where a model is to be approved that
+        was measured at another one."""
         participant, recording = session.get(Participant, row.participant), session.get(Recording, row.recording_id)
         assert participant is not None and recording is not None
         here = site_of(participant)
         test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
-        there = site_of_recording(recording, test)
-        if approved and there not in (None, here):
+        further = further_of(test)
+        pairs = [(site_of_recording(recording, test), here)]
+        pairs += [(tuple(own), site_of(participant, name)) for name, own in further.items()]
+        moved = next(((there, now) for there, now in pairs if there not in (None, now)), None)
+        if approved and moved is not None:
+            there, now = (in_words(site or here) for site in moved)
             detail = (
-                f"{row.id} was measured at {in_words(there)}. {row.participant} is now stimulated at {in_words(here)}. "
+                f"{row.id} was measured at {there}. {row.participant} is now stimulated at {now}. "
                 "Test anew there, or set the site back on the participant's page. Nothing was decided."
             )
             raise ApiError(409, "other-site", "This model is of another site", detail)
-        return here
+        return [*here, further] if further else list(here)
 
     def decision(self, model_id: str) -> Approval | None:
         """The newest decision on a version."""
@@ -301,13 +308,13 @@ class Versions:
         newest: dict[str, Approval] = {}
         with self.store.read() as session:
             of = session.scalars(select(Participant).where(Participant.code.in_(participants)))
-            sites = {row.code: site_of(row) for row in of}
+            people = {row.code: row for row in of}
             for decision in session.scalars(query.execution_options(yield_per=AT_ONCE)):
-                if len(newest) == len(sites):
+                if len(newest) == len(people):
                     break  # years of decisions are not read for today's
                 if not decision.approved:
                     rejected.add(decision.model_id)
-                elif decision.model_id not in rejected and kept(decision.site) == sites[decision.participant]:
+                elif decision.model_id not in rejected and holds_at(decision.site, people[decision.participant]):
                     newest.setdefault(decision.participant, decision)
         return newest
 
@@ -320,6 +327,7 @@ class Versions:
             for decision in decided
             if decision is newest[decision.model_id] and decision.approved
         ]
+        rows = [row for row in rows if family_of(row).can("carried")]
         return list({row.recording_id: row for row in reversed(rows)}.values())[::-1]
 
     def served(self, participant: str) -> Served | None:
@@ -346,7 +354,9 @@ class Versions:
             return None
         if served is None:
             return None
-        curve = json.loads(served.body)["recruitment"]
+        curve = json.loads(served.body).get("recruitment")
+        if curve is None:  # several muscles have one each
+            return None
         return {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
 
     def quality(self, row: Model) -> dict[str, Any]:

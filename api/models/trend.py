@@ -194,7 +194,8 @@ def _models(participant: str) -> Any:
         Model.id, Model.recording_id, Model.method, Model.effects, Model.fit, Model.created_utc,
         Recording.origin, Recording.created_utc.label("recorded_utc"), Recording.test_id,
     )  # fmt: skip
-    return select(*columns).join(Recording, Recording.id == Model.recording_id).where(Model.participant == participant)
+    of_one = (Model.participant == participant, Model.method != stored_model.JOINT)
+    return select(*columns).join(Recording, Recording.id == Model.recording_id).where(*of_one)
 
 
 def _tests(participant: str) -> Any:

@@ -77,7 +77,12 @@ def _above(name: str, value: float, was: float) -> str:
 
 
 def jumps(profile: Profile, new: Profile) -> list[str]:
-    """What rises by more than a quarter, in words: a limit, or the charge of a pulse, to which two small rises add."""
+    """What rises by more than a quarter, in words: a limit, or the charge of a pulse, to which two small rises add.
+
+    First limits rise from nothing.
+    """
+    if not profile:
+        return []
     found = [
         _rise(limit.words, profile[name], new[name], limit.unit)
         for name, limit in LIMITS.items()
@@ -127,7 +132,8 @@ def outside(asked: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bou
             found[name] = f"{value:g} {limit.unit} is not {bounds}, as this rig asks ({owner})"
     phase = limits.get("charge_per_phase_uc")
     of_charge = [name for name in ("max_pulse_width_us", "current_ma") if name in asked]
-    if not found and of_charge and phase is not None and phase.hi is not None:
+    known = {**profile, **asked}.keys() >= {"max_pulse_width_us", "current_ma"}
+    if not found and of_charge and known and phase is not None and phase.hi is not None:
         charge_uc = charge({**profile, **asked})
         if not (charge_uc <= phase.hi):
             most = f"above the {phase.hi:g} µC that this rig takes ({phase.owner})"

@@ -31,6 +31,7 @@ class Row:
     label: str
     value: str
     before: str = ""
+    muscle: int = 0  # number of the channel that it is about; its label is that one's name, and has its colour
 
 
 @dataclass

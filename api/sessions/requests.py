@@ -23,6 +23,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.models.tracking import USUAL_PERCENT, Limits
 from stimrig.api.people import accounts
 from stimrig.api.sessions import profiles
+from stimrig.api.sessions.channels import ChannelName
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, PULSE_RATES_HZ, Labels, Profile
 
@@ -172,6 +173,8 @@ OWN_FIELDS: dict[str, set[str]] = {
     MOVING: {"angle", "max_duration_s", "max_torque_time_nm_s"},
 }
 """Fields that only tests of some kinds have."""
+MUSCLES = "muscles"
+"""Kind of a test of several channels, each in turn and all together."""
 PLANNED_BY_ITSELF = {"segments", "protocol", "joins"}
 """What is not chosen for a test that chooses its own segments."""
 
@@ -248,7 +251,7 @@ class TestIn(Labels, Body):
         }
         sent = {name for name in self.model_fields_set if getattr(self, name) not in (None, default[name])}
         others = set().union(*OWN_FIELDS.values()) - OWN_FIELDS.get(self.kind, set())
-        planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING)
+        planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING, MUSCLES)
         if "reference_torque_nm" in sent & others:
             raise ValueError("reference_torque_nm: only a test of the kind sequence has one; leave it out")
         which = "has no such thing" if planned else "has a fixed plan"
@@ -282,11 +285,18 @@ class CalibrationIn(Body):
     max_torque_nm: TorqueNm | None = Field(
         None, description="torque at which a train stops, and later a test, N·m; None: the participant's own"
     )
+    channels: Annotated[dict[ChannelName, CurrentMa | None], Field(min_length=1, max_length=8)] | None = Field(
+        None, description="several channels in one go, each with its current, mA; null: the participant's own there"
+    )
+
+
+Channel = Annotated[ChannelName | Literal[""], Field(description="its name; of a calibration of several channels")]
 
 
 class StepIn(Body):
     """One train."""
 
+    channel: Channel = ""
     direction: Literal["up", "fine", "down", "repeat"] = "up"
     shown_us: Annotated[
         FiniteFloat | None, Field(description="the width that a person was shown; another one is not sent, µs")
@@ -296,6 +306,7 @@ class StepIn(Body):
 class MarkIn(Body):
     """What the participant feels, or the muscle does, at the last train's width."""
 
+    channel: Channel = ""
     threshold: Literal["sensory", "motor", "comfort"]
 
 
@@ -383,10 +394,17 @@ class ApprovalIn(DecisionIn):
     tracking: TrackingIn = Field(default=TrackingIn())
 
 
+EffectName = Annotated[
+    str,
+    StringConstraints(pattern=r"^([a-z0-9_-]{1,32}\.)?[a-z0-9_]{1,64}(:[a-z0-9_-]{1,32}>[a-z0-9_-]{1,32})?$"),
+    Field(description="`fatigue`; of several muscles `biceps.fatigue`, `co_contraction`, `cross_talk:biceps>triceps`"),
+]
+
+
 class EffectsIn(Body):
     """Effects to add to a model."""
 
-    effects: Annotated[list[Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]], Field(min_length=1)]
+    effects: Annotated[list[EffectName], Field(min_length=1)]
     reason: Annotated[str, StringConstraints(max_length=500)] = ""
     force: bool = Field(False, description="add it although the evidence is against it")
 

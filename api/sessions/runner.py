@@ -17,6 +17,7 @@ from stimrig.api.clock import Clock, asked_s
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.logs import current_test
 from stimrig.api.models.analyses import Analyses
+from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
@@ -24,6 +25,7 @@ from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Follower, Lifecycle
 from stimrig.api.sessions.live import Hub
+from stimrig.api.sessions.muscles import MusclesTests
 from stimrig.api.sessions.playing import Current, Playing, busy, other_than, refuse_archived, rests_of, right_ended
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
@@ -67,7 +69,7 @@ class Runner(Playing):
         self.hub = Hub(clock)
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
-        self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint)
+        self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint, MusclesTests(rig, store))
         self.lifecycle = Lifecycle(
             store, clock, rig, pool, versions, analyses, self.kinds, recordings_dir, follower, self.announce
         )
@@ -216,6 +218,7 @@ class Runner(Playing):
     def _check_joins(self, joins: str, participant: Participant, plan: messages.TestPlan) -> None:
         """The model whose recording the new one is to be joined to is the participant's own, and of the same place."""
         model = self.versions.get(joins)
+        family_of(model).require("joined")
         if model.participant != participant.code:
             detail = f"{model.id} is a model of {model.participant}, the test is for {participant.code}."
             raise ApiError(422, "other-participant", "The model is another participant's", detail)
@@ -266,7 +269,8 @@ class Runner(Playing):
         return {**await self._previewed(planned.plan), **planned.kept}
 
     async def _previewed(self, plan: messages.TestPlan) -> dict[str, Any]:
-        curve = await asyncio.to_thread(self._recruitment, plan.participant)
+        several = plan.channels is not None  # the curve is one muscle's
+        curve = None if several else await asyncio.to_thread(self._recruitment, plan.participant)
         return await self.rig.ask(requests.PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
 
     def _recruitment(self, participant: str) -> messages.RecruitmentTable | None:

@@ -345,6 +345,11 @@ def _0014(op: Operations) -> None:
     op.get_bind().execute(sa.update(rows).values(undone=sa.and_(sa.not_(rows.c.approved), said)))
 
 
+def _0015(op: Operations) -> None:
+    """What a participant has on the further channels of a rig; nobody has any yet."""
+    _add(op, "participants", "channels json?")
+
+
 STEPS: dict[str, Callable[[Operations], None]] = {
     name[1:]: step for name, step in globals().items() if re.fullmatch("_[0-9]{4}", name)
 }

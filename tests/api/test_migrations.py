@@ -32,7 +32,7 @@ ADDED_SINCE = [
     ("tokens", "participant"), ("tokens", "plan"), ("tokens", "made_by"),
     ("tests", "followed_by"), ("tests", "rig"),
     ("participants", "placement"), ("recordings", "site"), ("approvals", "site"),
-    ("approvals", "undone"),
+    ("approvals", "undone"), ("participants", "channels"),
 ]  # fmt: skip
 """Columns that the tables of a first database did not have."""
 NEWER = "UPDATE alembic_version SET version_num = '0900'"

@@ -6,7 +6,7 @@ What goes wrong is said on the page itself, above the buttons, with the calibrat
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request
@@ -14,7 +14,8 @@ from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
 from stimrig.api.language import lazy
-from stimrig.api.sessions import profiles
+from stimrig.api.sessions import channels, profiles
+from stimrig.api.sessions.channels import Channel
 from stimrig.api.sessions.questions import Question, Row
 from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import seen
@@ -22,10 +23,13 @@ from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import calibration, participants
 from stimrig.rig.messages import Status
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/calibration")
+FIRST = ("current_ma", "step_us")
+"""The form's fields on a rig of one channel."""
 DEFAULTS = CalibrationIn.model_validate({})
 MARKS = {
     "sensory": (lazy("It is felt"), lazy("the narrowest pulse the participant feels")),
@@ -62,22 +66,43 @@ async def show_page(
     status = problem.status if problem else 422 if errors else 200
     return page(
         request, "calibration.html", status,
-        participant=row, found=found, waits=waits, marks=MARKS, last=last(row), problem=problem,
-        texts=texts or usual(row), errors=errors or {},
+        participant=row, found=found, waits=waits, marks=MARKS, last=last(row.profile), problem=problem,
+        texts=texts or usual(context, row), errors=errors or {}, ladders=ladders(context, row, found),
+        channels=channels.of(row, context.rig.status),
         help={"current_ma": profiles.takes("current_ma", limits), "step_us": f"{low_us:g} to {high_us:g} µs"},
     )  # fmt: skip
 
 
-def usual(row: Participant) -> dict[str, str]:
-    """The participant's own current and the usual fine step: what holds where a form has neither."""
-    return {"current_ma": typed.number_text(row.profile["current_ma"]), "step_us": typed.number_text(DEFAULTS.step_us)}
+def usual(context: Context, row: Participant) -> dict[str, str]:
+    """The participant's own current and the usual fine step: what holds where a form has neither.
+
+    Of each further channel its own current, too; one without is left out.
+    """
+    first = row.profile["current_ma"]
+    texts = {"current_ma": typed.number_text(first), "step_us": typed.number_text(DEFAULTS.step_us)}
+    for one in channels.of(row, context.rig.status)[1:]:
+        texts[f"current_ma_{one.name}"] = typed.number_text(one.profile.get("current_ma") or first)
+    return texts
 
 
-def last(row: Participant) -> dict[str, float]:
-    """Marks of the participant's last calibration, µs; empty where there is none."""
-    if row.profile.get("sensory_pulse_width_us") is None:
+def last(profile: Mapping[str, Any]) -> dict[str, float]:
+    """Marks of the last calibration of a channel, µs; empty where there is none."""
+    if profile.get("sensory_pulse_width_us") is None:
         return {}
-    return {name: row.profile[field] for name, field in LAST.items()}
+    return {name: profile[field] for name, field in LAST.items()}
+
+
+def ladders(context: Context, row: Participant, found: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """What the page shows of each channel that is calibrated, side by side; of one without a name it is the whole."""
+    known = {one.name: one for one in channels.of(row, context.rig.status)}
+    shown = []
+    for of in (found or {}).get("channels") or ([found] if found else []):
+        name = of.get("name", "")
+        trains = [train for train in (found or {})["trains"] if train.get("channel", "") == name]
+        before = last(known[name].profile if name in known else row.profile)
+        number = known[name].number if name in known else 0
+        shown.append({"of": of, "name": name, "number": number, "trains": trains, "last": before})
+    return shown
 
 
 def fine_range(status: Status | None) -> tuple[float, float]:
@@ -104,21 +129,28 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     """Open one; a current that is far above the participant's is asked about first."""
     row = await asyncio.to_thread(participants.find, context, code)
     sent = await request.form()
-    texts = {name: str(sent.get(name, text))[:60] for name, text in usual(row).items()}
+    texts = {name: str(sent.get(name, text))[:60] for name, text in usual(context, row).items()}
+    texts = {name: text for name, text in texts.items() if text.strip() or name in FIRST}
     values, errors = read(texts, row, context.rig.status)
     if errors:
         return await show_page(request, context, code, texts, errors)
-    body = typed.checked(CalibrationIn, **values, large_steps=True)
+    playing = channels.of(row, context.rig.status)
+    currents = {one.name: values[_field(one)] for one in playing if _field(one) in values}
+    several = {"channels": currents} if len(currents) > 1 else {}
+    body = typed.checked(CalibrationIn, **{name: values[name] for name in FIRST}, large_steps=True, **several)
 
     async def open_it() -> str:
         await calibration.begin_calibration(context, who, code, Response(), body)
         return address(code)
 
     await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
-    doubts = profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]})
+    doubts = [
+        words for one in [{"profile": row.profile, "at": "current_ma"}, *_further(playing, values)]
+        for words in profiles.jumps(one["profile"], {**one["profile"], "current_ma": values[one["at"]]})
+    ]  # fmt: skip
     if not doubts:
         return await attempt(request, context, code, open_it(), address(code))
-    current = f"{values['current_ma']:g} mA"
+    current = ", ".join(f"{current_ma:g} mA" for current_ma in currents.values() or [values["current_ma"]])
     question = Question(
         participant=code,
         title=f"Calibrate {code} with {current}?",
@@ -134,6 +166,15 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     return RedirectResponse(context.questions.ask(question, who), 303)
 
 
+def _field(one: Channel) -> str:
+    """The form's field of a channel's current."""
+    return f"current_ma_{one.name}" if one.key else "current_ma"
+
+
+def _further(playing: list[Channel], values: Mapping[str, float]) -> list[dict[str, Any]]:
+    return [{"profile": one.profile, "at": _field(one)} for one in playing if one.key and _field(one) in values]
+
+
 def read(
     texts: dict[str, str], row: Participant, status: Status | None
 ) -> tuple[dict[str, float], dict[str, str]]:  # fmt: skip
@@ -142,28 +183,29 @@ def read(
     low_us, high_us = fine_range(status)
     if "step_us" in values and not (low_us <= values["step_us"] <= high_us):
         errors["step_us"] = f"{texts['step_us']!r} is not {low_us:g} to {high_us:g} µs"
-    current = {name: value for name, value in values.items() if name == "current_ma"}
     limits = {name: bound for name, bound in (status.limits if status else {}).items() if name == "current_ma"}
-    for name, words in profiles.outside(current, row.profile, limits).items():
-        errors[name] = f"{texts[name]!r}: {words}"
+    for name in values.keys() - {"step_us"}:
+        for words in profiles.outside({"current_ma": values[name]}, row.profile, limits).values():
+            errors[name] = f"{texts[name]!r}: {words}"
     return values, errors
 
 
 @router.post("/step/{direction}")
 async def step(
     request: Request, context: Ctx, who: Tester, code: str, direction: str,
-    shown_us: Annotated[float | None, Form()] = None,
+    shown_us: Annotated[float | None, Form()] = None, channel: Text = "",
 ) -> Response:  # fmt: skip
     """Play one train; the trains that the page knew of and the width on the button say whether both still hold."""
-    body = typed.checked(StepIn, direction=direction, shown_us=shown_us)
+    body = typed.checked(StepIn, direction=direction, shown_us=shown_us, channel=channel)
     done = calibration.play_step(context, who, code, body, Response())
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/mark/{threshold}")
-async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str) -> Response:
+async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str, channel: Text = "") -> Response:
     """Mark the last train's width."""
-    done = calibration.set_mark(context, who, code, typed.checked(MarkIn, threshold=threshold), Response())
+    body = typed.checked(MarkIn, threshold=threshold, channel=channel)
+    done = calibration.set_mark(context, who, code, body, Response())
     return await attempt(request, context, code, done, address(code))
 
 

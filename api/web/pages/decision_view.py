@@ -16,6 +16,7 @@ from starlette.datastructures import FormData
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _, lazy, localised
 from stimrig.api.models import advice, registry, stored_model
+from stimrig.api.models.family import family_of
 from stimrig.api.models.tracking import QUANTITIES, Limits
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx, Version
@@ -83,6 +84,7 @@ async def _question(
         typed=written,
         sent=sent,
         threshold_us=stored_model.threshold_us(row),
+        family=family_of(row),
         what_to_write=registry.WHAT_TO_WRITE,
     )
 

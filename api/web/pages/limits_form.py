@@ -37,7 +37,8 @@ class LimitsForm:
 
 def fresh(profile: Mapping[str, Any], status: Status | None) -> LimitsForm:
     """The form with what is saved."""
-    texts = {name: typed.number_text(profile[name]) for name in profiles.LIMITS} | angle_texts(profile, status)
+    texts = {name: typed.number_text(profile[name]) if name in profile else "" for name in profiles.LIMITS}
+    texts |= angle_texts(profile, status)
     return LimitsForm(texts, dict(texts))
 
 
@@ -50,7 +51,7 @@ def read(sent: FormData, profile: Mapping[str, Any], status: Status | None) -> L
     form = fresh(profile, status)
     form.seen |= {name: text for name in form.seen if (text := _one(sent, f"seen_{name}")) is not None}
     for name in profiles.LIMITS:
-        _take(form, name, sent, profile[name])
+        _take(form, name, sent, profile.get(name))
     limits: Mapping[str, Bound] = status.limits if status else {}
     for name, words in profiles.outside(form.asked, profile, limits).items():
         form.errors[name] = f"{form.texts[name]!r}: {words}"
@@ -74,7 +75,7 @@ def _take_angles(form: LimitsForm, sent: FormData, profile: Mapping[str, Any], s
     form.asked |= {} if errors else asked
 
 
-def _take(form: LimitsForm, name: str, sent: FormData, saved: float) -> None:
+def _take(form: LimitsForm, name: str, sent: FormData, saved: float | None) -> None:
     given = set(sent.getlist(name))
     if not given or given == {form.seen[name]}:
         return

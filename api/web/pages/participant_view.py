@@ -17,9 +17,9 @@ from stimrig.api.language import _, clock, lazy, ngettext
 from stimrig.api.models.places import site_of
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import controllers, profiles
+from stimrig.api.sessions import channels, controllers, profiles
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
-from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MuscleIn, NoteIn, TargetIn, TestIn
+from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MUSCLES, MuscleIn, NoteIn, TargetIn, TestIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant, Recording
 from stimrig.api.web.dependencies import Approver, Context, Ctx, Tester
@@ -44,9 +44,9 @@ async def participant(request: Request, context: Ctx, who: Tester, code: str) ->
 
 async def show_page(
     request: Request, context: Context, who: Principal, code: str, form: LimitsForm | None = None, status: int = 200,
-    made: dict[str, Any] | None = None,
+    made: dict[str, Any] | None = None, channel: str = "",
 ) -> Response:  # fmt: skip
-    """The page, with the form as it was sent where something was wrong with it.
+    """The page, with the form as it was sent where something was wrong with it: of a further `channel`, or the first.
 
     `made`: a controller's key that was just made, the only time its text is seen.
     """
@@ -60,7 +60,8 @@ async def show_page(
             "notes": context.notes.participant_notes(code),
             "calibrated": starting.calibrated(context, row),
             "step": next_view.step(context, row, who),
-            "form": form or limits_form.fresh(row.profile, context.rig.status),
+            "form": (None if channel else form) or limits_form.fresh(row.profile, context.rig.status),
+            "channels": channel_cards(context, row, channel, form),
             "meanwhile": participants.meanwhile(context, code),
             "fields": limits_form.fields(context.rig.status),
             "tests": tests[:shown],
@@ -73,6 +74,18 @@ async def show_page(
         }
 
     return page(request, "participant.html", status, **await asyncio.to_thread(gather))
+
+
+def channel_cards(
+    context: Context, row: Participant, of: str = "", sent: LimitsForm | None = None
+) -> list[dict[str, Any]]:
+    """What the page has of each channel of a rig with several, the first one first; `sent`: the form of one of them."""
+    status, found = context.rig.status, []
+    for one in channels.of(row, status):
+        form = sent if sent is not None and one.key == of else limits_form.fresh(one.profile, status)
+        standing = starting.calibrated(context, row, one.key)
+        found.append({"channel": one, "site": channels.held(row, one.key), "form": form, "calibrated": standing})
+    return found
 
 
 def trials_of(context: Context, who: Principal, code: str) -> Markup | None:
@@ -90,20 +103,29 @@ async def set_limits(request: Request, context: Ctx, who: Tester, code: str) -> 
     return await taken(request, context, who, code, start=False)
 
 
+@router.post("/channels/{channel}/profile")
+async def set_channel_limits(request: Request, context: Ctx, who: Tester, code: str, channel: str) -> Response:
+    """The limits of one channel of several."""
+    key = channels.key_of(context.rig.status, channel)
+    return await taken(request, context, who, code, start=False, channel=key)
+
+
 @router.post("/tests")
 async def start_test(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """To the question before the pre-session test; limits that were typed are set on the way, or asked about."""
     return await taken(request, context, who, code, start=True)
 
 
-async def taken(request: Request, context: Context, who: Principal, code: str, start: bool) -> Response:
+async def taken(
+    request: Request, context: Context, who: Principal, code: str, start: bool, channel: str = ""
+) -> Response:
     """Take the form: refuse it, ask about it, or do what it says."""
     row = await asyncio.to_thread(participants.find, context, code)
-    status = context.rig.status
+    status, profile = context.rig.status, channels.held(row, channel)["profile"]
     sent = await request.form()
-    form = limits_form.read(sent, row.profile, status)
+    form = limits_form.read(sent, profile, status)
     if form.errors:
-        return await show_page(request, context, who, code, form, 422)
+        return await show_page(request, context, who, code, form, 422, channel=channel)
     wanted = asked_test(sent, code) if start else None
 
     async def on() -> str:
@@ -114,30 +136,33 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
     if not form.asked:
         return RedirectResponse(await on(), 303)
     await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
-    new, voids = profiles.changed(row.profile, form.asked)
+    if not profile:  # nobody has set any yet: they come together
+        participants.check_asked(context, profile, form.asked)
+    new, voids = profiles.changed(profile, form.asked)
 
     async def save() -> str:
-        _row, place = await participants.change_profile(context, code, form.asked, who.name, bool(voids))
+        _row, place = await participants.change_profile(context, code, form.asked, who.name, bool(voids), channel)
         seen.looked.set(place)  # what is asked next rests on what was just decided
         return await on()
 
-    doubts = [*profiles.jumps(row.profile, new), *_lost(context, voids)]
-    return RedirectResponse(await context.questions.ask_if_doubtful(_question(row, new, doubts, save), who), 303)
+    doubts = [*profiles.jumps(profile, new), *_lost(context, voids)]
+    question = _question(row.code, profile, new, doubts, save)
+    return RedirectResponse(await context.questions.ask_if_doubtful(question, who), 303)
 
 
-def _question(row: Participant, new: dict[str, Any], doubts: list[str], save: Any) -> Question:
+def _question(code: str, was: dict[str, Any], new: dict[str, Any], doubts: list[str], save: Any) -> Question:
     lines, values = [], []
     for name, limit in profiles.LIMITS.items():
-        value, before = f"{new[name]:g} {limit.unit}", f"{row.profile[name]:g} {limit.unit}"
+        value, before = f"{new[name]:g} {limit.unit}", f"{was.get(name, new[name]):g} {limit.unit}"
         lines.append(Row(limit.words.capitalize(), value, before if before != value else ""))
         values.append(value)
     if (range_rad := profiles.range_of(new)) is not None:
-        now, was = profiles.range_words(range_rad), profiles.range_of(row.profile)
-        before = profiles.range_words(was) if was else "–"
+        now, was_rad = profiles.range_words(range_rad), profiles.range_of(was)
+        before = profiles.range_words(was_rad) if was_rad else "–"
         lines.append(Row("Joint angles", now, before if before != now else ""))
     return Question(
-        participant=row.code,
-        title=f"Set these limits for {row.code}?",
+        participant=code,
+        title=f"Set these limits for {code}?",
         button=f"Yes, set {', '.join(values)}",
         action=save,
         rows=lines,
@@ -159,6 +184,8 @@ def asked_test(sent: FormData, code: str) -> TestIn:
     Raises ApiError: 422 what was typed is no target, or no label.
     """
     asked: dict[str, Any] = {name: str(sent.get(name) or "").strip() or None for name in LABEL_TITLES}
+    if sent.get("plan") == MUSCLES:
+        asked["kind"] = MUSCLES
     if sent.get("plan") == "adaptive":
         percent = typed.wanted(str(sent.get("target") or ""), no_target)
         if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
@@ -282,17 +309,33 @@ async def set_muscle(
     name: Annotated[str, Form(alias="muscle")] = "", placement: Text = "",
 ) -> Response:  # fmt: skip
     """Say the site; asked about where calibration, approved model or keys would be lost."""
+    return await say_site(context, who, code, side, name, placement)
+
+
+@router.post("/channels/{channel}/muscle")
+async def set_channel_muscle(
+    context: Ctx, who: Tester, code: str, channel: str, side: Text = "",
+    name: Annotated[str, Form(alias="muscle")] = "", placement: Text = "",
+) -> Response:  # fmt: skip
+    """Say the site of one channel of several."""
+    return await say_site(context, who, code, side, name, placement, channels.key_of(context.rig.status, channel))
+
+
+async def say_site(
+    context: Context, who: Principal, code: str, side: str, name: str, placement: str, channel: str = ""
+) -> Response:
+    """Take the form of a site: ask about it, or do what it says."""
     body = typed.checked(MuscleIn, side=side or None, muscle=name.strip() or None, placement=placement.strip() or None)
     row = await asyncio.to_thread(participants.find, context, code)
 
     async def save() -> str:
-        await participants.change_site(context, code, body, who.name, voids=True)
+        await participants.change_site(context, code, body, who.name, True, channel)
         return f"/participants/{code}"
 
     await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
-    before, after = site_words(site_of(row)), site_words(participants.site_in(body))
+    before, after = site_words(site_of(row, channel)), site_words(participants.site_in(body))
     warnings = []
-    if participants.loses_calibration(row, body):
+    if participants.loses_calibration(row, body, channel):
         warnings += [_("The calibration is lost with it: its thresholds were found at %(muscle)s.", muscle=before)]
     if before != after and await asyncio.to_thread(context.versions.approved, code) is not None:
         warnings += [_("The approved model and its keys are of %(muscle)s. Here there is none.", muscle=before)]

@@ -8,7 +8,6 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from stimrig.api.charts import joint_charts, model_charts
 from stimrig.api.charts.svg import svg
 from stimrig.api.clock import local_day
 from stimrig.api.language import _
@@ -16,7 +15,7 @@ from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.places import site_of, site_of_recording
 from stimrig.api.store.tables import Note, Participant, Recording, Test
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
-from stimrig.api.web.pages.model_view import facts, measurement, versions_of
+from stimrig.api.web.pages.model_view import draw_own, facts, measurement, versions_of
 from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
@@ -35,8 +34,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
     measured = await measurement(context, row)
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
-    figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
-    figures |= joint_charts.joint_figures(document)
+    figures = draw_own(document, measured)
     words = {
         "comparison": _("Torque measured and predicted, what is left, and the pulse width, over time"),
         "recruitment": _("Steady torque over pulse width"),

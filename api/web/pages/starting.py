@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,11 +14,12 @@ from stimrig.api.language import _, lazy, localised, ngettext, translated, until
 from stimrig.api.models.changes import dose_words
 from stimrig.api.models.places import Site, site_of
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import profiles
+from stimrig.api.sessions import channels, profiles
+from stimrig.api.sessions.channels import Channel
 from stimrig.api.sessions.joint_plan import HELD, PASSIVE
 from stimrig.api.sessions.playing import other_than, refuse_archived
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.requests import TestIn
+from stimrig.api.sessions.requests import MUSCLES, TestIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context
@@ -37,15 +38,16 @@ class Calibrated:
     may_start: bool
 
 
-def calibrated(context: Context, row: Participant) -> Calibrated:
+def calibrated(context: Context, row: Participant, channel: str = "") -> Calibrated:
     """Whether a person has found this participant's limits today, who, and whether a test may start without."""
-    state = profiles.calibration(row.profile, context.clock.utc())
+    profile = channels.held(row, channel)["profile"]
+    state = profiles.calibration(profile, context.clock.utc())
     if state == "none":
         required = bool(context.rig.status and context.rig.status.require_calibration)
         return Calibrated(state, _("not calibrated"), not required)
     with context.store.read() as session:
         entry = seen.last(session, seen.actions_on(row.code, "finish calibration"))
-    said = {"time": when(row.profile.get("set_at_utc")), "end": until(row.profile.get("expires_at_utc"))}
+    said = {"time": when(profile.get("set_at_utc")), "end": until(profile.get("expires_at_utc"))}
     said["name"] = entry.who if entry else "–"
     if state == "expired":
         words = _("found on %(time)s by %(name)s, expired %(end)s", **said)
@@ -62,8 +64,10 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
     row = await asyncio.to_thread(participants.find, context, body.participant)
     refuse_archived(row)
     context.runner.refuse_second()
-    standing = await asyncio.to_thread(calibrated, context, row)
-    if not standing.may_start:
+    playing = channels.needed(row, context.rig.status) if body.kind == MUSCLES else []
+    found = [await asyncio.to_thread(calibrated, context, row, key) for key in [one.key for one in playing] or [""]]
+    standing = next((one for one in found if one.state != "valid"), found[0])
+    if not all(one.may_start for one in found):
         detail = f"{row.code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
     preview = await context.runner.preview(body)
@@ -72,7 +76,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         test = await context.runner.start(body, who.name, preview, who.token_hash)
         return f"/tests/{test.id}"
 
-    strength = f"{current_words(row)}, {number(widest_us(preview), 0, 'µs')}"
+    strength = f"{current_words(row, playing)}, {number(widest_us(preview), 0, 'µs')}"
     stimulates = widest_us(preview) > 0.0
     joint = preview.get("joint")
     question = Question(
@@ -80,7 +84,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         title=_("Start the %(kind)s of %(code)s?", kind=words(body.kind, "kind"), code=row.code),
         button=_("Start now: %(strength)s", strength=strength) if stimulates else _("Start now: no stimulation"),
         action=action,
-        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context))
+        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context), playing)
         + [Row(*said) for said in label_rows(vars(body))],
         warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
         stimulates=stimulates,
@@ -103,8 +107,11 @@ def out_of_reach(preview: dict[str, Any]) -> list[str]:
     return [] if reach is None or reach["reachable"] else [reach["words"]]
 
 
-def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str) -> list[Row]:
-    """What a person has to know before saying yes."""
+def rows(
+    row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str,
+    playing: Sequence[Channel] = (),
+) -> list[Row]:  # fmt: skip
+    """What a person has to know before saying yes; `playing`: the channels of a test of several."""
     pulses = sum(width > 0 for width in preview["pulse_width_us"])
     torque_time = preview.get("torque_time_nms")
     dose = ngettext(
@@ -131,17 +138,35 @@ def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by
         Row(_("Widest pulse"), _("%(widest)s, comfort maximum %(most)s", widest=widest, most=most)),
     ]
     stimulates = widest_us(preview) > 0.0
+    if playing:
+        current = [channel_row(one, preview["channels"][one.name]) for one in playing]
+        dose = _("all together: %(dose)s", dose=dose)
+    stops_nm = min([row.profile["max_torque_nm"], *(one.profile["max_torque_nm"] for one in playing)])
     return [
         Row(_("Who"), row.code),
         *(current if stimulates else []),
         *more,
         Row(_("How long"), long),
         Row(_("Dose"), dose),
-        Row(_("Stops at"), number(row.profile["max_torque_nm"], 1, "N·m")),
+        Row(_("Stops at"), number(stops_nm, 1, "N·m")),
         *([Row(_("Calibration"), standing.words)] if stimulates else []),
         Row(_("Run by"), ran_by),
         Row(_("Rig"), rig),
     ]
+
+
+def channel_row(one: Channel, planned: Mapping[str, Any]) -> Row:
+    """What one of several channels gets: where, its current, its widest pulse, its dose."""
+    said = {
+        "site": site_words(one.site),
+        "current": localised(f"{one.profile['current_ma']:g} mA"),
+        "widest": number(max(planned["pulse_width_us"], default=0.0), 0, "µs"),
+        "most": number(one.profile["max_pulse_width_us"], 0, "µs"),
+        "pulses": sum(width > 0 for width in planned["pulse_width_us"]),
+        "charge": dose_words(planned["charge_uc"]),
+    }
+    words = _("%(site)s · %(current)s · at most %(widest)s of %(most)s · %(pulses)s pulses, %(charge)s", **said)
+    return Row(one.name, words, muscle=one.number)
 
 
 def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -188,8 +213,10 @@ def site_words(site: Site) -> str:
 environment.globals |= {"site_words": site_words, "site_of": site_of}
 
 
-def current_words(row: Participant) -> str:
-    """The current of every pulse."""
+def current_words(row: Participant, playing: Sequence[Channel] = ()) -> str:
+    """The current of every pulse; of several channels each one's."""
+    if playing:
+        return localised(", ".join(f"{one.name} {one.profile['current_ma']:g} mA" for one in playing))
     return localised(f"{row.profile['current_ma']:g} mA")
 
 

@@ -334,6 +334,9 @@ class TrendOut(Document):
     changes: ChangesOut | None = Field(
         description="the last session against the last approved one before it; null: there is none"
     )
+    left_out: str | None = Field(
+        None, description="that models of several muscles are not in it; missing: there are none"
+    )
 
 
 class LevelOut(Document):

@@ -12,6 +12,7 @@ from pydantic import Field, FiniteFloat, StrictBool, model_validator
 from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
+from stimrig.api.models.family import family_of
 from stimrig.api.models.tracking import Limits
 from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn, tighter
 from stimrig.api.store import seen
@@ -84,6 +85,7 @@ def tracking(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     if found is None:
         participants.find(context, code)
         raise none_approved(code)
+    family_of(context.versions.get(found["approved_model_id"])).require("tracking")
     return found
 
 
@@ -178,6 +180,7 @@ async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: Width
     Of a version, or of one that was tracked from it (its `model_id`).
     """
     text = await asyncio.to_thread(context.tracked.text_of, model_id)
+    family_of(await asyncio.to_thread(context.tracked.version_of, model_id)).require("prediction")
     call = context.pool.submit(
         "forecast", urgent=True, model_json=text, pulse_width_us=body.pulse_width_us,
         pulse_rate_hz=body.pulse_rate_hz, angle_rad=body.angle_rad,
@@ -218,6 +221,7 @@ async def invert(
     """
     text = await asyncio.to_thread(context.tracked.text_of, model_id)
     version = await asyncio.to_thread(context.tracked.version_of, model_id)
+    family_of(version).require("widths")
     participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
     largest_us = tighter(width_us, participant.profile.get("max_pulse_width_us"))
     rig = context.rig.status

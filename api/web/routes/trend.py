@@ -10,7 +10,10 @@ from fastapi.responses import Response
 
 from stimrig.api import language
 from stimrig.api.models import changes
+from stimrig.api.models.family import SEVERAL_MUSCLES
+from stimrig.api.models.stored_model import JOINT
 from stimrig.api.models.trend import Session
+from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import TrendOut
@@ -36,12 +39,20 @@ async def sessions(context: Context, code: str) -> list[Session]:
     return await context.trend.sessions(code)
 
 
+async def left_out(context: Context, code: str) -> str | None:
+    """That some models of the participant are not in the trend; None where all are."""
+    of = (Model.participant == code, Model.method == JOINT)
+    some = await asyncio.to_thread(context.store.first, Model.id, *of)
+    return None if some is None else SEVERAL_MUSCLES.lacks["trend"]
+
+
 @router.get("/trend", **describe_answer(TrendOut))
 async def trend(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     """Figures with their uncertainty over the sessions, and what changed since the last approved one."""
-    found = await sessions(context, code)
+    found, lacking = await sessions(context, code), await left_out(context, code)
+    more = {} if lacking is None else {"left_out": lacking}
     with language.using("en"):
-        return {"participant": code, "sessions": [one.document() for one in found], "changes": newest(found)}
+        return {"participant": code, "sessions": [one.document() for one in found], "changes": newest(found), **more}
 
 
 def newest(found: list[Session]) -> dict[str, Any] | None:

@@ -1,0 +1,89 @@
+"""A rig's channels, and what a participant has on each of them.
+
+The first channel is what a participant has anyway: side, muscle, placement and profile. Further ones stand in
+`Participant.channels`, by their names. On a rig of one channel there are none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import StringConstraints
+
+from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.models.places import Site
+from stimrig.api.store.tables import Participant
+from stimrig.rig.messages import CHANNEL_NAME, Status
+
+ChannelName = Annotated[str, StringConstraints(pattern=CHANNEL_NAME)]
+NOTHING: dict[str, Any] = {"side": None, "muscle": None, "placement": None, "profile": {}}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel, and what a participant has on it."""
+
+    number: int  # from 1: its place on the rig, and its colour
+    name: str
+    key: str  # as `held` takes it: empty for the first
+    site: Site
+    profile: dict[str, Any]  # empty: nobody has set its limits
+
+
+def of_rig(status: Status | None) -> list[str]:
+    """Names of the rig's channels; none of a rig of one, or that has not spoken."""
+    told = (status.stimulator.get("channels") or []) if status is not None else []
+    return [str(one["name"]) for one in told] if len(told) > 1 else []
+
+
+def key_of(status: Status | None, name: str) -> str:
+    """A channel as `held` takes it. Raises NotFoundError (404): the rig has none of that name."""
+    names = of_rig(status)
+    if name not in names:
+        has = f"This rig has {', '.join(names)}." if names else "This rig has one channel, which needs no name."
+        raise NotFoundError("channel", name, has)
+    return "" if name == names[0] else name
+
+
+def held(row: Participant, key: str = "") -> dict[str, Any]:
+    """Side, muscle, placement and profile of a channel."""
+    if not key:
+        return {name: getattr(row, name) for name in NOTHING}
+    return {**NOTHING, **((row.channels or {}).get(key) or {})}
+
+
+def put(row: Participant, key: str, **new: Any) -> None:
+    """Change some of it."""
+    if key:
+        row.channels = {**(row.channels or {}), key: {**held(row, key), **new}}
+    for name, value in () if key else new.items():
+        setattr(row, name, value)
+
+
+def of(row: Participant, status: Status | None) -> list[Channel]:
+    """All of the rig's channels with what the participant has on each; none on a rig of one."""
+    found = []
+    for number, name in enumerate(of_rig(status), start=1):
+        own = held(row, key := name if number > 1 else "")
+        site = own["side"], own["muscle"], own["placement"]
+        found.append(Channel(number, name, key, site, own["profile"]))
+    return found
+
+
+def needed(row: Participant, status: Status | None) -> list[Channel]:
+    """The same, for what stimulates all of them.
+
+    Raises ApiError: 409 the rig has one channel; 422 nobody has set the limits of one.
+    """
+    found = of(row, status)
+    if not found:
+        detail = "This rig has one channel. The rig file names more under [[stimulator.channels]]."
+        raise ApiError(409, "one-channel", "The rig has one channel", detail)
+    if lacking := [one.name for one in found if not one.profile]:
+        detail = (
+            f"{row.code} has no limits on {', '.join(lacking)}. Calibrate it, or set them: "
+            "PUT /v1/participants/{code}/channels/{channel}/profile."
+        )
+        raise ApiError(422, "no-limits", "The participant has no limits", detail)
+    return found
