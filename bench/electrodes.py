@@ -69,10 +69,8 @@ class Person:
         torque_nm, share, comfort = field.torque_nm[rows], field.spill[rows], 10.0 - field.pain[rows]
         sure = self.wish.utility(torque_nm, np.digitize(share, SHARES), comfort)
         above = [np.ones_like(share), *(norm.cdf((share - each) / SHARE_SD) for each in SHARES), np.zeros_like(share)]
-        seen = sum(
-            (above[kind] - above[kind + 1]) * self.wish.utility(torque_nm, np.full(len(share), kind), comfort)
-            for kind in range(3)
-        )
+        kinds = [self.wish.utility(torque_nm, np.full(len(share), kind), comfort) for kind in range(3)]
+        seen = np.sum([(above[kind] - above[kind + 1]) * each for kind, each in enumerate(kinds)], axis=0)
         return {"kind": dict(zip(self.choices, sure, strict=True)), "seen": dict(zip(self.choices, seen, strict=True))}
 
 

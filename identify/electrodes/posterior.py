@@ -56,8 +56,8 @@ def likeness(one: Reach, other: Reach) -> np.ndarray:
     """Correlation of what is left over between choices of two sessions, without noise."""
     far = np.sum((one.where_mm[:, None] - other.where_mm[None]) ** 2, axis=2)
     near = np.exp(-0.5 * far / LENGTH_MM**2)
-    smooth = sum(near[np.ix_(one.ends[:, a], other.ends[:, b])] for a in (0, 1) for b in (0, 1)) / 4.0
-    gap = sum(far[np.ix_(one.ends[:, a], other.ends[:, a])] for a in (0, 1))
+    smooth = np.mean([near[np.ix_(one.ends[:, a], other.ends[:, b])] for a in (0, 1) for b in (0, 1)], axis=0)
+    gap = np.sum([far[np.ix_(one.ends[:, a], other.ends[:, a])] for a in (0, 1)], axis=0)
     kept = 1.0 if one.session == other.session else CARRIED
     return kept * ((1.0 - ALONE) * smooth + ALONE * (gap < 1.0))
 
