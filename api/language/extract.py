@@ -47,6 +47,7 @@ NAMED = {"Effect": ("name", "main"), "Interplay": ("name",), "Parameter": ("abou
 """Calls with arguments (of a dictionary its values) that pages show although they may be a single word."""
 NOT_SHOWN = {
     "Field",
+    "several",
     "Query",
     "describe_answer",
     "published",

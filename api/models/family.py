@@ -36,7 +36,7 @@ SEVERAL_MUSCLES = Family({
     "widths": "Pulse widths for a torque are found with the model of one muscle: with several, many would do.",
     "prediction": "A torque is foretold from the pulse widths of one muscle; this model has several.",
     "trend": "Models of several muscles are not in it: it follows one muscle from session to session.",
-    "side by side": "Models are laid side by side where each is of one muscle; this one is of several.",
+    "compared": "Models are laid side by side where each is of one muscle; this one is of several.",
     "story": "The story is told of models of one muscle; the versions of this one are on its page.",
     "joined": "A recording of several muscles is not joined to another one.",
     "carried": "The structure of a model of several muscles is not carried over to another session.",

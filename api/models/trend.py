@@ -19,6 +19,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.language import _
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
+from stimrig.api.models.family import family_of
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Approval, Model, Note, Recording, Test
@@ -118,6 +119,8 @@ class Trend:
 
     async def against(self, model: Model) -> tuple[Session, Session] | None:
         """The last approved session before the model's, and the model's with that model; None where there is none."""
+        if not family_of(model).can("trend"):
+            return None
         sessions, models = await asyncio.to_thread(self._read, model.participant)
         own = _session_of(sessions, models, model.id)
         before = [

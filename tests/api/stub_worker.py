@@ -92,9 +92,9 @@ def joint_diagnosis(model_json: str | None) -> dict[str, Any]:
     names = {CROSS_TALK: "Cross-talk from biceps to triceps", "co_contraction": "Co-contraction"}
     rows = [
         {"effect": name, "name": names[name], "probability": 0.97, "rms_before_nm": 0.12, "rms_after_nm": 0.05,
-         "held_out_rms_before_nm": 0.2, "held_out_rms_after_nm": 0.06, "confused_with": ["co_contraction"][: name != left[-1]],
-         "next_experiment": "Pulses to one channel alone.", "plain": "The electrode of one muscle also reaches the other.",
-         "parameters": {}}
+         "held_out_rms_before_nm": 0.2, "held_out_rms_after_nm": 0.06, "parameters": {},
+         "confused_with": ["co_contraction"][: name != left[-1]], "next_experiment": "Pulses to one channel alone.",
+         "plain": "The electrode of one muscle also reaches the other."}
         for name in left
     ]  # fmt: skip
     tried = [{"effect": "biceps.fatigue", "log_evidence_gain": -3.0}]

@@ -15,7 +15,7 @@ from stimrig.api.workers import muscle_verbs, verbs
 from tests.api.conftest import Service, csrf, own_service, signed_in, wait_done
 from tests.api.made_up_muscles import HEADER, write_csv
 from tests.api.stub_worker import CROSS_TALK, joint_model
-from tests.api.test_channels import OWN, PERSON, TRICEPS, TWO, seen_of, settled, two
+from tests.api.test_channels import OWN, PERSON, TRICEPS, TWO, seen_of, two
 
 __all__ = ["two"]
 service = own_service()
@@ -114,7 +114,7 @@ def lacking(two: httpx.Client, model: str) -> dict[str, httpx.Response]:
         "prediction": two.post(f"/v1/models/{model}/prediction", json={"pulse_width_us": [100.0]}),
         "widths": two.post(f"/v1/models/{model}/widths", json={"reference_torque_nm": [1.0, 2.0]}),
         "joined": two.post("/v1/tests", json={"participant": "P017", "joins": model}),
-        "side by side": two.get("/compare", params={"model": [model, model + "x"][:1] + [other(two, model)]}),
+        "compared": two.get("/compare", params={"model": [model, other(two, model)]}),
         "story": two.get(f"/models/{model}/story.html"),
     }
 

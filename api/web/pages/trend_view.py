@@ -89,7 +89,7 @@ async def chosen(context: Context, asked: list[str] | None) -> list[Model]:
         detail = f"{rows[0].id} is of {rows[0].participant}, {other.id} of {other.participant}."
         raise ApiError(422, "two-participants", "The models are of different participants", detail)
     for row in rows:
-        family_of(row).require("side by side")
+        family_of(row).require("compared")
     return sorted(rows, key=lambda row: row.created_utc)
 
 
