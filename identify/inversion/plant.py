@@ -21,6 +21,8 @@ OWED = 0.05
 """Most that one pulse leaves to those after it, as a share of the largest torque."""
 NOTHING = 2e-3
 """A demand below this share of the largest one gets no pulse."""
+QUIET = (2e-3, 5e-3, 0.01, 0.02)
+"""Shares of the largest torque that are not worth speaking of before a rise; the first that leads to one is taken."""
 PROBE_S = 3.0
 
 
@@ -101,9 +103,17 @@ class Plant:
 
     @cached_property
     def _ready_us(self) -> float:
-        """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing."""
-        quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= 0.002 * self.largest_nm)
-        ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+        """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing.
+
+        A fitted curve waves a little below its threshold. A wave above the smallest share must not keep the train below
+        the threshold, so from the pulse that is taken one rise leads to more than the largest share.
+        """
+        ready_us = 0.0
+        for share in QUIET:
+            quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= share * self.largest_nm)
+            ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+            if self.level(ready_us + (self.rise_us or np.inf)) > QUIET[-1] * self.largest_nm:
+                break
         return ready_us if ready_us >= self.shortest_us else 0.0
 
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:
