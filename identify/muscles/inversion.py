@@ -36,7 +36,7 @@ SMOOTH = 0.02
 ACTIVE = 0.01
 """The joint is active from where the reference first exceeds this share of the weaker side's largest, to the last."""
 FADE_S = 0.5
-"""In which co-contraction comes before that, and goes after it."""
+"""In which co-contraction comes before that, but not before the first pulse, and goes after it."""
 NEAR_ZERO = 0.15
 """Bound of `stiffness` where none is given, as a share of the weaker side's largest torque."""
 
@@ -196,7 +196,8 @@ class _Joint:
             np.arange(reference.torque_nm.size),
             np.flatnonzero(np.abs(reference.torque_nm) > ACTIVE * self.weaker_nm),
         )
-        away = np.maximum(at[0] - k, k - at[-1]) / (FADE_S * self.rate_hz) if at.size else np.ones(k.size)
+        fade = FADE_S * self.rate_hz
+        away = np.max([at[0] - k, k - at[-1], fade - k], axis=0) / fade if at.size else np.ones(k.size)
         self.active = _fading(away)  # 1 while the joint is active, 0 where it rests before and after
 
     def strength(self, sign: float) -> float:
