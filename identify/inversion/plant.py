@@ -22,7 +22,7 @@ OWED = 0.05
 NOTHING = 2e-3
 """A demand below this share of the largest one gets no pulse."""
 QUIET = (2e-3, 5e-3, 0.01, 0.02)
-"""Shares of the largest torque that are not worth speaking of before a rise; the first that leads to one is taken."""
+"""Shares of the largest torque that count for nothing before a rise; the first that leads into no wave is taken."""
 PROBE_S = 3.0
 
 
@@ -105,8 +105,8 @@ class Plant:
     def _ready_us(self) -> float:
         """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing.
 
-        A fitted curve waves a little below its threshold. A wave above the smallest share must not keep the train below
-        the threshold, so from the pulse that is taken one rise leads to more than the largest share.
+        A fitted curve waves below its threshold. A wave must not keep the train there, so from the pulse that is taken
+        one rise leads to more than the largest of the shares.
         """
         ready_us = 0.0
         for share in QUIET:
@@ -114,6 +114,8 @@ class Plant:
             ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
             if self.level(ready_us + (self.rise_us or np.inf)) > QUIET[-1] * self.largest_nm:
                 break
+        else:  # it waves more than that: the torque on the way, of some pulses, cannot be helped
+            ready_us = float(np.interp(QUIET[-1] * self.largest_nm, self.inverse_nm, self.inverse_us))
         return ready_us if ready_us >= self.shortest_us else 0.0
 
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:
