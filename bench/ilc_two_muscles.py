@@ -20,6 +20,9 @@ from bench.common import ROOT, in_processes, keep, parser, table, written_by
 from stimrig.hardware_sim.joint import Joint as Truth
 from stimrig.hardware_sim.joint_records import draw_joint, record
 from stimrig.identify import muscles
+from stimrig.identify.muscles.finish import finished
+from stimrig.identify.muscles.joint_fit import fit_all
+from stimrig.identify.muscles.problem import Acting
 
 sys.path.insert(0, str(ROOT / "examples"))
 from ilc_two_muscles import CO_CONTRACTIONS, Joint, learn_joint, reachable
@@ -31,6 +34,8 @@ BEFORE, BETWEEN = 40, 400
 """Pulses of rest before a trial, and between two."""
 RISE_US = 50.0
 INTERPLAY = [f"cross_talk:{NAMES[0]}>{NAMES[1]}", f"cross_talk:{NAMES[1]}>{NAMES[0]}", "co_contraction"]
+ENOUGH = 3.0
+"""Gain of the log evidence for which an interplay is added."""
 RUNS: dict[str, dict[str, Any]] = {
     **{f"both, {one}": {"co_contraction": one} for one in CO_CONTRACTIONS},
     **{f"{one} alone": {"only": one} for one in NAMES},
@@ -63,6 +68,20 @@ def test_of(joint: Truth, seed: int) -> muscles.JointRecord:
     return muscles.JointRecord.from_arrays(channels, told["time_s"], held, told["torque_nm"], segment[place])
 
 
+def identified(test: muscles.JointRecord) -> muscles.JointModel:
+    """The plain structure, and what interplay the evidence asks for: `muscles.improve` without effects, for speed."""
+    found = fit_all(test)
+    while True:
+        there = {acting.key(NAMES) for acting in found.acting}
+        left = [Acting.of(text, NAMES) for text in INTERPLAY if text not in there]
+        forms = [Acting(one.interplay, form.name, one.between) for one in left for form in one.interplay.forms]
+        tried = [found.with_(acting=[*found.acting, one]) for one in forms]
+        best = max(tried, key=lambda each: each.fitted.log_evidence, default=found)
+        if best.fitted.log_evidence < found.fitted.log_evidence + ENOUGH:
+            return finished(found)
+        found = best
+
+
 class Person:
     """Stands where the service stands: plays trials on a joint that remembers all of them; counts broken limits."""
 
@@ -91,7 +110,7 @@ def one(job: tuple[int, int]) -> dict[str, Any]:
     """All ways on one joint, each from a rested one: tracking error of each trial, % of the reference's range."""
     seed, trials = job
     truth = draw_joint(seed)
-    fitted = muscles.fit(test_of(truth, seed), interplay=INTERPLAY)
+    fitted = identified(test_of(truth, seed))
     model = fitted.to_dict()
     reference_nm = reachable(model)
     found: dict[str, Any] = {"seed": seed, "broken": 0, "errors": {}}

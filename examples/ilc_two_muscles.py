@@ -53,6 +53,9 @@ NEAR_ZERO = 0.15
 SMOOTH = 0.02
 """Share of the weaker muscle's largest torque in which one muscle hands over to the other."""
 FADE_S = 0.5
+DIVERGED = 1.5
+"""Two trials in a row that are worse, and worse by this factor than the best: what was learnt since leads nowhere, as
+where an electrode reaches the other muscle more the more it is sent. The controller goes back to the best trial."""
 
 
 @dataclass
@@ -221,20 +224,25 @@ def learn_joint(service: Any, joint: Joint, trials: int) -> list[JointTrial]:
     reference_nm, demand = joint.reference_nm, joint.planned()
     service.wanted_nm = reference_nm
     done: list[JointTrial] = []
-    share = 1.0
+    share, worse, best = 1.0, 0, (np.inf, demand, np.zeros(demand.size))
     for number in range(1, trials + 1):
         widths_us = joint.widths(demand)
         torque_nm, sent_us = service.play_joint(widths_us)
         error_nm = reference_nm - torque_nm
         percent = 100 * float(np.sqrt(np.mean(error_nm**2)) / np.ptp(reference_nm))
         if done:
-            worse = percent > done[-1].error_percent
+            worse = worse + 1 if percent > done[-1].error_percent else 0
             share = max(LEAST_SHARE, share / 2) if worse else min(1.0, GROWTH * share)
         lost = sum(int(np.sum(sent_us[name] != own)) for name, own in widths_us.items())
         done.append(JointTrial(widths_us, torque_nm, percent, lost))
         print(f"  trial {number:2d}  {percent:6.2f} % of the reference's range, {lost} pulses lost", file=sys.stderr)
         not_sent_nm = joint.torque(joint.levels(widths_us) - joint.levels(sent_us))  # no reason to learn from it
-        demand = joint.corrected(demand, error_nm - not_sent_nm, share)
+        if percent < best[0]:
+            best = percent, demand, error_nm - not_sent_nm
+        back = worse > 1 and percent > DIVERGED * best[0]
+        _, demand, learnt_nm = best if back else (percent, demand, error_nm - not_sent_nm)
+        best = (np.inf, *best[1:]) if back else best  # it is measured anew: the muscle may have changed
+        demand = joint.corrected(demand, learnt_nm, share)
     return done
 
 
