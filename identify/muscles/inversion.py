@@ -1,7 +1,7 @@
 """From a torque that a controller wants of a joint to the pulse widths of each channel, and how much both muscles pull.
 
 Two muscles can give one torque in many ways, so co-contraction is stated, not found. It is written as a floor below
-which no muscle may go (`_floors`); what is wanted beyond the floors is given by the muscles of one sign alone. Each
+which no muscle may go; what is wanted beyond the floors is given by the muscles of one sign alone. Each
 muscle's part is inverted as if it were alone; then what is asked for is corrected on the prediction of the whole model.
 """
 
@@ -75,13 +75,12 @@ class JointInversion(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
-        kept = ("co_contraction", "level", "bound_nm", "pulse_width_us", "fit_percent", "whole_fit_percent")
-        told = {name: getattr(self, name) for name in (*kept, "tolerance_nm")}
-        told["pulse_rate_hz"] = self.reference.pulse_rate_hz
-        told["duration_s"] = self.predicted_nm.size / self.reference.pulse_rate_hz
-        told["reference_torque_nm"] = self.reference.torque_nm.round(6)
-        told["predicted_torque_nm"] = self.predicted_nm.round(6)
-        told["muscle_torque_nm"] = {name: own.round(6) for name, own in self.muscle_nm.items()}
+        reference = self.reference
+        apart = ("reference", "predicted_nm", "muscle_nm", "unreachable")
+        told = {name: value for name, value in vars(self).items() if name not in apart}
+        told |= {"pulse_rate_hz": reference.pulse_rate_hz, "reference_torque_nm": reference.torque_nm.round(6)}
+        told |= {"duration_s": reference.torque_nm.size / reference.pulse_rate_hz}
+        told |= {"predicted_torque_nm": self.predicted_nm.round(6), "muscle_torque_nm": self.muscle_nm}
         return json_value(told | {"unreachable": [one.to_dict() for one in self.unreachable]})
 
 
@@ -106,12 +105,10 @@ def invert(
     co_contraction : str
         "none": each torque by the muscles of one sign, with a smooth change at 0. "constant": while the joint is
         active every muscle keeps `level` of its largest torque. "stiffness": the same, but only where |torque| is
-        below `bound_nm`, and gone at twice that; it keeps the joint from being loose at 0. How stiff it is then, no
-        torque of a joint at rest tells: it is the muscles' activity that is kept.
+        below `bound_nm`, by default 15 % of the weaker side's largest, and gone at twice that. It is the muscles'
+        activity that is kept: how stiff the joint is then, no torque of a joint at rest tells.
     level : float
-        Share of each muscle's largest torque, 0 to 0.5.
-    bound_nm : float, optional
-        Of "stiffness"; by default 15 % of the weaker side's largest torque.
+        0 to 0.5.
     limits : Limits or mapping
         Of each channel, or by channel; one that is not named has none.
     whole : bool
@@ -124,13 +121,14 @@ def invert(
     BadRequest
         A number that is none, a limit that is not positive, an unknown channel or choice, no antagonist to contract.
     """
-    rate_hz = model.pulse_rate_hz
-    reference = torque_nm if isinstance(torque_nm, Reference) else Reference.of(torque_nm, pulse_rate_hz=rate_hz)
-    joint = _Joint(model, reference, limits, whole)
+    if not isinstance(torque_nm, Reference):
+        torque_nm = Reference.of(torque_nm, pulse_rate_hz=model.pulse_rate_hz)
+    joint = _Joint(model, torque_nm, limits, whole)
     bound_nm = NEAR_ZERO * joint.weaker_nm if bound_nm is None else bound_nm
     _refuse(joint, co_contraction, level, bound_nm)
-    wanted = reference.torque_nm
-    floors = _floors(joint, wanted, co_contraction, level, bound_nm)
+    wanted = torque_nm.torque_nm
+    kept = {"none": 0.0, "constant": 1.0, "stiffness": _fading(np.abs(wanted) / bound_nm - 1.0)}[co_contraction]
+    floors = level * joint.largest_nm[:, None] * (kept * joint.active)
     asked, lower, best, least, idle = wanted, floors, None, np.inf, 0
     demands = np.zeros(floors.shape)
     for _ in range(alone.TURNS):
@@ -147,20 +145,24 @@ def invert(
         asked = np.clip(asked + alone.STEP * error, -joint.strength(-1.0), joint.strength(1.0))
         lower = np.minimum(lower + alone.STEP * lacking, joint.largest_nm[:, None])
     assert best is not None
-    return _judged(joint, reference, best, {"co_contraction": co_contraction, "level": level, "bound_nm": bound_nm})
+    return _judged(joint, torque_nm, best, {"co_contraction": co_contraction, "level": level, "bound_nm": bound_nm})
 
 
 def _refuse(joint: _Joint, co_contraction: str, level: float, bound_nm: float) -> None:
-    if co_contraction not in CO_CONTRACTIONS:
-        fix = f"Use one of: {', '.join(CO_CONTRACTIONS)}."
-        raise BadRequest(f"unknown co-contraction {co_contraction!r}", place="co_contraction", fix=fix)
-    if not 0.0 <= level <= LARGEST_LEVEL:
-        raise BadRequest(f"{level:g} of the largest torque", place="level", fix=f"Give 0 to {LARGEST_LEVEL:g}.")
-    if not 0.0 < bound_nm < np.inf:
-        raise BadRequest(f"{bound_nm:g} N·m", place="bound_nm", fix="Give a positive number, or leave it out.")
-    if co_contraction != "none" and np.ptp(joint.signs) == 0.0:
-        fix = 'Use "none": there is no antagonist.'
-        raise BadRequest("all muscles of the model pull in one direction", place="co_contraction", fix=fix)
+    one_way = co_contraction != "none" and np.ptp(joint.signs) == 0.0
+    for right, said, place, fix in (
+        (
+            co_contraction in CO_CONTRACTIONS,
+            f"unknown {co_contraction!r}",
+            "co_contraction",
+            ", ".join(CO_CONTRACTIONS),
+        ),
+        (not one_way, "all muscles of the model pull in one direction", "co_contraction", "none: no antagonist"),
+        (0.0 <= level <= LARGEST_LEVEL, f"{level:g} of the largest torque", "level", f"0 to {LARGEST_LEVEL:g}"),
+        (0.0 < bound_nm < np.inf, f"{bound_nm:g} N·m", "bound_nm", "a positive number, or none"),
+    ):
+        if not right:
+            raise BadRequest(said, place=place, fix=f"Give {fix}.")
 
 
 class _Joint:
@@ -255,12 +257,6 @@ def _fading(away: np.ndarray) -> np.ndarray:
     """1 at 0 and below, 0 from 1 on, smooth in between."""
     left = 1.0 - np.clip(away, 0.0, 1.0)
     return left**2 * (3.0 - 2.0 * left)
-
-
-def _floors(joint: _Joint, wanted_nm: np.ndarray, co_contraction: str, level: float, bound_nm: float) -> np.ndarray:
-    """What each muscle gives at least, N·m in its direction of pull, shape (C, K)."""
-    kept = {"none": 0.0, "constant": 1.0, "stiffness": _fading(np.abs(wanted_nm) / bound_nm - 1.0)}[co_contraction]
-    return level * joint.largest_nm[:, None] * (kept * joint.active)
 
 
 def _judged(
