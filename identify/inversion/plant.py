@@ -115,7 +115,8 @@ class Plant:
             if self.level(ready_us + (self.rise_us or np.inf)) > QUIET[-1] * self.largest_nm:
                 break
         else:  # it waves more than that: the torque on the way, of some pulses, cannot be helped
-            ready_us = float(np.interp(QUIET[-1] * self.largest_nm, self.inverse_nm, self.inverse_us))
+            before_top = self.level_nm[: np.argmax(self.level_nm) + 1]
+            ready_us = float(self.width_us[np.flatnonzero(before_top <= QUIET[-1] * self.largest_nm)[-1]])
         return ready_us if ready_us >= self.shortest_us else 0.0
 
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:
