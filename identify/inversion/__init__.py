@@ -18,7 +18,7 @@ from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.pulses import above_rest
 from stimrig.identify.summary import Sheet, quantity
 
-__all__ = ["Inversion", "Reference", "invert"]
+__all__ = ["Inversion", "Reference", "best_fit", "invert", "reasons_of", "stretches_of"]
 
 TURNS = 10
 """Corrections on the model's own prediction, at most: each is a trial that the model plays."""
@@ -32,9 +32,18 @@ TOLERANCE = 0.02
 """A torque that is missed by less of the largest one that the widest pulse gives counts as reached."""
 JOINED = 3
 """Stretches of one reason with fewer pulses between them are one."""
-REASONS = ("above-plateau", "below-zero", "rises-too-fast", "falls-too-fast", "under-threshold", "not-followed")
+REASONS = (
+    "above-plateau",
+    "below-zero",
+    "rises-too-fast",
+    "falls-too-fast",
+    "under-threshold",
+    "not-followed",
+    "beyond-dose",
+)
 """Too high for the largest width; the wrong sign, a muscle only pulls; faster than the muscle, or than the rise limit
-allows; a pulse there gives too little or too much; the rest, for example an effect that cannot be undone."""
+allows; a pulse there gives too little or too much; the rest, for example an effect that cannot be undone; of several
+muscles, where the dose of one of them is limited."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,14 @@ class Stretch:
     end_s: float
     reason: str  # one of `REASONS`
     shortfall_nm: float  # the largest difference between reference and prediction in it, positive
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return {name: value if name == "reason" else round(value, 6) for name, value in vars(self).items()}
+
+    def row(self) -> tuple[str, str]:
+        """As a line of a sheet."""
+        return f"{self.begin_s:.2f} to {self.end_s:.2f} s", f"lacks {self.shortfall_nm:.2g} N·m: {self.reason}"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -61,11 +78,8 @@ class Inversion(Result):
 
     def _sheet(self) -> Sheet:
         fit = f"fit {quantity(self.fit_percent, '%')} where it can be reached"
-        missed = [
-            (f"{one.begin_s:.2f} to {one.end_s:.2f} s", f"lacks {one.shortfall_nm:.2g} N·m: {one.reason}")
-            for one in self.unreachable
-        ]
-        rows = [("widths", f"up to {quantity(self.pulse_width_us.max(), 'µs')}"), *missed[:8]]
+        missed = [one.row() for one in self.unreachable[:8]]
+        rows = [("widths", f"up to {quantity(self.pulse_width_us.max(), 'µs')}"), *missed]
         return Sheet(f"Pulse widths for a torque: {self.pulse_width_us.size} pulses, {fit}", tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,10 +93,7 @@ class Inversion(Result):
                 **({} if reference.angle_rad is None else {"angle_rad": reference.angle_rad.round(6)}),
                 "pulse_width_us": self.pulse_width_us,
                 "predicted_torque_nm": self.predicted_nm.round(6),
-                "unreachable": [
-                    {name: value if name == "reason" else round(value, 6) for name, value in vars(one).items()}
-                    for one in self.unreachable
-                ],
+                "unreachable": [one.to_dict() for one in self.unreachable],
                 "fit_percent": self.fit_percent,
                 "whole_fit_percent": self.whole_fit_percent,
                 "tolerance_nm": self.tolerance_nm,
@@ -186,26 +197,29 @@ def _judged(
     wanted = plant.sign * reference.torque_nm
     error_nm, tolerance_nm = np.abs(wanted - got_nm), TOLERANCE * plant.largest_nm
     missed = error_nm > tolerance_nm
-    reasons = _reasons(plant, needed_nm, demand_nm, missed, wanted > got_nm, tolerance_nm)
-    step_s = 1.0 / reference.pulse_rate_hz
-    stretches = [
-        Stretch(float(run.start * step_s), float(run.stop * step_s), reason, float(np.max(error_nm[run])))
-        for index, reason in enumerate(REASONS)
-        for run in runs(_joined(reasons == index))
-    ]
-    stretches.sort(key=lambda one: one.begin_s)
+    reasons = reasons_of(plant, needed_nm, demand_nm, missed, wanted > got_nm, tolerance_nm)
     return Inversion(
         reference=reference,
         pulse_width_us=widths_us,
         predicted_nm=plant.sign * got_nm,
-        unreachable=tuple(stretches),
-        fit_percent=_best_fit(wanted[~missed], got_nm[~missed]),
-        whole_fit_percent=_best_fit(wanted, got_nm),
+        unreachable=stretches_of(reasons, error_nm, reference.pulse_rate_hz),
+        fit_percent=best_fit(wanted[~missed], got_nm[~missed]),
+        whole_fit_percent=best_fit(wanted, got_nm),
         tolerance_nm=tolerance_nm,
     )
 
 
-def _best_fit(wanted: np.ndarray, got: np.ndarray) -> float | None:
+def stretches_of(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float) -> tuple[Stretch, ...]:
+    """Where it is not reached, in order of time; `reasons`: what `reasons_of` gives, `error_nm`: positive."""
+    stretches = [
+        Stretch(float(run.start / pulse_rate_hz), float(run.stop / pulse_rate_hz), reason, float(np.max(error_nm[run])))
+        for index, reason in enumerate(REASONS)
+        for run in runs(_joined(reasons == index))
+    ]
+    return tuple(sorted(stretches, key=lambda one: one.begin_s))
+
+
+def best_fit(wanted: np.ndarray, got: np.ndarray) -> float | None:
     """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper."""
     spread = float(np.linalg.norm(wanted - wanted.mean())) if wanted.size else 0.0
     return None if spread < 1e-9 else 100.0 * (1.0 - float(np.linalg.norm(wanted - got)) / spread)
@@ -220,7 +234,7 @@ def _joined(rows: np.ndarray) -> np.ndarray:
     return filled
 
 
-def _reasons(
+def reasons_of(
     plant: Plant, wanted: np.ndarray, demand: np.ndarray, missed: np.ndarray, short: np.ndarray, tolerance_nm: float
 ) -> np.ndarray:
     """Index into `REASONS` for each pulse, -1 where it is reached; shape (K,)."""

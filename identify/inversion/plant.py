@@ -21,6 +21,8 @@ OWED = 0.05
 """Most that one pulse leaves to those after it, as a share of the largest torque."""
 NOTHING = 2e-3
 """A demand below this share of the largest one gets no pulse."""
+QUIET = (2e-3, 5e-3, 0.01, 0.02)
+"""Shares of the largest torque that count for nothing before a rise; the first that leads into no wave is taken."""
 PROBE_S = 3.0
 
 
@@ -101,9 +103,20 @@ class Plant:
 
     @cached_property
     def _ready_us(self) -> float:
-        """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing."""
-        quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= 0.002 * self.largest_nm)
-        ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+        """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing.
+
+        A fitted curve waves below its threshold. A wave must not keep the train there, so from the pulse that is taken
+        one rise leads to more than the largest of the shares.
+        """
+        ready_us = 0.0
+        for share in QUIET:
+            quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= share * self.largest_nm)
+            ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+            if self.level(ready_us + (self.rise_us or np.inf)) > QUIET[-1] * self.largest_nm:
+                break
+        else:  # it waves more than that: the torque on the way, of some pulses, cannot be helped
+            before_top = self.level_nm[: np.argmax(self.level_nm) + 1]
+            ready_us = float(self.width_us[np.flatnonzero(before_top <= QUIET[-1] * self.largest_nm)[-1]])
         return ready_us if ready_us >= self.shortest_us else 0.0
 
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:

@@ -9,6 +9,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from stimrig.identify.muscles.inversion import JointInversion as JointInversion
+    from stimrig.identify.muscles.inversion import Limits as Limits
+    from stimrig.identify.muscles.inversion import invert as invert
     from stimrig.identify.muscles.model import JointModel as JointModel
     from stimrig.identify.muscles.model import is_joint_model as is_joint_model
     from stimrig.identify.muscles.model import parts as parts
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 _PLACES = {
     name: f"{__name__}.{module}"
     for module, names in {
+        "inversion": ("JointInversion", "Limits", "invert"),
         "model": ("JointModel", "is_joint_model", "parts", "predict"),
         "record": ("Channel", "JointRecord", "is_joint", "read"),
         "results": ("JointDiagnosis", "JointImprovement"),

@@ -233,6 +233,12 @@ def parts(model: JointModel, record: JointRecord) -> dict[str, np.ndarray]:
     return dict(zip(model.names, problem.whole_and_parts(theta)[1], strict=True))
 
 
+def whole_and_parts(model: JointModel, record: JointRecord) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Both at once, the muscles in the order of the channels."""
+    problem, theta = _problem(model, record)
+    return problem.whole_and_parts(theta)
+
+
 def _problem(model: JointModel, record: JointRecord) -> tuple[JointProblem, np.ndarray]:
     missing = set(model.names) ^ set(record.names)
     if missing:

@@ -18,7 +18,7 @@ from stimrig.identify.inversion.plant import on_pulses
 from stimrig.identify.inversion.reference import read_reference
 from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve
-from stimrig.identify.recruitment.bases import SigmoidBasis
+from stimrig.identify.recruitment.bases import SigmoidBasis, SplineBasis
 from stimrig.identify.simulation.pulses import above_rest
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 from tests.identify import hidden_muscles
@@ -366,3 +366,17 @@ def test_a_table_that_is_none_is_refused_at_its_place(content: bytes, place: str
     with pytest.raises(IdentifyError) as caught:
         read_reference(content, "r.csv")
     assert caught.value.place == place and caught.value.fix
+
+
+@pytest.mark.parametrize("wave", [1.0, 20.0])
+def test_a_curve_that_waves_below_its_threshold_does_not_keep_a_train_with_a_rise_limit_at_0(wave: float):
+    """As fits have it: 0.4 % of the largest torque at 20 µs (or 9 %), nothing at 40 µs, its threshold near 110 µs."""
+    knots_us = np.r_[0.0:241.0:20.0]
+    values = np.array([0.0, 0.015, -0.003, 0.006, 0.027, 0.055, 0.4, 1.6, 2.7, 3.2, 3.4, 3.5, 3.5])
+    values[1:4] *= [-wave if wave > 1.0 else 1.0, wave, -wave if wave > 1.0 else 1.0]
+    basis = SplineBasis(knots_us)
+    model = muscle().with_(recruitment=Curve(basis, np.linalg.lstsq(basis.design(knots_us), values)[0]))
+    wanted = smooth(2.5)
+    found = invert(model, Reference.of(wanted), rise_us=50.0)
+    assert np.max(np.diff(np.r_[0.0, found.pulse_width_us])) <= 50.0
+    assert found.whole_fit_percent is not None and found.whole_fit_percent > (95.0 if wave == 1.0 else 80.0)
