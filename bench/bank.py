@@ -13,19 +13,20 @@ from __future__ import annotations
 import sys
 import time
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.adaptive import KINDS, LONGEST_S, NOISE_NM, TARGET, covered_by, paper_test, unseen_percent
-from bench.common import in_processes, keep, parser, table
+from bench.common import in_processes, keep_lines, lines_of, parser, table
 from stimrig import identify
 from stimrig.identify.estimation.earlier import USUAL
 from stimrig.identify.experiments.bank import UNLIKE, Bank
 from stimrig.identify.model import Model
-from tests.harness.adaptive import Muscle, Played, play
+from tests.harness.adaptive import Muscle, Played, play, recorded
 
-POOL, BANK = 40, 20
+POOL, BANK = 26, 20
 """People whose models are at hand, half of each kind, and models in a bank."""
 POOL_SEEDS = 500_000
 """Added to the first seed: the pool's people are none of the patients."""
@@ -73,13 +74,12 @@ def banks(muscle: Muscle, own: Model, pool: list[tuple[str, int, Model]], seed: 
     away = [float(np.linalg.norm(marks(KINDS[kind](number)) - here)) for kind, number, _ in pool]
     order = rng.permutation(len(pool))
 
-    def bank(places: Any, *more: Model) -> Bank:
-        found = {f"{pool[i][0]} {pool[i][1]}": pool[i][2] for i in places} | {"own": one for one in more}
-        return Bank.of(found)
+    def bank(places: Any, **more: Model) -> Bank:
+        return Bank.of({f"{pool[i][0]} {pool[i][1]}": pool[i][2] for i in places} | more)
 
     return {
-        "own": bank([], own),
-        "own among others": bank(order[: BANK - 1], own),
+        "own": bank([], own=own),
+        "own among others": bank(order[: BANK - 1], own=own),
         "others": bank(order[:BANK]),
         "unlike all": bank([i for i in order if away[i] >= FAR][:BANK]),
     }
@@ -101,8 +101,6 @@ def row(name: str, muscle: Muscle, made: Played, seed: int, spent_s: list[float]
 
 def unseen_noise(muscle: Muscle, model: Model, seed: int) -> float:
     """Error of the clean torque of random levels, divided by the noise of a sample."""
-    from tests.harness.adaptive import recorded
-
     levels = np.random.default_rng([seed, 7]).uniform(0.0, muscle.top_us, 30)
     widths = np.r_[np.zeros(40), np.repeat(levels, 20)]
     record = recorded(muscle, widths, ["validate"] * widths.size, np.zeros(20000), 400.0)
@@ -169,7 +167,12 @@ def main() -> None:
     made = parser(__doc__, "1000:1040")
     made.add_argument("--kinds", default="sigmoid,shaped")
     made.add_argument("--workers", type=int, default=2)
+    made.add_argument("--rows", type=Path, help="print the table of rows that were written before")
     settings = made.parse_args()
+    if settings.rows is not None:
+        rows = lines_of(settings.rows)
+        print(*told(rows), *told_of_time(rows), sep="\n")
+        return
     kinds = settings.kinds.split(",")
     first = POOL_SEEDS + settings.seeds.start
     people = [(("sigmoid", "shaped")[i % 2], first + i) for i in range(POOL)]
@@ -179,12 +182,18 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for found in in_processes(one, jobs, settings.workers):
         rows += found
-        keep(settings.json, rows, None)
+        keep_lines(settings.json, rows)
     print(*told(rows), sep="\n")
+    print(*told_of_time(rows), sep="\n")
+
+
+def told_of_time(rows: list[dict[str, Any]]) -> list[str]:
+    """Processor time of a decision."""
     cpu = {name: np.concatenate([line["cpu_s"][1:] for line in rows if line["row"] == name]) for name in ROWS}
-    for name, seconds in cpu.items():
-        half, most = np.quantile(seconds, [0.5, 0.99])
-        print(f"`decide`, {name}: {1e3 * half:.0f} ms of processor time in the middle, p99 {1e3 * most:.0f} ms.")
+    found = {name: 1e3 * np.quantile(seconds, [0.5, 0.99]) for name, seconds in cpu.items()}
+    return [
+        f"`decide`, {name}: {half:.0f} ms of processor time, p99 {most:.0f} ms." for name, (half, most) in found.items()
+    ]
 
 
 if __name__ == "__main__":

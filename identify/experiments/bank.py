@@ -200,7 +200,7 @@ def weigh(grid: Grid, bank: Bank, before: Weighed | None = None) -> Weighed:
 
 
 def evidence(fit: Short) -> float:
-    """Log evidence of a fit, averaged over the kinds of deviation of its curve, up to what all fits of a record share."""
+    """Log evidence of a fit, over all kinds of deviation of its curve, up to what all fits of a record share."""
     kinds = np.array([mode.log_evidence for mode in fit.modes])
     most = float(kinds.max())
     # Each fit has a noise of its own, whose size its modes leave out: the standard deviation of its innovations counts.
