@@ -44,10 +44,14 @@ def limits(muscle: Muscle) -> dict[str, float]:
     return {"left_s": LONGEST_S / 2.0, "left_nm_s": float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0}
 
 
-def model_of(made: Played) -> Model:
-    """The model that a test leaves."""
+def model_of(made: Played, bank: Bank | None = None) -> Model:
+    """The model that a test leaves, fitted with that of the bank which the person was found to be like."""
     assert made.record is not None
-    return identify.fit(made.record, recruitment="near-sigmoid")
+    weighed = made.decision.weighed
+    like = {} if bank is None else {one.name: one.model for one in bank.candidates}
+    earlier = None if weighed is None else like.get(weighed.name)
+    known = {} if earlier is None else {"earlier": earlier}
+    return identify.fit(made.record, recruitment="near-sigmoid", **known)
 
 
 def marks(muscle: Muscle) -> np.ndarray:
@@ -85,11 +89,11 @@ def banks(muscle: Muscle, own: Model, pool: list[tuple[str, int, Model]], seed: 
     }
 
 
-def row(name: str, muscle: Muscle, made: Played, seed: int, spent_s: list[float]) -> dict[str, Any]:
+def row(name: str, muscle: Muscle, made: Played, bank: Bank | None, seed: int, spent_s: list[float]) -> dict[str, Any]:
     """One line of the results."""
     known, weighed = made.decision.knowledge, made.decision.weighed
     curve, step, band = covered_by(known, muscle) if known is not None else (False, False, float("nan"))
-    model = model_of(made)
+    model = model_of(made, bank)
     return {
         "row": name, "seed": seed, "ended": made.decision.kind, "dose": made.dose_nm_s(muscle),
         "charge_us": float(np.sum(made.widths_us)), "seconds": made.seconds, "curve_covered": curve,
@@ -107,16 +111,18 @@ def unseen_noise(muscle: Muscle, model: Model, seed: int) -> float:
     return float(np.sqrt(np.mean((record.torque_nm - model.predict(record)) ** 2))) / NOISE_NM
 
 
-def one(job: tuple[str, int, list[tuple[str, int, str]]]) -> list[dict[str, Any]]:
+def one(job: tuple[str, int, list[tuple[str, int, str]], str]) -> list[dict[str, Any]]:
     """All rows of one patient."""
     warnings.filterwarnings("ignore", category=RuntimeWarning)
-    kind, seed, texts = job
+    kind, seed, texts, wanted = job
     pool = [(name, number, Model.from_json(text)) for name, number, text in texts]
     muscle = KINDS[kind](seed)
     day = muscle.another_day(np.random.default_rng([seed, 8]))
     own = model_of(play(day, noise_of(seed, 6), TARGET, **limits(day)))
     rows = []
-    for name, bank in {"from nothing": None, **banks(muscle, own, pool, seed)}.items():
+    for name, bank in {ROWS[0]: None, **banks(muscle, own, pool, seed)}.items():
+        if name not in wanted.split("; ") and name != ROWS[0]:
+            continue
         spent_s: list[float] = []
 
         def timed(call: Any, spent: list[float] = spent_s) -> Any:
@@ -127,7 +133,7 @@ def one(job: tuple[str, int, list[tuple[str, int, str]]]) -> list[dict[str, Any]
 
         known = {} if bank is None else {"bank": bank}
         made = play(muscle, noise_of(seed, 5), TARGET, timed=timed, **limits(muscle), **known)
-        rows.append({"kind": kind} | row(name, muscle, made, seed, spent_s))
+        rows.append({"kind": kind} | row(name, muscle, made, bank, seed, spent_s))
     for line in rows:
         for key, share in (("dose", "dose_share"), ("charge_us", "charge_share"), ("seconds", "time_share")):
             line[share] = line[key] / rows[0][key]
@@ -141,7 +147,7 @@ def told(rows: list[dict[str, Any]]) -> list[str]:
     heads += "step covered; enough; recognised"
     cells = []
     for kind in [*dict.fromkeys(line["kind"] for line in rows), "all"]:
-        for name in ROWS:
+        for name in dict.fromkeys(line["row"] for line in rows):
             own = [line for line in rows if line["row"] == name and kind in (line["kind"], "all")]
             first = [line for line in rows if line["row"] == ROWS[0] and kind in (line["kind"], "all")]
             mid = {key: float(np.median([line[key] for line in own])) for key in own[0] if key.endswith("_share")}
@@ -166,6 +172,7 @@ def main() -> None:
     """Print the table."""
     made = parser(__doc__, "1000:1040")
     made.add_argument("--kinds", default="sigmoid,shaped")
+    made.add_argument("--tests", default="; ".join(ROWS), help="those beside the one from nothing")
     made.add_argument("--workers", type=int, default=2)
     made.add_argument("--rows", type=Path, help="print the table of rows that were written before")
     settings = made.parse_args()
@@ -178,7 +185,7 @@ def main() -> None:
     people = [(("sigmoid", "shaped")[i % 2], first + i) for i in range(POOL)]
     texts = list(in_processes(pool_member, people, settings.workers))
     pool = [(*person, text) for person, text in zip(people, texts, strict=True)]
-    jobs = [(kind, seed, pool) for seed in settings.seeds for kind in kinds]
+    jobs = [(kind, seed, pool, settings.tests) for seed in settings.seeds for kind in kinds]
     rows: list[dict[str, Any]] = []
     for found in in_processes(one, jobs, settings.workers):
         rows += found
@@ -189,7 +196,10 @@ def main() -> None:
 
 def told_of_time(rows: list[dict[str, Any]]) -> list[str]:
     """Processor time of a decision."""
-    cpu = {name: np.concatenate([line["cpu_s"][1:] for line in rows if line["row"] == name]) for name in ROWS}
+    cpu = {
+        name: np.concatenate([line["cpu_s"][1:] for line in rows if line["row"] == name])
+        for name in dict.fromkeys(line["row"] for line in rows)
+    }
     found = {name: 1e3 * np.quantile(seconds, [0.5, 0.99]) for name, seconds in cpu.items()}
     return [
         f"`decide`, {name}: {half:.0f} ms of processor time, p99 {most:.0f} ms." for name, (half, most) in found.items()

@@ -58,6 +58,8 @@ ALIKE_SECOND_COST = 0.15
 """The same for a person who is like a model of the bank: little is left to find out, and a burst with a rest tells it
 at the smallest dose. With 0.3, and a ramp of 0.6 s in the opening, tests of the paper's kind of curve took 0.6 to 0.7
 of the dose from nothing (seeds 4 to 9), not less than a half."""
+PATIENT_S = 8.0
+"""From then on a second costs as much as ever: bursts alone may take half a minute where the torque is small."""
 SHARES = (0.03, 0.15, 0.35, 0.6, 0.85, 0.97)
 """Shares of the plateau whose widths are levels to move between."""
 
@@ -242,6 +244,7 @@ def _next(short: Short, known: Knowledge, played: np.ndarray, asked: Asked, alik
     rate = 1.0 / short.grid.step_s
     foresight = Foresight.of(short, played, asked.target)
     levels = _levels(short, known, asked.largest_us)
+    patient = alike and played.size / rate < PATIENT_S
     candidates = pieces(levels, rate) + (bursts(levels, rate) if alike else [])
     after, dose = foresight.after(candidates)
     seconds = np.array([piece.pulse_width_us.size for piece in candidates]) / rate
@@ -250,7 +253,7 @@ def _next(short: Short, known: Knowledge, played: np.ndarray, asked: Asked, alik
         return Decision(
             "spent", words=f"The torque-time or the time is used up. {_state(known)}", knowledge=known, short=short
         )
-    cost = dose / max(known.plateau_nm, 1e-9) + (ALIKE_SECOND_COST if alike else SECOND_COST) * seconds
+    cost = dose / max(known.plateau_nm, 1e-9) + (ALIKE_SECOND_COST if patient else SECOND_COST) * seconds
     score = np.where(allowed, np.log(np.maximum(foresight.now / after, 1.0)) / cost, -1.0)
     best = int(np.argmax(score))
     number = sum(1 for _ in short.grid.record.segment_names) + 1
