@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from stimrig.identify import muscles
 from stimrig.rig import archive
 from tests.harness.processes import Bench, short_plan
 
@@ -91,3 +92,34 @@ def test_an_array_behind_its_switch(make_bench: Callable[..., Bench]):
         told = [(one["event"], one["elements"]) for one in json.loads(file.attrs["events"]) if "elements" in one]
     assert told == [("relays", [5, 6]), ("relays_set", [5, 6]), ("relays_open", [])]
     assert bench.felt()
+
+
+def test_both_muscles_are_identified_from_what_was_sealed(make_bench: Callable[..., Bench]):
+    """The same muscles off line are the truth: the rig's pulses, times and torque must lead to them."""
+    bench = make_bench("--patient", "two_muscles:7", "--noise-seed", "7", speed=1.0)
+
+    def part(name: str, sequence: str, settings: dict[str, Any], of_triceps: dict[str, Any] | None) -> dict[str, Any]:
+        own = {} if of_triceps is None else {"triceps": {"sequence": sequence, "settings": of_triceps}}
+        return {"name": name, "sequence": sequence, "settings": settings, "channels": own}
+
+    ramp = {"up_s": 1.5, "down_s": 1.5}
+    segments = [
+        rest(1.0),
+        part("prbs", "prbs", {"chips": 50}, {"chips": 50, "seed": 40}),
+        rest(1.0),
+        part("ramp", "ramp", ramp, None),
+        {**rest(0.1), "name": "ramp", "channels": {"triceps": {"sequence": "ramp", "settings": ramp}}},
+        rest(1.0),
+        part("validate", "multilevel", {"duration_s": 4.0}, {"duration_s": 4.0, "seed": 31}),
+        rest(0.5),
+    ]
+    event = played(bench, short_plan("whole", segments=segments, **both()))
+    assert event["outcome"] == "completed", event
+    record = muscles.read(event["recording_path"])
+    assert record.names == ("biceps", "triceps")
+    assert record.channels[1].offset_s == pytest.approx(0.0125)
+    model = muscles.fit(record)
+    assert model.fit["held_out_fit_percent"] > 90, model.fit
+    predicted = muscles.parts(model, record)
+    assert predicted["biceps"].max() > 5 * abs(predicted["biceps"].min())
+    assert -predicted["triceps"].min() > 5 * abs(predicted["triceps"].max())
