@@ -178,11 +178,12 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
             f"--emulator-json: stimulator {stimulator} is not a pseudo-terminal of an emulator; real "
             "devices need a rig file"
         )
+    named = _emulated_channels(line)
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
         "require_calibration": False,  # no person is connected to an emulator
         "watch": line.get("watch", EMULATOR_WATCH),
-        "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator},
+        "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator, **named},
         "load_cell": {
             "device": "can_load_cell",
             "bus": can,
@@ -192,7 +193,27 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         },
         "angle_sensor": sensor,
     }
+    if line.get("switch"):
+        fed = {"channel": named["channels"][0]["name"], "elements": line.get("elements")}
+        content["switch"] = {"device": "scpi_matrix", "port": line["switch"], **fed}
     return check(content, "--emulator-json", **overrides)
+
+
+EMULATED = ("biceps", "m. biceps brachii"), ("triceps", "m. triceps brachii")
+
+
+def _emulated_channels(line: dict[str, Any]) -> dict[str, Any]:
+    """The rig-file settings of an emulator's outputs, where it has several, or an array of electrodes."""
+    outputs = line.get("outputs") or ([[0, 0]] if line.get("switch") else [])
+    of_p24 = line.get("stimulator_device", "p24") == "p24"
+    channels = []
+    for place, (connector, channel) in enumerate(outputs):
+        name, muscle = EMULATED[place] if place < len(EMULATED) else (f"muscle-{place + 1}", f"muscle {place + 1}")
+        plug = (
+            {"channel": channel + 1, "connector": connector + 1} if of_p24 else {"channel": 4 * connector + channel + 1}
+        )
+        channels.append({"name": name, "muscle": muscle, "side": "right", "electrode": "emulated", **plug})
+    return {"channels": channels} if channels else {}
 
 
 def _emulated_sensor(line: dict[str, Any]) -> dict[str, Any]:

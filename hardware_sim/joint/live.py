@@ -62,9 +62,11 @@ class LiveJoint:
         self.electrodes = Electrode(self), Electrode(self)
         self._state, self._done = np.zeros((2, STATES)), 0
         self._out = np.zeros((2, 3))  # of the last two steps
+        run(np.zeros((0, 2)), joint.parameters, self._state, self._out)  # compiled now, not in the first step
         self._kept: deque[tuple[Floats, Floats]] = deque([(self._state.copy(), self._out.copy())], REMEMBERED)
         self._lingering: list[tuple[float, float, Floats]] = []  # begin, end, N·m of each muscle
         self._active: dict[tuple[float, float], Floats] = {}
+        self._steady: tuple[float, float, Floats] = (0.0, 0.0, np.zeros(2))  # N·m of both, from and until a step
 
     def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
         """A pulse at the agonist's electrodes."""
@@ -80,6 +82,7 @@ class LiveJoint:
     def take(self, electrode: Electrode, at: float, width_us: float) -> None:
         """A pulse of this width at 20 mA, at a time in steps."""
         self._run_to(math.floor(at + 1e-6))
+        self._steady = 0.0, 0.0, np.zeros(2)
         last = electrode.held[-1] if electrode.held else _Held(-math.inf, -math.inf, 0.0)
         gap = at - last.end
         if gap < 0.0:
@@ -124,12 +127,16 @@ class LiveJoint:
     def _mean_active_nm(self, begin: float) -> Floats:
         """What both muscles' units give over the step from `begin`, in the mean."""
         end = begin + 1.0
+        if self._steady[0] <= begin and end <= self._steady[1]:
+            return self._steady[2]
         edges = {edge for one in self.electrodes for held in one.held[-3:] for edge in (held.begin, held.end)}
         times = [begin, *sorted(edge for edge in edges if begin < edge < end), end]
         mean_nm = np.zeros(2)
         for start, stop in pairwise(times):
             first, second = (one.width_us(start) for one in self.electrodes)
             mean_nm += (stop - start) * self._active_nm((first, second))
+        if len(times) == 2 and not any(one[1] > begin for one in self._lingering):
+            self._steady = begin, min((edge for edge in edges if edge > begin), default=math.inf), mean_nm
         for start, stop, more_nm in self._lingering:
             mean_nm += max(min(stop, end) - max(start, begin), 0.0) * more_nm
         return mean_nm

@@ -290,3 +290,20 @@ def test_a_rehastim_2_has_channels(tmp_path: Path):
     head, load_cell = GOOD.replace('"p24"', '"rehastim2"').split("[load_cell]")
     loaded = load(tmp_path, f"{head}{more}\n[load_cell]{load_cell}")
     assert [one["channel"] for one in loaded.stimulator.model_dump()["channels"]] == [1, 8]
+
+
+@pytest.mark.parametrize(
+    ("device", "plugs"),
+    [
+        ("p24", [{"channel": 1, "connector": 1}, {"channel": 2, "connector": 2}]),
+        ("rehastim2", [{"channel": 1}, {"channel": 6}]),
+    ],
+)
+def test_an_emulator_tells_its_outputs_and_its_switch(device: str, plugs: list[dict[str, int]]):
+    line = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}, "stimulator_device": device}
+    more = {"outputs": [[0, 0], [1, 1]], "switch": "/dev/pts/gone2", "elements": 16}
+    loaded = config.for_emulator(json.dumps({**line, **more}), data_dir=Path("d"), socket=Path("s"))
+    assert [(one.name, one.elements) for one in loaded.channels()] == [("biceps", 16), ("triceps", 0)]
+    told = loaded.stimulator.model_dump()["channels"]
+    assert [{name: one[name] for name in plug} for one, plug in zip(told, plugs, strict=True)] == plugs
+    assert config.for_emulator(json.dumps(line), data_dir=Path("d"), socket=Path("s")).channels() == ()

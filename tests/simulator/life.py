@@ -6,7 +6,7 @@ import math
 import random
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.load_cells.cells import CELLS, WithAngle
@@ -31,7 +31,8 @@ QUIET_S = 20.0
 """The longest that the rig may then need until it has played one more test."""
 SEVERAL = 0.3
 """Share of the lives whose rig has two channels."""
-NAMES = "biceps", "triceps"
+NAMES, OUTPUTS = ("biceps", "triceps"), ((0, 0), (0, 1))
+"""Both reach the one muscle of a life."""
 HELD, ROBOT = "held", "robot,from_deg=60,to_deg=110,deg_s=60,pause_s=0.2"
 
 
@@ -84,8 +85,9 @@ class Life:
         self.computer = Computer(world, chance.uniform(-100, 100), 1_764_000_000.0)
         self.disk.access = self.computer.access
         self.felt: list[Felt] = []
-        self._outputs: list[int] = []
-        self._connect_outputs()
+        if self.channels:
+            muscle = self.devices.electrodes.wired[OUTPUTS[0]]
+            self.devices.electrodes.wired = dict.fromkeys(OUTPUTS, muscle)
         self.wires = Wires(world, self.devices, chance.choice((0.01, 0.02, 0.03)), self._note)
         self.clinic = Clinic(world, self.devices.state)
         self.clinic.kill = lambda: self.kill(0.3)
@@ -202,21 +204,10 @@ class Life:
         first = ChannelPlan(name=NAMES[0], profile=self.profile)
         return first, ChannelPlan(name=NAMES[1], profile=other, offset_s=chance.choice((None, 0.004, 0.011)))
 
-    def _connect_outputs(self) -> None:
-        """The first two outputs reach the muscle, where the rig has two channels; which it was is noted."""
-        electrodes = self.devices.electrodes
-        fire, known = electrodes.fire, [electrodes.output, (electrodes.output[0], electrodes.output[1] + 1)]
-        used = known[: max(1, len(self.channels))]
-
-        def noted(time_s: float, points: Any, output: tuple[int, int], source: str) -> bool:
-            self._outputs.append(used.index(output) if output in used else -1)
-            return fire(time_s, points, electrodes.output if output in used else output, source)
-
-        electrodes.fire = noted  # type: ignore[method-assign]
-
     def _note(self, written_s: float, true: bool) -> None:
         for pulse in self.devices.electrodes.log[len(self.felt) :]:
-            output = self._outputs[len(self.felt)]
+            used = OUTPUTS[: max(1, len(self.channels))]
+            output = used.index(pulse.output) if pulse.output in used else -1
             felt = Felt(pulse.time_s, pulse.width_us, pulse.current_ma, pulse.balanced, written_s, true, output)
             self.felt.append(felt)
             deviant = f" output {output}" if self.channels else ""
