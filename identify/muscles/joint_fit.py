@@ -16,11 +16,11 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.joint import Fitted, solve
-from stimrig.identify.estimation.plain import fit_plain, pilot_solution
+from stimrig.identify.estimation.plain import estimate, pilot_solution, to_fitted
 from stimrig.identify.estimation.samples import Raw, block_means, fitted_rows, prepare
 from stimrig.identify.muscles.problem import Acting, JointProblem, drive_form
 from stimrig.identify.muscles.record import JointRecord
-from stimrig.identify.noise import NoiseLevel
+from stimrig.identify.noise import WHITE, NoiseLevel
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
@@ -54,6 +54,11 @@ class JointFitted:
     def setups(self) -> list[Setup]:
         """Of each muscle."""
         return [part.setup for part in self.problem.parts]
+
+    @cached_property
+    def white(self) -> JointFitted:
+        """The same with its noise held white: slow noise may hold what the structure leaves, and bend the curves."""
+        return replace(self, fitted=solve(self.problem, self.fitted.theta, WHITE))
 
     @cached_property
     def predicted(self) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -108,10 +113,10 @@ class JointFitted:
         effects = tuple(tuple(one) for one in (self.effects if effects is None else effects))
         acting = self.acting if acting is None else tuple(acting)
         problem = assemble(self.setups, effects, acting)
-        theta = _carried(problem, self, start or {})
-        fitted = solve(problem, theta, self.fitted.noise)
-        if _slow(fitted.noise):  # slow noise may hold what the structure left before
-            again = solve(problem, theta, NoiseLevel(0.0, 0.5, fitted.noise.sd_nm))
+        fitted = solve(problem, _carried(problem, self, start or {}), self.fitted.noise)
+        if _slow(fitted.noise):
+            begun = solve(problem, _carried(problem, self.white, start or {}), WHITE)
+            again = solve(problem, begun.theta, NoiseLevel(0.0, 0.5, begun.noise.sd_nm))
             fitted = max(fitted, again, key=lambda one: one.log_evidence)
         return replace(self, effects=effects, acting=acting, fitted=fitted)
 
@@ -217,7 +222,7 @@ def fit_all(record: JointRecord) -> JointFitted:
         fits = []
         for place, grid in enumerate(grids):
             own = _without(grid, sum(t for i, t in enumerate(torques) if i != place))
-            fitted = fit_plain(own, rows)
+            fitted = to_fitted(estimate(own, rows)[0], rows)
             fits.append(fitted)
             torques[place] = _torque_of(fitted)
     return _together(record, grids, raw, fits)

@@ -111,6 +111,10 @@ class JointProblem:
         self.upper = np.r_[np.concatenate([part.upper for part in parts]), [p.upper for p in table]]
         self.cores = np.concatenate([place.start + part.cores for part, place in zip(parts, self.places, strict=True)])
 
+    def fitted_on(self, rows: np.ndarray) -> JointProblem:
+        """The same, of which only these intervals are fitted, bool, shape (K,)."""
+        return JointProblem([part.fitted_on(rows) for part in self.parts], self.joint)
+
     def split(self, theta: np.ndarray) -> list[np.ndarray]:
         """The parameters of each muscle's problem."""
         return [theta[place] for place in self.places]

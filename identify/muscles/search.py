@@ -14,11 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.diagnosis.free import searched
-from stimrig.identify.diagnosis.search import Progress, silent
+from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.diagnosis.residual import vetoed
+from stimrig.identify.diagnosis.search import Progress, search_effects, silent
+from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.fit_statistics import rms
+from stimrig.identify.estimation.left_out import difference, leave_out
 from stimrig.identify.muscles.interplay import registry
 from stimrig.identify.muscles.joint_fit import JointFitted, fit_all
 from stimrig.identify.muscles.problem import Acting
@@ -30,8 +33,6 @@ LEAST_SHARE = 0.004
 """An interplay that changes the torque by less than this share of its spread where it acts is none: an inexact curve
 looks like it."""
 MOST_EFFECTS = 3
-RISE = 1.02
-"""The error on held-out pulses may rise by this factor with something that is added: chance alone."""
 JOINT_STAGES = {"additive"}
 """An effect of these stages is of the joint, not of one muscle; it is kept with the first channel."""
 
@@ -101,16 +102,24 @@ def _best(found: JointSearch, candidates: Sequence[Tried]) -> Tried | None:
     """The likeliest of a round that held-out pulses do not speak against; None if none gains enough."""
     ranked = sorted(candidates, key=lambda one: (-one.gain, one.key))
     found.rounds.append(ranked)
-    before = held_out_rms(found.last)
     for one in ranked:
         if one.gain < MARGIN:
             break
-        after = held_out_rms(one.found)
-        if before is not None and after is not None and after > RISE * before:
-            found.refused.append((one, f"The error on held-out pulses rises from {before:.3g} to {after:.3g} N·m."))
-            continue
-        return one
+        reason = _objection(found.last, one)
+        if reason is None:
+            return one
+        found.refused.append((one, reason))
     return None
+
+
+def _objection(last: JointFitted, one: Tried) -> str | None:
+    """What blocks that are left out, or held-out pulses, say against a candidate; None where they do not."""
+    known = find_effect(one.key.partition(".")[2]) if "." in one.key else None
+    if known is None or known.predictable:
+        seen = difference(leave_out(last.fitted), leave_out(one.found.fitted))
+        if not seen.errors >= thresholds.BETTER:
+            return seen.words
+    return vetoed(last.fitted, one.found.fitted)
 
 
 def _interplays(last: JointFitted) -> list[Tried]:
@@ -165,7 +174,8 @@ def _effects(found: JointSearch, say: Progress, number: int) -> list[Tried]:
             last.raw, torque_nm=view.problem.setup.grid.record.torque_nm, hum=None, ceiling_nm=None, floor_nm=None
         )
         held = [f"{effect}:{form.name}" for effect, form in last.effects[place]]
-        own, verdict = searched(view.problem.setup.grid, raw, tell, most=1, structure=held)
+        own = search_effects(view.problem.setup.grid, raw, last.problem.setup.fitted, tell, most=1, structure=held)
+        verdict = judge(own)
         if verdict.kind == "unexplained_structure":
             found.unexplained.append(name)
         for effect in own.added:
@@ -202,12 +212,6 @@ def _drop_idle(found: JointSearch) -> None:
         if last.fitted.log_evidence - without.fitted.log_evidence < MARGIN:
             found.added.remove(one)
             found.chain.append(without)
-
-
-def held_out_rms(found: JointFitted) -> float | None:
-    """On rows of `validate`, N·m; None without any."""
-    rows = found.record.held_out & found.grids[0].counted
-    return rms((found.record.torque_nm - found.predicted[0])[rows]) if rows.any() else None
 
 
 def probability(found: JointSearch, one: Tried) -> float:

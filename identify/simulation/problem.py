@@ -90,6 +90,10 @@ class Problem:
         self.lower = self.from_physical(np.array([p.lower for p in table]))
         self.upper = self.from_physical(np.array([p.upper for p in table]))
 
+    def fitted_on(self, rows: np.ndarray) -> Problem:
+        """The same, of which only these intervals are fitted, bool, shape (K,)."""
+        return Problem(self.setup.with_(fitted=rows), [(one.effect, one.form) for one in self.chosen])
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters; those of an effect start with its id: `fatigue.onset_s`."""
