@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
     from stimrig.identify import Model
+    from stimrig.identify.muscles import JointModel
 
 
 class Participant(TypedDict):
@@ -172,8 +173,12 @@ class ApprovedModel:
     etag: str
     changed: bool = True
 
-    def model(self) -> Model:
-        """The model itself, to predict with."""
+    def model(self) -> Model | JointModel:
+        """The model itself, to predict with; of several muscles where the document says so."""
+        if self.document.get("kind") == "joint":
+            from stimrig.identify.muscles import JointModel
+
+            return JointModel.from_dict(self.document)
         from stimrig.identify import Model  # here: a controller that reads the document alone needs no numpy
 
         return Model.from_dict(self.document)

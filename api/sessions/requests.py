@@ -271,6 +271,13 @@ class TestIn(Labels, Body):
         return self
 
 
+class CalibratedIn(Body):
+    """One of several channels that are calibrated in one go."""
+
+    name: ChannelName
+    current_ma: CurrentMa | None = Field(None, description="of every pulse, mA; null: the participant's own there")
+
+
 class CalibrationIn(Body):
     """How a guided calibration goes: one current, small steps, short trains."""
 
@@ -285,8 +292,8 @@ class CalibrationIn(Body):
     max_torque_nm: TorqueNm | None = Field(
         None, description="torque at which a train stops, and later a test, N·m; None: the participant's own"
     )
-    channels: Annotated[dict[ChannelName, CurrentMa | None], Field(min_length=1, max_length=8)] | None = Field(
-        None, description="several channels in one go, each with its current, mA; null: the participant's own there"
+    channels: Annotated[list[CalibratedIn], Field(min_length=1, max_length=8)] | None = Field(
+        None, description="several channels in one go; null: the first one alone"
     )
 
 

@@ -10,7 +10,7 @@ from stimrig.api import schemas
 from stimrig.api.decisions import DECISIONS
 from stimrig.api.web.middleware import REFUSALS
 from stimrig.api.web.responses.base import Problem
-from stimrig.api.web.responses.models import TrackedOut
+from stimrig.api.web.responses.models import JointModelOut, TrackedOut
 from stimrig.api.web.responses.rig import LiveOut
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
@@ -69,7 +69,7 @@ def describe(app: FastAPI) -> None:
 
 def _complete(document: dict[str, Any]) -> None:
     components = document["components"]["schemas"]
-    for model in (Problem, LiveOut, TrackedOut):
+    for model in (Problem, LiveOut, TrackedOut, JointModelOut):
         own = model.model_json_schema(ref_template="#/components/schemas/{model}")
         components.update(own.pop("$defs", {}) | {model.__name__: own})
     components["JsonValue"] = {"description": "any JSON value: what it holds depends on its key"}

@@ -126,9 +126,10 @@ def test_its_plan_is_its_own(two: httpx.Client, field: dict[str, Any]) -> None:
 
 def test_both_channels_are_calibrated_in_one_go(two: httpx.Client) -> None:
     at = f"{PERSON}/calibration"
-    refused = two.post(at, json={"channels": {"biceps": None, "triceps": None}})
+    refused = two.post(at, json={"channels": [{"name": name} for name in TWO]})
     assert refused.status_code == 422 and "current of triceps" in refused.json()["detail"]
-    begun = two.post(at, json={"channels": {"biceps": None, "triceps": 9.0}, "step_us": 5.0})
+    asked = [{"name": "biceps"}, {"name": "triceps", "current_ma": 9.0}]
+    begun = two.post(at, json={"channels": asked, "step_us": 5.0})
     assert begun.status_code == 201, begun.text
     assert [(one["name"], one["current_ma"]) for one in begun.json()["channels"]] == [
         ("biceps", 20.0),
@@ -150,6 +151,26 @@ def test_both_channels_are_calibrated_in_one_go(two: httpx.Client) -> None:
     assert two.put(f"{TRICEPS}/muscle", json=other).status_code == 200, "nobody had said one before"
     voids = two.put(f"{TRICEPS}/muscle", json={**other, "placement": "D"})
     assert voids.status_code == 409 and voids.json()["type"].endswith("voids-calibration")
+
+
+def test_the_page_calibrates_both_side_by_side(two: httpx.Client, service: Service) -> None:
+    ready(two)
+    at = "/participants/P017/calibration"
+    with signed_in(service) as tab:
+        form = tab.get(at).text
+        assert 'name="current_ma_triceps"' in form
+        typed = {"csrf": csrf(tab), "seen": seen_of(form), "current_ma": "20", "step_us": "10"}
+        assert tab.post(at, data={**typed, "current_ma_triceps": "9,5"}).status_code == 303
+        for name in TWO:
+            shown = tab.get(at).text
+            version = shown.split('name="calibration" value="')[1].split('"')[0]
+            sent = {"csrf": csrf(tab), "calibration": version, "channel": name, "shown_us": "10.0"}
+            assert tab.post(f"{at}/step/up", data=sent).status_code == 303
+        shown = tab.get(at).text
+        assert 'class="ladders"' in shown and 'id="step-up-triceps"' in shown and "data-keys" not in shown
+        assert shown.count('class="muscle n2" translate="no">triceps') >= 2
+        told = two.get(f"{PERSON}/calibration").json()["channels"]
+        assert [(one["current_ma"], one["pulse_width_us"]) for one in told] == [(20.0, 10.0), (9.5, 10.0)]
 
 
 # ---- pages --------------------------------------------------------------------------------------------------------

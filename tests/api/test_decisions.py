@@ -83,10 +83,12 @@ class World:
     @classmethod
     def made(cls, service: Service, code: str) -> World:
         me, colleague = service.client(), service.client(service.token("colleague", "administer"))
-        world = cls(service, me, colleague, code, {"code": code})
+        world = cls(service, me, colleague, code, {"code": code, "channel": "biceps"})
+        service.rig.channels = ["biceps", "triceps"]
         soon(lambda: service.rig.state != "running")
         if service.rig.state != "ready":
             assert me.post("/v1/rearm").is_success
+        soon(lambda: me.get("/v1/rig").json()["stimulator"].get("channels"))
         assert me.post("/v1/participants", json={"code": code}).is_success
         return world
 
@@ -276,7 +278,8 @@ def test_what_was_changed_since_is_decided_anew(world: World, door: str) -> None
 UNWRITTEN = {"POST /v1/participants/{code}/notes/{note_id}/strike", "POST /participants/{code}/notes/{note_id}/strike",
              "POST /v1/participants/{code}/unarchive", "POST /participants/{code}/unarchive",
              "POST /v1/participants/{code}/calibration/step", "POST /participants/{code}/calibration/step/{direction}",
-             "POST /participants/{code}/profile", "POST /participants/{code}/tests"}  # fmt: skip
+             "POST /participants/{code}/profile", "POST /participants/{code}/tests",
+             "POST /participants/{code}/channels/{channel}/profile"}  # fmt: skip
 """Done twice it changes nothing; a train is in the calibration's own recording; a jump is asked about first."""
 TWICE = {"POST /v1/rearm", "POST /rearm", "POST /v1/models/{model_id}/reject", "POST /models/{model_id}/reject",
          "POST /v1/participants/{code}/recordings", "POST /participants/{code}/recordings",

@@ -17,7 +17,7 @@ from stimrig.api.language import lazy
 from stimrig.api.sessions import channels, profiles
 from stimrig.api.sessions.channels import Channel
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
+from stimrig.api.sessions.requests import CalibratedIn, CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
@@ -129,14 +129,16 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     """Open one; a current that is far above the participant's is asked about first."""
     row = await asyncio.to_thread(participants.find, context, code)
     sent = await request.form()
-    texts = {name: str(sent.get(name, text))[:60] for name, text in usual(context, row).items()}
+    fields = usual(context, row).items()
+    texts = {name: str(sent.get(name, text if name in FIRST else ""))[:60] for name, text in fields}
     texts = {name: text for name, text in texts.items() if text.strip() or name in FIRST}
     values, errors = read(texts, row, context.rig.status)
     if errors:
         return await show_page(request, context, code, texts, errors)
     playing = channels.of(row, context.rig.status)
     currents = {one.name: values[_field(one)] for one in playing if _field(one) in values}
-    several = {"channels": currents} if len(currents) > 1 else {}
+    asked = [CalibratedIn(name=name, current_ma=current_ma) for name, current_ma in currents.items()]
+    several = {"channels": asked} if len(asked) > 1 else {}
     body = typed.checked(CalibrationIn, **{name: values[name] for name in FIRST}, large_steps=True, **several)
 
     async def open_it() -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, JsonValue
+from pydantic import Field, JsonValue, WithJsonSchema
 
 from stimrig.api.client import documents
 from stimrig.api.web.responses.base import Document, Problem, SegmentOut, fields_of
@@ -41,6 +41,27 @@ class CarriedOut(Document):
     no_longer_needed: list[str]
     undecided: list[str] = Field(description="left out; something else is missing that may hide them")
     effects: list[CarriedEffect]
+
+
+class JointChannelOut(Document):
+    """One muscle of a model of several."""
+
+    name: str = Field(description="of its channel")
+    muscle: str
+    side: str
+    electrode: str
+    offset_s: float = Field(description="by how much later than those of the first channel its pulses come, s")
+    model: Annotated[dict[str, JsonValue], WithJsonSchema({"$ref": "#/components/schemas/ModelJson"})]
+
+
+class JointModelOut(Document):
+    """MODEL.json of several muscles at one joint: the torque is the sum of theirs, and of one zero."""
+
+    schema_version: str
+    kind: Literal["joint"]
+    model_id: str
+    channels: list[JointChannelOut]
+    interplay: list[dict[str, JsonValue]] = Field(description="`cross_talk` (`from`, `to`) and `co_contraction`")
 
 
 class TrackingLimits(Document):

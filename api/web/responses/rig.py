@@ -18,10 +18,20 @@ class DeviceOut(Document):
     device: str = ""
 
 
+class RigChannelOut(Document):
+    """One output of the stimulator, as the rig file describes it."""
+
+    name: str
+    muscle: str = ""
+    side: str = ""
+    electrode: str = ""
+
+
 class StimulatorOut(DeviceOut):
     """The stimulator."""
 
     shortest_us: float | None = Field(default=None, description="no narrower pulse is sent, µs")
+    channels: list[RigChannelOut] | None = Field(default=None, description="of a rig with several; missing: it has one")
 
 
 class RigHealth(Document):
@@ -96,6 +106,12 @@ class SequencesOut(Document):
     default: list[SegmentOut] = Field(description="the segments of a test that is given none")
 
 
+class ChannelDoseOut(Document):
+    """What one of several channels is to get; of a preview also `pulse_time_s` and `pulse_width_us`."""
+
+    charge_uc: float = Field(description="charge of one phase, summed over its pulses, µC")
+
+
 class PlannedOut(Document):
     """What a test will take."""
 
@@ -103,6 +119,7 @@ class PlannedOut(Document):
     charge_uc: float = Field(0.0, description="charge of one phase, summed over the pulses, µC")
     torque_time_nms: float | None = Field(None, description="estimated torque-time, N·m·s; null without a model")
     segments: list[SegmentSpan] = Field([])
+    channels: dict[str, ChannelDoseOut] | None = Field(None, description="kind `muscles`: each channel by its name")
 
 
 class PreviewOut(PlannedOut):

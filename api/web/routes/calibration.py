@@ -176,9 +176,9 @@ def _store(
 def _several(context: Context, row: Participant, body: CalibrationIn) -> list[requests.CalibrateChannel] | None:
     """The channels of a calibration of several, each with its own current and last marks; None of one of one."""
     found = []
-    for name, current_ma in (body.channels or {}).items():
-        own = channels.held(row, channels.key_of(context.rig.status, name))["profile"]
-        current_ma = own.get("current_ma") if current_ma is None else current_ma
+    for one in body.channels or ():
+        name, own = one.name, channels.held(row, channels.key_of(context.rig.status, one.name))["profile"]
+        current_ma = own.get("current_ma") if one.current_ma is None else one.current_ma
         if current_ma is None:
             raise ApiError(422, "no-limits", "The participant has no limits", f"Send the current of {name}, too.")
         last = messages.Profile.model_validate(own) if own and body.large_steps else None

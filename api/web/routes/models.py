@@ -19,22 +19,25 @@ from stimrig.api.store import seen
 from stimrig.api.store.tables import Model, Participant
 from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
-from stimrig.api.web.responses.base import describe_answer, published
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import InversionOut, PredictionOut, TrackingOut, VersionOut
 from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 TAG = {"description": "send it as `If-None-Match`", "schema": {"type": "string"}}
 AGE = {"description": "with `tracked`: when it was found", "schema": {"type": "string"}}
+ANY_MODEL = {"anyOf": [{"$ref": f"#/components/schemas/{name}"} for name in ("ModelJson", "JointModelOut")]}
+"""MODEL.json of one muscle, or of several."""
+MODEL_JSON = {"description": "MODEL.json", "content": {"application/json": {"schema": ANY_MODEL}}}
 APPROVED: dict[int | str, dict[str, Any]] = {
-    200: {**published("model", "MODEL.json"), "headers": {"ETag": TAG, "Last-Modified": AGE}},
+    200: {**MODEL_JSON, "headers": {"ETag": TAG, "Last-Modified": AGE}},
     304: {"description": "it is the one of `If-None-Match`"},
 }
 WITH_MODEL: dict[str, Any] = {
     "description": "the version, and its MODEL.json as `model`",
     "content": {"application/json": {"schema": {"allOf": [
         {"$ref": "#/components/schemas/VersionOut"},
-        {"type": "object", "required": ["model"], "properties": {"model": {"$ref": "#/components/schemas/ModelJson"}}},
+        {"type": "object", "required": ["model"], "properties": {"model": ANY_MODEL}},
     ]}}},
 }  # fmt: skip
 
@@ -104,7 +107,7 @@ def one_model(context: Ctx, _who: ModelReader, row: Version, response: Response)
     return {**context.versions.document(row), "model": stored_model.read(row)}
 
 
-@router.get("/models/{model_id}/file", response_class=Response, responses={200: published("model", "MODEL.json")})
+@router.get("/models/{model_id}/file", response_class=Response, responses={200: MODEL_JSON})
 def model_file(_who: ModelReader, row: Version) -> Response:
     """MODEL.json, as it was stored."""
     headers = {"Content-Disposition": f'attachment; filename="{row.id}.json"', "ETag": f'"{row.etag}"'}
