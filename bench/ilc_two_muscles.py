@@ -20,6 +20,7 @@ from bench.common import ROOT, in_processes, keep, parser, table, written_by
 from stimrig.hardware_sim.joint import Joint as Truth
 from stimrig.hardware_sim.joint_records import draw_joint, record
 from stimrig.identify import muscles
+from stimrig.identify.errors import IdentifyError
 from stimrig.identify.muscles.finish import finished
 from stimrig.identify.muscles.joint_fit import fit_all
 from stimrig.identify.muscles.problem import Acting
@@ -113,11 +114,20 @@ def one(job: tuple[int, int]) -> dict[str, Any]:
     fitted = identified(test_of(truth, seed))
     model = fitted.to_dict()
     reference_nm = reachable(model)
+    try:
+        Joint(model, reference_nm)
+    except ValueError as error:  # the fit has a muscle pull the wrong way
+        return {"seed": seed, "refused": str(error)}
     found: dict[str, Any] = {"seed": seed, "broken": 0, "errors": {}}
     for choice in CO_CONTRACTIONS:
         person = Person(truth, seed)
         limits = muscles.Limits(rise_us=RISE_US)
-        planned = muscles.invert(fitted, reference_nm, co_contraction=choice, limits=limits)
+        try:
+            planned = muscles.invert(fitted, reference_nm, co_contraction=choice, limits=limits)
+        except IdentifyError as error:  # a curve that dips by more than it rises has no side
+            print(f"seed {seed}: {error}", file=sys.stderr)
+            found["errors"][f"`invert`, {choice}"] = [np.inf]
+            continue
         error_nm = reference_nm - person.play_joint(planned.pulse_width_us)[0]
         found["errors"][f"`invert`, {choice}"] = [100 * float(np.sqrt(np.mean(error_nm**2)) / np.ptp(reference_nm))]
         found["broken"] += person.broken
@@ -137,6 +147,9 @@ def main() -> None:
     options = made.parse_args()
     rows = []
     for row in in_processes(one, [(seed, options.trials) for seed in options.seeds]):
+        if "refused" in row:
+            print(f"seed {row['seed']} refused: {row['refused']}")
+            continue
         rows.append(row)
         last = "  ".join(f"{name} {errors[0]:.1f}>{errors[-1]:.2f}" for name, errors in row["errors"].items())
         print(f"seed {row['seed']}: {last}", file=sys.stderr, flush=True)
