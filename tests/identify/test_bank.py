@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from tests.harness.adaptive import Muscle, Played, play, recorded, shaped, sigmoid
 
-LIMITS = {"left_s": 30.0, "left_nm_s": 1e3}
+LIMITS: dict[str, Any] = {"left_s": 30.0, "left_nm_s": 1e3}
 MUSCLE = shaped(51_010)
 
 
