@@ -39,7 +39,7 @@ def noise_of(seed: int, which: int) -> np.ndarray:
     return np.random.default_rng([seed, which]).standard_normal(int((LONGEST_S + 30.0) * 400)) * NOISE_NM
 
 
-def limits(muscle: Muscle) -> dict[str, float]:
+def limits(muscle: Muscle) -> dict[str, Any]:
     """Time and torque-time as in `bench.adaptive`."""
     return {"left_s": LONGEST_S / 2.0, "left_nm_s": float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0}
 
@@ -50,7 +50,7 @@ def model_of(made: Played, bank: Bank | None = None) -> Model:
     weighed = made.decision.weighed
     like = {} if bank is None else {one.name: one.model for one in bank.candidates}
     earlier = None if weighed is None else like.get(weighed.name)
-    known = {} if earlier is None else {"earlier": earlier}
+    known: dict[str, Any] = {} if earlier is None else {"earlier": earlier}
     return identify.fit(made.record, recruitment="near-sigmoid", **known)
 
 
@@ -59,7 +59,7 @@ def marks(muscle: Muscle) -> np.ndarray:
     u = np.arange(muscle.top_us + 1.0)
     share = muscle.curve(u) / muscle.curve(muscle.top_us)
     low, middle, high = (float(u[np.argmax(share >= part)]) for part in (0.1, 0.5, 0.9))
-    logs = np.log([muscle.curve(muscle.top_us), max(high - low, 1.0), muscle.time_constant_s, muscle.damping])
+    logs = np.log([float(muscle.curve(muscle.top_us)), max(high - low, 1.0), muscle.time_constant_s, muscle.damping])
     sd = [USUAL.gain_log, USUAL.middle_us, USUAL.width_log, USUAL.time_constant_log, USUAL.damping_log]
     return np.array([logs[0], middle, *logs[1:]]) / np.array(sd)
 
@@ -131,7 +131,7 @@ def one(job: tuple[str, int, list[tuple[str, int, str]], str]) -> list[dict[str,
             spent.append(round(time.process_time() - began, 3))
             return found
 
-        known = {} if bank is None else {"bank": bank}
+        known: dict[str, Any] = {} if bank is None else {"bank": bank}
         made = play(muscle, noise_of(seed, 5), TARGET, timed=timed, **limits(muscle), **known)
         rows.append({"kind": kind} | row(name, muscle, made, bank, seed, spent_s))
     for line in rows:

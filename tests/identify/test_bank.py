@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from tests.harness.adaptive import Muscle, Played, play, recorded, shaped, sigmoid
 
-LIMITS = {"left_s": 30.0, "left_nm_s": 1e3}
-MUSCLE = shaped(51_004)
+LIMITS: dict[str, Any] = {"left_s": 30.0, "left_nm_s": 1e3}
+MUSCLE = shaped(51_010)
 
 
 def noise(seed: int) -> np.ndarray:
@@ -61,8 +62,8 @@ def away(made: Played, muscle: Muscle) -> bool:
 
 @pytest.mark.slow
 def test_somebody_of_the_bank_is_recognised_and_takes_half_the_dose(models: dict[str, Model]):
-    new = play(MUSCLE, noise(4), Target(), **LIMITS)
-    made = play(MUSCLE, noise(4), Target(), **LIMITS, bank=Bank.of(models))
+    new = play(MUSCLE, noise(4), Target(3.0, 3.0), **LIMITS)
+    made = play(MUSCLE, noise(4), Target(3.0, 3.0), **LIMITS, bank=Bank.of(models))
     assert made.decision.kind == "enough" and not away(made, MUSCLE)
     assert made.decision.weighed is not None and made.decision.weighed.name == "own"
     assert "Like own" in made.decision.words
@@ -73,8 +74,8 @@ def test_somebody_of_the_bank_is_recognised_and_takes_half_the_dose(models: dict
 @pytest.mark.slow
 def test_somebody_like_none_is_told_so_and_loses_nothing(models: dict[str, Model]):
     others = Bank.of({name: model for name, model in models.items() if name != "own"})
-    new = play(MUSCLE, noise(4), Target(), **LIMITS)
-    made = play(MUSCLE, noise(4), Target(), **LIMITS, bank=others)
+    new = play(MUSCLE, noise(4), Target(3.0, 3.0), **LIMITS)
+    made = play(MUSCLE, noise(4), Target(3.0, 3.0), **LIMITS, bank=others)
     assert made.decision.weighed is not None and made.decision.weighed.is_unlike
     assert made.decision.kind == "enough" and not away(made, MUSCLE)
     assert made.dose_nm_s(MUSCLE) <= 1.3 * new.dose_nm_s(MUSCLE)
