@@ -61,12 +61,12 @@ def effect_words(effect: str) -> str:
     """An effect's title; the id of a person's own effect as words. Of several muscles it says whose it is."""
     muscle, dot, own = effect.partition(".")
     if dot:
-        return language._("%(effect)s of %(muscle)s", effect=effect_words(own), muscle=muscle)
+        return f"{effect_words(own)} ({muscle})"
     known, _colon, ends = effect.partition(":")
     giving, _to, taking = ends.partition(">")
     title = fact_of(effect, "name", interplay().get(known, {}).get("name", ""))
     if taking:
-        return language._("%(effect)s from %(one)s to %(other)s", effect=language._(title), one=giving, other=taking)
+        return f"{language._(title)} ({giving} → {taking})"
     return language._(title) if title else effect.replace("_", " ").capitalize()
 
 

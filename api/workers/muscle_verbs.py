@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.api.effect_words import effect_words
 from stimrig.api.record_files import Progress
 from stimrig.api.workers.curves import POINTS, rounded, runs, step_response
 from stimrig.identify import muscles
@@ -121,6 +122,7 @@ def diagnosis(data: str, progress: Progress, model_json: str | None = None, **_o
     first = f"{record.names[0]}."
     for row in [*found["missing"], *found["candidates"]]:
         row["effect"] = row["effect"].replace(OF_THE_JOINT, first)
+        row["name"] = effect_words(row["effect"])  # as pages say it, and translate it
     for step in improved["steps"]:
         step["added"] = step["added"] and step["added"].replace(OF_THE_JOINT, first)
     told = {

@@ -89,7 +89,7 @@ def joint_diagnosis(model_json: str | None) -> dict[str, Any]:
     """Cross-talk first, then co-contraction; fatigue of the biceps is not asked for."""
     held = [one["id"] for one in json.loads(model_json)["interplay"]] if model_json else []
     left = [name for name in (CROSS_TALK, "co_contraction") if name.partition(":")[0] not in held]
-    names = {CROSS_TALK: "Cross-talk from biceps to triceps", "co_contraction": "Co-contraction"}
+    names = {CROSS_TALK: "Cross-talk (biceps → triceps)", "co_contraction": "Co-contraction"}
     rows = [
         {"effect": name, "name": names[name], "probability": 0.97, "rms_before_nm": 0.12, "rms_after_nm": 0.05,
          "held_out_rms_before_nm": 0.2, "held_out_rms_after_nm": 0.06, "parameters": {},

@@ -160,9 +160,7 @@ def test_its_page_shows_each_muscle_in_its_colour(two: httpx.Client, model: str,
             assert f'<span class="muscle n{number}" translate="no">{name}</span>' in text
         assert "0.051" in text and "0.052" in text and "0.077" in text, "the errors alone and together"
         assert SEVERAL_MUSCLES.lacks["tracking"] in text and f"/models/{model}/widths" not in text
-        assert (
-            "Cross-talk from biceps to triceps" in text and "The electrode of one muscle also reaches the other" in text
-        )
+        assert "Cross-talk (biceps → triceps)" in text and "The electrode of one muscle also reaches the other" in text
         for name in ("recruitment", "step", "comparison", "overview"):
             still = tab.get(f"/models/{model}/figures/{name}.html")
             assert "var(--muscle-1)" in still.text and "var(--muscle-2)" in still.text, name
@@ -180,7 +178,7 @@ def test_its_page_shows_each_muscle_in_its_colour(two: httpx.Client, model: str,
         assert added.status_code == 303
         child = two.get(f"{PERSON}/models").json()[0]["id"]
         page = tab.get(f"/models/{child}").text
-        assert "cross-talk from biceps to triceps" in page
+        assert "cross-talk (biceps → triceps)" in page
 
 
 # ---- a worker that really fits ------------------------------------------------------------------------------------
