@@ -23,6 +23,7 @@ from stimrig.identify.simulation.predict import fingerprint, problem_of, refuse_
 from stimrig.identify.summary import Sheet, Summarised, quantity
 
 KIND = "joint"
+WORDS = ("name", "muscle", "side", "electrode")
 WRITTEN = ("fit", "quality", "data", "valid_for")
 
 
@@ -106,7 +107,7 @@ class JointModel(Summarised):
             raise BadModel("not the model of a joint", place="kind", fix="Give a file of several muscles.")
         try:
             channels = tuple(
-                Channel(*(str(one[name]) for name in ("name", "muscle", "side", "electrode")), float(one["offset_s"]))
+                Channel(offset_s=float(one["offset_s"]), **{name: str(one[name]) for name in WORDS})
                 for one in data["channels"]
             )
             models = tuple(Model.from_dict(one["model"]) for one in data["channels"])

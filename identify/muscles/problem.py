@@ -70,7 +70,7 @@ def drive_form(acting: Acting, setups: Sequence[Setup]) -> Form:
     return acting.interplay.form(acting.form).make(other)
 
 
-class JointProblem:
+class JointProblem(Problem):
     """What `solve` needs of a problem, for several muscles.
 
     `theta` holds the parameters of each muscle's problem, in order, then those of forms that act on the joint. Each
@@ -85,6 +85,7 @@ class JointProblem:
     """
 
     def __init__(self, parts: Sequence[Problem], joint: Sequence[tuple[Interplay, JointForm]] = ()) -> None:
+        # Nothing of one muscle's problem is made: each part has its own.
         self.parts, self.joint = tuple(parts), tuple(joint)
         self.setup = parts[0].setup
         first = np.cumsum([0, *(part.size for part in parts)]).tolist()
@@ -135,11 +136,6 @@ class JointProblem:
         mean[rest] = 0.5 * (lower + upper)
         precision[rest, rest] = np.diag((3.0 / (upper - lower)) ** 2)
         return mean, precision
-
-    @cached_property
-    def prior_log_det(self) -> float:
-        """Logarithm of the determinant of the prior's precision."""
-        return float(np.linalg.slogdet(self.prior[1])[1])
 
     def parameters(self, theta: np.ndarray) -> list[dict[str, float]]:
         """Of each form that acts on the joint, by name."""

@@ -142,7 +142,7 @@ def _interplays(last: JointFitted) -> list[Tried]:
 def _can_act(last: JointFitted, acting: Acting) -> bool:
     """Co-contraction needs muscles that pull against each other."""
     signs = last.problem.signs
-    return acting.between is not None or (np.any(signs > 0) and np.any(signs < 0))
+    return acting.between is not None or bool(np.any(signs > 0) and np.any(signs < 0))
 
 
 def _with_interplay(last: JointFitted, acting: Acting) -> Tried:

@@ -161,8 +161,7 @@ def problem_of(
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
-    if settings is None:
-        settings = model.effects[0].get("settings", {}) if model.effects else {}
+    told: Mapping[str, Any] = settings or (model.effects[0].get("settings", {}) if model.effects else {})
     own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     setup = Setup(
         grid=grid,
@@ -170,14 +169,14 @@ def problem_of(
         fitted=grid.fitted,
         basis=model.recruitment.basis,
         roughness=np.zeros((model.recruitment.basis.size,) * 2),
-        scale_nm=float(settings.get("scale_nm", 1.0)),
-        noise_sd_nm=float(settings.get("noise_sd_nm", 0.0)),
+        scale_nm=float(told.get("scale_nm", 1.0)),
+        noise_sd_nm=float(told.get("noise_sd_nm", 0.0)),
         delay_bounds_s=(-math.inf, math.inf),
-        zero_nm=float(settings.get("zero_nm", 0.0)),
-        sign=float(settings.get("sign", 1.0)),
-        reference_s=float(settings.get("reference_s", 0.0)),
-        angle_late_s=float(settings.get("angle_late_s", 0.0)),
-        **_own_angles(model, own_record, settings),
+        zero_nm=float(told.get("zero_nm", 0.0)),
+        sign=float(told.get("sign", 1.0)),
+        reference_s=float(told.get("reference_s", 0.0)),
+        angle_late_s=float(told.get("angle_late_s", 0.0)),
+        **_own_angles(model, own_record, told),
         states={} if own_record else states_of(model),
     )
     acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]

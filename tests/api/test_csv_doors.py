@@ -45,7 +45,6 @@ DOORS: dict[str, tuple[int, str]] = {
     "api/charts/svg.py": (2, "no table: numbers in attributes of a picture"),
     "api/web/guards.py": (1, "no table: numbers of entries in a header"),
     "api/models/carried_structure.py": (1, "no table: names of effects in the database"),
-    "api/cli/several.py": (2, "numbers under a header of ours and names of channels, which are checked"),
     "bench/diagnosis.py": (1, "no table: the default of an option"),
     "bench/goals.py": (1, "a made-up record for a bench: segments of ours"),
     "bench/hidden_on_the_wire.py": (2, "a made-up record for a bench: segments of ours"),
