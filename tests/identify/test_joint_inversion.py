@@ -43,7 +43,10 @@ CROSS_TALK = {
     "id": "cross_talk", "from": "biceps", "to": "triceps", "form": "independent",
     "parameters": {"share": {"value": 0.2}, "threshold": {"value": 0.3}},
 }  # fmt: skip
-STIFFER = {"id": "co_contraction", "form": "stiffness", "parameters": {"loss": {"value": 0.2}}}
+STIFFER = {
+    "id": "co_contraction", "form": "yielding",
+    "parameters": {"stiffer_up": {"value": 0.15}, "stiffer_down": {"value": 0.1}},
+}  # fmt: skip
 
 
 def moves() -> np.ndarray:
