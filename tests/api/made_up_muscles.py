@@ -18,8 +18,9 @@ HEADER = "time_s,biceps_pulse_width_us,triceps_pulse_width_us,torque_nm,segment"
 
 def write_csv(path: Path, seed: int = 3) -> Path:
     """The default test of both muscles, as a table."""
-    plans = [ChannelPlan(name=name, profile=Profile()) for name in NAMES]
-    plan = TestPlan(test_id="T1", participant="P1", kind="muscles", profile=Profile(), channels=plans)
+    profile = Profile(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0)
+    plans = [ChannelPlan(name=name, profile=profile) for name in NAMES]
+    plan = TestPlan(test_id="T1", participant="P1", kind="muscles", profile=profile, channels=plans, segments=None)
     built = build(plan, for_plan({**HARD_LIMITS, **SUM_LIMITS}, plan), [RigChannel(n, "", "", "") for n in NAMES])
     found = record(draw_joint(seed), built.pulse_width_us[::2], built.pulse_width_us[1::2], seed=seed)
     place = np.searchsorted([s.end / 80.0 for s in built.segments[:-1]], found["time_s"], side="right")

@@ -18,7 +18,7 @@ from stimrig.rig.plan import build
 from tests.api.conftest import Service, csrf, own_service, signed_in, soon, wait_done
 
 TWO = ["biceps", "triceps"]
-OWN = {"current_ma": 12.0, "max_pulse_width_us": 250.0, "max_torque_nm": 20.0}
+OWN: dict[str, Any] = {"current_ma": 12.0, "max_pulse_width_us": 250.0, "max_torque_nm": 20.0}
 PERSON = "/v1/participants/P017"
 TRICEPS = f"{PERSON}/channels/triceps"
 
@@ -71,12 +71,15 @@ def test_a_further_channel_has_limits_and_a_site_of_its_own(two: httpx.Client) -
 
 def test_the_plan_is_one_that_the_rig_takes() -> None:
     """Each channel moves alone and with the other, in fitted and in held-out pulses; nothing is beyond its limits."""
+    channels = [
+        ChannelPlan(name=name, profile=Profile(**{**OWN, "current_ma": 10.0 + k})) for k, name in enumerate(TWO)
+    ]
     plan = TestPlan(
+        segments=None,
         test_id="T1", participant="P1", kind="muscles", profile=Profile(**OWN),
-        channels=[ChannelPlan(name=name, profile=Profile(**{**OWN, "current_ma": 10.0 + k}))
-                  for k, name in enumerate(TWO)],
+        channels=channels,
     )  # fmt: skip
-    plan.profile = plan.channels[0].profile
+    plan.profile = channels[0].profile
     built = build(plan, for_plan({**HARD_LIMITS, **SUM_LIMITS}, plan), [RigChannel(name, "", "", "") for name in TWO])
     seen: set[tuple[str, bool, bool]] = set()
     for part in built.segments:
@@ -111,8 +114,9 @@ def test_a_test_of_both_muscles_is_previewed_played_and_kept(two: httpx.Client, 
     }
     done = wait_done(two, test["id"])
     assert done["recording_id"], done
-    assert [one.name for one in service.rig.last_plan.channels] == TWO
-    assert [one.profile.current_ma for one in service.rig.last_plan.channels] == [20.0, 12.0]
+    played: Any = service.rig.last_plan
+    assert [one.name for one in played.channels] == TWO
+    assert [one.profile.current_ma for one in played.channels] == [20.0, 12.0]
     assert set(done["summary"]["channels"]) == set(TWO)
     with h5py.File(Path(next(service.rig.data.glob("*.h5")))) as file:
         assert [one["name"] for one in json.loads(str(file.attrs["channels"]))] == TWO

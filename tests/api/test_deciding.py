@@ -73,7 +73,7 @@ def test_the_page_asks_for_it_at_the_rate_of_the_recording(monkeypatch: pytest.M
 
     known = {"segments": DECIDING["segments"], "pulse_rate_hz": 25.0}
     context: Any = SimpleNamespace(analyses=SimpleNamespace(known_diagnosis=lambda _: {"experiment": known}))
-    row: Any = SimpleNamespace(id="M1", participant="P1")
+    row: Any = SimpleNamespace(id="M1", method="", participant="P1")
     monkeypatch.setattr(model_view.starting, "ask", ask)
     for rate_hz in (25.0, 40.0):  # a diagnosis that was kept by an earlier version tells none
         asyncio.run(model_view.run_experiment(context, SimpleNamespace(name="B"), row))  # pyright: ignore[reportArgumentType]
@@ -223,7 +223,7 @@ SITE = ("right", "biceps brachii", None)
 )  # fmt: skip
 def test_what_cannot_be_joined_is_refused_before_it_is_played(measured_at: Any, kind: str | None) -> None:
     versions = SimpleNamespace(
-        get=lambda _: SimpleNamespace(id="M1", participant="P1"), measured_at=lambda _: measured_at
+        get=lambda _: SimpleNamespace(id="M1", method="", participant="P1"), measured_at=lambda _: measured_at
     )
     participant: Any = SimpleNamespace(code="P1", side=SITE[0], muscle=SITE[1], placement=SITE[2])
     plan: Any = SimpleNamespace(profile=SimpleNamespace(current_ma=20.0))
