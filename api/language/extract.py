@@ -23,7 +23,7 @@ from stimrig.api.language import CODES, DEFAULT, HERE, catalogue, first
 ROOT = HERE.parents[1]
 KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}
 SENTENCES = (
-    "identify/conclusion.py", "identify/healing.py",
+    "identify/conclusion.py", "identify/healing.py", "identify/electrodes/search.py",
     "identify/errors.py", "identify/criticism/*.py", "identify/diagnosis/*.py",
     "identify/estimation/quality.py", "identify/effects/*.py", "identify/experiments/*.py", "identify/records/*.py",
     "identify/fitting.py", "identify/dynamics/grid.py", "identify/estimation/plain.py",
