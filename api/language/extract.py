@@ -93,7 +93,7 @@ VOCABULARY = (
     # where in a file
     "%(name)s, line %(line)s", "%(name)s, sample %(number)s", "%(name)s, pulse %(number)s",
     "%(name)s, attribute %(attribute)s", "attribute %(name)s",
-    "recording %(number)s", "%(unit)s (or %(others)s)", "negative",
+    "element %(number)s", "recording %(number)s", "%(unit)s (or %(others)s)", "negative",
     # thresholds; states of the rig and of the stimulator
     "comfort", "motor", "sensory", "arming", "calibrating", "disconnected", "latched", "ready", "stopping", "uncertain",
     "not initialised", "low level initialised", "mid level initialised", "mid level running", "did not answer",

@@ -143,8 +143,10 @@ class Search:
     def _why(self, elements: Elements, at: int | None, better: float) -> str:
         if at is None:
             return f"{_name(elements)}: nothing of use is known yet; probability {better:.0%} that this is."
-        again = " once more" if any(elements == each for each, _ in self.seen) else ""
-        return f"{_name(elements)}{again}: probability {better:.0%} to beat {_name(self.choices[at]).lower()}."
+        name, best = _name(elements), _name(self.choices[at]).lower()
+        if any(elements == each for each, _ in self.seen):
+            return f"{name} once more: probability {better:.0%} to beat {best}."
+        return f"{name}: probability {better:.0%} to beat {best}."
 
     def enough(self) -> Stop | None:
         """Whether to stop, and why; None: go on."""
