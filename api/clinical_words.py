@@ -38,6 +38,7 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "held": lazy("held-angle test"),
         "moving": lazy("movement under stimulation"),
         "muscles": lazy("test of both muscles"),
+        "electrode": lazy("stimulus of a search"),
     },
     "title": {
         "pre-session": lazy("Pre-session test"),
@@ -48,6 +49,7 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "held": lazy("Held angle"),
         "moving": lazy("Movement under stimulation"),
         "muscles": lazy("Test of both muscles"),
+        "electrode": lazy("Stimulus of a search"),
     },
     "end": {
         "known-enough": lazy("Enough is known"),

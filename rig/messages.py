@@ -377,7 +377,9 @@ class Status(Message):
         "channels: channels, each with name, muscle, side and electrode",
     )
     switch: dict[str, Any] | None = several(
-        None, "of a rig with a switch: device, id, port, channel (its name) and elements (how many)"
+        None,
+        "of a rig with a switch: device, id, port, channel (its name), elements (how many); rows, columns and "
+        "pitch_mm where the rig file tells them",
     )
     load_cell: dict[str, Any] = Field(default_factory=dict, description="device, measured sample rate, bus")
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: there was none")

@@ -23,7 +23,7 @@ from stimrig.api.language import CODES, DEFAULT, HERE, catalogue, first
 ROOT = HERE.parents[1]
 KEYWORDS = {"_": None, "gettext": None, "ngettext": (1, 2), "lazy": None}
 SENTENCES = (
-    "identify/conclusion.py", "identify/healing.py",
+    "identify/conclusion.py", "identify/healing.py", "identify/electrodes/search.py",
     "identify/errors.py", "identify/criticism/*.py", "identify/diagnosis/*.py",
     "identify/estimation/quality.py", "identify/effects/*.py", "identify/experiments/*.py", "identify/records/*.py",
     "identify/fitting.py", "identify/dynamics/grid.py", "identify/estimation/plain.py",
@@ -94,7 +94,7 @@ VOCABULARY = (
     # where in a file
     "%(name)s, line %(line)s", "%(name)s, sample %(number)s", "%(name)s, pulse %(number)s",
     "%(name)s, attribute %(attribute)s", "attribute %(name)s",
-    "recording %(number)s", "%(unit)s (or %(others)s)", "negative",
+    "element %(number)s", "recording %(number)s", "%(unit)s (or %(others)s)", "negative",
     # thresholds; states of the rig and of the stimulator
     "comfort", "motor", "sensory", "arming", "calibrating", "disconnected", "latched", "ready", "stopping", "uncertain",
     "not initialised", "low level initialised", "mid level initialised", "mid level running", "did not answer",

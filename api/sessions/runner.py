@@ -21,6 +21,7 @@ from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
+from stimrig.api.sessions.electrodes import ElectrodeTests
 from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Follower, Lifecycle
@@ -69,7 +70,9 @@ class Runner(Playing):
         self.hub = Hub(clock)
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
-        self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint, MusclesTests(rig, store))
+        self.kinds = Kinds(
+            Kind(rig), trials, self.adaptive, self.joint, MusclesTests(rig, store), ElectrodeTests(rig, store)
+        )
         self.lifecycle = Lifecycle(
             store, clock, rig, pool, versions, analyses, self.kinds, recordings_dir, follower, self.announce
         )

@@ -350,6 +350,13 @@ def _0015(op: Operations) -> None:
     _add(op, "participants", "channels json?")
 
 
+def _0016(op: Operations) -> None:
+    """Searches for the electrode of an array; there are none yet."""
+    _table(op, "searches", """id string key, participant string index > participants.code, channel string,
+        state string, asked json, document json, standing json, told json, chosen json?, created_by string,
+        created_utc string, closed_by string?, closed_utc string?""")  # fmt: skip
+
+
 STEPS: dict[str, Callable[[Operations], None]] = {
     name[1:]: step for name, step in globals().items() if re.fullmatch("_[0-9]{4}", name)
 }

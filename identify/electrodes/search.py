@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -119,12 +119,23 @@ class Search:
         at = self._best_index()
         return None if at is None else self.choices[at]
 
-    def next(self) -> Proposal:
-        """The choice from which most is to be gained: the largest expected improvement (Jones et al. 1998)."""
+    def sure(self) -> float | None:
+        """Probability that the best known choice is within 10 % of the best; None while none is of use."""
+        utility, at = self._draws["utility"], self._best_index()
+        return None if at is None else float(np.mean(utility[:, at] >= NEAR * utility.max(axis=1)))
+
+    def next(self, left_out: Collection[Elements] = ()) -> Proposal:
+        """The choice from which most is to be gained: the largest expected improvement (Jones et al. 1998).
+
+        `left_out`: choices that are not to be proposed.
+        """
         utility, at = self._draws["utility"], self._best_index()
         known = np.zeros((len(utility), 1)) if at is None else utility[:, [at]]
-        gain = np.maximum(utility - known, 0.0).mean(axis=0)
-        picked = int(np.argmax(gain)) if np.any(gain > 0.0) else int(np.argmax(utility.mean(axis=0)))
+        gain, mean = np.maximum(utility - known, 0.0).mean(axis=0), utility.mean(axis=0)
+        out = [place for place, elements in enumerate(self.choices) if elements in left_out]
+        if len(out) < len(self.choices):
+            gain[out], mean[out] = -1.0, -1.0
+        picked = int(np.argmax(gain)) if np.any(gain > 0.0) else int(np.argmax(mean))
         elements, mean, sd = self.choices[picked], float(utility[:, picked].mean()), float(utility[:, picked].std())
         better = float(np.mean(utility[:, picked] > known[:, 0]))
         return Proposal(elements, self._why(elements, at, better), mean, sd)
@@ -132,8 +143,10 @@ class Search:
     def _why(self, elements: Elements, at: int | None, better: float) -> str:
         if at is None:
             return f"{_name(elements)}: nothing of use is known yet; probability {better:.0%} that this is."
-        again = " once more" if any(elements == each for each, _ in self.seen) else ""
-        return f"{_name(elements)}{again}: probability {better:.0%} to beat {_name(self.choices[at]).lower()}."
+        name, best = _name(elements), _name(self.choices[at]).lower()
+        if any(elements == each for each, _ in self.seen):
+            return f"{name} once more: probability {better:.0%} to beat {best}."
+        return f"{name}: probability {better:.0%} to beat {best}."
 
     def enough(self) -> Stop | None:
         """Whether to stop, and why; None: go on."""

@@ -25,6 +25,9 @@ class Settings(DeviceSettings):
     port: str = Field(description="serial port, e.g. /dev/serial/by-id/usb-matrix-if00")
     channel: str = Field(description="name of the stimulator's channel that it feeds to the elements")
     elements: int = Field(ge=1, le=128, strict=True, description="how many elements, numbered from 1")
+    rows: int | None = Field(None, ge=1, le=128, strict=True, description="of elements, which are numbered along them")
+    columns: int | None = Field(None, ge=1, le=128, strict=True, description="elements of a row")
+    pitch_mm: float | None = Field(None, gt=0, le=100, description="from the middle of one element to the next, mm")
     baudrate: int = Field(9600, ge=300, le=921_600, strict=True)
     reply_timeout_s: float = Field(0.5, gt=0, le=5, description="for each command, real seconds")
 
@@ -49,7 +52,8 @@ class ScpiMatrix:
             self.close()
             raise
         said = {"device": settings.device, "id": serial.strip(), "firmware": firmware.strip(), "port": settings.port}
-        return {**said, "model": f"{maker} {model}".strip(), "channel": settings.channel, "elements": settings.elements}
+        laid = settings.model_dump(include={"channel", "elements", "rows", "columns", "pitch_mm"}, exclude_none=True)
+        return {**said, "model": f"{maker} {model}".strip(), **laid}
 
     async def connect(self, elements: Sequence[int]) -> None:
         await self.open_all()  # break before make

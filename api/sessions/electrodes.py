@@ -1,0 +1,176 @@
+"""Which electrode of an array: a search of short tests, one stimulus each. What comes next is found by a worker."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from stimrig.api.errors import ApiError
+from stimrig.api.language import lazy
+from stimrig.api.sessions import channels
+from stimrig.api.sessions.channels import ChannelName
+from stimrig.api.sessions.kinds import Kind, Planned
+from stimrig.api.sessions.requests import CurrentMa, TestIn, WidthUs
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.store import Store
+from stimrig.api.store.tables import OPEN_STATES, Participant, Search, Test
+from stimrig.rig.messages import ChannelPlan, Profile, SegmentPlan, Status, TestPlan
+
+ELECTRODE = "electrode"
+"""Kind of a test of one stimulus."""
+REST_S, RAMP_S, HOLD_S = 0.3, 0.6, 0.4
+"""Of a stimulus: without pulses, rising to its width, held there."""
+FARTHEST_PITCHES = 2.3
+"""Pairs that lie farther apart are no choice: the current of each flows for itself."""
+EARLIER = 2
+"""So many former searches of a person count."""
+WISHES = {
+    "balanced": lazy("Torque, selectivity and comfort, each at a price."),
+    "strong": lazy("The largest torque that is bearable; a strong spill-over is never acceptable."),
+    "selective": lazy("The wanted muscle alone; a slight spill-over costs more than half."),
+    "comfortable": lazy("Torque that can be borne for long: what feels bad counts little."),
+}
+"""As `stimrig.identify.electrodes.PRESETS`, which the service does not load."""
+
+
+@dataclass(frozen=True)
+class Array:
+    """The elements behind the rig's switch; `key`: of their channel, as `channels.held` takes it."""
+
+    channel: str
+    key: str
+    elements: int
+    laid: dict[str, Any]  # rows, columns and pitch_mm, as far as the rig file tells them
+
+
+def array_of(status: Status | None) -> Array | None:
+    """The rig's array; None where it has no switch."""
+    switch = status.switch if status is not None else None
+    if status is None or not switch:
+        return None
+    first = next((one["name"] for one in status.stimulator.get("channels") or []), switch["channel"])
+    laid = {name: switch[name] for name in ("rows", "columns", "pitch_mm") if switch.get(name)}
+    key = "" if switch["channel"] == first else switch["channel"]
+    return Array(switch["channel"], key, switch["elements"], laid)
+
+
+def needed(status: Status | None) -> Array:
+    """The same. Raises ApiError: 409 the rig has no switch."""
+    found = array_of(status)
+    if found is None:
+        detail = "No channel of this rig has a switch to an array. The rig file names one under [switch]."
+        raise ApiError(409, "no-switch", "This rig has no electrode array", detail)
+    return found
+
+
+def words(elements: Sequence[int]) -> str:
+    """A choice as it is written into the placement, and read there."""
+    return f"element {elements[0]}" if len(elements) == 1 else f"elements {elements[0]} and {elements[1]}"
+
+
+def chosen_at(placement: str | None) -> list[int]:
+    """The elements that a placement names; empty where it names none."""
+    found = re.fullmatch(r"elements? (\d{1,3})(?: and (\d{1,3}))?", placement or "")
+    return [int(number) for number in found.groups() if number] if found else []
+
+
+def positions_mm(rows: int, columns: int, pitch_mm: float) -> list[list[float]]:
+    """Where the elements lie: numbered along the rows."""
+    return [[column * pitch_mm, row * pitch_mm] for row in range(rows) for column in range(columns)]
+
+
+def shortened(document: dict[str, Any], earlier: int) -> dict[str, Any]:
+    """A search with so many former ones."""
+    prior = document["prior"]
+    return {**document, "prior": shortened(prior, earlier - 1) if prior and earlier else None}
+
+
+def refuse_wider(own: dict[str, Any], width_us: float, current_ma: float) -> None:
+    """Raise ApiError (422) where the participant's limits of that channel are tighter, or nobody has set them."""
+    asked = {"max_pulse_width_us": width_us, "current_ma": current_ma}
+    if lacking := [name for name in (*asked, "max_torque_nm") if own.get(name) is None]:
+        detail = f"There is no {', '.join(lacking)} on the array's channel. Calibrate it, or set the limits."
+        raise ApiError(422, "no-limits", "The participant has no limits", detail)
+    if wider := [f"{name} {value:g} is above {own[name]:g}" for name, value in asked.items() if value > own[name]]:
+        detail = f"{', '.join(wider)}, the participant's limit. Begin a search within it."
+        raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
+
+
+class StimulusIn(TestIn):
+    """One stimulus of a search; no request has it."""
+
+    search_id: str
+    elements: list[int]
+    channel: ChannelName
+    width_us: WidthUs
+    asked_ma: CurrentMa
+
+
+class ElectrodeTests(Kind):
+    """Plans them: a rest, a rise of the pulse width, a short hold. They give no model."""
+
+    names, fitted = (ELECTRODE,), False
+
+    def __init__(self, rig: RigClient, store: Store) -> None:
+        super().__init__(rig)
+        self.store = store
+
+    async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:  # noqa: ARG002
+        """As `Kind`. Raises ApiError: 409 no such switch; 422 it is of no search, or beyond the limits."""
+        if not isinstance(body, StimulusIn):
+            detail = "It belongs to a search: POST /v1/participants/{code}/searches begins one."
+            raise ApiError(422, "of-a-search", "Such a test is not started by itself", detail)
+        row: Participant = await asyncio.to_thread(self.store.get, Participant, plan.participant)
+        array = needed(self.rig.status)
+        own = channels.held(row, array.key)["profile"]
+        if array.channel != body.channel:
+            detail = f"The search is of {body.channel}, the switch is at {array.channel}. Begin another one."
+            raise ApiError(409, "no-switch", "The array is at another channel", detail)
+        refuse_wider(own, body.width_us, body.asked_ma)
+        profile = Profile(**own).model_copy(update={"current_ma": body.asked_ma})
+        channel = ChannelPlan(
+            name=array.channel, profile=profile, max_pulse_width_us=body.width_us, elements=body.elements
+        )
+        rise, hold = (round(length_s * plan.pulse_rate_hz) for length_s in (RAMP_S, HOLD_S))
+        widths = [body.width_us * min(1.0, (k + 1) / rise) for k in range(rise + hold)]
+        segments = [
+            SegmentPlan(name="rest", sequence="rest", settings={"duration_s": REST_S}),
+            SegmentPlan(name="stimulus", sequence="widths", settings={"pulse_width_us": widths}),
+        ]
+        played = plan.model_copy(update={"profile": profile, "channels": [channel], "segments": segments})
+        return Planned(played, {"search": body.search_id, "elements": body.elements})
+
+
+def tests_of(store: Store, row: Search) -> list[Test]:
+    """The stimuli of a search, in order."""
+    own = Test.participant == row.participant, Test.kind == ELECTRODE, Test.requested_utc >= row.created_utc
+    rows = store.all(Test, *own, order=Test.requested_utc)
+    return [test for test in rows if test.plan.get("search") == row.id]
+
+
+def document(store: Store, row: Search) -> dict[str, Any]:
+    """A search as clients see it."""
+    told = {each["test_id"]: each for each in row.told}
+    blank = dict.fromkeys(("spill", "comfort", "torque_nm", "by", "at_utc"))
+    stimuli = [
+        {"test_id": test.id, "elements": test.plan["elements"], "state": test.state, **blank, **told.get(test.id, {})}
+        for test in tests_of(store, row)
+    ]
+    waits = next((one for one in stimuli[-1:] if one["comfort"] is None), None)
+    plays = waits is not None and waits["state"] in OPEN_STATES
+    ended = waits is not None and waits["state"] == "completed"
+    return {
+        "id": row.id, "participant": row.participant, "channel": row.channel, "state": row.state, **row.asked,
+        "stimuli": stimuli, "playing": plays, "waiting": waits["test_id"] if waits and ended else None,
+        "chosen": row.chosen, "prior": row.document["prior"] is not None, **row.standing,
+        "left_out": left_out(stimuli),
+        **{name: getattr(row, name) for name in ("created_by", "created_utc", "closed_by", "closed_utc")},
+    }  # fmt: skip
+
+
+def left_out(stimuli: Sequence[dict[str, Any]]) -> list[list[int]]:
+    """Choices whose stimulus was stopped: they are not proposed again."""
+    return [list(each) for each in sorted({tuple(one["elements"]) for one in stimuli if one["state"] == "stopped"})]
