@@ -180,7 +180,7 @@ def test_model_page_says_what_carries_over(
 def test_a_damaged_approved_model_leaves_the_plain_one(document: bytes) -> None:
     """A damaged row of the database must not cost a test its model."""
     plain = SimpleNamespace(id="M2", participant="P1", recording_id="R2", effects=[])
-    earlier = SimpleNamespace(id="M1", recording_id="R1", document=document, etag="")
+    earlier = SimpleNamespace(id="M1", recording_id="R1", document=document, etag="", method="maximum-likelihood")
     kept: list[dict[str, Any]] = []
     versions: Any = SimpleNamespace(
         last_approved=lambda _: earlier,

@@ -411,8 +411,8 @@ PAGES = (
     "/", "/participants/X2", "/participants/X1", "/models/{model}", "/models/{other}", "/tests/{test}",
     "/participants/X1/calibration", "/participants/X1/trend", "/compare?model={model}&model={other}",
     "/models/{model}/report", "/administration", "/sign-in", "/models/none", "/participants/X3",
-    "/participants/X1/electrodes", "/models/{poor}/approve", "/models/{model}/widths", "/participants/X1/joint", "/rig/angle", "/jobs/none",
-    "/participants/none", "/compare", "/models/{model}/story",
+    "/participants/X1/electrodes", "/models/{poor}/approve", "/models/{model}/widths", "/participants/X1/joint",
+    "/rig/angle", "/jobs/none", "/participants/none", "/compare", "/models/{model}/story",
 )  # fmt: skip
 
 
