@@ -24,9 +24,9 @@ def array_map(found: dict[str, Any], label: str) -> Markup:
         return EDGE + STEP * column, EDGE + STEP * row
 
     pairs = [one for one in found["map"] if len(one["elements"]) == 2 and one["stimulated"]]
-    parts = [_bar(*map(at, one["elements"]), one, best) for one in pairs]
+    parts = [_bar(at(one["elements"][0]), at(one["elements"][1]), one, best) for one in pairs]
     if len(proposed) == 2:
-        parts.append(_line(*map(at, proposed), role("stimulate"), 3, 'stroke-dasharray="5 4"'))
+        parts.append(_line(at(proposed[0]), at(proposed[1]), role("stimulate"), 3, 'stroke-dasharray="5 4"'))
     single = [(one["elements"][0], one) for one in found["map"] if len(one["elements"]) == 1]
     parts += [_spot(*at(element), one, best, ringed=element in proposed) for element, one in single]
     width, height = (2 * EDGE + STEP * (count - 1) for count in (columns, found["rows"]))

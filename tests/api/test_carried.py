@@ -176,11 +176,14 @@ def test_model_page_says_what_carries_over(
     assert 'id="carried"' not in pages.get(f"/models/{approved['id']}").text
 
 
+METHOD = "maximum-likelihood"
+
+
 @pytest.mark.parametrize("document", [b"\xff\xfe", b'{"sample_rate_hz": 41.0}'], ids=["no text", "another digit"])
 def test_a_damaged_approved_model_leaves_the_plain_one(document: bytes) -> None:
     """A damaged row of the database must not cost a test its model."""
-    plain = SimpleNamespace(id="M2", participant="P1", recording_id="R2", effects=[])
-    earlier = SimpleNamespace(id="M1", recording_id="R1", document=document, etag="", method="maximum-likelihood")
+    plain = SimpleNamespace(id="M2", participant="P1", recording_id="R2", effects=[], method=METHOD)
+    earlier = SimpleNamespace(id="M1", recording_id="R1", document=document, etag="", method=METHOD)
     kept: list[dict[str, Any]] = []
     versions: Any = SimpleNamespace(
         last_approved=lambda _: earlier,

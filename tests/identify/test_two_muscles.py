@@ -50,7 +50,7 @@ def test_both_muscles_are_found_from_one_torque() -> None:
 
 def test_the_derivatives_are_those_of_the_torque() -> None:
     names = _made(0.15, 0.2)[0].names
-    acting = [Acting.of(CROSS, names), Acting.of("co_contraction:compliance", names)]
+    acting = [Acting.of(CROSS, names), Acting.of("co_contraction:yielding", names)]
     found = _fitted(0.15, 0.2).with_(acting=acting)
     problem, theta = found.problem, found.fitted.theta
     slopes = problem.run(theta, derivatives=True)[1]

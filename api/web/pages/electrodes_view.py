@@ -52,7 +52,7 @@ async def show_page(
         request, "electrodes.html", status, participant=person, array=array, found=found, problem=problem, row=row,
         texts=texts or kept, errors=errors or {}, wishes=electrodes.WISHES, named=named, rows=ranked(found),
         picture=array_map(found, _("Map of the array")) if found else "",
-        voids=bool(array and found and found["best"])
+        voids=array is not None and found is not None and bool(found["best"])
         and searches.loses_calibration(person, array.key, electrodes.words(found["best"])),
     )  # fmt: skip
 
