@@ -1,7 +1,8 @@
-"""The pictures of the page: `python -m bench.pictures [model] [joint]` writes them to docs/img, all or those asked for.
+"""The pictures of the page: `python -m bench.pictures [model] [joint] [muscles]` writes them to docs/img.
 
-`model`: page.png and why.png, of a recording of a muscle with a hidden hysteresis. `joint`: joint.png, of an emulated
-arm's isometric test and its guided tests, joined. A service on the emulated rig, a clinician, and Debian's chromium.
+Without a name all of them. `model`: page.png and why.png, of a recording of a muscle with a hidden hysteresis. `joint`:
+joint.png, of an emulated arm's isometric test and its guided tests, joined. `muscles`: two-muscles.png, of one test of
+two. A service on the emulated rig, a clinician, and Debian's chromium.
 """
 
 from __future__ import annotations
@@ -12,20 +13,26 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 from bench.common import ROOT, http_client, parser, services, sign_in
 from bench.moving_joint import as_record, guided_tests, joined
+from bench.two_muscles import NAMES, PULSES_HZ, RATE_HZ, widths
 from stimrig.hardware_sim import hidden_records
 from stimrig.hardware_sim.arm_patient import arm_patient
 from stimrig.hardware_sim.arm_records import record
+from stimrig.hardware_sim.joint_records import draw_joint
+from stimrig.hardware_sim.joint_records import record as made_of_two
 from stimrig.identify.fitting import fit
 from stimrig.identify.records.join import write_joined
+from stimrig.rig import protocols
 from tests.api.browser import CHROMIUM, PASSWORD, chart
 
 IMAGES = ROOT / "docs" / "img"
 WIDTH, HEIGHT, MARGIN, COLOURS = 1366, 768, 14, 128
+TWO = 16
 ARM = 3
 """Whose joint is shown: one of those that were developed on."""
 
@@ -52,6 +59,27 @@ def prepared_joint(url: str, folder: Path) -> str:
         return str(
             http.post("/v1/participants/P018/models", json={"recordings": [recording]}).raise_for_status().json()["id"]
         )
+
+
+def prepared_muscles(url: str, folder: Path) -> str:
+    """A participant with the test of two muscles; the id of its model with all that the record asks for."""
+    made = draw_joint(TWO)
+    top = [float(muscle.base.largest_width_us) for muscle in made.muscles]
+    widths_us, names = widths(protocols.several(NAMES), top)
+    path = folder / "two.csv"
+    path.write_text(as_table(made_of_two(made, *widths_us, seed=1), names))
+    with http_client(url) as http:
+        model = str(taken(http, "P019", path)["model"]["id"])
+        http.get(f"/v1/models/{model}/diagnosis").raise_for_status()
+    return model
+
+
+def as_table(made: dict[str, Any], names: list[str]) -> str:
+    """A record of two muscles as the table that is read."""
+    segment = np.repeat(names, round(RATE_HZ / PULSES_HZ))
+    columns = zip(made["time_s"], made["first_us"], made["second_us"], made["torque_nm"], segment, strict=True)
+    head = ",".join(["time_s", *(f"{name}_pulse_width_us" for name in NAMES), "torque_nm,segment"])
+    return "\n".join([head, *(f"{t:.5f},{a:g},{b:g},{nm:.5f},{name}" for t, a, b, nm, name in columns)]) + "\n"
 
 
 def taken(http: Any, code: str, path: Path) -> dict[str, Any]:
@@ -103,13 +131,24 @@ def photograph_joint(page: Page, url: str, model: str) -> None:
     keep("joint", cut(page, "#joint", "#joint"))
 
 
-PICTURES = {"model": (prepared, photograph), "joint": (prepared_joint, photograph_joint)}
+def photograph_muscles(page: Page, url: str, model: str) -> None:
+    """Each muscle's share under the measured torque, and what the muscles do to each other."""
+    page.goto(f"{url}/models/{model}")
+    page.wait_for_timeout(4000)
+    keep("two-muscles", page.screenshot())
+
+
+PICTURES = {
+    "model": (prepared, photograph),
+    "joint": (prepared_joint, photograph_joint),
+    "muscles": (prepared_muscles, photograph_muscles),
+}
 
 
 def main() -> None:
     """Those that are asked for."""
     made = parser(__doc__)
-    made.add_argument("names", nargs="*", metavar="model|joint", help="default: both")
+    made.add_argument("names", nargs="*", metavar="model|joint|muscles", help="default: all")
     names = made.parse_args().names or list(PICTURES)
     if unknown := set(names) - set(PICTURES):
         made.error(f"no picture {sorted(unknown)[0]}; take one of {', '.join(PICTURES)}")

@@ -87,6 +87,7 @@ def statistics_of(found: JointFitted) -> dict[str, Any]:
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
     told = fit_statistics(grid, found.problem.setup.fitted, predicted, noise)
     told |= {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
+    del told["repetition"]  # it goes by the pulses of one channel
     return told | held_out_errors(found.record, predicted, grid.counted)
 
 

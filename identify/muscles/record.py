@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -187,7 +187,7 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> JointRecord:
     if len(names) < 2:
         fix = "It needs two columns such as biceps_pulse_width_us and triceps_pulse_width_us."
         raise BadRecord("the file holds the pulses of one channel", place=path.name, fix=fix)
-    records = [read_one(path, pulse_rate_hz, {"pulse_width_us": f"{name}_pulse_width_us"}) for name in names]
+    records = [_of_table(read_one, path, pulse_rate_hz, name) for name in names]
     offsets_s = _offsets(records)
     shifted = [
         replace(record, pulse_width_us=_earlier(record.time_s, record.pulse_width_us, offset_s))
@@ -195,6 +195,13 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> JointRecord:
     ]
     channels = [Channel(name, offset_s=offset_s) for name, offset_s in zip(names, offsets_s, strict=True)]
     return JointRecord(tuple(channels), tuple(shifted))
+
+
+def _of_table(read_one: Callable[..., Record], path: Path, pulse_rate_hz: float | None, name: str) -> Record:
+    """One channel of a table; that its column is the width is no assumption."""
+    record = read_one(path, pulse_rate_hz, {"pulse_width_us": f"{name}_pulse_width_us"})
+    notes = tuple(note for note in record.source.notes if not note.startswith("pulse_width_us is "))
+    return replace(record, source=replace(record.source, notes=notes))
 
 
 def _offsets(records: Iterable[Record]) -> list[float]:

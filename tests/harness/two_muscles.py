@@ -30,7 +30,7 @@ def make(
     up, down = (_respond(one, rng.uniform(0.1, 0.35)) for one in drives)
     loss = 1.0 + stiffer * (up + 0.6 * down)
     own = largest[0] * up, -largest[1] * down
-    torque = (own[0] * (1.0 + stiffer * up) + own[1] * (1.0 + 0.6 * stiffer * down)) / loss + zero_nm
+    torque = (own[0] + own[1]) / loss + zero_nm
     step = FINE_HZ // RATE_HZ
     time_s = np.arange(torque[::step].size) / RATE_HZ
     true_nm = torque[::step]

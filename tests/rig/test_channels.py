@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from stimrig.rig import archive, assembly, channels, journal, limits, plan
 from stimrig.rig.acquire.run import RunResult
 from stimrig.rig.channels import RigChannel
-from stimrig.rig.errors import RigError
+from stimrig.rig.errors import PlanError, RigError
 from stimrig.rig.journal import Intent, Kind
 from stimrig.rig.limits import HARD_LIMITS, LONGEST_PULSE_S, SUM_LIMITS, Limit
 from stimrig.rig.messages import AdaptivePlan, ChannelPlan, ChannelSequence, Profile, SegmentPlan, TestPlan
@@ -111,11 +111,22 @@ class TestPlans:
         assert [(s.start, s.end) for s in test.segments] == [(0, 8), (8, 88), (88, 92), (92, 172)]
         assert test.charge_uc == pytest.approx(42 * 6.0 + 42 * 6.0)
 
-    def test_the_default_test_is_the_first_channels(self) -> None:
+    def test_the_default_test_plays_each_channel_alone_and_all_together(self) -> None:
         request = TestPlan(test_id="t", participant="P", profile=BICEPS, channels=both())
         test = plan.build(request, limits.for_plan(BASE, request), RIG)
-        assert test.pulse_width_us[::2].max() == 300.0
-        assert not test.pulse_width_us[1::2].any()
+        biceps, triceps = test.pulse_width_us.reshape(-1, 2).T > 0
+        assert test.duration_s < 1.5 * 38.75
+        for rows in (biceps & ~triceps, triceps & ~biceps, biceps & triceps):
+            assert rows.sum() > 3 * 40
+        assert abs(np.corrcoef(*test.pulse_width_us.reshape(-1, 2).T)[0, 1]) < 0.2
+        paper = request.model_copy(update={"protocol": "paper", "channels": None})
+        alone = plan.build(paper, limits.for_plan(BASE, paper), RIG)
+        own_us = test.pulse_width_us.reshape(-1, 2).sum(axis=0)
+        most_us = 1.3 * alone.pulse_width_us.sum() * np.array([1.0, both()[1].profile.max_pulse_width_us / 300.0])
+        assert np.all(own_us <= most_us)
+        short = request.model_copy(update={"protocol": "short"})
+        with pytest.raises(PlanError, match="is for one channel"):
+            plan.build(short, limits.for_plan(BASE, short), RIG)
 
     @pytest.mark.parametrize(
         ("chosen", "words"),
