@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from stimrig.api.sessions import electrodes
+from stimrig.api.store.tables import Participant
 from stimrig.identify.electrodes import PRESETS
 from tests.api.conftest import REAL, Service, csrf, own_service, shared_service, signed_in, soon, wait_done
 
@@ -96,6 +97,7 @@ def test_a_stimulus_is_played_told_and_moves_the_map(shared: Service, client: ht
     assert search["proposal"]["elements"] in [one["elements"] for one in search["map"]]
     search = play(client, search, [3])
     plan = shared.rig.last_plan
+    assert plan is not None and plan.channels is not None and plan.segments is not None
     (channel,) = plan.channels
     assert (channel.name, channel.elements, channel.profile.current_ma) == ("biceps", [3], 16.0)
     assert channel.max_pulse_width_us == 240.0 and plan.kind == "electrode"
@@ -178,11 +180,9 @@ def test_a_calibration_at_another_electrode_ends_only_when_that_is_said(shared: 
     search = begin(client)
     site = {"side": "left", "muscle": "biceps brachii", "placement": "element 1"}
     assert client.put(f"/v1/participants/{code}/muscle", json=site).status_code == 200
-    row = shared.context.store
-    with row.write() as session:
-        from stimrig.api.store.tables import Participant
-
+    with shared.context.store.write() as session:
         person = session.get(Participant, code)
+        assert person is not None
         person.profile = {**person.profile, "sensory_pulse_width_us": 60.0, "motor_pulse_width_us": 90.0}
     at = f"/v1/searches/{search['id']}/choice"
     assert client.post(at, json={"elements": [1]}).status_code == 200

@@ -18,6 +18,7 @@ from stimrig.rig import plan
 from stimrig.rig.limits import HARD_LIMITS
 from tests.api.browser import open_tab
 from tests.api.conftest import Service, run_test, shared_service
+from tests.api.test_electrodes import LAID, fitted
 
 OPEN = {"/health", "/metrics", "/v1/sessions", "/v1/schemas", "/v1/schemas/{name}"}
 FREE_FORM = {"JsonValue", "SchemaOut"}
@@ -105,12 +106,17 @@ def test_the_answer_to_a_guess_is_as_the_document_says_and_the_cookie_has_its_na
         assert held.status_code == 429 and int(held.headers["Retry-After"]) >= 1
 
 
-def test_real_answers_hold_to_the_document(client: httpx.Client, document: dict[str, Any]) -> None:
+def test_real_answers_hold_to_the_document(
+    client: httpx.Client, document: dict[str, Any], service: Service
+) -> None:  # fmt: skip
     client.post("/v1/participants", json={"code": "P017"}).raise_for_status()
     test = run_test(client, "P017")
     ids = {"code": "P017", "test_id": test["id"], "model_id": test["model_id"], "name": "model"}
     client.post(f"/v1/models/{test['model_id']}/approve", json={"reason": "good"}).raise_for_status()
     client.post("/v1/users", json={"name": "Ada", "password": "long enough"}).raise_for_status()
+    fitted(service, client)
+    begun = client.post("/v1/participants/P017/searches", json=LAID)
+    ids["search_id"] = begun.raise_for_status().json()["id"]
     tried = 0
     for path, method, operation in operations(document):
         kinds = operation["responses"].get("200", {}).get("content", {})
@@ -125,6 +131,8 @@ def test_real_answers_hold_to_the_document(client: httpx.Client, document: dict[
         errors = [error.message for error in jsonschema_rs.Draft202012Validator(schema).iter_errors(answer.json())]
         assert errors == [], path
         tried += 1
+    service.rig.switch, service.rig.channels = None, []
+    service.rig.become("ready")
     assert tried > 12
 
 
