@@ -14,7 +14,7 @@ from pydantic import StringConstraints
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.models.places import Site
 from stimrig.api.store.tables import Participant
-from stimrig.rig.messages import CHANNEL_NAME, Status
+from stimrig.rig.messages import CHANNEL_NAME, ChannelPlan, Profile, Status, TestPlan
 
 ChannelName = Annotated[str, StringConstraints(pattern=CHANNEL_NAME)]
 NOTHING: dict[str, Any] = {"side": None, "muscle": None, "placement": None, "profile": {}}
@@ -87,3 +87,15 @@ def needed(row: Participant, status: Status | None) -> list[Channel]:
         )
         raise ApiError(422, "no-limits", "The participant has no limits", detail)
     return found
+
+
+def for_all(plan: TestPlan, row: Participant, status: Status | None) -> tuple[TestPlan, dict[str, Any]]:
+    """A plan that plays on all of the rig's channels, with the participant's profile on each; and what is kept of it.
+
+    Raises ApiError: as `needed`.
+    """
+    playing = needed(row, status)
+    plans = [ChannelPlan(name=one.name, profile=Profile(**one.profile)) for one in playing]
+    plans[0].profile = plan.profile
+    sites = {one.name: list(one.site) for one in playing if one.key}
+    return plan.model_copy(update={"channels": plans}), {"sites": sites}

@@ -10,7 +10,7 @@ from stimrig.api.sessions.requests import MUSCLES, TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Participant
-from stimrig.rig.messages import ChannelPlan, Profile, TestPlan
+from stimrig.rig.messages import TestPlan
 
 
 class MusclesTests(Kind):
@@ -25,8 +25,4 @@ class MusclesTests(Kind):
     async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:  # noqa: ARG002
         """As `Kind`. Raises ApiError: 409 the rig has one channel; 422 the participant has no limits on one."""
         row: Participant = await asyncio.to_thread(self.store.get, Participant, plan.participant)
-        playing = channels.needed(row, self.rig.status)
-        plans = [ChannelPlan(name=one.name, profile=Profile(**one.profile)) for one in playing]
-        plans[0].profile = plan.profile
-        sites = {one.name: list(one.site) for one in playing if one.key}
-        return Planned(plan.model_copy(update={"channels": plans}), {"sites": sites})
+        return Planned(*channels.for_all(plan, row, self.rig.status))

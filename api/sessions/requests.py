@@ -126,6 +126,15 @@ SETTINGS = {
 }
 
 
+class ChannelSequenceIn(Body):
+    """What one channel plays in a segment."""
+
+    sequence: Annotated[
+        str, StringConstraints(min_length=1, max_length=40), Field(description="an id of `GET /v1/sequences`")
+    ]
+    settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
+
+
 class SegmentIn(Body):
     """One segment of a test: a sequence of the library by name, with its settings."""
 
@@ -136,6 +145,11 @@ class SegmentIn(Body):
         Field(description="an id of `GET /v1/sequences`", examples=["prbs"]),
     ]
     settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
+    channels: Annotated[dict[ChannelName, ChannelSequenceIn], Field(min_length=1, max_length=8)] | None = Field(
+        default=None,
+        description="on a rig of several channels, what each plays, by its name; one that is not named rests, but the "
+        "first, which plays the segment's own sequence. All are padded with rest to the longest",
+    )
 
 
 LEAST_PERCENT, MOST_PERCENT = 0.2, 50.0

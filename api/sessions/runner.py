@@ -8,6 +8,7 @@ import math
 import secrets
 from collections.abc import Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
+from stimrig.api.sessions import channels
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.electrodes import ElectrodeTests
 from stimrig.api.sessions.joint import JointTests
@@ -209,7 +211,11 @@ class Runner(Playing):
         )
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body.joins, participant, plan)
-        return await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
+        planned = await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
+        if planned.plan.channels is None and any(one.channels for one in body.segments or ()):
+            several, sites = channels.for_all(planned.plan, participant, self.rig.status)
+            planned = replace(planned, plan=several, kept=planned.kept | sites)
+        return planned
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:
         """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""
@@ -249,7 +255,7 @@ class Runner(Playing):
             **dict(zip(("side", "muscle", "placement"), site_of(participant), strict=True)),
             "tokens": current.tokens,
             **planned.kept,
-            **self.kinds[body.kind].kept(body, len(preview["pulse_width_us"])),
+            **self.kinds[body.kind].kept(body, _pulses(preview)),
         }
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
@@ -475,6 +481,12 @@ class Runner(Playing):
             await kind.close()
         await asyncio.to_thread(self._notes.shutdown)
         await asyncio.to_thread(self._telling.shutdown)
+
+
+def _pulses(preview: Mapping[str, Any]) -> int:
+    """How many pulses a test has, those of width 0 included; of several channels, each of them."""
+    several = preview.get("channels") or {"": preview}
+    return max(len(one["pulse_width_us"]) for one in several.values())
 
 
 def not_what_was_seen() -> ApiError:

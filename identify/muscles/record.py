@@ -199,8 +199,9 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> JointRecord:
 
 def _of_table(read_one: Callable[..., Record], path: Path, pulse_rate_hz: float | None, name: str) -> Record:
     """One channel of a table; that its column is the width is no assumption."""
-    record = read_one(path, pulse_rate_hz, {"pulse_width_us": f"{name}_pulse_width_us"})
-    notes = tuple(note for note in record.source.notes if not note.startswith("pulse_width_us is "))
+    column = f"{name}_pulse_width_us"
+    record = read_one(path, pulse_rate_hz, {"pulse_width_us": column})
+    notes = tuple(note for note in record.source.notes if column not in note)
     return replace(record, source=replace(record.source, notes=notes))
 
 

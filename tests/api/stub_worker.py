@@ -69,7 +69,7 @@ def joint_model(effects: list[str]) -> dict[str, Any]:
     alone = {"biceps": {"held_out_rms_nm": 0.051}, "triceps": {"held_out_rms_nm": 0.052}}
     fit = {**whole["fit"], "alone": alone, "both": {"held_out_rms_nm": 0.077}}
     kept = {name: whole[name] for name in ("schema_version", "model_id", "created", "quality", "data", "software")}
-    return {**kept, "kind": "joint", "channels": channels, "interplay": between, "fit": fit}
+    return {**kept, "kind": "joint", "pulse_rate_hz": 40.0, "channels": channels, "interplay": between, "fit": fit}
 
 
 def joint_curves() -> dict[str, Any]:

@@ -213,3 +213,58 @@ def test_the_workers_verbs_take_recordings_of_two(table: Path, tmp_path: Path) -
     kept, again = (muscle_verbs.muscles.read(path) for path in (table, out))
     for one, other_one in zip(kept.records, again.records, strict=True):
         assert (one.pulse_width_us == other_one.pulse_width_us).all()
+
+
+# ---- a controller's trials ----------------------------------------------------------------------------------------
+
+TRIAL: dict[str, Any] = {
+    "participant": "P017",
+    "kind": "sequence",
+    "segments": [
+        {
+            "name": "trial",
+            "sequence": "widths",
+            "settings": {"pulse_width_us": [0.0, 60.0, 80.0] * 20},
+            "channels": {"triceps": {"sequence": "widths", "settings": {"pulse_width_us": [50.0, 0.0, 0.0] * 20}}},
+        }
+    ],
+}
+
+
+def key_with(two: httpx.Client, service: Service, current_ma: float) -> httpx.Client:
+    """A client with a controller's key."""
+    plan = {"name": "ilc", "current_ma": current_ma, "max_pulse_width_us": 200.0, "max_duration_s": 60.0, "trials": 3}
+    made = two.post(f"{PERSON}/keys", json=plan)
+    assert made.status_code == 201, made.text
+    return httpx.Client(base_url=service.url, headers={"Authorization": f"Bearer {made.json()['key']}"}, timeout=20.0)
+
+
+def test_a_trial_plays_on_both_muscles(two: httpx.Client, model: str, service: Service) -> None:
+    assert two.post(f"/v1/models/{model}/approve", json={}).status_code == 200
+    started = two.post("/v1/tests", json=TRIAL)
+    assert started.status_code == 202, started.text
+    done = wait_done(two, started.json()["id"])
+    assert done["state"] == "completed", done
+    played: Any = service.rig.last_plan
+    assert [one.name for one in played.channels] == TWO
+    assert [one.profile.current_ma for one in played.channels] == [20.0, OWN["current_ma"]]
+    assert played.segments[0].channels["triceps"].sequence == "widths"
+
+
+def test_a_key_plays_on_both_within_its_plan(two: httpx.Client, model: str, service: Service) -> None:
+    assert two.post(f"/v1/models/{model}/approve", json={}).status_code == 200
+    for current_ma, status, said in ((10.0, 403, "triceps has 12 mA"), (20.0, 202, "")):
+        with key_with(two, service, current_ma) as controller:
+            tag = controller.get(f"{PERSON}/model").headers["etag"]
+            answer = controller.post("/v1/tests", json=TRIAL, headers={"If-Match": tag})
+            assert answer.status_code == status and said in answer.text, answer.text
+
+
+def test_a_key_of_one_muscles_model_plays_on_one(two: httpx.Client, service: Service) -> None:
+    assert two.put(f"{TRICEPS}/profile", json=OWN).status_code == 200
+    done = wait_done(two, two.post("/v1/tests", json={"participant": "P017"}).json()["id"])
+    assert two.post(f"/v1/models/{done['model_id']}/approve", json={}).status_code == 200
+    with key_with(two, service, 20.0) as controller:
+        tag = controller.get(f"{PERSON}/model").headers["etag"]
+        answer = controller.post("/v1/tests", json=TRIAL, headers={"If-Match": tag})
+        assert answer.status_code == 403 and "of one muscle" in answer.text, answer.text
