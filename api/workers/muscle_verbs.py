@@ -17,7 +17,7 @@ from stimrig.api.workers.curves import POINTS, rounded, runs, step_response
 from stimrig.identify import muscles
 from stimrig.identify.criticism import worst_places
 from stimrig.identify.json_text import json_value, parse
-from stimrig.identify.muscles import interplay, search
+from stimrig.identify.muscles import interplay
 from stimrig.identify.muscles import verbs as joint
 
 Verb = Callable[..., dict[str, Any]]
@@ -110,15 +110,12 @@ def diagnosis(data: str, progress: Progress, model_json: str | None = None, **_o
     """As `verbs.diagnosis`, with the improvement that was found by the way."""
     record = muscles.read(Path(data))
     structure: list[str] = []
-    if model_json is None:
-        searched = search.search(record, progress)
-        found, improved = joint.diagnosis_of(searched).to_dict(), joint.improvement_of(searched).to_dict()
-    else:
-        model = muscles.JointModel.from_json(model_json)
+    model = None if model_json is None else muscles.JointModel.from_json(model_json)
+    if model is not None:
         own, structure = joint.structure_of(model)
         structure += [f"{name}.{effect}" for name, effects in own.items() for effect in effects]
-        found = muscles.diagnose(record, model, lambda share, text="": progress(share / 2, text)).to_dict()
-        improved = muscles.improve(record, model, lambda share, text="": progress(0.5 + share / 2, text)).to_dict()
+    searched = joint.searched(record, model, progress)
+    found, improved = joint.diagnosis_of(searched).to_dict(), joint.improvement_of(searched).to_dict()
     first = f"{record.names[0]}."
     for row in [*found["missing"], *found["candidates"]]:
         row["effect"] = row["effect"].replace(OF_THE_JOINT, first)

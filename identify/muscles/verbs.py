@@ -114,7 +114,8 @@ def structure_of(model: JointModel) -> tuple[dict[str, list[str]], list[str]]:
     return effects, [f"{key_of(one)}:{one['form']}" for one in model.interplay]
 
 
-def _searched(record: JointRecord, model: JointModel | None, progress: Progress | None) -> JointSearch:
+def searched(record: JointRecord, model: JointModel | None, progress: Progress | None) -> JointSearch:
+    """One search, for both `diagnosis_of` and `improvement_of`. Raises as `diagnose`."""
     base = None
     if model is not None:
         effects, interplay = structure_of(model)
@@ -132,7 +133,7 @@ def diagnose(record: JointRecord, model: JointModel | None = None, progress: Pro
 
     Raises BadRequest, BadRecord, NotIdentifiable: as `fit`. Cancelled: `progress` asked to stop.
     """
-    return diagnosis_of(_searched(record, model, progress))
+    return diagnosis_of(searched(record, model, progress))
 
 
 def diagnosis_of(found: JointSearch) -> JointDiagnosis:
@@ -203,7 +204,7 @@ def compare(model: JointModel, record: JointRecord) -> dict[str, Any]:
 
 def improve(record: JointRecord, model: JointModel | None = None, progress: Progress | None = None) -> JointImprovement:
     """Fit models of several muscles, each with one thing more, while something is needed. Raises as `diagnose`."""
-    return improvement_of(_searched(record, model, progress))
+    return improvement_of(searched(record, model, progress))
 
 
 def improvement_of(found: JointSearch) -> JointImprovement:
