@@ -120,8 +120,8 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
 def _refuse_channels(runner: Runner, participant: Participant, plan: dict[str, Any]) -> None:
     """A key plays on several channels where the approved model is of several muscles, within its plan on each.
 
-    The widths of all channels stand in the preview; the first one's current is narrowed to the plan, the others' are the
-    participant's own.
+    The widths of all channels stand in the preview; the first one's current is narrowed to the plan, the others'
+    are the participant's own.
     """
     served = runner.versions.served(participant.code)
     if served is None or json.loads(served.body).get("kind") != JOINT:

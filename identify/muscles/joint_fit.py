@@ -24,7 +24,9 @@ from stimrig.identify.noise import WHITE, NoiseLevel
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
-PILOT_TURNS, TURNS = 4, 2
+PILOT_TURNS, TURNS = 12, 2
+SETTLED = 0.01
+"""Change of the muscles' torques in a turn, as a share of their size, from which no further turn follows."""
 SLOW = 0.3
 """Share of the noise, times the correlation of neighbours, from which a fit is begun again with white noise."""
 PINNED = 1e-6
@@ -239,12 +241,15 @@ def _pilots(grids: Sequence[Grid], rows: np.ndarray) -> list[np.ndarray]:
     """Each muscle's torque in the intervals, roughly."""
     torques = [np.zeros(grid.size) for grid in grids]
     for _ in range(PILOT_TURNS):
+        before = np.stack(torques)
         for place, grid in enumerate(grids):
             own = _without(grid, sum(t for i, t in enumerate(torques) if i != place))
             found = pilot_solution(own, rows)
             size, parts = found.projection.basis.size, grid.begins.size
             kept = np.r_[np.arange(size), np.arange(size + parts, found.coefficients.size)]
             torques[place] = found.columns[:, kept] @ found.coefficients[kept]
+        if np.linalg.norm(np.stack(torques) - before) <= SETTLED * np.linalg.norm(before):
+            break
     return torques
 
 
