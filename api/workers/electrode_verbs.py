@@ -59,8 +59,9 @@ def rise_nm(recording: Path) -> float:
     """Torque at the end of the hold above that at rest, N·m; flexion is positive. Raises BadRecord: no such test."""
     record = read_recording(bounds.content_of(recording), recording, channel=0)
     rest = record.torque_nm[record.segment == record.segment_names.index(REST)]
-    held = record.torque_nm[record.time_s > record.time_s[-1] - HELD_S]
-    if not (rest.size and held.size and record.pulse_width_us[-1] > 0):
+    late = record.time_s > record.time_s[-1] - HELD_S
+    held = record.torque_nm[late]
+    if not (rest.size and held.size and np.mean(record.pulse_width_us[late] > 0) > 0.5):  # a pulse or two may be lost
         raise BadRecord("no stimulus with a rest before it", place=recording.name, fix="Play it again.")
     return float(np.mean(held) - np.mean(rest))
 

@@ -121,6 +121,17 @@ def test_a_stimulus_is_played_told_and_moves_the_map(shared: Service, client: ht
     assert client.get(f"/v1/tests/{told['test_id']}").json()["state"] == "completed", "it gives no model"
 
 
+def test_a_stimulus_without_a_usable_recording_holds_nothing_up(shared: Service, client: httpx.Client) -> None:
+    search = play(client, begin(client), [1])
+    for path in shared.rig.data.glob(f"*{search['waiting']}*.h5"):
+        path.write_bytes(b"nothing")
+    assert tell(client, search).status_code == 422
+    after = client.get(f"/v1/searches/{search['id']}").json()
+    assert after["waiting"] is None and after["stimuli"][0]["torque_nm"] is None
+    assert not any(one["stimulated"] for one in after["map"]), "it is no evidence"
+    assert play(client, after, [1])["waiting"]
+
+
 def test_the_wanted_direction_turns_the_torque(client: httpx.Client) -> None:
     search = play(client, begin(client, direction="extension"), [1])
     assert tell(client, search).json()["stimuli"][0]["torque_nm"] < -0.5
