@@ -109,7 +109,10 @@ def read_recording(
     """
     file = StrictFile(content, str(path))
     _check_format(file)
-    if (several := _channels(file)) and channel is None:
+    several = _channels(file)
+    if len(several) == 1:  # of a channel that has a name
+        channel = 0
+    if several and channel is None:
         names = ", ".join(one["name"] for one in several)
         message = f"it holds the pulses of several channels ({names})"
         raise BadRecord(message, place=file.name, fix="Give it to fit, predict, compare, diagnose or improve.")
