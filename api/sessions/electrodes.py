@@ -77,6 +77,37 @@ def chosen_at(placement: str | None) -> list[int]:
     return [int(number) for number in found.groups() if number] if found else []
 
 
+def held_elements(row: Participant, array: Array) -> list[int]:
+    """The elements that a participant's placement names. Raises ApiError: 409 it names none of this array."""
+    found = chosen_at(channels.held(row, array.key)["placement"])
+    if not found or max(found) > array.elements:
+        detail = f"No element of the array is chosen for {row.code}. Search for one, or name it: placement “element 3”."
+        raise ApiError(409, "no-element", "No electrode is chosen", detail)
+    return found
+
+
+def connected(plan: TestPlan, row: Participant, status: Status | None) -> TestPlan:
+    """A plan with the elements that the switch connects for this participant; as it is on a rig without a switch.
+
+    Raises ApiError: 409 none is chosen.
+    """
+    array = array_of(status)
+    if array is None or plan.kind == ELECTRODE:
+        return plan
+    playing = plan.channels
+    if playing is None:
+        if array.key:  # the switch is at another channel than the one that plays
+            return plan
+        playing = [ChannelPlan(name=array.channel, profile=plan.profile)]
+    if array.channel not in {one.name for one in playing}:
+        return plan
+    elements = held_elements(row, array)
+    own = {True: {"elements": elements}, False: {}}
+    return plan.model_copy(
+        update={"channels": [one.model_copy(update=own[one.name == array.channel]) for one in playing]}
+    )
+
+
 def positions_mm(rows: int, columns: int, pitch_mm: float) -> list[list[float]]:
     """Where the elements lie: numbered along the rows."""
     return [[column * pitch_mm, row * pitch_mm] for row in range(rows) for column in range(columns)]

@@ -21,7 +21,7 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.sessions import channels
+from stimrig.api.sessions import channels, electrodes
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.electrodes import ElectrodeTests
 from stimrig.api.sessions.joint import JointTests
@@ -215,7 +215,7 @@ class Runner(Playing):
         if planned.plan.channels is None and any(one.channels for one in body.segments or ()):
             several, sites = channels.for_all(planned.plan, participant, self.rig.status)
             planned = replace(planned, plan=several, kept=planned.kept | sites)
-        return planned
+        return replace(planned, plan=electrodes.connected(planned.plan, participant, self.rig.status))
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:
         """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""

@@ -186,6 +186,22 @@ def test_the_choice_is_the_placement_and_the_next_search_knows(client: httpx.Cli
     assert [one["id"] for one in listed] == [second["id"], search["id"]]
 
 
+def test_other_tests_are_played_at_the_chosen_electrode(shared: Service, client: httpx.Client) -> None:
+    code = client.headers["X-Code"]
+    asked = {"participant": code, "segments": [{"name": "rest", "sequence": "rest"}]}
+    refused = client.post("/v1/tests", json=asked)
+    assert refused.status_code == 409 and refused.json()["type"].endswith("no-element"), refused.text
+    for placement, elements in (("elements 1 and 3", [1, 3]), ("element 9", None)):
+        site = {"side": "left", "muscle": "biceps brachii", "placement": placement}
+        assert client.put(f"/v1/participants/{code}/muscle", json=site).status_code == 200
+        answer = client.post("/v1/tests", json=asked)
+        assert answer.status_code == (409 if elements is None else 202), answer.text
+        if elements is not None:
+            wait_done(client, answer.json()["id"])
+            played: Any = shared.rig.last_plan
+            assert [(one.name, one.elements) for one in played.channels] == [("biceps", elements)]
+
+
 def test_a_calibration_at_another_electrode_ends_only_when_that_is_said(shared: Service, client: httpx.Client) -> None:
     code = client.headers["X-Code"]
     search = begin(client)
