@@ -145,7 +145,7 @@ class SegmentIn(Body):
         Field(description="an id of `GET /v1/sequences`", examples=["prbs"]),
     ]
     settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
-    channels: Annotated[dict[ChannelName, ChannelSequenceIn], Field(min_length=1, max_length=8)] | None = Field(
+    channels: Annotated[dict[str, ChannelSequenceIn], Field(min_length=1, max_length=8)] | None = Field(
         default=None,
         description="on a rig of several channels, what each plays, by its name; one that is not named rests, but the "
         "first, which plays the segment's own sequence. All are padded with rest to the longest",

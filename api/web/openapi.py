@@ -77,6 +77,7 @@ def _complete(document: dict[str, Any]) -> None:
         components.pop(name, None)
     for name in EMBEDDED:
         components.update(schemas.components(name))
+    components["JointChannelOut"]["properties"]["model"] = {"$ref": "#/components/schemas/ModelJson"}
     components["ModelJson"]["properties"]["tracking"] = {"$ref": "#/components/schemas/TrackedOut"}
     _tell_of_decisions(document)
     for methods in document["paths"].values():

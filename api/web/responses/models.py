@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field, JsonValue, WithJsonSchema
+from pydantic import Field, JsonValue
 
 from stimrig.api.client import documents
 from stimrig.api.web.responses.base import Document, Problem, SegmentOut, fields_of
@@ -51,7 +51,7 @@ class JointChannelOut(Document):
     side: str
     electrode: str
     offset_s: float = Field(description="by how much later than those of the first channel its pulses come, s")
-    model: Annotated[dict[str, JsonValue], WithJsonSchema({"$ref": "#/components/schemas/ModelJson"})]
+    model: dict[str, JsonValue] = Field(description="its MODEL.json")
 
 
 class JointModelOut(Document):
