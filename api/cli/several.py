@@ -19,7 +19,7 @@ def is_joint(data: Sequence[Path]) -> bool:
     """Whether a verb's DATA are the pulses of several channels; a file that cannot be read is left to the verb."""
     from stimrig.identify import muscles
 
-    with contextlib.suppress(identify.IdentifyError):
+    with contextlib.suppress(identify.IdentifyError, OSError):
         return any(muscles.is_joint(path) for path in data)
     return False
 

@@ -51,7 +51,7 @@ OF_TEST = (
 OF_PLAN = (
     "test_id", "profile", "segments", "protocol", "pulse_rate_hz", "max_pulse_width_us", "max_torque_nm", "adaptive",
     "angle", "preview", "joins", "side", "muscle", "tokens", "target", "reach", "bounds", "joint", "approval_id",
-    "reference_torque_nm", "participant", "kind",
+    "reference_torque_nm", "participant", "kind", "channels",
 )  # fmt: skip
 """What a centre is told of a test, and of its plan. Nothing else leaves: a new column or label only once it is here."""
 SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -182,7 +182,7 @@ def telling(row: Table) -> Telling | None:
 def _test(row: Test) -> dict[str, Any]:
     plan = {name: value for name, value in (row.plan or {}).items() if name in OF_PLAN}
     if isinstance(preview := plan.get("preview"), dict):
-        plan["preview"] = {name: value for name, value in preview.items() if not isinstance(value, list)}
+        plan["preview"] = {name: value for name, value in preview.items() if not isinstance(value, list | dict)}
     return {**{name: getattr(row, name) for name in OF_TEST}, "plan": plan}
 
 

@@ -40,7 +40,7 @@ def routed(name: str, one: Verb) -> Verb:
 
 def is_joint(given: dict[str, Any]) -> bool:
     """Whether a call is about several muscles; what cannot be read is left to the usual verb, which says so."""
-    with contextlib.suppress(identify.IdentifyError, ValueError):
+    with contextlib.suppress(identify.IdentifyError, OSError, ValueError):
         if model_json := given.get("model_json"):
             return '"kind"' in model_json and muscles.is_joint_model(parse(model_json))
         return muscles.is_joint(given["data"])

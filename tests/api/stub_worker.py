@@ -43,6 +43,8 @@ def is_joint(arguments: dict[str, Any]) -> bool:
     """Whether a call is about several muscles."""
     if model_json := arguments.get("model_json"):
         return json.loads(model_json).get("kind") == "joint"
+    if not Path(arguments["data"]).is_file():
+        return False
     head = Path(arguments["data"]).read_bytes()[:200]
     if head.startswith(b"\x89HDF"):
         import h5py
