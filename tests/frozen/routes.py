@@ -300,7 +300,7 @@ def everything(day: Day) -> None:
             continue
         for which in ("first", "second") if "_id}" in path else ("",):
             filled = re.sub(r"\{(model|test|recording)_id\}", rf"{{\1_{which}}}", path)
-            filled = filled.replace("{job_id}", "none").replace("{code}", "P1")
+            filled = filled.replace("{job_id}", "none").replace("{search_id}", "none").replace("{code}", "P1")
             day.ask("GET", filled)
     day.ask("GET", "/v1/participants?q=p&archived=true")
 
