@@ -20,6 +20,8 @@ class Participant(TypedDict):
     side: Literal["left", "right"] | None
     muscle: str | None
     placement: str | None
+    channels: dict[str, Any]
+    """By name, side, muscle, placement and profile of each further channel of a rig with several."""
     archived_utc: str | None
 
 
