@@ -122,6 +122,26 @@ class JointFitted:
             fitted = max(fitted, again, key=lambda one: one.log_evidence)
         return replace(self, effects=effects, acting=acting, fitted=fitted)
 
+    def with_likeliest(self, forms: Sequence[Acting]) -> JointFitted:
+        """With the form of an interplay that the evidence prefers."""
+        tried = [self.with_(acting=[*self.acting, form]) for form in forms]
+        return max(tried, key=lambda one: one.fitted.log_evidence)
+
+    def with_effect(self, place: int, effect: str, form: Form, values: Mapping[str, float]) -> JointFitted:
+        """With one more effect of a muscle, begun at these values."""
+        effects = [list(own) for own in self.effects]
+        effects[place].append((effect, form))
+        return self.with_(effects=effects, start={f"{place}.{effect}": values})
+
+    def without(self, key: str) -> JointFitted:
+        """Without what is called so: an interplay, or "biceps.fatigue"; what is of the joint is the first muscle's."""
+        names = self.record.names
+        acting = [one for one in self.acting if one.key(names) != key]
+        whose, _, effect = key.partition(".")
+        place = names.index(whose) if whose in names else 0
+        effects = [[one for one in own if i != place or one[0] != effect] for i, own in enumerate(self.effects)]
+        return self.with_(effects=effects, acting=acting)
+
 
 def _slow(noise: NoiseLevel) -> bool:
     return not noise.held and min(noise.share, 1.0) * noise.ar1 > SLOW
@@ -131,10 +151,12 @@ def assemble(
     setups: Sequence[Setup], effects: Sequence[Sequence[tuple[str, Form]]], acting: Sequence[Acting]
 ) -> JointProblem:
     """The problem of all muscles."""
-    parts = []
+    parts, grids, bases = [], [setup.grid for setup in setups], [setup.basis for setup in setups]
     for place, (setup, own) in enumerate(zip(setups, effects, strict=True)):
         reached = [
-            (_cross_name(one), drive_form(one, setups)) for one in acting if one.between and one.between[1] == place
+            (_cross_name(one), drive_form(one, grids, bases))
+            for one in acting
+            if one.between and one.between[1] == place
         ]
         parts.append(Problem(setup, [*reached, *own]))
     joint = [(one.interplay, one.interplay.form(one.form)) for one in acting if one.between is None]

@@ -17,6 +17,7 @@ from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.json_text import BadJson, json_value, parse
 from stimrig.identify.model import LARGEST_TEXT, SCHEMA_VERSION, SOFTWARE, Model
+from stimrig.identify.muscles.interplay import Other
 from stimrig.identify.muscles.problem import Acting, JointProblem, drive_form
 from stimrig.identify.muscles.record import Channel, JointRecord
 from stimrig.identify.simulation.predict import fingerprint, problem_of, refuse_rate
@@ -203,8 +204,6 @@ def _parameters_of(acting: Acting) -> Sequence[Any]:
     form = acting.interplay.form(acting.form)
     if acting.between is None:
         return form.parameters
-    from stimrig.identify.muscles.interplay import Other
-
     nothing = np.zeros(1)
     return form.make(Other((nothing, nothing), 0.0)).parameters
 
@@ -250,12 +249,11 @@ def _problem(model: JointModel, record: JointRecord) -> tuple[JointProblem, np.n
     acting = model.acting()
     own = model.data.get("fingerprint") == joint_fingerprint(record)
     moved = [_of_train(one, grid) for one, grid in zip(model.models, grids, strict=True)]
-    pairs = list(zip(moved, grids, strict=True))
-    setups = [problem_of(one, grid, settings=one.extra.get(KIND))[0].setup for one, grid in pairs]
+    bases = [one.recruitment.basis for one in moved]
     problems, thetas = [], []
-    for place, (one, grid) in enumerate(pairs):
+    for place, (one, grid) in enumerate(zip(moved, grids, strict=True)):
         further = [
-            (replace(drive_form(acts, setups), name=f"{acts.interplay.id}_{number}"), list(values.values()))
+            (replace(drive_form(acts, grids, bases), name=f"{acts.interplay.id}_{number}"), list(values.values()))
             for number, (acts, values) in enumerate(acting)
             if acts.between is not None and acts.between[1] == place
         ]

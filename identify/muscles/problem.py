@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.muscles.interplay import Interplay, JointForm, Other, find
+from stimrig.identify.recruitment import Basis
 from stimrig.identify.simulation.problem import Chosen, Problem
-from stimrig.identify.simulation.setup import Setup
 
 CHANGE = 1e-5
 """Of a level, for derivatives of the interplay."""
@@ -30,7 +31,15 @@ class Acting:
 
     @classmethod
     def of(cls, text: str, names: Sequence[str]) -> Acting:
-        """From "id", "id:form", "id:from>to" or "id:from>to:form". Raises BadRequest: unknown, or no such channels."""
+        """The first one that a text means. Raises BadRequest: as `meant`."""
+        return cls.meant(text, names)[0]
+
+    @classmethod
+    def meant(cls, text: str, names: Sequence[str]) -> list[Acting]:
+        """Each form that "id", "id:form", "id:from>to" or "id:from>to:form" leaves open.
+
+        Raises BadRequest: unknown, or no such channels.
+        """
         identifier, *more = text.split(":")
         interplay = find(identifier)
         between = None
@@ -46,9 +55,8 @@ class Acting:
             raise BadRequest(
                 f"{text!r} {'names no' if interplay.directed else 'names'} channels", place="interplay", fix=fix
             )
-        form = more[0] if more else interplay.forms[0].name
-        interplay.form(form)
-        return cls(interplay, form, between)
+        forms = [interplay.form(more[0])] if more else interplay.forms
+        return [cls(interplay, form.name, between) for form in forms]
 
     def key(self, names: Sequence[str]) -> str:
         """What it is called: "co_contraction", or "cross_talk:biceps>triceps"."""
@@ -57,11 +65,11 @@ class Acting:
         return f"{self.interplay.id}:{names[self.between[0]]}>{names[self.between[1]]}"
 
 
-def drive_form(acting: Acting, setups: Sequence[Setup]) -> Form:
+def drive_form(acting: Acting, grids: Sequence[Grid], bases: Sequence[Basis]) -> Form:
     """The form of the stage "gain" by which one channel's pulses reach the other muscle."""
     assert acting.between is not None
-    giving, taking = (setups[place].grid for place in acting.between)
-    share = giving.pulse_width_us / max(setups[acting.between[0]].basis.largest_us, 1e-9)
+    giving, taking = (grids[place] for place in acting.between)
+    share = giving.pulse_width_us / max(bases[acting.between[0]].largest_us, 1e-9)
     ahead = (taking.offset_s - giving.offset_s) / giving.step_s
     if ahead >= 0.0:
         other = Other((share, np.r_[share[1:], 0.0]), ahead)
@@ -151,7 +159,9 @@ class JointProblem(Problem):
         ]
         levels = np.stack([self._level(place, theta, mean) for place, (mean, _) in enumerate(ran)])
         total = sum(turn * mean for turn, (mean, _) in zip(self.turned, ran, strict=True))
-        total = total + self._interplay(levels, self.parameters(theta))
+        values = self.parameters(theta)
+        now = self._interplay(levels, values)
+        total = total + now
         if not derivatives:
             return total, None
         jacobian = np.zeros((self.size, total.size))
@@ -162,23 +172,17 @@ class JointProblem(Problem):
             if self.joint:
                 moved = levels.copy()
                 moved[place] += CHANGE
-                by = (
-                    self._interplay(moved, self.parameters(theta)) - self._interplay(levels, self.parameters(theta))
-                ) / CHANGE
+                by = (self._interplay(moved, values) - now) / CHANGE
                 shown = slopes.copy()
                 shown[list(part.baselines)] = 0.0
                 own += by / self.scales_nm[place] * shown
-        self._own_slopes(theta, levels, jacobian)
-        return total, jacobian
-
-    def _own_slopes(self, theta: np.ndarray, levels: np.ndarray, jacobian: np.ndarray) -> None:
-        now = self._interplay(levels, self.parameters(theta)) if self.own else 0.0
         for one in self.own:
             for place in one.places:
                 step = CHANGE if theta[place] + CHANGE <= self.upper[place] else -CHANGE
                 there = theta.copy()
                 there[place] += step
                 jacobian[place] = (self._interplay(levels, self.parameters(there)) - now) / step
+        return total, jacobian
 
     def _level(self, place: int, theta: np.ndarray, torque_nm: np.ndarray, at_samples: bool = False) -> np.ndarray:
         """A muscle's torque without its baseline, as a share of its largest."""

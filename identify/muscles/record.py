@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -214,8 +213,3 @@ def _offsets(records: Iterable[Record]) -> list[float]:
         offset_s = float(np.mod(phase_s - first_s + 0.5 * sample_s, step_s)) - 0.5 * sample_s
         found.append(0.0 if abs(offset_s) < 0.75 * sample_s else offset_s)
     return found
-
-
-def channels_text(channels: Iterable[Channel]) -> str:
-    """As a recording's attribute holds them."""
-    return json.dumps([channel.to_dict() for channel in channels])

@@ -19,7 +19,6 @@ from stimrig.identify.diagnosis.residual import vetoed
 from stimrig.identify.diagnosis.search import Progress, search_effects, silent
 from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import find_effect
-from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.fit_statistics import rms
 from stimrig.identify.estimation.left_out import difference, leave_out
 from stimrig.identify.muscles.interplay import registry
@@ -47,21 +46,36 @@ class Tried:
     gain: float  # of log evidence, with its prior odds
 
 
+@dataclass(frozen=True)
+class Refused:
+    """Why something that was tried was not added."""
+
+    gain: float  # of log evidence, with its prior odds
+    reason: str
+
+
+NOTHING = Refused(0.0, "The evidence does not ask for it.")
+
+
 @dataclass
 class JointSearch:
-    """The models, each with one thing more, and what was tried beside each."""
+    """The models, each with one thing more, and what was tried and not added."""
 
     record: JointRecord
-    chain: list[JointFitted]
+    chain: list[JointFitted]  # the first one, and the model with each of `added`
     added: list[Tried] = field(default_factory=list)
-    rounds: list[list[Tried]] = field(default_factory=list)
-    refused: list[tuple[Tried, str]] = field(default_factory=list)
+    refused: dict[str, Refused] = field(default_factory=dict)  # by key
     unexplained: list[str] = field(default_factory=list)  # muscles whose own record keeps structure
 
     @property
     def last(self) -> JointFitted:
         """The model with all that was found."""
         return self.chain[-1]
+
+    def append(self, one: Tried) -> None:
+        """Go on from the model with it."""
+        self.added.append(one)
+        self.chain.append(one.found)
 
 
 def search(record: JointRecord, progress: Progress | None = None, base: JointFitted | None = None) -> JointSearch:
@@ -80,35 +94,32 @@ def search(record: JointRecord, progress: Progress | None = None, base: JointFit
     say(0.02, "fitting all muscles")
     found = JointSearch(record, [base or fit_all(record)])
     while (best := _best(found, _interplays(found.last))) is not None:
-        _append(found, best)
+        found.append(best)
         say(min(0.1 + 0.05 * len(found.added), 0.3), f"added {best.key}")
     for number in range(MOST_EFFECTS):
         best = _best(found, _effects(found, say, number))
         if best is None:
             break
-        _append(found, best)
+        found.append(best)
         while (more := _best(found, _interplays(found.last))) is not None:
-            _append(found, more)
-    _drop_idle(found)
+            found.append(more)
+    drop_idle(found)
     return found
-
-
-def _append(found: JointSearch, best: Tried) -> None:
-    found.added.append(best)
-    found.chain.append(best.found)
 
 
 def _best(found: JointSearch, candidates: Sequence[Tried]) -> Tried | None:
     """The likeliest of a round that held-out pulses do not speak against; None if none gains enough."""
     ranked = sorted(candidates, key=lambda one: (-one.gain, one.key))
-    found.rounds.append(ranked)
+    for one in ranked:
+        if found.refused.get(one.key, NOTHING).reason == NOTHING.reason:
+            found.refused[one.key] = Refused(one.gain, NOTHING.reason)
     for one in ranked:
         if one.gain < MARGIN:
             break
         reason = _objection(found.last, one)
         if reason is None:
             return one
-        found.refused.append((one, reason))
+        found.refused[one.key] = Refused(one.gain, reason)
     return None
 
 
@@ -132,10 +143,9 @@ def _interplays(last: JointFitted) -> list[Tried]:
             forms = [Acting(interplay, form.name, between) for form in interplay.forms]
             if forms[0].key(names) in present or not _can_act(last, forms[0]):
                 continue
-            results = [_with_interplay(last, acting) for acting in forms]
-            best = max(results, key=lambda one: one.gain)
-            if _size(last, best.found) >= LEAST_SHARE:
-                tried.append(best)
+            best = last.with_likeliest(forms)
+            if _size(last, best) >= LEAST_SHARE:
+                tried.append(_tried(last, forms[0].key(names), best.acting[-1].form, best))
     return tried
 
 
@@ -145,10 +155,10 @@ def _can_act(last: JointFitted, acting: Acting) -> bool:
     return acting.between is not None or bool(np.any(signs > 0) and np.any(signs < 0))
 
 
-def _with_interplay(last: JointFitted, acting: Acting) -> Tried:
-    found = last.with_(acting=[*last.acting, acting])
-    gain = found.fitted.log_evidence - last.fitted.log_evidence + acting.interplay.log_odds
-    return Tried(acting.key(last.record.names), acting.form, found, gain)
+def _tried(last: JointFitted, key: str, form: str, found: JointFitted) -> Tried:
+    """With what it gains; all kinds of interplay are equally likely before, effects are not."""
+    prior = find_effect(key.partition(".")[2]).prior if "." in key else 0.0
+    return Tried(key, form, found, found.fitted.log_evidence - last.fitted.log_evidence + prior)
 
 
 def _size(before: JointFitted, after: JointFitted) -> float:
@@ -182,8 +192,9 @@ def _effects(found: JointSearch, say: Progress, number: int) -> list[Tried]:
             if find_effect(effect).band:
                 continue
             form = dict(own.last.effects)[effect]
-            values = own.last.parameters_of(effect)
-            tried.append(_with_effect(last, place, effect, form, values))
+            whose = "joint" if form.stage in JOINT_STAGES else name
+            both = last.with_effect(place, effect, form, own.last.parameters_of(effect))
+            tried.append(_tried(last, f"{whose}.{effect}", form.name, both))
     return tried
 
 
@@ -191,40 +202,24 @@ def _within(say: Progress, begin: float, step: float, name: str) -> Progress:
     return lambda share, text: say(begin + step * share, f"{name}: {text}")
 
 
-def _with_effect(last: JointFitted, place: int, effect: str, form: Form, values: dict[str, float]) -> Tried:
-    effects = [list(own) for own in last.effects]
-    effects[place].append((effect, form))
-    found = last.with_(effects=effects, start={f"{place}.{effect}": values})
-    gain = found.fitted.log_evidence - last.fitted.log_evidence + find_effect(effect).prior
-    whose = "joint" if form.stage in JOINT_STAGES else last.record.names[place]
-    return Tried(f"{whose}.{effect}", form.name, found, gain)
-
-
-def _drop_idle(found: JointSearch) -> None:
-    """Take away an interplay that later ones have made idle."""
-    names = found.record.names
-    for one in list(found.added[:-1]):
-        last = found.last
-        kept = [acting for acting in last.acting if acting.key(names) != one.key]
-        if len(kept) == len(last.acting):
+def drop_idle(found: JointSearch) -> None:
+    """Take away each interplay that later ones have made idle, and with it the models that still hold it."""
+    for one in [one for one in found.added[:-1] if "." not in one.key]:
+        without = found.last.without(one.key)
+        if found.last.fitted.log_evidence - without.fitted.log_evidence >= MARGIN:
             continue
-        without = last.with_(acting=kept)
-        if last.fitted.log_evidence - without.fitted.log_evidence < MARGIN:
-            found.added.remove(one)
-            found.chain.append(without)
+        place = found.added.index(one)
+        later, chain = found.added[place + 1 :], [without]
+        for each in later[:0:-1]:
+            chain.insert(0, chain[0].without(each.key))
+        del found.added[place:], found.chain[place + 1 :]
+        for each, fitted in zip(later, chain, strict=True):
+            found.append(_tried(found.last, each.key, each.form, fitted))
 
 
 def probability(found: JointSearch, one: Tried) -> float:
     """That this is there, and not one of its rivals, by the evidence: of models with and without it."""
-    names = found.record.names
-    last = found.last
-    if one.key in {acting.key(names) for acting in last.acting}:
-        without = last.with_(acting=[acting for acting in last.acting if acting.key(names) != one.key])
-    else:
-        place = 0 if one.key.startswith("joint.") else names.index(one.key.partition(".")[0])
-        effect = one.key.partition(".")[2]
-        effects = [[each for each in own if i != place or each[0] != effect] for i, own in enumerate(last.effects)]
-        without = last.with_(effects=effects)
+    last, without = found.last, found.last.without(one.key)
     rivals = [without.fitted.log_evidence]
     for rival in rivals_of(one.key):
         rivals += [each.found.fitted.log_evidence for each in _interplays(without) if each.key.startswith(rival)]

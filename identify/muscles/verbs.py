@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from stimrig.identify.muscles.model import JointModel, key_of, predict
 from stimrig.identify.muscles.problem import Acting
 from stimrig.identify.muscles.record import JointRecord
 from stimrig.identify.muscles.results import JointDiagnosis, JointImprovement, conclude, name_of
-from stimrig.identify.muscles.search import JointSearch, Tried, probability, rivals_of, search
+from stimrig.identify.muscles.search import JointSearch, probability, rivals_of, search
 
 COLUMNS = ("fit_percent", "rms_nm", "held_out_rms_nm", "held_out_fit_percent", "alone", "both")
 
@@ -50,7 +51,7 @@ def fit(
     BadRecord, NotIdentifiable
         The record does not determine the model.
     """
-    acting = [Acting.of(text, record.names) for text in interplay]
+    acting = [Acting.meant(text, record.names) for text in interplay]
     for name in effects or {}:
         if name not in record.names:
             raise BadRequest(f"no channel {name!r}", place="effects", fix=f"Use {', '.join(record.names)}.")
@@ -63,15 +64,16 @@ def fit(
 
 
 def _solved(
-    record: JointRecord, effects: Mapping[str, Sequence[str]], acting: Sequence[Acting], say: Progress
+    record: JointRecord, effects: Mapping[str, Sequence[str]], acting: Sequence[Sequence[Acting]], say: Progress
 ) -> JointFitted:
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             say(0.1, "fitting all muscles")
             found = fit_all(record)
-            for number, one in enumerate(acting):
-                found = _likeliest_form(found, one)
-                say(0.4 + 0.2 * (number + 1) / len(acting), f"fitting {one.interplay.name.lower()}")
+            for number, forms in enumerate(acting):
+                if forms[0].key(record.names) not in {one.key(record.names) for one in found.acting}:
+                    found = found.with_likeliest(forms)
+                say(0.4 + 0.2 * (number + 1) / len(acting), f"fitting {forms[0].interplay.name.lower()}")
             for name, wanted in effects.items():
                 for text in wanted:
                     say(0.7, f"fitting {text} of {name}")
@@ -80,14 +82,6 @@ def _solved(
     except np.linalg.LinAlgError as error:
         fix = "Check that the torque follows the pulses of each channel."
         raise NotIdentifiable(f"no solution on this record ({error})", fix=fix) from error
-
-
-def _likeliest_form(found: JointFitted, one: Acting) -> JointFitted:
-    tried = [
-        found.with_(acting=[*found.acting, Acting(one.interplay, form.name, one.between)])
-        for form in one.interplay.forms
-    ]
-    return max(tried, key=lambda each: each.fitted.log_evidence)
 
 
 def _with_named(found: JointFitted, place: int, text: str) -> JointFitted:
@@ -100,9 +94,22 @@ def _with_named(found: JointFitted, place: int, text: str) -> JointFitted:
     if tried is None or effect.band:
         name = found.record.names[place]
         raise NotIdentifiable(f"the record shows nothing of {name} that looks like {identifier}", fix="Leave it out.")
-    effects = [list(own) for own in found.effects]
-    effects[place].append((identifier, tried.form))
-    return found.with_(effects=effects, start={f"{place}.{identifier}": tried.fitted.parameters_of(identifier)})
+    return found.with_effect(place, identifier, tried.form, tried.fitted.parameters_of(identifier))
+
+
+def parted(effects: Sequence[str], names: Sequence[str]) -> tuple[dict[str, list[str]], list[str], list[str]]:
+    """Of texts like "biceps.fatigue" and "co_contraction": by channel its effects; the interplay; what is neither."""
+    own: dict[str, list[str]] = {}
+    between, neither = [], []
+    for text in effects:
+        channel, _, effect = text.partition(".")
+        if text.partition(":")[0] in registry():
+            between.append(text)
+        elif effect and channel in names:
+            own.setdefault(channel, []).append(effect)
+        else:
+            neither.append(text)
+    return own, between, neither
 
 
 def structure_of(model: JointModel) -> tuple[dict[str, list[str]], list[str]]:
@@ -119,7 +126,7 @@ def searched(record: JointRecord, model: JointModel | None, progress: Progress |
     base = None
     if model is not None:
         effects, interplay = structure_of(model)
-        acting = [Acting.of(text, record.names) for text in interplay]
+        acting = [Acting.meant(text, record.names) for text in interplay]
         base = _solved(record, effects, acting, silent)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -155,7 +162,7 @@ def diagnosis_of(found: JointSearch) -> JointDiagnosis:
 
 def _missing(found: JointSearch) -> list[dict[str, Any]]:
     rows, errors = [], [statistics_of(one) for one in found.chain]
-    for one, before, after in zip(found.added, errors, errors[1:], strict=False):
+    for one, (before, after) in zip(found.added, pairwise(errors), strict=True):
         told = registry().get(one.key.partition(":")[0])
         effect = told or find_effect(one.key.partition(".")[2])
         rows.append(
@@ -178,17 +185,12 @@ def _missing(found: JointSearch) -> list[dict[str, Any]]:
 
 
 def _refused(found: JointSearch) -> tuple[dict[str, Any], ...]:
-    added, rows = {one.key for one in found.added}, {}
-    for tried in found.rounds:
-        for one in tried:
-            if one.key not in added:
-                rows[one.key] = _row(one, "The evidence does not ask for it.")
-    rows |= {one.key: _row(one, reason) for one, reason in found.refused if one.key not in added}
-    return tuple(rows.values())
-
-
-def _row(one: Tried, reason: str) -> dict[str, Any]:
-    return {"effect": one.key, "name": name_of(one.key), "log_evidence_gain": one.gain, "reason": reason}
+    added = {one.key for one in found.added}
+    return tuple(
+        {"effect": key, "name": name_of(key), "log_evidence_gain": one.gain, "reason": one.reason}
+        for key, one in found.refused.items()
+        if key not in added
+    )
 
 
 def compare(model: JointModel, record: JointRecord) -> dict[str, Any]:
@@ -196,10 +198,14 @@ def compare(model: JointModel, record: JointRecord) -> dict[str, Any]:
 
     Raises BadModel, BadRequest: as `predict`.
     """
+    return errors_of(record, predict(model, record))
+
+
+def errors_of(record: JointRecord, predicted_nm: np.ndarray) -> dict[str, Any]:
+    """The same of a prediction at the record's samples, N·m, shape (N,)."""
     grids, raw = prepared(record)
-    predicted = predict(model, record)
-    told = fit_statistics(grids[0], grids[0].fitted, predicted, raw.noise_sd_nm)
-    return told | held_out_errors(record, predicted, grids[0].counted)
+    told = fit_statistics(grids[0], grids[0].fitted, predicted_nm, raw.noise_sd_nm)
+    return told | held_out_errors(record, predicted_nm, grids[0].counted)
 
 
 def improve(record: JointRecord, model: JointModel | None = None, progress: Progress | None = None) -> JointImprovement:
@@ -210,7 +216,7 @@ def improve(record: JointRecord, model: JointModel | None = None, progress: Prog
 def improvement_of(found: JointSearch) -> JointImprovement:
     """The improvement of a search."""
     steps, models, parent = [], [], ""
-    for one, fitted in zip([None, *found.added], found.chain, strict=False):
+    for one, fitted in zip([None, *found.added], found.chain, strict=True):
         reason = (
             "The plain structure of all muscles." if one is None else f"It raises the log evidence by {one.gain:.1f}."
         )

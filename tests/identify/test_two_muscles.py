@@ -14,7 +14,8 @@ from stimrig.identify import muscles
 from stimrig.identify.errors import BadModel, BadRecord, BadRequest, NotIdentifiable
 from stimrig.identify.muscles.joint_fit import JointFitted, fit_all
 from stimrig.identify.muscles.problem import Acting
-from stimrig.identify.muscles.search import search
+from stimrig.identify.muscles.search import JointSearch, Tried, drop_idle, search
+from stimrig.identify.muscles.verbs import improvement_of
 from tests.harness import two_muscles
 
 CROSS = "cross_talk:biceps>triceps"
@@ -95,6 +96,30 @@ def test_what_the_muscles_do_to_each_other_is_named(cross_talk: float, stiffer: 
     found = search(record)
     assert {one.key for one in found.added} == named
     assert _rms((found.last.predicted[0] - true_nm)[record.held_out]) < 0.03
+
+
+def test_an_interplay_that_a_later_one_made_idle_leaves_no_model_behind() -> None:
+    first = _fitted(0.0, 0.25)
+    names = first.record.names
+    found = JointSearch(first.record, [first])
+    for key in (CROSS, "co_contraction"):
+        both = found.last.with_likeliest(Acting.meant(key, names))
+        found.append(Tried(key, both.acting[-1].form, both, 99.0))
+    drop_idle(found)
+    assert [one.key for one in found.added] == ["co_contraction"]
+    assert [[one.key(names) for one in model.acting] for model in found.chain] == [[], ["co_contraction"]]
+    gained = found.last.fitted.log_evidence - first.fitted.log_evidence
+    assert found.added[0].gain == pytest.approx(gained)
+    improved = improvement_of(found)
+    assert [step["added"] for step in improved.steps] == [None, "co_contraction"]
+    assert [len(model.interplay) for model in improved.models] == [0, 1]
+
+
+def test_a_form_that_is_asked_for_is_the_one_that_is_fitted() -> None:
+    record = _made(0.15)[0]
+    for form in ("independent", "nested"):
+        model = muscles.fit(record, interplay=[f"{CROSS}:{form}", CROSS])
+        assert [one["form"] for one in model.interplay] == [form]
 
 
 def test_the_size_of_cross_talk_is_told() -> None:

@@ -61,7 +61,6 @@ class Interplay:
     separated_by: str  # the test that separates them
     plain: str  # a paragraph for clinicians
     source: str = ""
-    log_odds: float = 0.0  # logarithm of its prior odds
 
     def form(self, name: str) -> Any:
         """A form by its name. Raises BadRequest: there is none."""
