@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from stimrig import identify
+from stimrig.api.cli import terminal
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import LARGEST_MODEL_BYTES, number, percent, say, say_json, table, write, writing
+from stimrig.api.cli.terminal import number, percent, say, say_json, table, write
 from stimrig.api.progress_bar import progress_bar
 
 STRUCTURE = "co_contraction, cross_talk:FROM>TO, or CHANNEL.EFFECT"
@@ -41,42 +42,22 @@ def refuse(**unknown: Any) -> None:
             raise InputError(f"--{name.replace('_', '-')} is for records of one muscle. Leave it out.")
 
 
-def load_model(path: Path) -> Any:
-    """A model of several muscles. Raises InputError: the file cannot be read, or holds none."""
+def load_model(path: Path, usage: str = "") -> Any:
+    """A model of several muscles. Raises InputError: as `terminal.load_model`."""
     from stimrig.identify import muscles
 
-    try:
-        with path.open("rb") as file:
-            return muscles.JointModel.from_json(file.read(LARGEST_MODEL_BYTES))
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
-    except identify.IdentifyError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def parted(effects: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """What `--effects` names: by channel its effects, and the interplay. Raises InputError: neither."""
-    from stimrig.identify.muscles import interplay
-
-    own: dict[str, list[str]] = {}
-    between: list[str] = []
-    for name in effects:
-        channel, dot, effect = name.partition(".")
-        if name.partition(":")[0] in interplay.registry():
-            between.append(name)
-        elif dot and effect:
-            own.setdefault(channel, []).append(effect)
-        else:
-            raise InputError(f"--effects {name}: with several muscles give {STRUCTURE}.")
-    return own, between
+    return terminal.load_model(path, usage, muscles.JointModel.from_json)
 
 
 def fit(data: Sequence[Path], effects: Sequence[str], output: Path | None, as_json: bool, **unknown: Any) -> None:
     """As `stimrig fit`."""
     from stimrig.identify import muscles
+    from stimrig.identify.muscles.verbs import parted
 
     record = load(data, **unknown)
-    own, between = parted(effects)
+    own, between, neither = parted(effects, record.names)
+    if neither:
+        raise InputError(f"--effects {neither[0]}: with several muscles give {STRUCTURE}.")
     with progress_bar() as progress:
         model = muscles.fit(record, own, between, progress)
     _told(model, output, as_json)
@@ -98,31 +79,20 @@ def keep(output: Path, model: Any) -> None:
     write(output, model.to_json())
 
 
-def predict(model_json: Path, data: Path, output: Path, as_json: bool, **unknown: Any) -> None:
-    """As `stimrig predict`; with a column for each muscle's share."""
-    import numpy as np
-
+def predict(model_json: Path, data: Path, usage: str, **unknown: Any) -> tuple[Any, dict[str, Any]]:
+    """The record, and the columns of `stimrig predict`, with one for each muscle's share."""
     from stimrig.identify import muscles
-    from stimrig.identify.estimation.fit_statistics import best_fit_percent, rms
 
-    record, model = load([data], **unknown), load_model(model_json)
-    predicted = muscles.predict(model, record)
-    found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
-    found |= {f"{name}_torque_nm": torque for name, torque in muscles.parts(model, record).items()}
-    with writing(output) as place:
-        np.savetxt(place, np.column_stack(list(found.values())), "%.9g", ",", header=",".join(found), comments="")
-    reached, error = best_fit_percent(record.torque_nm, predicted), rms(record.torque_nm - predicted)
-    if as_json:
-        say_json({"output": str(output), "rows": len(predicted), "fit_percent": reached, "rms_nm": error})
-        return
-    say(f"{output}: {len(predicted)} rows, fit {percent(reached)} over the whole record, rms {number(error, 4)} N·m")
+    record, model = load([data], **unknown), load_model(model_json, usage)
+    predicted, own = muscles.whole_and_parts(model, record)
+    return record, {"predicted_torque_nm": predicted, **{f"{name}_torque_nm": torque for name, torque in own.items()}}
 
 
 def compare(model_json: Path, data: Sequence[Path], as_json: bool, **unknown: Any) -> None:
     """As `stimrig compare`: the errors by segment, and while each muscle moved alone and all did."""
     from stimrig.identify import muscles
 
-    found = muscles.compare(load_model(model_json), load(data, **unknown))
+    found = muscles.compare(load_model(model_json, "compare MODEL.json DATA"), load(data, **unknown))
     if as_json:
         say_json(found)
         return

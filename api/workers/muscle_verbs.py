@@ -8,8 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from stimrig import identify
 from stimrig.api.effect_words import effect_words
 from stimrig.api.record_files import Progress
@@ -17,7 +15,6 @@ from stimrig.api.workers.curves import POINTS, rounded, runs, step_response
 from stimrig.identify import muscles
 from stimrig.identify.criticism import worst_places
 from stimrig.identify.json_text import json_value, parse
-from stimrig.identify.muscles import interplay
 from stimrig.identify.muscles import verbs as joint
 
 Verb = Callable[..., dict[str, Any]]
@@ -47,21 +44,11 @@ def is_joint(given: dict[str, Any]) -> bool:
     return False
 
 
-def parted(effects: Sequence[str], names: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """By channel its effects, and the interplay. What names no channel is of one muscle's structure, and left out."""
-    own: dict[str, list[str]] = {}
-    for name in effects:
-        channel, dot, effect = name.partition(".")
-        if dot and channel in names:
-            own.setdefault(channel, []).append(effect)
-    return own, [name for name in effects if name.partition(":")[0] in interplay.registry()]
-
-
 def fit(data: str, progress: Progress, effects: Sequence[str] = (), **_of_one: Any) -> dict[str, Any]:
-    """As `verbs.fit`."""
+    """As `verbs.fit`; effects that name no channel are of one muscle's structure, and are left out."""
     progress(0.05, "reading the recording")
     record = muscles.read(Path(data))
-    own, between = parted(effects, record.names)
+    own, between, _of_one_muscle = joint.parted(effects, record.names)
     model = muscles.fit(record, own, between, lambda share, text="": progress(0.1 + 0.9 * share, text))
     first = record.records[0]
     told = {"json": model.to_json(), "model": model.to_dict()}
@@ -72,7 +59,8 @@ def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]
     """As `curves.comparison`, and the error on held-out pulses of each muscle alone and of both."""
     progress(0.1, "comparing")
     record, model = muscles.read(Path(data)), muscles.JointModel.from_json(model_json)
-    found, residual = muscles.compare(model, record), record.torque_nm - muscles.predict(model, record)
+    predicted = muscles.predict(model, record)
+    found, residual = joint.errors_of(record, predicted), record.torque_nm - predicted
     noise_nm, pick = found["noise_sd_nm"], _pick(record)
     where = worst_places(record.records[0], residual, noise_nm, rows=record.grids[0].counted)
     series = {"time_s": record.time_s[pick], "residual_nm": residual[pick], "noise_band_nm": 2.0 * noise_nm}
@@ -84,7 +72,7 @@ def curves(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """As `curves.page_curves`; of each muscle also its share of the torque, its pulse widths, its step response."""
     progress(0.1, "predicting")
     record, model = muscles.read(Path(data)), muscles.JointModel.from_json(model_json)
-    pick, parts = _pick(record), muscles.parts(model, record)
+    pick, (predicted, parts) = _pick(record), muscles.whole_and_parts(model, record)
     own = {
         name: {
             "torque_nm": parts[name][pick].round(5),
@@ -96,7 +84,7 @@ def curves(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     first, labels = record.records[0], [record.records[0].segment_names[index] for index in record.records[0].segment]
     return json_value({
         "time_s": record.time_s[pick].round(5), "torque_nm": record.torque_nm[pick].round(5),
-        "predicted_torque_nm": muscles.predict(model, record)[pick].round(5),
+        "predicted_torque_nm": predicted[pick].round(5),
         "pulse_width_us": first.pulse_width_us[pick].round(2), "segments": runs(labels, record.time_s),
         "step_response": own[record.names[0]]["step_response"], "muscles": own,
     })  # fmt: skip
@@ -140,17 +128,11 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
     progress(0.1, "reading the recording")
     record = muscles.read(Path(data))
     widths = {
-        f"{name}_pulse_width_us": held(record.time_s, one.pulse_width_us, channel.offset_s)
+        f"{name}_pulse_width_us": muscles.held_later(record.time_s, one.pulse_width_us, channel.offset_s)
         for name, one, channel in zip(record.names, record.records, record.channels, strict=True)
     }
     progress(0.7, "writing")
     return write_table(record.records[0], {**widths, "torque_nm": record.torque_nm}, Path(out))
-
-
-def held(time_s: Any, width_us: Any, offset_s: float) -> Any:
-    """Widths that stand on the slots of the first channel, held from their own pulses on."""
-    before = np.searchsorted(time_s, time_s - offset_s + 1e-6, side="right") - 1
-    return np.where(before < 0, 0.0, width_us[np.clip(before, 0, None)])
 
 
 OF_SEVERAL: dict[str, Verb] = {

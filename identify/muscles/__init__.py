@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from stimrig.identify.muscles.model import is_joint_model as is_joint_model
     from stimrig.identify.muscles.model import parts as parts
     from stimrig.identify.muscles.model import predict as predict
+    from stimrig.identify.muscles.model import whole_and_parts as whole_and_parts
     from stimrig.identify.muscles.record import Channel as Channel
     from stimrig.identify.muscles.record import JointRecord as JointRecord
+    from stimrig.identify.muscles.record import held_later as held_later
     from stimrig.identify.muscles.record import is_joint as is_joint
     from stimrig.identify.muscles.record import read as read
     from stimrig.identify.muscles.results import JointDiagnosis as JointDiagnosis
@@ -31,8 +33,8 @@ _PLACES = {
     name: f"{__name__}.{module}"
     for module, names in {
         "inversion": ("JointInversion", "Limits", "invert"),
-        "model": ("JointModel", "is_joint_model", "parts", "predict"),
-        "record": ("Channel", "JointRecord", "is_joint", "read"),
+        "model": ("JointModel", "is_joint_model", "parts", "predict", "whole_and_parts"),
+        "record": ("Channel", "JointRecord", "held_later", "is_joint", "read"),
         "results": ("JointDiagnosis", "JointImprovement"),
         "verbs": ("compare", "diagnose", "fit", "improve"),
     }.items()

@@ -249,7 +249,7 @@ class _Joint:
         time_s, nothing = np.arange(held.shape[1]) / (each * self.rate_hz), np.zeros(held.shape[1])
         records = [Record.from_arrays(time_s, own, nothing, pulse_rate_hz=self.rate_hz) for own in held]
         whole_nm, own_nm = whole_and_parts(self.model, JointRecord(self.channels, tuple(records)))
-        means = np.stack([whole_nm, *own_nm]).reshape(len(own_nm) + 1, -1, each).mean(axis=2)[:, rest:]
+        means = np.stack([whole_nm, *own_nm.values()]).reshape(len(own_nm) + 1, -1, each).mean(axis=2)[:, rest:]
         return means[0], means[1:]
 
 

@@ -223,20 +223,19 @@ def predict(model: JointModel, record: JointRecord) -> np.ndarray:
 
     Raises BadModel: as `stimrig.identify.predict`. BadRequest: the record has other channels.
     """
-    problem, theta = _problem(model, record)
-    return problem.at_samples(theta)
+    return whole_and_parts(model, record)[0]
 
 
 def parts(model: JointModel, record: JointRecord) -> dict[str, np.ndarray]:
     """Torque of each muscle by itself, without the zero, N·m, shape (N,)."""
-    problem, theta = _problem(model, record)
-    return dict(zip(model.names, problem.whole_and_parts(theta)[1], strict=True))
+    return whole_and_parts(model, record)[1]
 
 
-def whole_and_parts(model: JointModel, record: JointRecord) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Both at once, the muscles in the order of the channels."""
+def whole_and_parts(model: JointModel, record: JointRecord) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Both at once. Raises as `predict`."""
     problem, theta = _problem(model, record)
-    return problem.whole_and_parts(theta)
+    whole, own = problem.whole_and_parts(theta)
+    return whole, dict(zip(model.names, own, strict=True))
 
 
 def _problem(model: JointModel, record: JointRecord) -> tuple[JointProblem, np.ndarray]:

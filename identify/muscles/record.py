@@ -19,8 +19,12 @@ from stimrig.identify.records.record import Record
 NAME = r"[a-z][a-z0-9_-]{0,31}"
 """What a channel may be called."""
 _COLUMN = re.compile(rf"(?P<name>{NAME})_pulse_width_us")
+HEAD_BYTES = 4096
+"""Of a table, in which its header stands."""
 MOST = 8
 """Channels of a stimulator."""
+HAIR_S = 1e-6
+"""Times that lie so close together are the same."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,8 @@ class JointRecord:
         for channel in channels:
             if channel.name not in pulse_width_us:
                 raise BadRecord(f"no pulse widths of {channel.name}", place=channel.name, fix="Give a column for it.")
-            width_us = _earlier(np.asarray(time_s, float), np.asarray(pulse_width_us[channel.name]), channel.offset_s)
+            given_us = np.asarray(pulse_width_us[channel.name])
+            width_us = held_later(np.asarray(time_s, float), given_us, -channel.offset_s)
             records.append(Record.from_arrays(time_s, width_us, torque_nm, segment, pulse_rate_hz=pulse_rate_hz))
         return cls(tuple(channels), tuple(records))
 
@@ -134,28 +139,34 @@ class JointRecord:
         return found
 
 
-def _earlier(time_s: np.ndarray, width_us: np.ndarray, offset_s: float) -> np.ndarray:
-    """Widths as they would be held if their pulses came `offset_s` earlier."""
-    if offset_s == 0.0 or time_s.size < 2:
+def held_later(time_s: np.ndarray, width_us: np.ndarray, later_s: float) -> np.ndarray:
+    """Widths, shape (N,), as they are held if their pulses come so much later, or earlier; 0 before the first."""
+    if later_s == 0.0:
         return width_us
-    hair = 1e-6 * (time_s[-1] - time_s[0]) / time_s.size
-    last = np.searchsorted(time_s, time_s + offset_s + hair, side="right") - 1
-    return width_us[np.clip(last, 0, time_s.size - 1)]
+    last = np.searchsorted(time_s, time_s - later_s + HAIR_S, side="right") - 1
+    return np.where(last < 0, 0.0, width_us[np.maximum(last, 0)])
 
 
 def is_joint(path: str | Path) -> bool:
-    """Whether a file holds the pulses of several channels. Raises BadRecord: it cannot be read."""
-    content = bounds.content_of(Path(path))
-    if content.startswith(HDF5_MAGIC):
+    """Whether a file holds the pulses of several channels; a pipe, which can be read once, does not.
+
+    Raises BadRecord: it cannot be read.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        return False
+    with bounds.opened(path) as file:
+        head = file.read(HEAD_BYTES)
+    if head.startswith(HDF5_MAGIC):
         from stimrig.identify.records.recording import channels_of
 
-        return len(channels_of(content, Path(path))) > 1
-    return len(_columns(content)) > 1
+        return len(channels_of(bounds.content_of(path), path)) > 1
+    return len(_columns(head)) > 1
 
 
 def _columns(content: bytes) -> list[str]:
     """The channels of a table's header; empty where it names none."""
-    for line in content[:4096].decode("utf-8", "replace").splitlines():
+    for line in content[:HEAD_BYTES].decode("utf-8", "replace").splitlines():
         if found := _COLUMN.findall(line):
             return list(dict.fromkeys(found))
     return []
@@ -189,7 +200,7 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> JointRecord:
     records = [_of_table(read_one, path, pulse_rate_hz, name) for name in names]
     offsets_s = _offsets(records)
     shifted = [
-        replace(record, pulse_width_us=_earlier(record.time_s, record.pulse_width_us, offset_s))
+        replace(record, pulse_width_us=held_later(record.time_s, record.pulse_width_us, -offset_s))
         for record, offset_s in zip(records, offsets_s, strict=True)
     ]
     channels = [Channel(name, offset_s=offset_s) for name, offset_s in zip(names, offsets_s, strict=True)]

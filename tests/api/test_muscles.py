@@ -11,7 +11,9 @@ import pytest
 
 from stimrig.api.models import stored_model
 from stimrig.api.models.family import SEVERAL_MUSCLES
-from stimrig.api.workers import muscle_verbs, verbs
+from stimrig.api.workers import verbs
+from stimrig.identify import muscles
+from stimrig.identify.muscles.verbs import parted
 from tests.api.conftest import Service, csrf, own_service, signed_in, wait_done
 from tests.api.made_up_muscles import HEADER, write_csv
 from tests.api.stub_worker import CROSS_TALK, joint_model
@@ -48,9 +50,10 @@ def test_a_document_says_what_it_holds_of_each_muscle() -> None:
 
 def test_effects_are_parted_by_their_channels() -> None:
     asked = ["fatigue", "biceps.fatigue:fitness", "triceps.tremor", CROSS_TALK, "co_contraction:stiffness"]
-    own, between = muscle_verbs.parted(asked, TWO)
+    own, between, neither = parted(asked, TWO)
     assert own == {"biceps": ["fatigue:fitness"], "triceps": ["tremor"]}
-    assert between == [CROSS_TALK, "co_contraction:stiffness"], "what names no channel is of one muscle's structure"
+    assert between == [CROSS_TALK, "co_contraction:stiffness"]
+    assert neither == ["fatigue"], "what names no channel is of one muscle's structure"
 
 
 # ---- versions -----------------------------------------------------------------------------------------------------
@@ -210,7 +213,7 @@ def test_the_workers_verbs_take_recordings_of_two(table: Path, tmp_path: Path) -
     out = tmp_path / "out.csv"
     asked("export_csv", data=str(table), out=str(out))
     assert out.read_text().splitlines()[0] == HEADER
-    kept, again = (muscle_verbs.muscles.read(path) for path in (table, out))
+    kept, again = (muscles.read(path) for path in (table, out))
     for one, other_one in zip(kept.records, again.records, strict=True):
         assert (one.pulse_width_us == other_one.pulse_width_us).all()
 

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from scipy.io import loadmat
 
 from stimrig.api.cli import main
 from tests.harness import two_muscles
@@ -40,6 +41,9 @@ def test_a_model_of_two_muscles_is_fitted_compared_and_predicts(capsys: Capture,
     head, first = out.read_text().splitlines()[:2]
     assert head == "time_s,torque_nm,predicted_torque_nm,biceps_torque_nm,triceps_torque_nm"
     assert len(first.split(",")) == 5
+    matlab = out.with_suffix(".mat")
+    assert _run(capsys, "predict", model, table, "-o", matlab)[0] == 0
+    assert set(head.split(",")) <= set(loadmat(matlab))
 
 
 def test_cross_talk_is_named(capsys: Capture, table: Path) -> None:

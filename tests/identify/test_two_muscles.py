@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -160,6 +161,18 @@ def test_a_table_of_two_channels_is_read(tmp_path: Path) -> None:
     assert again.channels[1].offset_s == pytest.approx(two_muscles.OFFSET_S)
     for mine, own in zip(again.records, record.records, strict=True):
         assert np.allclose(mine.pulse_width_us[100:-100], own.pulse_width_us[100:-100], atol=1e-3)
+
+
+def test_a_pipe_is_left_to_the_one_who_reads_it() -> None:
+    content = b"time_s,biceps_pulse_width_us,triceps_pulse_width_us,torque_nm\n"
+    there, here = os.pipe()
+    try:
+        os.write(here, content)
+        os.close(here)
+        assert not muscles.is_joint(f"/dev/fd/{there}")
+        assert os.read(there, 4096) == content
+    finally:
+        os.close(there)
 
 
 def test_bad_records_say_what_is_wrong(tmp_path: Path) -> None:
