@@ -22,7 +22,7 @@ from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import typed
-from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.render import done_or_said, page
 from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import calibration, participants
 from stimrig.rig.messages import Status
@@ -115,13 +115,7 @@ def fine_range(status: Status | None) -> tuple[float, float]:
 
 async def attempt(request: Request, context: Context, code: str, done: Awaitable[Any], leads: str) -> Response:
     """Do it and go on; what the rig or the service refuses is said on the page."""
-    try:
-        await done
-    except seen.ChangedError:  # it has a page of its own
-        raise
-    except ApiError as error:
-        return await show_page(request, context, code, problem=error)
-    return RedirectResponse(leads, 303)
+    return await done_or_said(done, lambda problem: show_page(request, context, code, problem=problem), leads)
 
 
 @router.post("")

@@ -8,16 +8,14 @@ from collections.abc import Awaitable
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
-from fastapi.responses import RedirectResponse
 
 from stimrig.api.charts.electrode_map import array_map, named
 from stimrig.api.errors import ApiError
 from stimrig.api.language import _
 from stimrig.api.sessions import channels, electrodes
-from stimrig.api.store import seen
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import typed
-from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.render import done_or_said, page
 from stimrig.api.web.routes import electrodes as searches
 from stimrig.api.web.routes import participants
 
@@ -65,13 +63,8 @@ def ranked(found: dict[str, Any] | None) -> list[dict[str, Any]]:
 
 async def attempt(request: Request, context: Context, code: str, done: Awaitable[Any]) -> Response:
     """Do it and show the page; what is refused is said there."""
-    try:
-        await done
-    except seen.ChangedError:  # it has a page of its own
-        raise
-    except ApiError as error:
-        return await show_page(request, context, code, problem=error)
-    return RedirectResponse(f"/participants/{code}/electrodes", 303)
+    leads = f"/participants/{code}/electrodes"
+    return await done_or_said(done, lambda problem: show_page(request, context, code, problem), leads)
 
 
 @router.post("")

@@ -15,12 +15,11 @@ from stimrig.api.sessions.joint import target_of
 from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE
 from stimrig.api.sessions.requests import AngleIn, TestIn
 from stimrig.api.sessions.trials import SEQUENCE
-from stimrig.api.store.seen import ChangedError
 from stimrig.api.store.tables import Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import limits_form, starting, typed
 from stimrig.api.web.pages.model_view import to_job
-from stimrig.api.web.pages.render import page
+from stimrig.api.web.pages.render import done_or_said, page
 from stimrig.api.web.routes import joint, participants
 from stimrig.api.web.routes.joint import PoseIn, TogetherIn
 
@@ -135,12 +134,10 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
     except ValueError as error:
         return await sensor_page(request, context, text, str(error), again=first)
     body = typed.checked(PoseIn, angle_rad=angle_rad, first=first)
-    try:
-        await joint.pose(context, who, body)
-    except ChangedError:  # it has a page of its own
-        raise
-    except ApiError as error:
-        words = error.detail.removeprefix("angle_pose: ")
-        error.detail = words[:1].upper() + words[1:]
-        return await sensor_page(request, context, text, problem=error, again=first)
-    return RedirectResponse("/rig/angle", 303)
+
+    async def said(problem: ApiError) -> Response:
+        words = problem.detail.removeprefix("angle_pose: ")
+        problem.detail = words[:1].upper() + words[1:]
+        return await sensor_page(request, context, text, problem=problem, again=first)
+
+    return await done_or_said(joint.pose(context, who, body), said, "/rig/angle")

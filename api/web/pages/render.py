@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
@@ -44,6 +44,17 @@ class Face:
 
     environment: Environment
     bar: Callable[[Request, Principal | None, Principal | None], dict[str, Any]]
+
+
+async def done_or_said(done: Awaitable[Any], said: Callable[[ApiError], Awaitable[Response]], leads: str) -> Response:
+    """Do it and go on to a page; what the rig or the service refuses is said on the page that `said` makes."""
+    try:
+        await done
+    except seen.ChangedError:  # it has a page of its own
+        raise
+    except ApiError as error:
+        return await said(error)
+    return RedirectResponse(leads, 303)
 
 
 NEWEST = 30
