@@ -6,6 +6,7 @@ import asyncio
 import logging
 import math
 import secrets
+import time
 from collections.abc import Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -51,6 +52,7 @@ PREVIEW_S = 35.0
 MISSED_POLLS = 3
 """After so many states that don't name the test, its end was lost: it comes within milliseconds of the state."""
 NOTE_S = 0.3
+NOTE_AGAIN_S = (0.5, 1.0, 2.0, 4.0, 8.0, 0.0)  # a database may restart while a stop is written down
 """So long the answer to a stop waits for its entry in the audit trail; the entry is made all the same."""
 EMERGENCY = "Use the stimulator's own emergency switch now."
 
@@ -320,11 +322,15 @@ class Runner(Playing):
         """Write a stop down; a database that is slow or gone does not keep its answer back."""
 
         def write() -> None:
-            try:
-                with self.store.write() as session:
-                    audit.write(session, self.clock.utc(), by, action, subject, **detail)
-            except SQLAlchemyError:
-                log.exception("%s by %s could not be written into the audit trail", action, by)
+            for wait_s in NOTE_AGAIN_S:
+                try:
+                    with self.store.write() as session:
+                        audit.write(session, self.clock.utc(), by, action, subject, **detail)
+                    return
+                except SQLAlchemyError:
+                    log.exception("%s by %s could not yet be written into the audit trail", action, by)
+                time.sleep(wait_s)
+            log.error("%s by %s is not in the audit trail; the rig's journal has it", action, by)
 
         noted = asyncio.get_running_loop().run_in_executor(self._notes, write)  # threads that nothing else can fill
         await asyncio.wait({noted}, timeout=NOTE_S)

@@ -52,7 +52,7 @@ def fit(data: str, progress: Progress, effects: Sequence[str] = (), **_of_one: A
     model = muscles.fit(record, own, between, lambda share, text="": progress(0.1 + 0.9 * share, text))
     first = record.records[0]
     told = {"json": model.to_json(), "model": model.to_dict()}
-    return {**told, "notes": list(first.notes), "of": first.source.participant}
+    return {**told, "notes": model.data["notes"], "of": first.source.participant}
 
 
 def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
@@ -114,7 +114,7 @@ def diagnosis(data: str, progress: Progress, model_json: str | None = None, **_o
         row["effect"]: {"name": row["name"], "plain": row.get("plain", "")}
         for row in (*found["missing"], *found["candidates"])
     }
-    empty = {"where": [], "free": [], "experiment": None, "deciding_experiment": None, "signatures": {}, "notes": []}
+    empty = {"where": [], "free": [], "experiment": None, "deciding_experiment": None, "signatures": {}}
     kept = {**found, **empty, "candidates": [found["candidates"]], "structure": structure, "library": told}
     for row in kept["missing"]:
         row.setdefault("parameters", {})

@@ -37,7 +37,8 @@ def finished(found: JointFitted, reasons: Sequence[str] = ()) -> JointModel:
             "name": source.name,
             "recording_id": source.recording_id,
             "sha256": source.sha256,
-            "fingerprint": joint_fingerprint(found.record),
+            "fingerprint": joint_fingerprint(found.measured),
+            "notes": [*found.record.records[0].notes],
         },
         reasons=tuple(reasons),
     )

@@ -17,12 +17,13 @@ from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.joint import Fitted, solve
 from stimrig.identify.estimation.plain import estimate, pilot_solution, to_fitted
-from stimrig.identify.estimation.samples import Raw, block_means, fitted_rows, prepare
+from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.muscles.problem import Acting, JointProblem, drive_form
 from stimrig.identify.muscles.record import JointRecord
 from stimrig.identify.noise import WHITE, NoiseLevel
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
+from stimrig.identify.summary import quantity
 
 PILOT_TURNS, TURNS = 12, 2
 SETTLED = 0.01
@@ -39,7 +40,8 @@ Start = Mapping[str, Mapping[str, float]]
 class JointFitted:
     """All muscles fitted to a record."""
 
-    record: JointRecord
+    record: JointRecord  # as `prepared` gives it
+    measured: JointRecord  # as it was given
     grids: tuple[Grid, ...]  # with the whole torque
     raw: Raw
     effects: tuple[tuple[tuple[str, Form], ...], ...]  # of each muscle
@@ -216,8 +218,8 @@ def _carried(problem: JointProblem, before: JointFitted, start: Start) -> np.nda
     return theta
 
 
-def prepared(record: JointRecord) -> tuple[tuple[Grid, ...], Raw]:
-    """The record's grids, with the noise of its samples and without hum.
+def prepared(record: JointRecord) -> tuple[JointRecord, tuple[Grid, ...], Raw]:
+    """The record without hum, its clipped samples doubted, with notes on both; its grids; what its samples show.
 
     Raises BadRecord, NotIdentifiable: as `prepare`, or a channel has no pulse.
     """
@@ -226,11 +228,31 @@ def prepared(record: JointRecord) -> tuple[tuple[Grid, ...], Raw]:
             fix = "Play a test of all channels, or leave this one out."
             raise NotIdentifiable(f"no pulse of {channel.name} is among the fitted rows", place=channel.name, fix=fix)
     _, raw = prepare(record.records[0])
-    grids = tuple(
-        replace(grid, torque_nm=block_means(grid, raw.torque_nm), noise_sd_nm=raw.noise_sd_nm, readings=raw.readings)
-        for grid in record.grids
-    )
-    return grids, raw
+    record = _cleaned(record, raw)
+    known = {"noise_sd_nm": raw.noise_sd_nm, "readings": raw.readings}
+    return record, tuple(replace(grid, **known) for grid in record.grids), raw
+
+
+def _cleaned(record: JointRecord, raw: Raw) -> JointRecord:
+    measured_nm, notes = record.torque_nm, []
+    clipped = np.zeros(measured_nm.size, bool)
+    if raw.hum is not None:
+        notes.append(f"Mains hum of {raw.hum['frequency_hz']:.0f} Hz was taken away.")
+    if raw.ceiling_nm is not None or raw.floor_nm is not None:
+        top_nm = np.inf if raw.ceiling_nm is None else raw.ceiling_nm
+        bottom_nm = -np.inf if raw.floor_nm is None else raw.floor_nm
+        clipped = (measured_nm >= top_nm) | (measured_nm <= bottom_nm)
+        share = quantity(100.0 * float(np.mean(clipped)), "%")
+        notes.append(f"The sensor reaches the end of its range: {share} of the samples are left out.")
+    if not notes:
+        return record
+    cleaned = [
+        replace(one.with_torque(raw.torque_nm), doubted=clipped | (one.doubted if one.doubted is not None else False))
+        for one in record.records
+    ]
+    first = cleaned[0].source
+    cleaned[0] = replace(cleaned[0], source=replace(first, notes=(*first.notes, *notes)))
+    return replace(record, records=tuple(cleaned))
 
 
 def fit_all(record: JointRecord) -> JointFitted:
@@ -238,7 +260,7 @@ def fit_all(record: JointRecord) -> JointFitted:
 
     Raises BadRecord, NotIdentifiable: as `prepared`, or the record does not tell the muscles apart.
     """
-    grids, raw = prepared(record)
+    measured, (record, grids, raw) = record, prepared(record)
     rows = fitted_rows(grids[0], None)
     torques = _pilots(grids, rows)
     fits: list[Fitted] = []
@@ -249,7 +271,7 @@ def fit_all(record: JointRecord) -> JointFitted:
             fitted = to_fitted(estimate(own, rows)[0], rows)
             fits.append(fitted)
             torques[place] = _torque_of(fitted)
-    return _together(record, grids, raw, fits)
+    return _together(measured, record, grids, raw, fits)
 
 
 def _without(grid: Grid, others_nm: np.ndarray | float) -> Grid:
@@ -282,7 +304,9 @@ def _torque_of(fitted: Fitted) -> np.ndarray:
     return setup.sign * (mean - fitted.physical[list(problem.baselines)][setup.grid.part])
 
 
-def _together(record: JointRecord, grids: tuple[Grid, ...], raw: Raw, fits: Sequence[Fitted]) -> JointFitted:
+def _together(
+    measured: JointRecord, record: JointRecord, grids: tuple[Grid, ...], raw: Raw, fits: Sequence[Fitted]
+) -> JointFitted:
     """All muscles at once, from the fit of each."""
     first = fits[0].problem.setup
     setups = [first.with_(grid=grids[0], target_nm=first.to_muscle(grids[0].torque_nm))]
@@ -302,7 +326,7 @@ def _together(record: JointRecord, grids: tuple[Grid, ...], raw: Raw, fits: Sequ
             theta[place.start + np.array(part.initials)] = 0.0
     noise = min((fitted.noise for fitted in fits), key=lambda one: one.sd_nm)
     start = NoiseLevel(noise.ar1, 0.5, noise.sd_nm) if not noise.held else noise
-    return JointFitted(record, grids, raw, nothing, (), solve(problem, theta, start))
+    return JointFitted(record, measured, grids, raw, nothing, (), solve(problem, theta, start))
 
 
 def _begins_at_rest(grid: Grid) -> bool:

@@ -179,6 +179,7 @@ class JointModel(Summarised):
         rows += [(key_of(one), _values(one)) for one in self.interplay]
         if self.quality:
             rows.append(("quality", str(self.quality.get("words", self.quality.get("verdict", "")))))
+        rows += [("note", str(note)) for note in self.data.get("notes", ())]
         return Sheet(f"Model {self.model_id[:8]} of {' and '.join(self.names)}", tuple(rows))
 
 

@@ -39,6 +39,7 @@ class JointDiagnosis(Result):
     candidates: tuple[Row, ...]  # what was tried and not added: `effect`, `log_evidence_gain`, `reason`
     model: JointModel  # the examined one
     conclusion: Mapping[str, str]  # `kind`, `title`, `words` and `advice`
+    notes: tuple[str, ...]  # what was assumed of the record
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON, without the model."""
@@ -49,6 +50,7 @@ class JointDiagnosis(Result):
         for row in self.missing:
             errors = f"{quantity(row['rms_before_nm'], 'N·m')} to {quantity(row['rms_after_nm'], 'N·m')}"
             rows.append((row["name"], f"{100 * row['probability']:.0f} %, error {errors}"))
+        rows += [("note", note) for note in self.notes]
         return Sheet(f"Diagnosis: {self.conclusion['title']}", tuple(rows))
 
 

@@ -192,8 +192,10 @@ def _effects(found: JointSearch, say: Progress, number: int) -> list[Tried]:
             if find_effect(effect).band:
                 continue
             form = dict(own.last.effects)[effect]
-            whose = "joint" if form.stage in JOINT_STAGES else name
-            both = last.with_effect(place, effect, form, own.last.parameters_of(effect))
+            where, whose = (0, "joint") if form.stage in JOINT_STAGES else (place, name)
+            if effect in dict(last.effects[where]) or f"{whose}.{effect}" in {one.key for one in tried}:
+                continue
+            both = last.with_effect(where, effect, form, own.last.parameters_of(effect))
             tried.append(_tried(last, f"{whose}.{effect}", form.name, both))
     return tried
 

@@ -157,6 +157,7 @@ def diagnosis_of(found: JointSearch) -> JointDiagnosis:
         candidates=_refused(found),
         model=first,
         conclusion=conclude(missing, found.unexplained),
+        notes=found.last.record.records[0].notes,
     )
 
 
@@ -203,9 +204,10 @@ def compare(model: JointModel, record: JointRecord) -> dict[str, Any]:
 
 def errors_of(record: JointRecord, predicted_nm: np.ndarray) -> dict[str, Any]:
     """The same of a prediction at the record's samples, N·m, shape (N,)."""
-    grids, raw = prepared(record)
+    record, grids, raw = prepared(record)
     told = fit_statistics(grids[0], grids[0].fitted, predicted_nm, raw.noise_sd_nm)
-    return told | held_out_errors(record, predicted_nm, grids[0].counted)
+    notes = list(record.records[0].notes)
+    return {"notes": notes} | told | held_out_errors(record, predicted_nm, grids[0].counted)
 
 
 def improve(record: JointRecord, model: JointModel | None = None, progress: Progress | None = None) -> JointImprovement:

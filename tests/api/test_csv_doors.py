@@ -40,7 +40,6 @@ DOORS: dict[str, tuple[int, str]] = {
     "api/cohort/bids.py": (3, "test_an_export"),
     "api/models/inverted.py": (1, ONLY_NUMBERS),
     "api/cli/commands/predict.py": (2, ONLY_NUMBERS),
-    "api/cli/several.py": (2, "numbers under a header of ours, and channels: small letters, digits, _ and -"),
     "api/models/analyses.py": (1, "no table: names of effects in the database"),
     "api/charts/svg.py": (2, "no table: numbers in attributes of a picture"),
     "api/web/guards.py": (1, "no table: numbers of entries in a header"),

@@ -78,7 +78,7 @@ def test_the_page_asks_for_it_at_the_rate_of_the_recording(monkeypatch: pytest.M
     for rate_hz in (25.0, 40.0):  # a diagnosis that was kept by an earlier version tells none
         asyncio.run(model_view.run_experiment(context, SimpleNamespace(name="B"), row))  # pyright: ignore[reportArgumentType]
         assert bodies[-1].pulse_rate_hz == rate_hz and bodies[-1].joins == "M1"
-        assert [dict(one) for one in bodies[-1].segments] == DECIDING["segments"]
+        assert [one.model_dump(exclude_unset=True) for one in bodies[-1].segments] == DECIDING["segments"]
         known.pop("pulse_rate_hz", None)
 
 

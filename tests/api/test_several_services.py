@@ -292,7 +292,7 @@ def test_a_stop_is_answered_while_the_database_is_frozen_and_all_goes_on_after_i
         cluster.restart()
         assert soon(lambda: at_b.get("/v1/audit").status_code == 200)
         assert at_b.get("/v1/audit").json()["whole"]
-        assert "frozen" in json.dumps(at_b.get("/v1/audit").json())
+        assert soon(lambda: "frozen" in json.dumps(at_b.get("/v1/audit").json()))
 
 
 def test_a_turn_that_is_given_up_is_let_go(cluster: Cluster, address: str) -> None:

@@ -16,7 +16,7 @@ from stimrig.identify.errors import BadModel, BadRecord, BadRequest, NotIdentifi
 from stimrig.identify.muscles.joint_fit import JointFitted, fit_all
 from stimrig.identify.muscles.problem import Acting
 from stimrig.identify.muscles.search import JointSearch, Tried, drop_idle, search
-from stimrig.identify.muscles.verbs import improvement_of
+from stimrig.identify.muscles.verbs import diagnosis_of, improvement_of
 from tests.harness import two_muscles
 
 CROSS = "cross_talk:biceps>triceps"
@@ -121,6 +121,23 @@ def test_a_form_that_is_asked_for_is_the_one_that_is_fitted() -> None:
     for form in ("independent", "nested"):
         model = muscles.fit(record, interplay=[f"{CROSS}:{form}", CROSS])
         assert [one["form"] for one in model.interplay] == [form]
+
+
+def test_hum_is_taken_away_and_told() -> None:
+    record = _made(0.15)[0]
+    humming = record.with_torque(record.torque_nm + 0.3 * np.sin(2 * np.pi * 50.0 * record.time_s + 0.3))
+    found = muscles.fit(humming, interplay=[CROSS])
+    assert any("50 Hz" in note for note in found.data["notes"]) and "note" in str(found)
+    told = muscles.compare(found, humming)
+    assert told["held_out_rms_nm"] < 1.2 * muscles.compare(_model(), record)["held_out_rms_nm"]
+
+
+def test_clipped_samples_are_left_out() -> None:
+    record = _made()[0]
+    low, high = np.percentile(record.torque_nm, [3, 97])
+    found = search(record.with_torque(np.clip(record.torque_nm, low, high)))
+    assert any("end of its range" in note for note in diagnosis_of(found).notes)
+    assert not found.added  # before, they were explained twice by `joint.voluntary_effort`
 
 
 def test_the_size_of_cross_talk_is_told() -> None:
