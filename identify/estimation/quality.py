@@ -13,7 +13,7 @@ from stimrig.identify.effects import depend_on_joint
 from stimrig.identify.errors import RunsAway
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.joint_surface import Acting, Surfaces
+from stimrig.identify.simulation.joint_surface import JointEffect, Surfaces
 from stimrig.identify.simulation.predict import refuse_rate
 from stimrig.identify.simulation.pulses import Motion, above_rest
 from stimrig.identify.yardstick import held_out_pulses
@@ -152,7 +152,7 @@ def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:
 def _stable(model: Model) -> dict[str, Any]:
     linear = model.linear
     stable = linear.stable if isinstance(linear, Discrete) else linear.time_constant_s > 0 and linear.damping > 0
-    if stable and any(Acting.of(entry).form.stage == "lags" for entry in model.effects):
+    if stable and any(JointEffect.of(entry).form.stage == "lags" for entry in model.effects):
         stable = _tame(model)
     return _gate(stable, "refuse", "the dynamics are unstable")
 

@@ -31,7 +31,7 @@ FORMULA = "T = baseline + g(x, v) y + h(x, v) + inertia a; y = G f(u); x: angle,
 
 
 @dataclass(frozen=True)
-class Acting:
+class JointEffect:
     """One effect of a model, with its values."""
 
     effect: Effect
@@ -39,7 +39,7 @@ class Acting:
     values: dict[str, float]
 
     @classmethod
-    def of(cls, entry: Mapping[str, Any]) -> Acting:
+    def of(cls, entry: Mapping[str, Any]) -> JointEffect:
         """From its row in MODEL.json.
 
         Raises BadModel: the effect or its form is unknown here, or a parameter is missing.
@@ -61,7 +61,7 @@ class Acting:
 class Surfaces:
     """g and h of a model, to be asked at any angles and velocities."""
 
-    acting: tuple[Acting, ...]  # the model's effects that depend on the joint
+    acting: tuple[JointEffect, ...]  # the model's effects that depend on the joint
     settings: Mapping[str, Any]  # those that the effects were fitted with
 
     @classmethod
@@ -71,7 +71,7 @@ class Surfaces:
         Raises BadModel: an effect or its form is unknown here, or an older version fitted it, without its own
         angle.
         """
-        acting = [one for one in map(Acting.of, effects) if one.effect.moves_with_joint]
+        acting = [one for one in map(JointEffect.of, effects) if one.effect.moves_with_joint]
         if not acting:
             return None
         settings = effects[0].get("settings", {})

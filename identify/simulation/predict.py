@@ -18,7 +18,7 @@ from stimrig.identify.errors import BadModel, BadRequest, RunsAway
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
-from stimrig.identify.simulation.joint_surface import Acting, angle_range
+from stimrig.identify.simulation.joint_surface import JointEffect, angle_range
 from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.simulation.setup import Setup
 
@@ -181,7 +181,7 @@ def problem_of(
     )
     acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]
     for entry in model.effects:
-        own = Acting.of(entry)
+        own = JointEffect.of(entry)
         if not own.effect.predictable and not own_record:
             baseline_nm += entry.get("unforeseen", {}).get("mean_nm", 0.0)
             continue
