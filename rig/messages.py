@@ -43,6 +43,8 @@ MOST_CHANNELS = 8
 MOST_ELEMENTS = 2
 """Of an array that one channel stimulates over at the same time: one, or a pair."""
 CHANNEL_NAME = r"^[a-z][a-z0-9_-]{0,31}$"
+RESERVED_NAMES = ("joint", "predicted")
+"""Words of files of several channels, which no channel may have for a name."""
 
 PULSE_RATES_HZ = (1.0, 60.0)
 """Least and most that any rig plays (`stimrig.rig.limits` says why)."""

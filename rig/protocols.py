@@ -64,9 +64,11 @@ def several(names: Sequence[str]) -> list[SegmentPlan]:
     themselves. The channels' levels are drawn apart, so that they are not correlated; the last ramps overlap by a half,
     so that every channel also moves while another one holds much or little.
     """
-    turns = list(enumerate(names))
+    turns, last = list(enumerate(names)), max(len(names) - 1, 1)
     alone = [[(name, "ramp", {"up_s": 3.3, "down_s": 3.3})] for name in names]
-    together = [(name, "ramp", {"up_s": 2.0 + 1.4 * turn, "down_s": 3.2 - 1.2 * turn}) for turn, name in turns]
+    together = [
+        (name, "ramp", {"up_s": 2.0 + 1.4 * turn / last, "down_s": 3.2 - 1.2 * turn / last}) for turn, name in turns
+    ]
     both = [(name, "multilevel", {"duration_s": 6.0, "seed": 20 + 7 * turn}) for turn, name in turns]
     own = [[(name, "multilevel", {"duration_s": 2.4, "seed": 3 + turn, "zero_share": 0.0})] for turn, name in turns]
     random = [(name, "prbs", {"seed": 1 + 41 * turn, "chips": 108}) for turn, name in turns]

@@ -13,7 +13,7 @@ from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import number, percent, say, say_json, table, write
 from stimrig.api.progress_bar import progress_bar
 
-STRUCTURE = "co_contraction, cross_talk:FROM>TO, or CHANNEL.EFFECT"
+STRUCTURE = "co_contraction, 'cross_talk:FROM>TO' with the quotes, or CHANNEL.EFFECT"
 
 
 def is_joint(data: Sequence[Path]) -> bool:

@@ -1,7 +1,8 @@
 """A rig's channels, and what a participant has on each of them.
 
 The first channel is what a participant has anyway: side, muscle, placement and profile. Further ones stand in
-`Participant.channels`, by their names. On a rig of one channel there are none.
+`Participant.channels`, by their names. On a rig of one channel there are none. Under `FIRST` stands there which channel
+was the first one when its limits were set: on a rig with another first one they are not that channel's.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from pydantic import StringConstraints
 
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.models.places import Site
+from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.store.tables import Participant
 from stimrig.rig.messages import CHANNEL_NAME, ChannelPlan, Profile, Status, TestPlan
 
 ChannelName = Annotated[str, StringConstraints(pattern=CHANNEL_NAME)]
+FIRST = ""
 NOTHING: dict[str, Any] = {"side": None, "muscle": None, "placement": None, "profile": {}}
 
 
@@ -53,12 +56,27 @@ def held(row: Participant, key: str = "") -> dict[str, Any]:
     return {**NOTHING, **((row.channels or {}).get(key) or {})}
 
 
-def put(row: Participant, key: str, **new: Any) -> None:
+def put(row: Participant, key: str, status: Status | None, **new: Any) -> None:
     """Change some of it."""
+    if not key and (names := of_rig(status)):
+        row.channels = {**(row.channels or {}), FIRST: {"name": names[0]}}
     if key:
         row.channels = {**(row.channels or {}), key: {**held(row, key), **new}}
     for name, value in () if key else new.items():
         setattr(row, name, value)
+
+
+def refuse_reordered(row: Participant, status: Status | None) -> None:
+    """Raise ApiError (409) where the participant's limits of the first channel are of another one than the rig's."""
+    names, known = of_rig(status), row.channels or {}
+    first = known.get(FIRST, {}).get("name")
+    if not names or first == names[0] or (first is None and names[0] not in known):
+        return
+    detail = (
+        f"The first channel of this rig is {names[0]}, the limits of {row.code} were set where it was "
+        f"{first or 'another one'}. Set them anew, channel by channel, or restore the order in the rig file."
+    )
+    raise ApiError(409, "other-order", "The rig's channels have another order", detail)
 
 
 def of(row: Participant, status: Status | None) -> list[Channel]:
@@ -92,10 +110,18 @@ def needed(row: Participant, status: Status | None) -> list[Channel]:
 def for_all(plan: TestPlan, row: Participant, status: Status | None) -> tuple[TestPlan, dict[str, Any]]:
     """A plan that plays on all of the rig's channels, with the participant's profile on each; and what is kept of it.
 
+    What the request narrows is narrowed on each.
+
     Raises ApiError: as `needed`.
     """
     playing = needed(row, status)
-    plans = [ChannelPlan(name=one.name, profile=Profile(**one.profile)) for one in playing]
+    asked = plan.profile.model_dump(include=set(LIMITS))
+    own = row.profile
+    narrower = {name: value for name, value in asked.items() if value is not None and value < own.get(name, value)}
+    plans = []
+    for one in playing:
+        least = {name: min(value, one.profile.get(name, value)) for name, value in narrower.items()}
+        plans.append(ChannelPlan(name=one.name, profile=Profile(**one.profile | least)))
     plans[0].profile = plan.profile
     sites = {one.name: list(one.site) for one in playing if one.key}
     return plan.model_copy(update={"channels": plans}), {"sites": sites}

@@ -15,8 +15,8 @@ from stimrig.api.sessions.channels import ChannelName
 from stimrig.api.sessions.kinds import Kind, Planned
 from stimrig.api.sessions.requests import CurrentMa, TestIn, WidthUs
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.store import Store
-from stimrig.api.store.tables import OPEN_STATES, Participant, Search, Test
+from stimrig.api.store import Store, seen
+from stimrig.api.store.tables import OPEN_STATES, AuditEntry, Participant, Search, Test
 from stimrig.rig.messages import ChannelPlan, Profile, SegmentPlan, Status, TestPlan
 
 ELECTRODE = "electrode"
@@ -64,6 +64,19 @@ def needed(status: Status | None) -> Array:
         detail = "No channel of this rig has a switch to an array. The rig file names one under [switch]."
         raise ApiError(409, "no-switch", "This rig has no electrode array", detail)
     return found
+
+
+def elements_of_first(row: Participant, status: Status | None) -> list[int]:
+    """The elements of the first channel; empty where no switch is at it. Raises ApiError: as `held_elements`."""
+    array = array_of(status)
+    return held_elements(row, array) if array is not None and not array.key else []
+
+
+def refuse_other_channel(array: Array, channel: str) -> None:
+    """Raise ApiError (409) where a search is of another channel than the one with the switch."""
+    if array.channel != channel:
+        detail = f"The search is of {channel}, the switch is at {array.channel}. Begin another one."
+        raise ApiError(409, "no-switch", "The array is at another channel", detail)
 
 
 def words(elements: Sequence[int]) -> str:
@@ -154,12 +167,11 @@ class ElectrodeTests(Kind):
         if not isinstance(body, StimulusIn):
             detail = "It belongs to a search: POST /v1/participants/{code}/searches begins one."
             raise ApiError(422, "of-a-search", "Such a test is not started by itself", detail)
+        await asyncio.to_thread(self._refuse_untold, body.search_id)
         row: Participant = await asyncio.to_thread(self.store.get, Participant, plan.participant)
         array = needed(self.rig.status)
         own = channels.held(row, array.key)["profile"]
-        if array.channel != body.channel:
-            detail = f"The search is of {body.channel}, the switch is at {array.channel}. Begin another one."
-            raise ApiError(409, "no-switch", "The array is at another channel", detail)
+        refuse_other_channel(array, body.channel)
         refuse_wider(own, body.width_us, body.asked_ma)
         profile = Profile(**own).model_copy(update={"current_ma": body.asked_ma})
         channel = ChannelPlan(
@@ -172,7 +184,25 @@ class ElectrodeTests(Kind):
             SegmentPlan(name="stimulus", sequence="widths", settings={"pulse_width_us": widths}),
         ]
         played = plan.model_copy(update={"profile": profile, "channels": [channel], "segments": segments})
-        return Planned(played, {"search": body.search_id, "elements": body.elements})
+        kept = {"search": body.search_id, "elements": body.elements}
+        side, muscle = (channels.held(row, array.key)[name] for name in ("side", "muscle"))
+        at = words(body.elements)
+        site = {"sites": {array.key: [side, muscle, at]}} if array.key else {"placement": at}
+        return Planned(played, kept | site)
+
+    def _refuse_untold(self, search_id: str) -> None:
+        """Raise ApiError (409): the last stimulus was not told, or a page is older than what was told, or a stop."""
+        row: Search = self.store.get(Search, search_id)
+        now = document(self.store, row)
+        if now["playing"] or now["waiting"]:
+            raise ApiError(409, "not-told", "The last stimulus was not told yet", "Tell first what it gave.")
+        self.store.refuse_changed(*rests_of(row))
+
+
+def rests_of(row: Search) -> tuple[seen.About, ...]:
+    """What a stimulus rests on: limits, what was told of those before, and that nothing was stopped since."""
+    told = seen.actions_on(row.id, "tell stimulus")
+    return seen.participant(row.participant), told, AuditEntry.action.in_(("stop", "re-arm"))
 
 
 def tests_of(store: Store, row: Search) -> list[Test]:

@@ -200,6 +200,7 @@ class Runner(Playing):
             raise ApiError(503, "too-late", "The start took too long", detail)
 
     async def _planned(self, body: TestIn, participant: Participant) -> Planned:
+        channels.refuse_reordered(participant, self.rig.status)
         segments = None
         if body.segments is not None:
             segments = [messages.SegmentPlan(**segment.model_dump()) for segment in body.segments]

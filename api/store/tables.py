@@ -36,7 +36,8 @@ class Participant(Table):
     def as_dict(self) -> dict[str, Any]:
         """As `Table`; who has one channel never sees that there are more."""
         found = super().as_dict()
-        return found if self.channels else {name: value for name, value in found.items() if name != "channels"}
+        further = {name: one for name, one in (found.pop("channels") or {}).items() if name}
+        return found | ({"channels": further} if further else {})
 
 
 class Test(Table):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from stimrig.identify.json_text import json_value, parse
 from stimrig.identify.muscles import verbs as joint
 
 Verb = Callable[..., dict[str, Any]]
-OF_THE_JOINT = "joint."
+OF_THE_JOINT = re.compile(r"^joint\.")
 """Before an effect that is of the joint, as a search names it; it is kept with the first channel."""
 
 
@@ -106,10 +107,10 @@ def diagnosis(data: str, progress: Progress, model_json: str | None = None, **_o
     found, improved = joint.diagnosis_of(searched).to_dict(), joint.improvement_of(searched).to_dict()
     first = f"{record.names[0]}."
     for row in [*found["missing"], *found["candidates"]]:
-        row["effect"] = row["effect"].replace(OF_THE_JOINT, first)
+        row["effect"] = OF_THE_JOINT.sub(first, row["effect"])
         row["name"] = effect_words(row["effect"])  # as pages say it, and translate it
     for step in improved["steps"]:
-        step["added"] = step["added"] and step["added"].replace(OF_THE_JOINT, first)
+        step["added"] = step["added"] and OF_THE_JOINT.sub(first, step["added"])
     told = {
         row["effect"]: {"name": row["name"], "plain": row.get("plain", "")}
         for row in (*found["missing"], *found["candidates"])

@@ -110,8 +110,9 @@ def held_out_errors(record: JointRecord, predicted_nm: np.ndarray, counted: np.n
 def _quality(names: Sequence[str], models: Sequence[Model]) -> dict[str, Any]:
     """The worst of the muscles' verdicts, with all their checks."""
     order = ("usable", "usable with care", "not usable")
-    worst = max((model.quality for model in models), key=lambda one: order.index(one["verdict"]))
     named = list(zip(names, models, strict=True))
+    whose, of = max(named, key=lambda one: order.index(one[1].quality["verdict"]))
+    worst = of.quality
     gates = {f"{name}.{gate}": told for name, model in named for gate, told in model.quality["gates"].items()}
     reasons = list(dict.fromkeys(f"{name}: {reason}" for name, model in named for reason in model.quality["reasons"]))
-    return {"verdict": worst["verdict"], "words": worst["words"], "reasons": reasons, "gates": gates}
+    return {"verdict": worst["verdict"], "words": f"{whose}: {worst['words']}", "reasons": reasons, "gates": gates}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -19,7 +20,7 @@ from stimrig.identify.json_text import BadJson, json_value, parse
 from stimrig.identify.model import LARGEST_TEXT, SCHEMA_VERSION, SOFTWARE, Model
 from stimrig.identify.muscles.interplay import Other
 from stimrig.identify.muscles.problem import Acting, JointProblem, drive_form
-from stimrig.identify.muscles.record import Channel, JointRecord
+from stimrig.identify.muscles.record import MOST, NAME, RESERVED, Channel, JointRecord
 from stimrig.identify.simulation.predict import fingerprint, problem_of, refuse_rate
 from stimrig.identify.summary import Sheet, Summarised, quantity
 
@@ -122,7 +123,7 @@ class JointModel(Summarised):
                 created=str(data.get("created", "")),
             )
             found.check()
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             said = " ".join(f"{type(error).__name__} {error}".split())[:100]
             raise BadModel(f"the parts do not match ({said})", fix=model_schema.FIX) from error
         except BadRequest as error:
@@ -134,12 +135,21 @@ class JointModel(Summarised):
         rates = {model.pulse_rate_hz for model in self.models}
         interval_s = 1.0 / max(rates)
         offsets_s = [channel.offset_s for channel in self.channels]
-        if len(self.channels) < 2 or len(set(self.names)) < len(self.names) or len(rates) > 1:
+        known = all(re.fullmatch(NAME, name) and name not in RESERVED for name in self.names)
+        if not 2 <= len(set(self.names)) == len(self.names) <= MOST or not known or len(rates) > 1:
             raise BadModel("channels that make no joint", place="channels", fix=model_schema.FIX)
         if not all(-interval_s < offset_s < interval_s for offset_s in offsets_s):
             raise BadModel("an offset longer than a pulse interval", place="channels", fix=model_schema.FIX)
         if not all(isinstance(model.linear, SecondOrder) for model in self.models):
             raise BadModel("a muscle without second-order dynamics", place="channels", fix=model_schema.FIX)
+        keys = [key_of(entry) for entry in self.interplay]
+        if len(set(keys)) < len(keys):
+            raise BadModel("an interplay twice", place="interplay", fix=model_schema.FIX)
+        told = [self.fit.get("alone") or {}, self.fit.get("both") or {}]
+        if not all(isinstance(one, dict) for one in (*told, *dict(told[0]).values())):
+            raise BadModel("no errors of each muscle", place="fit", fix=model_schema.FIX)
+        if not isinstance(self.data.get("notes", []), list):
+            raise BadModel("no list of notes", place="data", fix=model_schema.FIX)
         for acting, values in self.acting():
             known = {p.name: p for p in _parameters_of(acting)}
             if set(values) != set(known):

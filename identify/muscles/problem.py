@@ -51,7 +51,11 @@ class Acting:
                 )
             between = names.index(ends[0]), names.index(ends[1])
         if interplay.directed != (between is not None):
-            fix = f"Write {identifier}:{names[0]}>{names[1]}." if interplay.directed else f"Write {identifier} alone."
+            fix = (
+                f"Write '{identifier}:{names[0]}>{names[1]}', with the quotes."
+                if interplay.directed
+                else f"Write {identifier} alone."
+            )
             raise BadRequest(
                 f"{text!r} {'names no' if interplay.directed else 'names'} channels", place="interplay", fix=fix
             )

@@ -18,6 +18,8 @@ from stimrig.identify.records.record import Record
 
 NAME = r"[a-z][a-z0-9_-]{0,31}"
 """What a channel may be called."""
+RESERVED = ("joint", "predicted")
+"""What a channel may not be called: files say it of the joint, and of a prediction."""
 _COLUMN = re.compile(rf"(?P<name>{NAME})_pulse_width_us")
 HEAD_BYTES = 4096
 """Of a table, in which its header stands."""
@@ -194,6 +196,10 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> JointRecord:
         names: list[str] = []
     else:
         names = _columns(content)
+    if taken := set(names) & set(RESERVED):
+        raise BadRecord(f"a channel called {taken.pop()}", place=path.name, fix="Give its column another name.")
+    if len(names) > MOST:
+        raise BadRecord(f"pulses of {len(names)} channels", place=path.name, fix=f"Give at most {MOST}.")
     if len(names) < 2:
         fix = "It needs two columns such as biceps_pulse_width_us and triceps_pulse_width_us."
         raise BadRecord("the file holds the pulses of one channel", place=path.name, fix=fix)

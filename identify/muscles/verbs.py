@@ -97,6 +97,10 @@ def _with_named(found: JointFitted, place: int, text: str) -> JointFitted:
     return found.with_effect(place, identifier, tried.form, tried.fitted.parameters_of(identifier))
 
 
+JOINT = "joint"
+"""Whose an effect is that no muscle has by itself: it is kept with the first channel."""
+
+
 def parted(effects: Sequence[str], names: Sequence[str]) -> tuple[dict[str, list[str]], list[str], list[str]]:
     """Of texts like "biceps.fatigue" and "co_contraction": by channel its effects; the interplay; what is neither."""
     own: dict[str, list[str]] = {}
@@ -105,8 +109,8 @@ def parted(effects: Sequence[str], names: Sequence[str]) -> tuple[dict[str, list
         channel, _, effect = text.partition(".")
         if text.partition(":")[0] in registry():
             between.append(text)
-        elif effect and channel in names:
-            own.setdefault(channel, []).append(effect)
+        elif effect and channel in (*names, JOINT):
+            own.setdefault(names[0] if channel == JOINT else channel, []).append(effect)
         else:
             neither.append(text)
     return own, between, neither

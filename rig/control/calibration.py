@@ -343,8 +343,15 @@ class CalibrationOfChannels:
     ) -> None:  # fmt: skip
         self.request, self._playing = request, ""
         if request.channels is None:
+            of = None
+            if rig and (rig[0].elements or request.elements):
+                of = CalibrateChannel(
+                    name=rig[0].name, current_ma=request.current_ma, last=request.last, elements=request.elements
+                )
+                self._check([of], table, rig)
+                self._playing = of.name
             table = limits.narrowed(table, rig[0].limits, f"rig file, {rig[0].name}") if rig else table
-            self._of = {"": Calibration(request, table, unix_s, steps)}
+            self._of = {self._playing: Calibration(request, table, unix_s, steps, of)}
             return
         self._check(request.channels, table, rig)
         own = {one.name: limits.narrowed(table, one.limits, f"rig file, {one.name}") for one in rig}
@@ -364,6 +371,8 @@ class CalibrationOfChannels:
 
     def channel(self, name: str) -> Calibration:
         """That channel's. Raises PlanError: it is none of this calibration's, or not named."""
+        if self.request.channels is None and not name:
+            name = self._playing
         if name not in self._of:
             known = ", ".join(filter(None, self._of)) or "leave it out: there is one"
             raise PlanError(f"calibration: channel {name!r} is not calibrated ({known})")
@@ -377,7 +386,7 @@ class CalibrationOfChannels:
     def result(self, unix_s: float) -> CalibrationResult:
         """With a profile for each channel. Raises PlanError (a threshold is not marked: names the channel)."""
         if self.request.channels is None:
-            return CalibrationResult(profile=self._of[""].profile(unix_s), recordings=self.recordings)
+            return CalibrationResult(profile=self._of[self._playing].profile(unix_s), recordings=self.recordings)
         profiles = dict[str, Profile]()
         for name, one in self._of.items():
             try:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from stimrig.rig.devices import DeviceSettings
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.machine import Machine, Port
-from stimrig.rig.messages import CHANNEL_NAME, LONGEST_NAME, MOST_CHANNELS, several
+from stimrig.rig.messages import CHANNEL_NAME, LONGEST_NAME, MOST_CHANNELS, RESERVED_NAMES, several
 from stimrig.rig.signals import Ack, LateError
 from stimrig.rig.tasks import Signal
 
@@ -373,6 +373,10 @@ class LineSettings(DeviceSettings, Generic[C]):
     def _differ(self) -> LineSettings[C]:
         if self.channels and self.model_fields_set & {"channel", "connector"}:
             raise ValueError("with [[stimulator.channels]] each of them names its output: remove it from [stimulator]")
+        for place, channel in enumerate(self.channels):
+            if channel.name in RESERVED_NAMES:
+                why = "stands for something else in files of several channels; give another name"
+                raise ValueError(f"channels.{place}.name: {channel.name!r} {why}")
         for what, values in (
             ("names", [channel.name for channel in self.channels]),
             ("outputs", [channel.output for channel in self.channels]),

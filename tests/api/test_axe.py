@@ -163,6 +163,7 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: http
     opened()
     examined(tab, "model, all open")
     tab.get_by_role("button", name="Add this effect").click()
+    tab.wait_for_url(lambda url: first["model_id"] not in url)  # a chart of the page before would be gone meanwhile
     chart(tab, "falling")
     settled(tab)
     examined(tab, "versions")

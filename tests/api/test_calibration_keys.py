@@ -226,6 +226,7 @@ def test_an_end_that_is_refused_says_why(page: Any, client: httpx.Client) -> Non
     page.locator("#discard").click()
     page.get_by_text("No calibration of K1 is open").wait_for()
     assert page.url.endswith("/participants/K1/calibration"), "loaded again it sends nothing"
+    page.wait_for_load_state()
     page.get_by_role("button", name="Begin the calibration").click()
     page.locator("#step-up").wait_for()
     page.wait_for_load_state()

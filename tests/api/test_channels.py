@@ -96,6 +96,17 @@ def test_the_plan_is_one_that_the_rig_takes() -> None:
     assert abs(float(((first > 0) == (second > 0)).mean()) - 0.5) < 0.1, "the two look like each other"
 
 
+@pytest.mark.parametrize("count", [3, 4, 8])
+def test_more_channels_have_such_a_plan_too(count: int) -> None:
+    names = [f"c{number}" for number in range(count)]
+    channels = [ChannelPlan(name=name, profile=Profile(**{**OWN, "current_ma": 5.0})) for name in names]
+    plan = TestPlan(
+        segments=None, test_id="T1", participant="P1", kind="muscles", profile=channels[0].profile, channels=channels
+    )
+    built = build(plan, for_plan({**HARD_LIMITS, **SUM_LIMITS}, plan), [RigChannel(name, "", "", "") for name in names])
+    assert (built.pulse_width_us.reshape(-1, count).max(axis=0) > 100.0).all()
+
+
 def ready(two: httpx.Client) -> None:
     assert two.put(f"{TRICEPS}/profile", json=OWN).status_code == 200
 
@@ -120,6 +131,39 @@ def test_a_test_of_both_muscles_is_previewed_played_and_kept(two: httpx.Client, 
     assert set(done["summary"]["channels"]) == set(TWO)
     with h5py.File(Path(next(service.rig.data.glob("*.h5")))) as file:
         assert [one["name"] for one in json.loads(str(file.attrs["channels"]))] == TWO
+
+
+def test_limits_stay_with_their_channel_whatever_the_order_in_the_rig_file(two: httpx.Client, service: Service) -> None:
+    """A first channel's limits stand by its place: a rig with another first one plays nothing by them."""
+    ready(two)
+    assert two.put(f"{PERSON}/channels/biceps/profile", json={"current_ma": 18.0}).status_code == 200
+    service.rig.channels = TWO[::-1]
+    service.rig.become("ready")
+    soon(lambda: two.get("/v1/rig").json()["stimulator"]["channels"][0]["name"] == "triceps")
+    two.put(f"{PERSON}/channels/biceps/profile", json=OWN)
+    for body in ({"kind": "muscles"}, {"kind": "test"}):
+        refused = two.post("/v1/tests", json={"participant": "P017", **body})
+        assert refused.status_code == 409 and refused.json()["type"].endswith("other-order"), refused.text
+    assert two.post(f"{PERSON}/calibration").status_code == 409
+    assert service.rig.last_plan is None and set(two.get(PERSON).json()["channels"]) == set(TWO)
+    assert two.put(f"{TRICEPS}/profile", json={"current_ma": 5.0}).status_code == 200, "set anew"
+    assert two.post("/v1/preview", json={"participant": "P017", "kind": "muscles"}).status_code == 200
+
+
+def test_what_a_request_narrows_is_narrowed_on_each_channel(two: httpx.Client, service: Service) -> None:
+    ready(two)
+    weak = {"current_ma": 15.0, "max_pulse_width_us": 100.0, "max_torque_nm": 3.0}
+    test = two.post("/v1/tests", json={"participant": "P017", "kind": "muscles", "profile": weak}).json()
+    wait_done(two, test["id"])
+    played: Any = service.rig.last_plan
+    assert [one.profile.current_ma for one in played.channels] == [15.0, 12.0]
+    assert (played.max_pulse_width_us, played.max_torque_nm) == (100.0, 3.0), "of all"
+
+
+def test_a_calibration_keeps_to_the_tightest_torque_limit_of_its_channels(two: httpx.Client) -> None:
+    two.put(f"{TRICEPS}/profile", json={**OWN, "max_torque_nm": 8.0})
+    begun = two.post(f"{PERSON}/calibration", json={"channels": [{"name": "triceps"}]}).json()
+    assert begun["max_torque_nm"] == 8.0, begun
 
 
 @pytest.mark.parametrize("field", [{"segments": [{"name": "rest", "sequence": "rest"}]}, {"angle": {}}, {"joins": "m"}])

@@ -157,6 +157,46 @@ def test_a_stopped_stimulus_is_no_evidence_and_not_proposed_again(shared: Servic
     assert client.post("/v1/rearm").is_success
 
 
+def test_the_next_stimulus_waits_for_the_answer_even_while_the_last_one_plays(
+    shared: Service, client: httpx.Client
+) -> None:
+    search = begin(client)
+    begun = client.post(f"/v1/searches/{search['id']}/stimuli", json={"elements": [1]}).json()
+    statuses = set[int]()
+    for _ in range(40):
+        statuses.add(client.post(f"/v1/searches/{search['id']}/stimuli", json={"elements": [4]}).status_code)
+    wait_done(client, begun["stimuli"][0]["test_id"])
+    assert statuses == {409}
+    assert [one["elements"] for one in client.get(f"/v1/searches/{search['id']}").json()["stimuli"]] == [[1]]
+
+
+def test_what_was_seen_before_an_answer_or_a_stop_plays_nothing(shared: Service, client: httpx.Client) -> None:
+    search = begin(client)
+    at = f"/v1/searches/{search['id']}"
+    old = {"If-Match": client.get(at).headers["etag"]}
+    tell(client, play(client, search, [1]), "strong", 0.0)
+    refused = client.post(f"{at}/stimuli", json={"elements": [1]}, headers=old)
+    assert refused.status_code == 409 and "tell stimulus" in refused.json()["detail"], refused.text
+    old = {"If-Match": client.get(at).headers["etag"]}
+    assert client.post("/v1/stop", json={"reason": "pain"}).status_code == 200
+    assert client.post("/v1/rearm").is_success
+    soon(lambda: client.get("/v1/rig").json()["state"] == "ready")
+    refused = client.post(f"{at}/stimuli", json={"elements": [1]}, headers=old)
+    assert refused.status_code == 409 and "re-arm" in refused.json()["detail"], refused.text
+
+
+def test_a_search_of_another_channel_chooses_nothing(shared: Service, client: httpx.Client) -> None:
+    search = begin(client)
+    try:
+        shared.rig.channels = ["biceps", "triceps"]
+        shared.rig.switch = {**SWITCH, "channel": "triceps"}
+        shared.rig.become("ready")
+        soon(lambda: client.get("/v1/rig").json()["switch"]["channel"] == "triceps")
+        assert client.post(f"/v1/searches/{search['id']}/choice", json={"elements": [2]}).status_code == 409
+    finally:
+        fitted(shared, client)
+
+
 def test_narrower_limits_end_a_wider_search(client: httpx.Client) -> None:
     search, code = begin(client), client.headers["X-Code"]
     assert client.put(f"/v1/participants/{code}/profile", json={"current_ma": 9.0}).status_code == 200
@@ -215,6 +255,10 @@ def test_a_calibration_at_another_electrode_ends_only_when_that_is_said(shared: 
     assert client.post(at, json={"elements": [1]}).status_code == 200
     refused = client.post(at, json={"elements": [2]})
     assert refused.status_code == 409 and refused.json()["type"].endswith("voids-calibration")
+    with shared.context.store.write() as session:
+        session.get(Participant, code).placement = None  # pyright: ignore[reportOptionalMemberAccess]
+    refused = client.post(at, json={"elements": [2]})
+    assert refused.status_code == 409, "calibrated where no element was said"
     assert client.post(at, json={"elements": [2], "void_calibration": True}).status_code == 200
     assert client.get(f"/v1/participants/{code}").json()["profile"].get("motor_pulse_width_us") is None
 
@@ -263,4 +307,10 @@ def test_the_page_leads_from_the_wish_to_the_choice(stubbed: Service) -> None:
         assert "1 is good: use it" in html
         assert sent(tab, f"{at}/choice", elements="1+2").status_code == 303
         assert http.get(PERSON).json()["placement"] == "elements 1 and 2"
+        assert http.post("/v1/participants", json={"code": "P018"}).status_code == 201
+        seen = re.findall(r'name="seen" value="([^"]+)"', tab.get(PAGE.replace("P017", "P018")).text)[0]
+        form = {"csrf": csrf(tab), "seen": seen, "elements": "1"}
+        for deed in ("stimuli", "choice"):
+            other = tab.post(f"{at.replace('P017', 'P018')}/{deed}", data=form)
+            assert other.status_code == 404, "a search is its participant's"
         assert "1+2 is used" in tab.get(PAGE).text and 'name="wish"' in tab.get(f"{PAGE}?anew=1").text

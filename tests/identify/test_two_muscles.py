@@ -199,6 +199,10 @@ def test_bad_records_say_what_is_wrong(tmp_path: Path) -> None:
     assert not muscles.is_joint(path)
     with pytest.raises(BadRecord, match="one channel"):
         muscles.read(path)
+    for names, why in ((["joint", "b"], "called joint"), ([f"c{k}" for k in range(200)], "200 channels")):
+        path.write_text("time_s," + "".join(f"{name}_pulse_width_us," for name in names) + "torque_nm,segment\n")
+        with pytest.raises(BadRecord, match=why):
+            muscles.read(path)
     with pytest.raises(BadRecord, match="channels biceps, biceps"):
         muscles.JointRecord((record.channels[0], record.channels[0]), record.records)
     silent = replace(record.records[1], pulse_width_us=np.zeros(record.time_s.size))
@@ -223,6 +227,13 @@ def test_bad_records_say_what_is_wrong(tmp_path: Path) -> None:
         lambda d: d["interplay"][0].update(form="magic"),
         lambda d: d.update(kind="tin"),
         lambda d: d["channels"][0].pop("model"),
+        lambda d: d["channels"][0].update(name="joint"),
+        lambda d: d["channels"][0].update(name="\x1b[31mred"),
+        lambda d: d["interplay"].append(d["interplay"][0]),
+        lambda d: d["interplay"][0]["parameters"]["share"].update(value=10**400),
+        lambda d: d["fit"].update(alone="text"),
+        lambda d: d["fit"].update(both=7),
+        lambda d: d["data"].update(notes=1),
     ],
 )
 def test_a_damaged_model_is_refused(damage: Any) -> None:

@@ -263,6 +263,7 @@ def test_one_channel_sees_nothing_of_it(tmp_path: Path):
         ({"triceps": "biceps"}, "their names must differ: biceps, biceps"),
         ({"connector = 2": "connector = 1", "channel = 2": "channel = 1"}, "their outputs must differ"),
         ({'"triceps"': '"Triceps!"'}, "stimulator.channels.1.name"),
+        ({'"triceps"': '"joint"'}, "stimulator.channels.1.name"),
         ({'side = "right"': 'side = "up"'}, "stimulator.channels.0.side"),
         ({"channel = 2": "channel = 5"}, "stimulator.channels.1.channel"),
         ({"channel = 2\n": ""}, "stimulator.channels.1.channel: missing"),

@@ -10,7 +10,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from stimrig.api.charts.electrode_map import array_map, named
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.language import _
 from stimrig.api.sessions import channels, electrodes
 from stimrig.api.web.dependencies import Context, Ctx, Tester
@@ -50,8 +50,7 @@ async def show_page(
         request, "electrodes.html", status, participant=person, array=array, found=found, problem=problem, row=row,
         texts=texts or kept, errors=errors or {}, wishes=electrodes.WISHES, named=named, rows=ranked(found),
         picture=array_map(found, _("Map of the array")) if found else "",
-        voids=array is not None and found is not None and bool(found["best"])
-        and searches.loses_calibration(person, array.key, electrodes.words(found["best"])),
+        voids=array is not None and searches.loses_calibration(person, array.key, ""),
     )  # fmt: skip
 
 
@@ -88,7 +87,7 @@ async def play(request: Request, context: Ctx, who: Tester, code: str, search_id
 
     async def done() -> None:
         body = typed.checked(searches.PlayIn, elements=_elements(sent))
-        await searches.play_stimulus(context, who, search_id, body)
+        await searches.play_stimulus(context, who, await own(context, code, search_id), body)
 
     return await attempt(request, context, code, done())
 
@@ -103,21 +102,31 @@ async def tell(request: Request, context: Ctx, who: Tester, code: str, search_id
             raise typed.unusable("Say both: how far it spilled over, and how it felt.")
         comfort = typed.wanted(str(sent["comfort"]), lambda why: f"comfort: {why}")
         given = {"test_id": str(sent.get("test_id")), "spill": sent["spill"], "comfort": comfort}
-        await searches.tell_seen(context, who, search_id, typed.checked(searches.SeenIn, **given))
+        await searches.tell_seen(
+            context, who, await own(context, code, search_id), typed.checked(searches.SeenIn, **given)
+        )
 
     return await attempt(request, context, code, done())
 
 
 @router.post("/{search_id}/choice")
 async def choose(request: Request, context: Ctx, who: Tester, code: str, search_id: str) -> Response:
-    """Use these elements from now on; the page has said that a calibration at another place ends with it."""
+    """Use these elements from now on; `voids`: the form said that a calibration at another place ends with it."""
     sent = await request.form()
 
     async def done() -> None:
-        body = typed.checked(searches.ChoiceIn, elements=_elements(sent), void_calibration=True)
-        await searches.choose(context, who, search_id, body)
+        given = {"elements": _elements(sent), "void_calibration": "voids" in sent}
+        await searches.choose(
+            context, who, await own(context, code, search_id), typed.checked(searches.ChoiceIn, **given)
+        )
 
     return await attempt(request, context, code, done())
+
+
+async def own(context: Context, code: str, search_id: str) -> str:
+    """The search's id. Raises NotFoundError (404): it is another participant's."""
+    row = await asyncio.to_thread(searches.find, context, search_id)
+    return require_found(search_id if row.participant == code else None, "search", search_id, searches.LISTED)
 
 
 def _elements(sent: Any) -> list[int]:

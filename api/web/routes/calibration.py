@@ -165,7 +165,8 @@ def _store(
             for key, name in keys.items():
                 new = (result.profiles or {})[name].model_dump() if name else found
                 before = channels.held(row, key)["profile"]
-                channels.put(row, key, profile=new | {k: v for k, v in before.items() if new.get(k) is None})
+                profile = new | {k: v for k, v in before.items() if new.get(k) is None}
+                channels.put(row, key, context.rig.status, profile=profile)
             found = dict(row.profile)
         action, said = "finish calibration" if found else "discard calibration", {"calibration": identity}
         said |= {"channels": list(keys.values())} if result.profiles else {}
@@ -200,8 +201,13 @@ async def begin_calibration(
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
+        if not body.channels:
+            channels.refuse_reordered(row, context.rig.status)
         several = _several(context, row, body)
         asked = settings(body, row.profile)
+        if body.max_torque_nm is None and several:  # one limit holds for all trains: the tightest
+            own = [channels.held(row, channels.key_of(context.rig.status, one.name))["profile"] for one in several]
+            asked["max_torque_nm"] = min(profile.get("max_torque_nm", asked["max_torque_nm"]) for profile in own)
         identity = await asyncio.to_thread(_write_begin, context, who.name, code, asked)
         last = messages.Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
@@ -211,6 +217,7 @@ async def begin_calibration(
                 by=who.name,
                 last=last,
                 channels=several,
+                elements=[] if several else electrodes.elements_of_first(row, context.rig.status),
                 **{name: value for name, value in asked.items() if name != "channels"},
             )
         )

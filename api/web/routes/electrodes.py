@@ -161,10 +161,8 @@ def list_searches(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]
 async def one_search(context: Ctx, _who: Tester, search_id: str, response: Response) -> dict[str, Any]:
     """A search: the map of all choices, the proposal, whether it is enough, each stimulus with what was seen."""
     row = await asyncio.to_thread(find, context, search_id)
-    about = seen.participant(row.participant)
-    response.headers["ETag"] = await asyncio.to_thread(
-        context.store.etag, context.clock, f"/v1/searches/{search_id}", about
-    )
+    path, about = f"/v1/searches/{search_id}", electrodes.rests_of(row)
+    response.headers["ETag"] = await asyncio.to_thread(context.store.etag, context.clock, path, *about)
     return await standing(context, row)
 
 
@@ -175,8 +173,6 @@ async def play_stimulus(context: Ctx, who: Tester, search_id: str, body: PlayIn)
     if row.state == "closed":
         raise ApiError(409, "closed", "This search is closed", "Begin another one; it knows what this one has seen.")
     now = await standing(context, row)
-    if now["waiting"]:
-        raise ApiError(409, "not-told", "The last stimulus was not told yet", "Tell first what it gave.")
     chosen = sorted(body.elements or now["proposal"]["elements"])
     refuse_unknown(now, chosen)
     stimulus = electrodes.StimulusIn(
@@ -231,13 +227,13 @@ async def choose(context: Ctx, who: Tester, search_id: str, body: ChoiceIn) -> d
 def loses_calibration(person: Participant, key: str, placement: str) -> bool:
     """Whether this choice ends the calibration: it was found at another placement."""
     held = channels.held(person, key)
-    found = any(held["profile"].get(name) is not None for name in profiles.FOUND)
-    return found and held["placement"] not in (None, placement)
+    return held["placement"] != placement and any(held["profile"].get(name) is not None for name in profiles.FOUND)
 
 
 @in_limits_turn
 def _choose(context: Context, row: Search, elements: list[int], by: str, voids: bool) -> Search:
     array, placement, now = electrodes.needed(context.rig.status), electrodes.words(elements), context.clock.utc()
+    electrodes.refuse_other_channel(array, row.channel)
     participants.refuse_busy(context, row.participant)
     with context.store.write() as session:
         person, kept = participants.within(session, row.participant), session.get(Search, row.id)
@@ -245,10 +241,11 @@ def _choose(context: Context, row: Search, elements: list[int], by: str, voids: 
         seen.check(session, seen.participant(person.code))
         lost, own = loses_calibration(person, array.key, placement), channels.held(person, array.key)["profile"]
         if lost and not voids:
-            detail = f"It was calibrated at {site_of(person, array.key)[2]}. To choose {placement}: void_calibration."
+            before = site_of(person, array.key)[2] or "no element"
+            detail = f"It was calibrated at {before}. To choose {placement}: void_calibration."
             raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
         profile = {**own, **dict.fromkeys(profiles.FOUND)} if lost else own
-        channels.put(person, array.key, placement=placement, profile=profile)
+        channels.put(person, array.key, context.rig.status, placement=placement, profile=profile)
         kept.state, kept.chosen, kept.closed_by, kept.closed_utc = "closed", elements, by, now
         side, muscle, _ = site_of(person, array.key)
         said = {"side": side, "muscle": muscle, "placement": placement, "channel": array.channel, "search": row.id}

@@ -86,7 +86,7 @@ def change_profile(
             )
             raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
         if profile != before:
-            channels.put(row, channel, profile=profile)
+            channels.put(row, channel, context.rig.status, profile=profile)
             of = {"channel": channel} if channel else {}
             audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids, **of)
         shown = seen.shown.get()
@@ -226,7 +226,8 @@ def change_site(
         if here != site_in(body):
             profile = channels.held(row, channel)["profile"]
             profile = {**profile, **dict.fromkeys(profiles.FOUND)} if lost else profile
-            channels.put(row, channel, **body.model_dump(include=set(MuscleIn.model_fields)), profile=profile)
+            site = body.model_dump(include=set(MuscleIn.model_fields))
+            channels.put(row, channel, context.rig.status, **site, profile=profile)
             said = {**body.model_dump(), **({"channel": channel} if channel else {})}
             audit.write(session, now, by, "set muscle", code, **said, voids_calibration=lost)
     return row
