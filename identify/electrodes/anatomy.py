@@ -15,8 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SOURCES = 4
-"""Two motor points of the wanted muscle, then two neighbours."""
 OWN = 24
 """Numbers of a person; then as many as `SESSION` for each earlier session."""
 SESSION = (4.0, 4.0, 0.2, 0.15)
