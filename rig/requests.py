@@ -151,7 +151,7 @@ class CalibrateStartRequest(Message):
     pulse_rate_hz: float = 40.0
     max_pulse_width_us: float | None = Field(None, description="widest pulse allowed, µs; None: the hard limits")
     max_torque_nm: float = Field(30.0, description="torque at which a train stops, N·m")
-    elements: list[int] = Field([], description="where its channel has a switch: one element, or a pair; no channels")
+    elements: list[int] = several([], "where its channel has a switch: one element, or a pair; no channels")
     channels: list[CalibrateChannel] | None = several(
         None,
         "several channels in one calibration, each with its own trains, marks and profile. None: the rig's first "

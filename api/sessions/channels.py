@@ -57,24 +57,31 @@ def held(row: Participant, key: str = "") -> dict[str, Any]:
 
 
 def put(row: Participant, key: str, status: Status | None, **new: Any) -> None:
-    """Change some of it."""
-    if not key and (names := of_rig(status)):
-        row.channels = {**(row.channels or {}), FIRST: {"name": names[0]}}
+    """Change some of it; with `profile` of the first channel also which channel that is."""
     if key:
         row.channels = {**(row.channels or {}), key: {**held(row, key), **new}}
-    for name, value in () if key else new.items():
+        return
+    for name, value in new.items():
         setattr(row, name, value)
+    if "profile" in new and (names := of_rig(status)):
+        row.channels = {**(row.channels or {}), FIRST: {"name": names[0]}}
+
+
+def is_reordered(row: Participant, status: Status | None) -> bool:
+    """Whether what the participant has on the first channel was found on another one than the rig's first."""
+    names, known = of_rig(status), row.channels or {}
+    first = known.get(FIRST, {}).get("name")
+    return bool(names) and first != names[0] and (first is not None or names[0] in known)
 
 
 def refuse_reordered(row: Participant, status: Status | None) -> None:
-    """Raise ApiError (409) where the participant's limits of the first channel are of another one than the rig's."""
-    names, known = of_rig(status), row.channels or {}
-    first = known.get(FIRST, {}).get("name")
-    if not names or first == names[0] or (first is None and names[0] not in known):
+    """Raise ApiError (409) there: the limits and thresholds of one channel are never another one's."""
+    if not is_reordered(row, status):
         return
+    before = (row.channels or {}).get(FIRST, {}).get("name", "another one")
     detail = (
-        f"The first channel of this rig is {names[0]}, the limits of {row.code} were set where it was "
-        f"{first or 'another one'}. Set them anew, channel by channel, or restore the order in the rig file."
+        f"The first channel of this rig is {of_rig(status)[0]}, the limits of {row.code} were set where it was "
+        f"{before}. Set all of them anew, or restore the order in the rig file."
     )
     raise ApiError(409, "other-order", "The rig's channels have another order", detail)
 

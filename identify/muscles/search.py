@@ -61,7 +61,6 @@ NOTHING = Refused(0.0, "The evidence does not ask for it.")
 class JointSearch:
     """The models, each with one thing more, and what was tried and not added."""
 
-    record: JointRecord
     chain: list[JointFitted]  # the first one, and the model with each of `added`
     added: list[Tried] = field(default_factory=list)
     refused: dict[str, Refused] = field(default_factory=dict)  # by key
@@ -92,7 +91,7 @@ def search(record: JointRecord, progress: Progress | None = None, base: JointFit
     """
     say = progress or silent
     say(0.02, "fitting all muscles")
-    found = JointSearch(record, [base or fit_all(record)])
+    found = JointSearch([base or fit_all(record)])
     while (best := _best(found, _interplays(found.last))) is not None:
         found.append(best)
         say(min(0.1 + 0.05 * len(found.added), 0.3), f"added {best.key}")

@@ -157,7 +157,7 @@ def diagnosis_of(found: JointSearch) -> JointDiagnosis:
         base=first.fit,
         verdict=verdict,
         missing=missing,
-        muscles=tuple({"name": name, "unexplained": name in found.unexplained} for name in found.record.names),
+        muscles=tuple({"name": name, "unexplained": name in found.unexplained} for name in found.last.record.names),
         candidates=_refused(found),
         model=first,
         conclusion=conclude(missing, found.unexplained),

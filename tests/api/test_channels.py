@@ -146,7 +146,12 @@ def test_limits_stay_with_their_channel_whatever_the_order_in_the_rig_file(two: 
         assert refused.status_code == 409 and refused.json()["type"].endswith("other-order"), refused.text
     assert two.post(f"{PERSON}/calibration").status_code == 409
     assert service.rig.last_plan is None and set(two.get(PERSON).json()["channels"]) == set(TWO)
-    assert two.put(f"{TRICEPS}/profile", json={"current_ma": 5.0}).status_code == 200, "set anew"
+    assert two.put(f"{TRICEPS}/muscle", json={"side": "left", "muscle": "triceps brachii"}).status_code == 409
+    part = two.put(f"{TRICEPS}/profile", json={"current_ma": 5.0})
+    assert part.status_code == 422, "nothing of the other channel's is taken over"
+    assert two.put(f"{TRICEPS}/profile", json={**OWN, "current_ma": 5.0}).status_code == 200, "set anew"
+    found = two.get(PERSON).json()
+    assert (found["profile"]["current_ma"], found["muscle"]) == (5.0, None), "the site was the other channel's, too"
     assert two.post("/v1/preview", json={"participant": "P017", "kind": "muscles"}).status_code == 200
 
 

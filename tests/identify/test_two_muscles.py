@@ -102,7 +102,7 @@ def test_what_the_muscles_do_to_each_other_is_named(cross_talk: float, stiffer: 
 def test_an_interplay_that_a_later_one_made_idle_leaves_no_model_behind() -> None:
     first = _fitted(0.0, 0.25)
     names = first.record.names
-    found = JointSearch(first.record, [first])
+    found = JointSearch([first])
     for key in (CROSS, "co_contraction"):
         both = found.last.with_likeliest(Acting.meant(key, names))
         found.append(Tried(key, both.acting[-1].form, both, 99.0))

@@ -201,8 +201,7 @@ async def begin_calibration(
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
-        if not body.channels:
-            channels.refuse_reordered(row, context.rig.status)
+        channels.refuse_reordered(row, context.rig.status)
         several = _several(context, row, body)
         asked = settings(body, row.profile)
         if body.max_torque_nm is None and several:  # one limit holds for all trains: the tightest

@@ -239,6 +239,8 @@ def _choose(context: Context, row: Search, elements: list[int], by: str, voids: 
         person, kept = participants.within(session, row.participant), session.get(Search, row.id)
         assert kept is not None
         seen.check(session, seen.participant(person.code))
+        if not array.key:
+            channels.refuse_reordered(person, context.rig.status)
         lost, own = loses_calibration(person, array.key, placement), channels.held(person, array.key)["profile"]
         if lost and not voids:
             before = site_of(person, array.key)[2] or "no element"

@@ -43,7 +43,8 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
     with context.store.write() as session:
         if session.get(Participant, body.code) is not None:
             raise ApiError(409, "exists", "The code is taken", f"Participant {body.code!r} exists. Take another code.")
-        row = Participant(code=body.code, profile=profile, created_utc=now, created_by=by)
+        row = Participant(code=body.code, created_utc=now, created_by=by)
+        channels.put(row, channels.FIRST, context.rig.status, profile=profile)
         row.side, row.muscle, row.placement = body.side, body.muscle, body.placement
         session.add(row)
         session.flush()
@@ -77,7 +78,8 @@ def change_profile(
         row = within(session, code)
         poses = [] if asked.get(profiles.RANGE) is None else [seen.poses()]
         seen.check(session, seen.participant(code), *poses)
-        before = channels.held(row, channel)["profile"]
+        anew = not channel and channels.is_reordered(row, context.rig.status)
+        before = {} if anew else channels.held(row, channel)["profile"]
         check_asked(context, before, asked)
         profile, voids = profiles.changed(before, add_calibration_time(context, asked))
         if voids and not may_void:
@@ -85,8 +87,9 @@ def change_profile(
                 f"{voids[0].upper()}{voids[1:]}. To set it and make the calibration invalid: ?void_calibration=true."
             )
             raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
-        if profile != before:
-            channels.put(row, channel, context.rig.status, profile=profile)
+        if profile != before or anew:
+            site = {name: None for name in ("side", "muscle", "placement") if anew}
+            channels.put(row, channel, context.rig.status, **site, profile=profile)
             of = {"channel": channel} if channel else {}
             audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids, **of)
         shown = seen.shown.get()
@@ -216,6 +219,8 @@ def change_site(
     with context.store.write() as session:
         row = within(session, code)
         seen.check(session, seen.participant(code))
+        if not channel:
+            channels.refuse_reordered(row, context.rig.status)
         lost, here = loses_calibration(row, body, channel), site_of(row, channel)
         if lost and not voids:
             detail = (
