@@ -40,6 +40,12 @@ def of_rig(status: Status | None) -> list[str]:
     return [str(one["name"]) for one in told] if len(told) > 1 else []
 
 
+def first_of(status: Status | None) -> str | None:
+    """Name of the rig's first channel, though it be the only one; None where it has none."""
+    told = (status.stimulator.get("channels") or []) if status is not None else []
+    return str(told[0]["name"]) if told else None
+
+
 def key_of(status: Status | None, name: str) -> str:
     """A channel as `held` takes it. Raises NotFoundError (404): the rig has none of that name."""
     names = of_rig(status)
@@ -63,15 +69,16 @@ def put(row: Participant, key: str, status: Status | None, **new: Any) -> None:
         return
     for name, value in new.items():
         setattr(row, name, value)
-    if "profile" in new and (names := of_rig(status)):
-        row.channels = {**(row.channels or {}), FIRST: {"name": names[0]}}
+    if "profile" in new and (first := first_of(status)):  # what it had as a further channel is older
+        others = {name: one for name, one in (row.channels or {}).items() if name != first}
+        row.channels = {**others, FIRST: {"name": first}}
 
 
 def is_reordered(row: Participant, status: Status | None) -> bool:
     """Whether what the participant has on the first channel was found on another one than the rig's first."""
-    names, known = of_rig(status), row.channels or {}
-    first = known.get(FIRST, {}).get("name")
-    return bool(names) and first != names[0] and (first is not None or names[0] in known)
+    now, known = first_of(status), row.channels or {}
+    before = known.get(FIRST, {}).get("name")
+    return now is not None and before != now and (before is not None or now in known)
 
 
 def refuse_reordered(row: Participant, status: Status | None) -> None:
@@ -80,7 +87,7 @@ def refuse_reordered(row: Participant, status: Status | None) -> None:
         return
     before = (row.channels or {}).get(FIRST, {}).get("name", "another one")
     detail = (
-        f"The first channel of this rig is {of_rig(status)[0]}, the limits of {row.code} were set where it was "
+        f"The first channel of this rig is {first_of(status)}, the limits of {row.code} were set where it was "
         f"{before}. Set all of them anew, or restore the order in the rig file."
     )
     raise ApiError(409, "other-order", "The rig's channels have another order", detail)

@@ -79,6 +79,18 @@ def refuse_other_channel(array: Array, channel: str) -> None:
         raise ApiError(409, "no-switch", "The array is at another channel", detail)
 
 
+def refuse_closed(row: Search) -> None:
+    """Raise ApiError (409) for a search that plays no more."""
+    if row.state == "closed":
+        raise ApiError(409, "closed", "This search is closed", "Begin another one; it knows what this one has seen.")
+
+
+def refuse_untold(now: dict[str, Any]) -> None:
+    """Raise ApiError (409) until it was told what the last stimulus of a search gave."""
+    if now["playing"] or now["waiting"]:
+        raise ApiError(409, "not-told", "The last stimulus was not told yet", "Tell first what it gave.")
+
+
 def words(elements: Sequence[int]) -> str:
     """A choice as it is written into the placement, and read there."""
     return f"element {elements[0]}" if len(elements) == 1 else f"elements {elements[0]} and {elements[1]}"
@@ -193,9 +205,8 @@ class ElectrodeTests(Kind):
     def _refuse_untold(self, search_id: str) -> None:
         """Raise ApiError (409): the last stimulus was not told, or a page is older than what was told, or a stop."""
         row: Search = self.store.get(Search, search_id)
-        now = document(self.store, row)
-        if now["playing"] or now["waiting"]:
-            raise ApiError(409, "not-told", "The last stimulus was not told yet", "Tell first what it gave.")
+        refuse_closed(row)
+        refuse_untold(document(self.store, row))
         self.store.refuse_changed(*rests_of(row))
 
 

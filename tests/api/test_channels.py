@@ -152,7 +152,13 @@ def test_limits_stay_with_their_channel_whatever_the_order_in_the_rig_file(two: 
     assert two.put(f"{TRICEPS}/profile", json={**OWN, "current_ma": 5.0}).status_code == 200, "set anew"
     found = two.get(PERSON).json()
     assert (found["profile"]["current_ma"], found["muscle"]) == (5.0, None), "the site was the other channel's, too"
+    assert set(found["channels"]) == {"biceps"}, "what triceps had before is older, and comes back no more"
     assert two.post("/v1/preview", json={"participant": "P017", "kind": "muscles"}).status_code == 200
+    service.rig.channels = ["biceps"]
+    service.rig.become("ready")
+    soon(lambda: len(two.get("/v1/rig").json()["stimulator"].get("channels") or []) < 2)
+    refused = two.post("/v1/tests", json={"participant": "P017"})
+    assert refused.status_code == 409 and refused.json()["type"].endswith("other-order"), "of a rig of one, too"
 
 
 def test_what_a_request_narrows_is_narrowed_on_each_channel(two: httpx.Client, service: Service) -> None:

@@ -170,9 +170,9 @@ async def one_search(context: Ctx, _who: Tester, search_id: str, response: Respo
 async def play_stimulus(context: Ctx, who: Tester, search_id: str, body: PlayIn) -> dict[str, Any]:
     """Play one stimulus of a second; the next one only after it was told what this one gave."""
     row = await asyncio.to_thread(find, context, search_id)
-    if row.state == "closed":
-        raise ApiError(409, "closed", "This search is closed", "Begin another one; it knows what this one has seen.")
+    electrodes.refuse_closed(row)
     now = await standing(context, row)
+    electrodes.refuse_untold(now)
     chosen = sorted(body.elements or now["proposal"]["elements"])
     refuse_unknown(now, chosen)
     stimulus = electrodes.StimulusIn(
