@@ -1,9 +1,9 @@
 """`python -m stimrig.rig.builder previews` (or `live`): what the rig has built by a process of its own.
 
 Previews: the first line on standard input holds the rig's limits; each further line is the request for one preview, and
-gets one line as its reply. Live: each pickled `Taken` gets two lines. Both are asked by `rig.adapters.builders`. The
-process ends when its standard input ends, or with the rig. It has a lower priority at the processor than the rig, for
-previews the lowest, and a limit on its memory.
+gets one line as its reply. Live: each pickled `Taken` gets two lines. An empty line says that it takes them. Both are
+asked by `rig.adapters.builders`. The process ends when its standard input ends, or with the rig. It has a lower
+priority at the processor than the rig, for previews the lowest, and a limit on its memory.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ def main(builds: str) -> int:
     _modest(5 if builds == "previews" else 0)
     from stimrig.rig.control import live, replies  # after the limits are set: importing numpy takes time
 
+    print(flush=True)
     {"previews": replies.serve, "live": live.serve}[builds](sys.stdin.buffer, sys.stdout.buffer)
     return 0
 

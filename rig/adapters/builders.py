@@ -24,6 +24,8 @@ from stimrig.rig.limits import Limit
 log = logging.getLogger("rig.builders")
 
 MAX_WAITING = 8
+MAX_START_S = 20.0
+"""Real seconds after which a builder that has not begun is given up. An idle computer needs half a second."""
 MAX_BUILD_S = 30.0
 """Real seconds allowed for one preview. The longest test needs 0.1 s of processor time, at the lowest priority."""
 MAX_LIVE_S = 5.0
@@ -40,9 +42,13 @@ class Builder:
         self._process: asyncio.subprocess.Process | None = None
 
     async def warm(self) -> None:
-        """Start it, so that the first request does not wait for it."""
+        """Start it, so that the first request does not wait for it: on a busy computer that takes seconds."""
         async with self._one:
-            await self._begin()
+            try:
+                await self._begin()
+            except OSError as error:  # it is started again when it is needed
+                log.warning("the builder of %s did not start: %r", self._builds, error)
+                await self.close()
 
     async def close(self) -> None:
         process, self._process = self._process, None
@@ -52,6 +58,7 @@ class Builder:
             await process.wait()
 
     async def _begin(self) -> asyncio.subprocess.Process:
+        """The process, once it has said that it takes requests."""
         if self._process is None or self._process.returncode is not None:
             self._process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "stimrig.rig.builder", self._builds,
@@ -59,11 +66,17 @@ class Builder:
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )  # fmt: skip
             assert self._process.stdin is not None
+            assert self._process.stdout is not None
             self._process.stdin.write(self._first)
+            if not await asyncio.wait_for(self._process.stdout.readline(), MAX_START_S):
+                raise ConnectionError("the builder has died")
         return self._process
 
-    async def _ask(self, request: bytes, lines: int = 1) -> list[bytes]:
-        process = await self._begin()
+    async def _ask(self, request: bytes, within_s: float, lines: int = 1) -> list[bytes]:
+        process = await self._begin()  # its start is not part of the time
+        return await asyncio.wait_for(self._exchange(process, request, lines), within_s)
+
+    async def _exchange(self, process: asyncio.subprocess.Process, request: bytes, lines: int) -> list[bytes]:
         assert process.stdin is not None
         assert process.stdout is not None
         process.stdin.write(request)
@@ -94,7 +107,7 @@ class Previews(Builder):
         request = json.dumps(angle_set_at_utc).encode() + b"\n" + line.rstrip(b"\n") + b"\n"
         try:
             async with self._one:
-                return (await asyncio.wait_for(self._ask(request), MAX_BUILD_S))[0]
+                return (await self._ask(request, MAX_BUILD_S))[0]
         except TimeoutError:
             await self.close()
             raise BusyError(f"preview: not built within {MAX_BUILD_S:g} s, the computer is busy; try again") from None
@@ -116,7 +129,7 @@ class LiveLines(Builder):
         async with self._one:
             for _ in range(2):  # what became of a pulse is told once: it is worth a new process
                 try:
-                    found = await asyncio.wait_for(self._ask(pickle.dumps(taken), 2), MAX_LIVE_S)
+                    found = await self._ask(pickle.dumps(taken), MAX_LIVE_S, 2)
                     return found if found[0].strip() else []
                 except (OSError, ValueError) as error:  # a timeout is one, too
                     log.warning("a live event could not be made: %r", error)

@@ -82,8 +82,8 @@ class Server:
                 f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
             ) from None
         self._keep(self._loop.create_task(self._live()))
-        for builder in (self._previews, self._live_lines):
-            self._keep(self._loop.create_task(builder.warm()))
+        # whoever is told that the rig is ready sees its first test from the beginning
+        await asyncio.gather(self._previews.warm(), self._live_lines.warm())
 
     async def close(self) -> None:
         if self._server is not None:

@@ -163,6 +163,38 @@ def test_one_that_takes_too_long_is_ended_and_the_next_is_built(monkeypatch: pyt
     asyncio.run(run())
 
 
+def test_a_slow_start_is_not_part_of_a_requests_time(monkeypatch: pytest.MonkeyPatch):
+    code = "import sys, time; time.sleep(2); print(flush=True); sys.stdin.readline(); print(sys.stdin.readline())"
+
+    async def run() -> None:
+        execute = asyncio.create_subprocess_exec
+        slow = lambda *_, **options: execute(sys.executable, "-c", code, **options)  # noqa: E731
+        monkeypatch.setattr(asyncio, "create_subprocess_exec", slow)
+        monkeypatch.setattr(builders, "MAX_BUILD_S", 1.9)
+        asked = Previews(HARD_LIMITS, 1.0)
+        asked._first = b""
+        await asked.warm()  # whoever waits for it knows that it takes requests
+        assert await asked.reply(REQUEST) == REQUEST
+        await asked.close()
+        assert await asked.reply(REQUEST) == REQUEST
+        await asked.close()
+
+    asyncio.run(run())
+
+
+def test_a_builder_that_does_not_start_is_given_up_and_started_again_when_needed(monkeypatch: pytest.MonkeyPatch):
+    async def run() -> None:
+        asked = Previews(HARD_LIMITS, 1.0)
+        monkeypatch.setattr(builders, "MAX_START_S", 0.0)
+        await asked.warm()
+        assert asked._process is None
+        monkeypatch.setattr(builders, "MAX_START_S", 60.0)
+        assert json.loads(await asked.reply(REQUEST))["ok"]
+        await asked.close()
+
+    asyncio.run(run())
+
+
 def test_who_would_wait_for_too_long_is_refused_at_once(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(builders, "MAX_BUILD_S", 60.0)
 

@@ -63,14 +63,14 @@ def test_a_watched_test_is_extended_to_its_end(shared: tuple[Bench, RigClient]):
         "bad-plan"
     )
     seen, plain = events_of(watcher, "watched"), events_of(client, "watched")
+    finished = seen[-1]
+    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("completed", "plan"), finished["reason"]
     assert all(event["samples"] is None for event in plain[:-1])
     samples = [event["samples"] for event in seen[:-1]]
     counter = np.concatenate([batch["counter"] for batch in samples])
     assert np.all(np.diff(counter) == 1)
     assert len(counter) > 1500
     watcher.close()
-    finished = seen[-1]
-    assert (finished["outcome"], finished["summary"]["ended_by"]) == ("completed", "plan"), finished["reason"]
     laid = seen[-2]["laid_segments"]
     assert [s["name"] for s in laid] == ["rest", "added", "added", "added", "ramp", "rest"]
     with h5py.File(finished["recording_path"]) as file:
