@@ -197,7 +197,8 @@ class Follower(Watcher):
 
     def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
         told, known = self.told, said["knowledge"]
-        fits = said["kind"] != "misfit"  # else that is told as the problem, and its bands mean nothing
+        # a misfit is told as the problem, and its bands mean nothing; at the end those stay on which it was decided
+        fits = said["kind"] != "misfit" and not self.told.ended
         if fits:
             told.words = said["words"]
         row = {
@@ -230,10 +231,14 @@ class Follower(Watcher):
         request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.laid, segments=chosen)
         if ended:
             request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
+            # at once: what comes while the rig answers is neither asked about, nor told as what the end was decided on
+            self.told.state, self.told.ended = "ending", self.told.ended or ended
         self._added += (widths := [segment.settings["pulse_width_us"] for segment in chosen])
         try:
             await self.rig.ask(request)
         except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, and then it is asked again
+            if ended:
+                self.told.state, self.told.ended = "choosing", ""
             if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
                 raise
             del self._added[len(self._added) - len(widths) :]
@@ -241,8 +246,6 @@ class Follower(Watcher):
             log.info("not laid: %s", error.detail, extra={"test_id": test_id})
             return
         self._write(answer, sample_to_plan_ms=round(1e3 * (self.clock.monotonic_s() - answer.heard_s), 1))
-        if ended:
-            self.told.state, self.told.ended = "ending", self.told.ended or ended
         self.tell()
 
     def _spent(self) -> str:

@@ -28,7 +28,7 @@ from stimrig.rig.messages import (
     SegmentPlan,
     TestPlan,
 )
-from stimrig.rig.requests import ExtendRequest
+from stimrig.rig.requests import EnoughRequest, ExtendRequest
 from tests.api.conftest import Service, own_service, soon, wait_done
 
 service = own_service(speed=1.0)
@@ -356,6 +356,8 @@ class World:
         self.asked.append(arguments)
         if (answer := self.answers.pop(0) if self.answers else None) is None:
             await asyncio.Event().wait()
+        while answer.get("late") and not self.requests:
+            await asyncio.sleep(0)
         return answer
 
     async def events(self, _path: object, test_id: str) -> AsyncGenerator[LiveEvent, None]:
@@ -409,6 +411,17 @@ def test_the_newest_answer_is_sent_at_once(monkeypatch: pytest.MonkeyPatch) -> N
     [(at_s, request)] = world.requests
     assert request.segments[0].name == "ramp 2"
     assert at_s == pytest.approx(FIRST_S - AHEAD / 40.0 - adaptive_follower.LATE_S, abs=0.03)
+
+
+def test_the_end_is_told_with_what_it_was_decided_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A later answer that knows less, and would go on, comes when the test is being ended."""
+    known, less = ({"curve_percent": percent, "step_percent": 1.0} for percent in (1.5, 2.5))
+    enough = {**SAID, "kind": "enough", "segments": [], "knowledge": known}
+    world = World([enough, {**SAID, "knowledge": less, "late": True}])
+    told = followed(world, 40.0, monkeypatch).told
+    assert len(world.asked) == 2 and [type(request) for _, request in world.requests] == [EnoughRequest]
+    assert (told.ended, told.knowledge, len(told.decisions)) == ("known-enough", known, 2)
+    assert told.decisions[1]["late"]
 
 
 def test_the_adviser_learns_what_the_muscle_outcomes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,8 @@ class Whole:
         """Ask until the rest between two tests is over; the test's id. What it can reach is computed before."""
         end = time.monotonic() + PATIENCE_S
         body = {"participant": "P017", "kind": "adaptive", **more}
-        assert self.client.post("/v1/preview", json=body).status_code == 200
+        answer = self.client.post("/v1/preview", json=body)
+        assert answer.status_code == 200, answer.text
         while True:
             answer = self.client.post("/v1/tests", json=body)
             if answer.status_code == 202 or "rest_between_tests_s" not in answer.text:
