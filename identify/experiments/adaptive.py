@@ -149,7 +149,10 @@ def decide(
             short, wrong = _fitted(grid, raw, last, before.short if before else None, weighed)
     except (np.linalg.LinAlgError, IdentifyError) as error:
         return Decision("misfit", words=f"No model can be fitted ({error}). The rest of the fixed test is played.")
-    return replace(_judged(short, wrong, played_us, asked, before, weighed), weighed=weighed)
+    found = _judged(short, wrong, played_us, asked, before, weighed)
+    if weighed is not None and found.kind != "misfit":
+        found = replace(found, words=f"{found.words} {weighed.words()}")
+    return replace(found, weighed=weighed)
 
 
 def _judged(
@@ -170,8 +173,7 @@ def _judged(
             return Decision("misfit", words=words, knowledge=known, short=short)
         return replace(_next(short, known, played, asked, alike), doubted_s=since_s)
     if known.reaches(asked.target) and _settled(short):
-        words = f"Enough is known. {_state(known)}" + (f" {weighed.words()}" if weighed else "")
-        return Decision("enough", words=words, knowledge=known, short=short)
+        return Decision("enough", words=f"Enough is known. {_state(known)}", knowledge=known, short=short)
     return _next(short, known, played, asked, alike)
 
 

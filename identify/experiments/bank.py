@@ -140,8 +140,8 @@ class Weighed:
 
     def words(self) -> str:
         """One sentence for people."""
-        share = f"({100.0 * self.weights[self.likely]:.0f} %)"
-        return f"Like no model of the bank {share}." if self.is_unlike else f"Like {self.name} {share}."
+        percent = f"{100.0 * self.weights[self.likely]:.0f}"
+        return f"Like no earlier model ({percent} %)." if self.is_unlike else f"Like {self.name} ({percent} %)."
 
     @cached_property
     def mixed(self) -> Short:

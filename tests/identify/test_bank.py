@@ -166,4 +166,4 @@ def test_a_burst_is_followed_by_silence():
 def test_the_words_name_whom_the_person_is_like():
     told = Weighed(("own", UNLIKE), np.array([0.9, 0.1]), (), (None, None))
     assert told.words() == "Like own (90 %)."
-    assert replace(told, weights=np.array([0.2, 0.8])).words() == "Like no model of the bank (80 %)."
+    assert replace(told, weights=np.array([0.2, 0.8])).words() == "Like no earlier model (80 %)."
