@@ -148,8 +148,8 @@ class Client(Connection):
     def start_test(self, participant: str, **more: Any) -> SessionTest:
         """Start a test, the pre-session test by default. `more`: `kind`, `segments` or `protocol`, `joins`, limits.
 
-        With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`. What it
-        can reach is then asked for before, in a request of its own.
+        With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`, `bank`.
+        What it can reach is then asked for before, in a request of its own.
         """
         if more.get("kind") == "adaptive":  # a start must be played at once or not at all, and this may take long
             self.post("/v1/preview", json={"participant": participant, **more}, timeout=OUTLOOK_S)

@@ -54,6 +54,11 @@ def place_of(row: Test) -> Place:
     return plan.get("side"), plan.get("muscle"), plan.get("placement"), plan.get("profile", {}).get("current_ma")
 
 
+def same_muscle(one: Site, other: Site) -> bool:
+    """Whether two people's sites are of one side and muscle, as far as both are known; not where electrodes are."""
+    return not differ((*one[:2], None, None), (*other[:2], None, None))
+
+
 def differ(one: Place, other: Place) -> bool:
     """Whether two places are known to be different ones."""
     return any(a is not None and b is not None and a != b for a, b in zip(one, other, strict=True))

@@ -8,6 +8,7 @@ import logging
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from sqlalchemy import select
@@ -17,7 +18,16 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
 from stimrig.api.models.family import family_of
-from stimrig.api.models.places import Site, further_of, holds_at, in_words, place_of, site_of, site_of_recording
+from stimrig.api.models.places import (
+    Site,
+    further_of,
+    holds_at,
+    in_words,
+    place_of,
+    same_muscle,
+    site_of,
+    site_of_recording,
+)
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
@@ -329,6 +339,15 @@ class Versions:
         ]
         rows = [row for row in rows if family_of(row).can("carried")]
         return list({row.recording_id: row for row in reversed(rows)}.values())[::-1]
+
+    def last_of_others(self, participant: Participant, most: int) -> list[Model]:
+        """The versions approved last of others who are not archived, at the same side and muscle, newest first."""
+        others = (Participant.code != participant.code, Participant.archived_utc.is_(None))
+        here = site_of(participant)
+        alike = [row.code for row in self.store.all(Participant, *others) if same_muscle(site_of(row), here)]
+        decided = sorted(self._last_approvals(alike).values(), key=lambda decision: -decision.id)
+        rows = (self.get(decision.model_id) for decision in decided)
+        return list(islice((row for row in rows if family_of(row).can("carried")), most))
 
     def served(self, participant: str) -> Served | None:
         """What the controller gets, or None where nothing is approved. Raises ApiError (500) where that is damaged."""

@@ -33,8 +33,8 @@ LATE_S = 0.35
 """The second one, with the newest samples."""
 SEND_S = 0.06
 """The early answer is sent if the late one is not there."""
-LEAST_S = 2.05
-"""A shorter record tells nothing."""
+LEAST_S = 2.0
+"""A shorter record tells nothing. Besides a pulse whose samples are under way, and one that is cut off as not whole."""
 SHORTEST_PIECE_S = 1.0
 """Of the pieces that are chosen."""
 
@@ -87,6 +87,8 @@ class Told:
     problem: str = ""
     knowledge: dict[str, Any] | None = None
     least_known: dict[str, Any] | None = None
+    bank: dict[str, float] | None = None
+    """How probable each earlier model is, by its name; None without a bank, and before the first fit."""
     ended: str = ""
     decisions: list[dict[str, Any]] = field(default_factory=list)
 
@@ -159,7 +161,8 @@ class Follower(Watcher):
         idle = self._asking is None or self._asking.done()
         turn = self._turn
         early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
-        if idle and not turn.sent and event.elapsed_s >= LEAST_S and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
+        least_s = LEAST_S + 2.0 / self.plan.pulse_rate_hz
+        if idle and not turn.sent and event.elapsed_s >= least_s and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
             turn.asked = 2 if left_s <= LATE_S else 1
             self._asking = self.begin(self._ask(turn))
         elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
@@ -200,7 +203,7 @@ class Follower(Watcher):
         # a misfit is told as the problem, and its bands mean nothing; at the end those stay on which it was decided
         fits = said["kind"] != "misfit" and not self.told.ended
         if fits:
-            told.words = said["words"]
+            told.words, told.bank = said["words"], said.get("bank")
         row = {
             "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
             "segments": [segment["name"] for segment in said["segments"]],

@@ -180,7 +180,7 @@ class AngleIn(Body):
 
 
 OWN_FIELDS: dict[str, set[str]] = {
-    "adaptive": {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"},
+    "adaptive": {"target", "max_duration_s", "max_torque_time_nm_s", "anyway", "bank"},
     "sequence": {"reference_torque_nm", "angle"},
     PASSIVE: {"angle", "max_duration_s"},
     HELD: {"angle"},
@@ -239,6 +239,9 @@ class TestIn(Labels, Body):
     )
     anyway: StrictBool = Field(
         default=False, description="kind `adaptive`: play it although the target is out of reach"
+    )
+    bank: StrictBool = Field(
+        default=False, description="kind `adaptive`: start from earlier models, the participant's own and others'"
     )
 
     angle: AngleIn | None = Field(

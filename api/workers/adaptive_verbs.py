@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,20 +35,25 @@ def outlook(
     max_torque_nm: float,
     pulse_rate_hz: float,
     models: Sequence[str] = (),
+    bank: Sequence[tuple[str, str]] | None = None,
 ) -> dict[str, Any]:
     """The opening's pulse widths, and what the test will probably reach.
 
-    `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
+    `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first; `bank`: names
+    and models that the person may be like. The reply's `bank` tells how many of them can be used.
     """
     from stimrig.identify.experiments.adaptive import Asked, decide, reach
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.1, "playing the test on a simulated muscle")
-    asked = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models))
+    like = bank_of(bank)
+    asked = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models), like)
     opening = decide(None, (), asked)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
     found = reach(asked, NEW_PERSON_SHARE * max_torque_nm)
-    return json_value({"opening_us": widths, "reach": asdict(found), "known": asked.earlier is not None})
+    usable = None if bank is None else len(like.candidates) if like else 0
+    known_before = asked.earlier is not None
+    return json_value({"opening_us": widths, "reach": asdict(found), "known": known_before, "bank": usable})
 
 
 def warm() -> None:
@@ -68,20 +74,41 @@ def known(models: Sequence[str]) -> Any:
     for text in models:
         last = None
         with suppress(identify.IdentifyError):
-            last = identify.Model.from_json(text)
+            last = model_of(text)
             read.append(last)
     with suppress(identify.IdentifyError):
         return None if last is None else Earlier(last, learn_change(read))
     return None
 
 
-def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any) -> dict[str, Any]:
+@lru_cache(maxsize=32)
+def model_of(text: str) -> identify.Model:
+    """The model. It is kept, so that a test begins at once with those that its outlook has read."""
+    return identify.Model.from_json(text)
+
+
+def bank_of(models: Sequence[tuple[str, str]] | None) -> Any:
+    """The `Bank` of those that can be read here and used; None where there is none: then it is a test as ever."""
+    from stimrig.identify.experiments.bank import Bank
+
+    read = {}
+    for name, text in models or ():
+        with suppress(identify.IdentifyError):
+            read[name] = model_of(text)
+    found = Bank.of(read)
+    return found if found.candidates else None
+
+
+def begin(
+    progress: Progress, target: dict[str, float], models: Sequence[str] = (),
+    bank: Sequence[tuple[str, str]] | None = None, **limits: Any,
+) -> dict[str, Any]:  # fmt: skip
     """A test begins, within the limits that `Running` has: what was known of another one is forgotten."""
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.5, "beginning")
     _running.clear()
-    _running.append(Running(Target(**target), known(models), **limits))
+    _running.append(Running(Target(**target), known(models), bank_of(bank), **limits))
     return {}
 
 
@@ -97,6 +124,7 @@ class Running:
 
     target: Any
     known: Any
+    bank: Any
     playable_s: float
     max_torque_time_nm_s: float
     largest_us: float
@@ -136,7 +164,7 @@ class Running:
         committed_nm_s = self._expected(laid_us[round(measured_s * self.pulse_rate_hz) :])
         left_s = max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz)
         left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
-        asked = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.known)
+        asked = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.known, self.bank)
         found = decide(record, played_us, asked, self.before)
         self.before = found if found.short is not None else self.before
         told = found.to_dict()

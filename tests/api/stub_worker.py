@@ -300,6 +300,8 @@ class Stub:
         self.pause = pause
         self.advice, self.target = 0, 0.0
         """Answers since the test began, and the target that it told."""
+        self.bank: list[str] = []
+        """Names of the models that it may be like."""
 
     def line(self, line: str | bytes, write: Callable[[str], Any]) -> None:
         """Do one call; what it says is written line by line."""
@@ -360,12 +362,20 @@ class Stub:
                 words += "6.0 % and the step response within 3.0 %."
             reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
                      "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
-            return {"result": {"opening_us": OPENING, "reach": reach, "known": bool(arguments["models"])}}
+            bank = None if arguments["bank"] is None else len(arguments["bank"])
+            known = bool(arguments["models"])
+            return {"result": {"opening_us": OPENING, "reach": reach, "known": known, "bank": bank}}
         if verb == "adaptive_begin":
             self.advice, self.target = 0, arguments["target"]["curve_percent"]
+            self.bank = [name for name, _text in arguments["bank"] or []]
         if verb == "adaptive_advise":
             self.advice += 1
-            return {"result": advised(self.advice, self.target, self.pause)}
+            found = advised(self.advice, self.target, self.pause)
+            if self.bank:
+                likely = {name: 0.9 * 0.1**place for place, name in enumerate(self.bank)}
+                words = f"{found['words']} Like {self.bank[0]} (90 %)."
+                found |= {"words": words, "bank": {**likely, "unlike all": 1.0 - sum(likely.values())}}
+            return {"result": found}
         if verb == "track":
             return {"result": tracked(arguments, self.pause)}
         if verb == "forecast":

@@ -211,6 +211,10 @@ class AdaptiveOut(Document):
     problem: str = Field(description="why the fixed plan plays on; empty while segments are chosen")
     knowledge: KnowledgeOut | None = Field(description="both curves with their bands; null before the first fit")
     least_known: dict[str, float] | None = Field(description="`pulse_width_us` and `time_s` where the bands are widest")
+    bank: dict[str, float] | None = Field(
+        None, description="how probable it is that the muscle is like each earlier model, by its name, or `unlike "
+        "all`; null without a bank, and before the first fit"
+    )  # fmt: skip
     ended: str = Field(
         description="`known-enough`, `enough` (a person said so), `torque-time`, `time`, `limit` (of the "
         "charge, say), `fixed-rest` (the fixed plan was played to its end), `stopped` or `fault`; empty while it runs"
