@@ -193,7 +193,7 @@ def asked_test(sent: FormData, code: str) -> TestIn:
             within = f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %"
             raise typed.unusable(no_target(within))
         target = TargetIn(curve_percent=percent, step_percent=percent)
-        asked |= {"kind": "adaptive", "target": target, "anyway": True}
+        asked |= {"kind": "adaptive", "target": target, "anyway": True, "bank": "bank" in sent}
     return typed.checked(TestIn, participant=code, **asked)
 
 

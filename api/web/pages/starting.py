@@ -131,6 +131,8 @@ def rows(
         dose = _("at most %(most)s of torque", most=most)
         more = [Row(_("Stops once known within"), number(preview["target"]["curve_percent"], 1, "%"))]
         more += [Row(_("Expected"), translated(reach["words"]))] if reach["reachable"] else []
+        none = _("none that can be used: a test as ever")
+        more += [] if reach["bank"] is None else [Row(_("Earlier models"), str(reach["bank"] or none))]
     widest, most = number(widest_us(preview), 0, "µs"), number(row.profile["max_pulse_width_us"], 0, "µs")
     current = [
         Row(_("Side and muscle"), site_words(site_of(row))),
