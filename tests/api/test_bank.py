@@ -38,6 +38,7 @@ def names(service: Service, code: str = "P017") -> list[str]:
     plan = TestPlan(
         test_id="T1",
         participant=code,
+        segments=None,
         profile=Profile(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0),
     )
     return [name for name, _text in service.context.runner.adaptive._known(plan, with_bank=True)["bank"]]
