@@ -38,8 +38,9 @@ REST_S, RISE_S, TOP_S, FALL_S = 0.5, 1.0, 0.3, 0.5
 """The opening: rest, a ramp to the largest width, a while there, silence."""
 BANK_OPENING_S = (0.5, 0.4, 0.0, 1.1)
 """The same with a bank: a glance is enough to see which of its models a person may be like."""
-LEAST_S = 2.0
-"""A record that is shorter tells nothing: the opening is played."""
+LEAST_S = 1.9
+"""A record that is shorter tells nothing: the opening is played. Of the shortest one, 2 s, the last sample lies before
+its end."""
 ALARM = 1e-3
 """P-value of a residual test below which the structure fits badly; each test is asked about ten times in one test."""
 CONFIRMED_S = 1.0

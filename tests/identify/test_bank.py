@@ -157,6 +157,16 @@ def test_the_first_look_keeps_to_what_is_left(models: dict[str, Model]):
     assert decide(None, [], less).kind == "spent"
 
 
+@pytest.mark.parametrize("rate_hz", [10.0, 40.0])
+def test_the_first_look_is_played_once(models: dict[str, Model], rate_hz: float):
+    asked = Asked(Target(), largest_us=MUSCLE.top_us, pulse_rate_hz=rate_hz, bank=Bank.of(models), **LIMITS)
+    widths = np.array(decide(None, [], asked).segments[0].settings["pulse_width_us"])
+    time_s = np.arange(widths.size * 5) / (5.0 * rate_hz)
+    torque = MUSCLE.curve(np.repeat(widths, 5)) + noise(8)[: time_s.size]
+    record = Record.from_arrays(time_s, np.repeat(widths, 5), torque, pulse_rate_hz=rate_hz)
+    assert decide(record, widths, asked).short is not None
+
+
 def test_a_burst_is_followed_by_silence():
     for piece in bursts(np.array([0.0, 100.0, 200.0]), 40.0):
         assert piece.pulse_width_us.size == 40 and not piece.pulse_width_us[16:].any()
