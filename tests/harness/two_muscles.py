@@ -24,10 +24,10 @@ def make(
     late = round(OFFSET_S * FINE_HZ)
     fine[NAMES[1]] = np.r_[np.zeros(late), fine[NAMES[1]][:-late]]
     largest = rng.uniform(4.0, 12.0, 2)
-    drives = [_sigmoid(one, rng.uniform(100, 180), rng.uniform(12, 30)) for one in fine.values()]
+    drives = [sigmoid(one, rng.uniform(100, 180), rng.uniform(12, 30)) for one in fine.values()]
     reached = cross_talk * np.clip((fine[NAMES[0]] / LARGEST_US - 0.45) / 0.55, 0.0, 1.0)
     drives[1] = drives[1] + reached * (1.0 - drives[1])
-    up, down = (_respond(one, rng.uniform(0.1, 0.35)) for one in drives)
+    up, down = (respond(one, rng.uniform(0.1, 0.35)) for one in drives)
     loss = 1.0 + stiffer * (up + 0.6 * down)
     own = largest[0] * up, -largest[1] * down
     torque = (own[0] + own[1]) / loss + zero_nm
@@ -64,12 +64,12 @@ def _widths(rng: np.random.Generator) -> tuple[list[np.ndarray], list[float]]:
     return found, [2.0, 24.5, 43.0]
 
 
-def _sigmoid(width_us: np.ndarray, middle_us: float, steep_us: float) -> np.ndarray:
+def sigmoid(width_us: np.ndarray, middle_us: float, steep_us: float) -> np.ndarray:
     low = 1.0 / (1.0 + np.exp(middle_us / steep_us))
     return np.clip(1.0 / (1.0 + np.exp(-(width_us - middle_us) / steep_us)) - low, 0.0, None) / (1.0 - low)
 
 
-def _respond(drive: np.ndarray, period_s: float) -> np.ndarray:
+def respond(drive: np.ndarray, period_s: float) -> np.ndarray:
     system: Any = cont2discrete(([1.0], [period_s**2, 1.8 * period_s, 1.0]), 1.0 / FINE_HZ)
     return np.asarray(lfilter(np.ravel(system[0]), np.ravel(system[1]), drive))
 
