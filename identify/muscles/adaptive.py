@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -75,16 +75,6 @@ class Decision:
     knowledge: tuple[Knowledge, ...] = ()  # of each channel; none before the first fit
     dose_nm_s: tuple[float, ...] = field(default=())
     """Torque-time of each channel at the end of what is laid, with `piece`, at most."""
-
-    def to_dict(self, names: Sequence[str], number: int = 1) -> dict[str, Any]:
-        """Plain values, for the test's document and the page; `number`: of the piece."""
-        return {
-            "kind": self.kind,
-            "segments": [] if self.piece is None else [self.piece.segment(number, names)],
-            "words": self.words,
-            "knowledge": {name: one.to_dict() for name, one in zip(names, self.knowledge, strict=False)},
-            "dose_nm_s": dict(zip(names, self.dose_nm_s, strict=False)),
-        }
 
 
 def decide(record: JointRecord | None, played_us: np.ndarray, asked: Asked) -> Decision:

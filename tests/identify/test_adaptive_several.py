@@ -99,6 +99,13 @@ def test_a_record_that_no_pulse_moves_is_a_misfit():
     assert decide(recorded(JOINT, widths), widths, ASKED).kind == "misfit"
 
 
+@pytest.mark.slow
+def test_pieces_at_random_take_longer(whole, monkeypatch):
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(Foresight, "after", lambda _self, pieces, _target: (2.0, rng.uniform(0.01, 1.0, len(pieces))))
+    assert len(play(JOINT, ASKED).widths_us) > 1.5 * len(whole.widths_us)
+
+
 def test_a_piece_of_one_muscle_teaches_of_that_one(foresight):
     quiet = np.zeros(80)
     stairs = np.repeat([90.0, 130.0, 170.0, 210.0], 20)
