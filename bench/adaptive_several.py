@@ -1,6 +1,6 @@
 """An adaptive test of two muscles against the fixed one: its time, the dose of each muscle, the error on unseen pulses.
 
-    python -m bench.adaptive_several --seeds 1200:1212 [--noise 0.05] [--target 3] [--plain] [--json FILE]
+    python -m bench.adaptive_several --seeds 1200:1212 [--noise 0.05] [--target 2] [--plain] [--json FILE]
 
 Emulated joints by seed, with the fixed test and the unseen record of `bench.two_muscles`, in which both muscles move.
 It may take as long as the fixed one without its held-out levels, and give each muscle as much torque-time
@@ -128,7 +128,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
 def main() -> None:
     options = parser(__doc__, "1200:1212")
     options.add_argument("--noise", type=float, default=0.05)
-    options.add_argument("--target", type=float, default=3.0, help="largest half-width of the bands, %%")
+    options.add_argument("--target", type=float, default=2.0, help="largest half-width of the bands, %%")
     options.add_argument("--plain", action="store_true", help="no search: the fit that decides, of both records")
     options.add_argument("--workers", type=int, default=2)
     given = options.parse_args()
