@@ -62,9 +62,9 @@ def test_three_muscles_are_known_in_one_test():
     assert made.last.kind == "enough" and covered(joint, made)
 
 
-@pytest.mark.parametrize("bound", ["most_nm_s", "most_us"])
-@pytest.mark.parametrize("place", [0, 1])
-def test_no_channel_gets_more_than_its_dose(whole, bound, place):
+@pytest.mark.slow
+@pytest.mark.parametrize(("place", "bound"), [(0, "most_nm_s"), (1, "most_us")])
+def test_no_channel_gets_more_than_its_dose(whole, place, bound):
     """A third of what the test would take of that channel after its opening; the other one is not held back by it."""
     opening = whole.decisions[0].piece.pulse_width_us
     taken = {
