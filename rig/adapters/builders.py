@@ -48,7 +48,6 @@ class Builder:
                 await self._begin()
             except OSError as error:  # it is started again when it is needed
                 log.warning("the builder of %s did not start: %r", self._builds, error)
-                await self.close()
 
     async def close(self) -> None:
         process, self._process = self._process, None
@@ -60,16 +59,22 @@ class Builder:
     async def _begin(self) -> asyncio.subprocess.Process:
         """The process, once it has said that it takes requests."""
         if self._process is None or self._process.returncode is not None:
-            self._process = await asyncio.create_subprocess_exec(
+            process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "stimrig.rig.builder", self._builds,
                 stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_REPLY_BYTES,
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )  # fmt: skip
-            assert self._process.stdin is not None
-            assert self._process.stdout is not None
-            self._process.stdin.write(self._first)
-            if not await asyncio.wait_for(self._process.stdout.readline(), MAX_START_S):
-                raise ConnectionError("the builder has died")
+            assert process.stdin is not None
+            assert process.stdout is not None
+            try:
+                process.stdin.write(self._first)
+                if not await asyncio.wait_for(process.stdout.readline(), MAX_START_S):
+                    raise ConnectionError("the builder has died")
+            except BaseException:  # a cancelled one, too: its first line is no reply to the next request
+                with contextlib.suppress(ProcessLookupError):
+                    process.kill()
+                raise
+            self._process = process
         return self._process
 
     async def _ask(self, request: bytes, within_s: float, lines: int = 1) -> list[bytes]:
