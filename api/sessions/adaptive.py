@@ -104,18 +104,21 @@ class AdaptiveTests(Watched):
             return self._outlooks[name]
 
     def _known(self, plan: TestPlan, with_bank: bool) -> dict[str, Any]:
-        """The participant's models; with a bank also that: names and models that the participant may be like.
+        """For the adviser: the participant's models, and with a bank that."""
+        person = self.versions.store.get(Participant, plan.participant)
+        own = self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
+        return {"models": [text for _, text in own], "bank": self._bank(person, own) if with_bank else None}
+
+    def _bank(self, person: Participant, own: list[tuple[str, str]]) -> list[tuple[str, str]]:
+        """Names and models that the participant may be like.
 
         Whoever reads a test may be barred from other people, so their names tell nothing of them.
         """
-        person = self.versions.store.get(Participant, plan.participant)
-        own = self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
         bank = [(f"own model {number} of {day}", text) for number, (day, text) in enumerate(reversed(own), start=1)]
-        others = self.versions.last_of_others(person, MOST_IN_BANK - len(bank)) if with_bank else []
-        for number, row in enumerate(others, start=1):
+        for number, row in enumerate(self.versions.last_of_others(person, MOST_IN_BANK - len(bank)), start=1):
             with contextlib.suppress(ApiError):
                 bank.append((f"another person {number}", stored_model.text(row)))
-        return {"models": [text for _, text in own], "bank": bank if with_bank else None}
+        return bank
 
     def _models(self, participant: str, place: Place) -> list[tuple[str, str]]:
         """The days of the participant's approved models, and the models, oldest first.
@@ -126,8 +129,9 @@ class AdaptiveTests(Watched):
         of_rows = self.versions.store.all(Test, Test.recording_id.in_([row.recording_id for row in rows]))
         tests = {test.recording_id: test for test in of_rows}
         found = []
-        for row in [row for row in rows if not _elsewhere(tests.get(row.recording_id), place)][-MOST_MODELS:]:
-            test = tests.get(row.recording_id)
+        pairs = [(row, tests.get(row.recording_id)) for row in rows]
+        here = [(row, test) for row, test in pairs if test is None or not differ(place_of(test), place)]
+        for row, test in here[-MOST_MODELS:]:
             with contextlib.suppress(ApiError):
                 found.append((local_day(test.requested_utc if test else row.created_utc), stored_model.text(row)))
         return found
@@ -176,10 +180,6 @@ class AdaptiveTests(Watched):
             "torque_time_nm_s": None,
             **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach"), state="fixed", problem=why)),
         }
-
-
-def _elsewhere(test: Test | None, place: Place) -> bool:
-    return test is not None and differ(place_of(test), place)
 
 
 def fixed_plan(

@@ -229,6 +229,7 @@ class Follower(Watcher):
         if kind == "misfit":
             self.give_up(answer.said["words"])
             return
+        before = self.told.state, self.told.ended
         chosen = [SegmentPlan(**segment) for segment in answer.said["segments"]]
         ended = {"enough": "known-enough", "spent": self._spent()}.get(kind, "")
         request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.laid, segments=chosen)
@@ -241,7 +242,7 @@ class Follower(Watcher):
             await self.rig.ask(request)
         except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, and then it is asked again
             if ended:
-                self.told.state, self.told.ended = "choosing", ""
+                self.told.state, self.told.ended = before
             if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
                 raise
             del self._added[len(self._added) - len(widths) :]
