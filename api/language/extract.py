@@ -79,9 +79,9 @@ VOCABULARY = (
     # what is joined
     "%(one)s and %(other)s", "%(one)s, then %(other)s", "“%(name)s”",
     "%(one)s from %(other)s", "%(name)s (%(form)s)", " by %(who)s", "with %(effects)s",
-    # a sentence without the figure that `stimrig.api.structure.worded` takes away; made by `format`
     # whom a person is like: as short as a sentence can be
     "Like %(name)s (%(percent)s %%).",
+    # a sentence without the figure that `stimrig.api.structure.worded` takes away; made by `format`
     "%(test)s should separate %(those)s.", "%(test)s is the best test to separate %(those)s, but it may not be enough.",
     "pulse widths of %(range)s µs", "%(range)s pulses/s",
     # what was not found, what ran

@@ -19,6 +19,8 @@ from stimrig.identify.estimation.short_record import Short
 from stimrig.identify.experiments.designs import Piece
 
 POINTS = 61
+LONGEST_S = 12.0
+"""Of a step response, that is looked at."""
 LEVEL = 0.95
 EVEN = 0.9
 """The band is at least about this share of its largest width everywhere: where a curve has a sudden bend, the draws
@@ -108,7 +110,7 @@ def knowledge(short: Short) -> Knowledge:
     width = np.linspace(0.0, short.basis.largest_us, POINTS)
     plateau = max(short.plateau_nm, 1e-9)
     curves = short.coefficients_nm @ short.basis.design(width).T / plateau
-    time_s = np.linspace(0.0, min(short.linear.memory_s, 12.0), POINTS)
+    time_s = np.linspace(0.0, min(short.linear.memory_s, LONGEST_S), POINTS)
     return Knowledge(
         curve=whole_band(width, curves, 1.0 + HIDDEN * short.strange),
         step=whole_band(time_s, step_responses(short.dynamics, time_s), 1.0 + HIDDEN),

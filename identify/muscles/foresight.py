@@ -13,7 +13,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.linear import SecondOrder, step_responses
 from stimrig.identify.estimation.uncertainty import whole_factor
-from stimrig.identify.experiments.knowledge import HIDDEN, LEAST_SD, NORM, POINTS, Band, Knowledge, Target
+from stimrig.identify.experiments.knowledge import HIDDEN, LEAST_SD, LONGEST_S, NORM, POINTS, Band, Knowledge, Target
 from stimrig.identify.muscles.joint_fit import JointFitted, assemble
 from stimrig.identify.muscles.pieces import Piece
 from stimrig.identify.muscles.problem import JointProblem
@@ -23,8 +23,6 @@ from stimrig.identify.records.record import Record
 
 CHANGE = 1e-3
 """Of the logarithm of the time constant and of the damping, for derivatives."""
-LONGEST_S = 12.0
-"""Of a step response, that is looked at."""
 SAMPLES = 4
 """Per pulse of a piece that is simulated."""
 APART_S = 1.5
@@ -64,7 +62,7 @@ class Foresight:
     def after(self, pieces: Sequence[Piece], target: Target) -> tuple[float, np.ndarray]:
         """Width of the bands now, and expected after each piece, over the target, in a norm."""
         targets = self.targets(target)
-        now = _norm(np.sum((targets @ np.linalg.inv(self.known)) * targets, axis=1), len(self.muscles))
+        now = _norm(np.sum((targets @ np.linalg.inv(self.known)) * targets, axis=1))
         simulated, begins, stops = self._laid(pieces)
         _, slopes = simulated.run(self.fitted.theta, derivatives=True)
         assert slopes is not None
@@ -74,7 +72,7 @@ class Foresight:
         for size in stops - begins:
             own = white[:, at : at + size] * self.scale[:, None]
             left = np.linalg.solve(self.known + own @ own.T, targets.T)
-            after.append(_norm(np.sum(targets * left.T, axis=1), len(self.muscles)))
+            after.append(_norm(np.sum(targets * left.T, axis=1)))
             at += size
         return now, np.array(after)
 
@@ -113,9 +111,9 @@ class Foresight:
         return assemble(setups, self.found.effects, self.found.acting), stops - sizes, stops
 
 
-def _norm(variance: np.ndarray, muscles: int) -> float:
-    """The widest places of each curve count most, but not alone."""
-    half = np.sqrt(np.maximum(variance, 0.0)).reshape(2 * muscles, POINTS)
+def _norm(variance: np.ndarray) -> float:
+    """The widest places of all curves count most, but not alone."""
+    half = np.sqrt(np.maximum(variance, 0.0))
     return float(np.sum(half**NORM) ** (1 / NORM))
 
 
