@@ -182,6 +182,32 @@ def test_a_slow_start_is_not_part_of_a_requests_time(monkeypatch: pytest.MonkeyP
     asyncio.run(run())
 
 
+def test_a_request_that_is_cancelled_while_its_builder_starts_leaves_no_reply_to_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    execute, begun = asyncio.create_subprocess_exec, list[asyncio.subprocess.Process]()
+
+    async def slow(*command: str, **options: Any) -> asyncio.subprocess.Process:
+        code = "import time; time.sleep(60)"
+        begun.append(await execute(*(command if begun else (sys.executable, "-c", code)), **options))
+        return begun[-1]
+
+    async def run() -> None:
+        monkeypatch.setattr(asyncio, "create_subprocess_exec", slow)
+        asked = Previews(HARD_LIMITS, 1.0)
+        first = asyncio.create_task(asked.reply(REQUEST))
+        while not begun:
+            await asyncio.sleep(0.01)
+        first.cancel()
+        await asyncio.gather(first, return_exceptions=True)
+        assert first.cancelled()
+        assert json.loads(await asked.reply(REQUEST))["ok"]
+        assert await begun[0].wait() < 0, "nobody waits for it any more"
+        await asked.close()
+
+    asyncio.run(run())
+
+
 def test_a_builder_that_does_not_start_is_given_up_and_started_again_when_needed(monkeypatch: pytest.MonkeyPatch):
     async def run() -> None:
         asked = Previews(HARD_LIMITS, 1.0)
