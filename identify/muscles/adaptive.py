@@ -87,12 +87,9 @@ def decide(record: JointRecord | None, played_us: np.ndarray, asked: Asked) -> D
     played_us : array, shape (P, C)
         Widths of all pulses of each channel that were played or are committed, µs; may reach beyond the record's end.
     asked : Asked
-        What the test is to find out, and what it may cost.
+        What the test is to find out, and what it may cost. Its channels and its pulse rate must be the record's.
 
-    Raises
-    ------
-    BadRecord
-        The record holds what no measurement gives.
+    A record that cannot be used is a `misfit`, with the reason in its words. What then plays is the caller's choice.
     """
     if record is None:
         return _opening(asked)

@@ -1,4 +1,4 @@
-"""Pieces of an adaptive test of several muscles: two to three seconds, one muscle alone or all at once.
+"""Pieces of an adaptive test of several muscles: 1.3 to 3 s after the opening, one muscle alone or all at once.
 
 Each is a list of pulse widths for each channel, which the rig's sequence `widths` plays as it is.
 """
