@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +25,19 @@ SCHEMA_VERSION = "1.0"
 LARGEST_TEXT = 16 * 2**20
 """Characters. A model with 1000 knots and all effects has two million."""
 WRITTEN_AS_THEY_ARE = ("fit", "residual_tests", "valid_for", "quality", "data", "joint", "extra", "software")
-SOFTWARE = {"name": "stimrig", "version": "0.1.0"}
+
+
+@cache
+def _version() -> str:
+    try:
+        return version("stimrig")
+    except PackageNotFoundError:  # run from its folder, without an installation
+        return "0"
+
+
+def made_by() -> dict[str, Any]:
+    """What a model of today is made by."""
+    return {"name": "stimrig", "version": _version()}
 
 
 @dataclass(frozen=True)
@@ -78,7 +92,7 @@ class Model(Summarised):
     extra: dict[str, Any] = field(default_factory=dict)
     model_id: str = ""
     created: str = ""
-    software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))
+    software: dict[str, Any] = field(default_factory=made_by)
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""

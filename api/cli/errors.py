@@ -5,6 +5,11 @@ from __future__ import annotations
 import os
 
 INTERRUPTED = 130
+PAGE = frozenset({
+    "alembic", "argon2", "can", "cantools", "cryptography", "fastapi", "fastapi_offline", "fpdf", "joserfc",
+    "multipart", "prometheus_client", "pydantic_settings", "serial", "sqlalchemy", "starlette", "uvicorn",
+})  # fmt: skip
+"""Modules that the extra `page` brings: identification works without them."""
 
 
 def leave(*_: object) -> None:

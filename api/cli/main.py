@@ -22,7 +22,7 @@ import typer
 from typer.exceptions import TyperException
 
 from stimrig.api.cli import commands
-from stimrig.api.cli.errors import INTERRUPTED, CommandError, leave
+from stimrig.api.cli.errors import INTERRUPTED, PAGE, CommandError, leave
 from stimrig.api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.version import software_version
@@ -166,6 +166,12 @@ def _one_line(verb: str, given: list[str], error: Exception) -> int:
     if isinstance(error, ServiceError):
         print(f"{name}: {flat(str(error))}", file=sys.stderr)
         return 2 if isinstance(error, INPUT_AT_FAULT) or error.code == "rig-disconnected" else 1
+    if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in PAGE:
+        print(
+            f"{name}: needs rig, service and page: pip install 'stimrig[page]' ({error.name} is missing)",
+            file=sys.stderr,
+        )
+        return 2
     log = Path(tempfile.gettempdir()) / f"stimrig-error-{os.getpid()}.log"
     log.write_text("".join(traceback.format_exception(error)))
     print(f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", file=sys.stderr)

@@ -17,7 +17,7 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.json_text import BadJson, json_value, parse
-from stimrig.identify.model import LARGEST_TEXT, SCHEMA_VERSION, SOFTWARE, Model
+from stimrig.identify.model import LARGEST_TEXT, SCHEMA_VERSION, Model, made_by
 from stimrig.identify.muscles.interplay import Other
 from stimrig.identify.muscles.problem import Acting, JointProblem, drive_form
 from stimrig.identify.muscles.record import MOST, NAME, RESERVED, Channel, JointRecord
@@ -50,7 +50,7 @@ class JointModel(Summarised):
     reasons: tuple[str, ...] = ()
     model_id: str = ""
     created: str = ""
-    software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))
+    software: dict[str, Any] = field(default_factory=made_by)
 
     @property
     def names(self) -> tuple[str, ...]:
