@@ -130,10 +130,15 @@ def emulate(options: str = "", data: str | Path | None = None) -> Iterator[Clien
     Raises
     ------
     LaunchError
-        A process does not come up.
+        A process does not come up, or the extra `page` is not installed.
     """
-    from stimrig.api.cli.launcher import Services
-    from stimrig.api.settings import Settings
+    from stimrig.api.cli.errors import LaunchError
+
+    try:
+        from stimrig.api.cli.launcher import Services
+        from stimrig.api.settings import Settings
+    except ModuleNotFoundError as error:
+        raise LaunchError(f"needs more packages: pip install 'stimrig[page]' ({error.name} is missing)") from None
 
     token = secrets.token_urlsafe(32)
     with tempfile.TemporaryDirectory(prefix="stimrig-") as folder:

@@ -69,5 +69,5 @@ chmod -R u=rwX,go=rX "$root"
 find "$root" -exec touch -h -d "@$SOURCE_DATE_EPOCH" {} +
 mkdir -p "$target"
 say "packing"
-dpkg-deb --root-owner-group --threads-max=2 -Zxz -z"${LEVEL:-6}" --build "$root" "$target/stimrig_${version}_$architecture.deb" >&2
+dpkg-deb --root-owner-group --threads-max=2 -Zzstd -z12 --build "$root" "$target/stimrig_${version}_$architecture.deb" >&2
 echo "$target/stimrig_${version}_$architecture.deb"
