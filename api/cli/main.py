@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import gc
 import importlib
 import os
@@ -30,6 +31,7 @@ from stimrig.identify.errors import IdentifyError
 
 COMPUTES = {"compare", "diagnose", "explain", "export", "fit", "improve", "invert", "predict", "table1"}
 """Verbs that only compute: they hold no device, and Ctrl-C may end them whatever they are in."""
+PACKAGE = Path(__file__).resolve().parents[1]
 GRACE_S = 0.7
 """For what is to be tidied up after Ctrl-C."""
 interrupted = threading.Event()
@@ -119,6 +121,7 @@ def run(arguments: list[str] | None = None) -> int:
     """Run a verb; its exit code."""
     # Matrices of a fit are small: a second BLAS thread only waits for the first, and on a busy machine for long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _keep_compiled()
     given = arguments if arguments is not None else sys.argv[1:]
     verb = next((word for word in given if word[:1] != "-"), "")
     try:
@@ -138,6 +141,16 @@ def run(arguments: list[str] | None = None) -> int:
             print("stimrig: interrupted", file=sys.stderr)
             return INTERRUPTED
         return _one_line(verb, given, error)
+
+
+def _keep_compiled() -> None:
+    """Where the installation is another user's, what numba compiles lies in this user's cache; workers are told of it."""
+    if "NUMBA_CACHE_DIR" in os.environ or os.access(PACKAGE, os.W_OK):
+        return
+    with contextlib.suppress(OSError, RuntimeError):  # no home: `stimrig doctor` tells what follows
+        place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stimrig" / "numba"
+        place.mkdir(parents=True, exist_ok=True)
+        os.environ["NUMBA_CACHE_DIR"] = str(place)
 
 
 def _interrupt(*_: object) -> None:

@@ -66,6 +66,7 @@ environment
 files
 control
 chmod -R u=rwX,go=rX "$root"
+find "$root" -type f -name "*.so*" -exec chmod a-x {} +
 find "$root" -exec touch -h -d "@$SOURCE_DATE_EPOCH" {} +
 mkdir -p "$target"
 say "packing"
