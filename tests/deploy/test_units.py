@@ -133,12 +133,32 @@ def test_systemd_knows_every_setting(tmp_path: Path) -> None:
     """Unknown settings and wrong values; that programs are not installed here is not its matter."""
     for path in (DEPLOY / "systemd").glob("stimrig*.*"):
         if path.suffix in (".service", ".timer"):
-            text = re.sub(r"/opt/stimrig/current/venv/bin/python", "/bin/true", path.read_text("utf-8"))
+            text = re.sub(r"/usr/lib/stimrig/venv/bin/python3", "/bin/true", path.read_text("utf-8"))
             (tmp_path / path.name.replace("@", "@can0")).write_text(text.replace("%i", "can0"))
     units = [str(path) for path in tmp_path.iterdir()]
     answer = subprocess.run(["systemd-analyze", "verify", "--man=no", *units], capture_output=True, text=True)
     ours = [line for line in answer.stderr.splitlines() if "stimrig" in line and "not executable" not in line]
     assert ours == []
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+@pytest.mark.parametrize("name", sorted(path.name for path in (DEPLOY / "systemd").glob("*.service")))
+def test_no_unit_is_exposed(name: str, tmp_path: Path) -> None:
+    """An exposure of at most 2.0, and a unit that asks for nothing is over it."""
+    hardened, bare = tmp_path / name.replace("@", "@can0"), tmp_path / "bare.service"
+    hardened.write_text((DEPLOY / "systemd" / name).read_text("utf-8"), "utf-8")
+    bare.write_text("[Service]\nExecStart=/bin/true\n", "utf-8")
+    command = ["systemd-analyze", "security", "--offline=true", "--no-pager", "--threshold=20"]
+    answer = subprocess.run([*command, str(hardened)], capture_output=True, text=True)
+    assert answer.returncode == 0, answer.stdout.splitlines()[-1:]
+    assert subprocess.run([*command, str(bare)], capture_output=True).returncode == 1
+
+
+def test_what_brings_the_cells_interface_up_may_do_no_more() -> None:
+    settings = unit("stimrig-can@.service")
+    assert settings["CapabilityBoundingSet"] == ["CAP_NET_ADMIN"]
+    assert "AF_NETLINK" in settings["RestrictAddressFamilies"][0] and settings["PrivateDevices"] == ["yes"]
+    assert 'KERNEL=="can0", TAG+="systemd", ENV{SYSTEMD_WANTS}+="stimrig-can@can0.service"' in RULES
 
 
 def test_the_installer_is_sound_and_changes_nothing_in_a_dry_run() -> None:
@@ -147,14 +167,16 @@ def test_the_installer_is_sound_and_changes_nothing_in_a_dry_run() -> None:
     assert subprocess.run([str(script), "--nonsense"], capture_output=True).returncode == 2
     if not Path("/etc/debian_version").exists():
         pytest.skip("the dry run wants a Debian machine")
-    before = Path("/opt/stimrig").exists(), Path("/etc/stimrig").exists()
+    before = Path("/usr/lib/stimrig").exists(), Path("/etc/stimrig").exists()
     answer = subprocess.run([str(script), "--dry-run"], capture_output=True, text=True)
     assert answer.returncode == 0, answer.stderr
-    assert "would: systemctl --quiet enable stimrig-rig.service" in answer.stdout
-    assert (Path("/opt/stimrig").exists(), Path("/etc/stimrig").exists()) == before
+    assert "would: deploy/deb/build.sh" in answer.stdout and "apt-get install" in answer.stdout
+    assert (Path("/usr/lib/stimrig").exists(), Path("/etc/stimrig").exists()) == before
 
 
-def test_nothing_is_installed_that_the_installer_does_not_name() -> None:
-    text = (DEPLOY / "install.sh").read_text("utf-8")
-    units = {path.name for path in (DEPLOY / "systemd").iterdir()}
-    assert {name for name in units if name not in text} == set()
+def test_everything_beside_the_units_is_put_into_the_package() -> None:
+    """Services and timers are taken by their suffix."""
+    text = (DEPLOY / "deb" / "build.sh").read_text("utf-8")
+    assert "deploy/systemd/*.service deploy/systemd/*.timer" in text
+    others = {path.name for path in (DEPLOY / "systemd").iterdir() if path.suffix not in (".service", ".timer")}
+    assert {name for name in others if name not in text} == set()
