@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: demo centre test frozen check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
+.PHONY: demo centre test frozen check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help packages setup setup-test setup-centre simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -83,6 +83,9 @@ $(VENV)/.centre: requirements/centre.txt pyproject.toml deploy/setup.sh
 
 $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench
+
+packages: setup-test ## wheel, sdist, Debian package and container, built into dist/ and tried (docs/install.md)
+	@bash deploy/packages.sh
 
 words: setup ## renew the catalogues of the pages' languages; LANGUAGE=fr begins one (docs/languages.md)
 	@$(BIN)/python -m stimrig.api.language.extract $(LANGUAGE)
