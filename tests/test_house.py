@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 FIXED_TOP_LEVEL = {"pyproject.toml", "rig", "identify", "api", "hardware_sim", "tests", "deploy"}
 BESIDE = {
     "README.md", "CONTRIBUTING.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
-    "CITATION.cff", ".ci", ".gitattributes", ".gitignore", ".pre-commit-config.yaml",
+    "CITATION.cff", ".containerignore", ".ci", ".gitattributes", ".gitignore", ".pre-commit-config.yaml",
 }  # fmt: skip
 
 

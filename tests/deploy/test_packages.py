@@ -197,14 +197,18 @@ def test_the_locked_list_of_a_rig_holds_base_and_page() -> None:
 # ---- the Debian package: its scripts in a root of their own, with commands that only tell ---------------------------
 
 
+PLACES = (
+    "etc/stimrig", "etc/systemd/system/multi-user.target.wants", "etc/udev/rules.d", "run/systemd/system",
+    "usr/lib/stimrig/venv/bin", "usr/share/stimrig", "var/lib/stimrig/rig", "var/backups/stimrig", "var/cache/stimrig",
+)  # fmt: skip
+
+
 class FakeRoot:
     """A folder that stands for `/`, and stubs in the place of what talks to systemd."""
 
     def __init__(self, folder: Path) -> None:
         self.root, self.stubs, self.told = folder / "root", folder / "stubs", folder / "told"
-        for place in ("etc/stimrig", "etc/systemd/system/multi-user.target.wants", "etc/udev/rules.d",
-                      "run/systemd/system", "usr/lib/stimrig/venv/bin", "usr/share/stimrig", "var/lib/stimrig/rig", "var/backups/stimrig",
-                      "var/cache/stimrig"):  # fmt: skip
+        for place in PLACES:
             (self.root / place).mkdir(parents=True)
         self.stubs.mkdir()
         for name in ("systemctl", "deb-systemd-helper", "deb-systemd-invoke", "systemd-sysusers", "systemd-tmpfiles",
