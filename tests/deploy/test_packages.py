@@ -313,7 +313,7 @@ def backend_files() -> list[str]:
     shipped = next(node.value for node in tree.body if isinstance(node, ast.Assign)
                    and ast.unparse(node.targets[0]) == "SHIPPED")  # fmt: skip
     assert isinstance(shipped, ast.Tuple)
-    return [one.value for one in shipped.elts if isinstance(one, ast.Constant)] + ["deploy/commit-time"]
+    return [str(one.value) for one in shipped.elts if isinstance(one, ast.Constant)] + ["deploy/commit-time"]
 
 
 def test_the_container_is_nobodys_user_has_a_health_check_and_copies_what_a_build_needs() -> None:
