@@ -75,8 +75,11 @@ def bring_back(connection: Connection, revision: str) -> list[str]:
         return []
     query = sa.select(SET_ASIDE).where(SET_ASIDE.c.revision == revision).order_by(SET_ASIDE.c.id)
     stays: dict[str, int] = {}
+    tables: dict[str, sa.Table] = {}
     for row in connection.execute(query).mappings().all():
-        if _put(connection, row):
+        name = row["of_table"]
+        held = tables[name] = tables[name] if name in tables else reflected(connection, name)
+        if _put(connection, held, row):
             connection.execute(SET_ASIDE.delete().where(SET_ASIDE.c.id == row["id"]))
         else:
             stays[row["why"]] = stays.get(row["why"], 0) + 1
@@ -94,8 +97,7 @@ def reflected(connection: Connection, table: str) -> sa.Table:
     return sa.Table(table, sa.MetaData(), autoload_with=connection, resolve_fks=False)
 
 
-def _put(connection: Connection, row: Mapping[str, Any]) -> bool:
-    held = reflected(connection, row["of_table"])
+def _put(connection: Connection, held: sa.Table, row: Mapping[str, Any]) -> bool:
     key, content, guard = (_value(row[name]) for name in ("row_key", "content", "unless_changed"))
     now = connection.execute(sa.select(held).where(*_at(held, key))).mappings().first()
     if now is None:

@@ -21,7 +21,7 @@ def upgrade(
     copied: Annotated[bool, typer.Option("--copied", help="PostgreSQL: a backup was made by pg_dump")] = False,
     as_json: Json = False,
 ) -> None:
-    """Bring the data of an older version to this one, or back: with a copy before, and resumable after a kill."""
+    """Bring the data of an older version to this one, or back. Exit 1: it is done, but a recording is in doubt."""
     from stimrig.api.clock import Clock
     from stimrig.api.progress_bar import progress_bar
     from stimrig.api.settings import Settings
@@ -39,6 +39,8 @@ def upgrade(
         say_json(found)
     else:
         say(*_lines(found))
+    if found["doubts"]:
+        raise typer.Exit(1)
 
 
 def _lines(found: dict[str, object]) -> list[str]:
