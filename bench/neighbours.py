@@ -56,7 +56,9 @@ def centre(tree: Path, folder: Path) -> Iterator[tuple[str, str]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     settings = {"DATA_DIR": str(folder), "PORT": str(port), "ADMIN_TOKEN": TOKEN}
-    with process(tree, "api.centre.server", {f"STIMRIG_CENTRE_{name}": value for name, value in settings.items()}) as one:
+    with process(
+        tree, "api.centre.server", {f"STIMRIG_CENTRE_{name}": value for name, value in settings.items()}
+    ) as one:
         assert one.stdout is not None
         url = json.loads(one.stdout.readline())["url"]
         head = {"Authorization": f"Bearer {TOKEN}"}
@@ -98,16 +100,19 @@ def record(old: Path, place: Path) -> None:
     KEPT.mkdir(exist_ok=True)
     data = place / "old-old/rig/stimrig.db"
     names = ("chain", "seq", "kind", "key", "body", "sha256", "file", "file_bytes", "at_utc", "previous", "hash")
-    items = [dict(zip(names, row, strict=True)) for row in rows(data, f"SELECT {', '.join(names)} FROM outbox ORDER BY id")]
+    items = [
+        dict(zip(names, row, strict=True)) for row in rows(data, f"SELECT {', '.join(names)} FROM outbox ORDER BY id")
+    ]
     chain = items[0]["chain"]
     sent = [{**item, "body": json.loads(item["body"])} for item in items]
     for item in sent:
         del item["chain"]
     batch = {"chain": chain, "items": sent}
     (KEPT / "old_rig.json").write_text(json.dumps(batch, indent=1, ensure_ascii=False) + "\n", "utf-8")
-    with centre(old, place / "answers") as (url, key), httpx.Client(
-        base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=60
-    ) as http:
+    with (
+        centre(old, place / "answers") as (url, key),
+        httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=60) as http,
+    ):
         hello = {"chain": chain, "seq": 0, "hash": "0" * 64, "utc": "2026-11-23T10:00:00.000Z", "version": "1.0"}
         found = {
             "POST /v1/rig/hello": http.post("/v1/rig/hello", json=hello),

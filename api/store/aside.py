@@ -88,7 +88,9 @@ def bring_back(connection: Connection, revision: str) -> list[str]:
 
 def told(connection: Connection) -> list[str]:
     """A line for each kind of thing that is aside."""
-    counted = sa.select(SET_ASIDE.c.why, sa.func.count()).group_by(SET_ASIDE.c.why).order_by(sa.func.min(SET_ASIDE.c.id))
+    counted = (
+        sa.select(SET_ASIDE.c.why, sa.func.count()).group_by(SET_ASIDE.c.why).order_by(sa.func.min(SET_ASIDE.c.id))
+    )
     return [f"{count} × {why}" for why, count in connection.execute(counted)]
 
 

@@ -51,7 +51,9 @@ def _end_approvals(connection: Connection, now_utc: str) -> list[str]:
     held = aside.reflected(connection, "approvals")
     in_force = sa.and_(held.c.approved, sa.or_(held.c.expires_utc.is_(None), held.c.expires_utc > now_utc))
     ended = connection.execute(held.update().where(in_force).values(expires_utc=now_utc)).rowcount
-    return [f"{ended} × approval in force: it ends now, since version 0.1 knows no sites. Approve anew."] if ended else []
+    return (
+        [f"{ended} × approval in force: it ends now, since version 0.1 knows no sites. Approve anew."] if ended else []
+    )
 
 
 def _0016(op: Operations, shelf: Shelf) -> None:

@@ -67,7 +67,9 @@ def refuse_unsealed(rig_data: Path) -> None:
     """Version 0.1 may not read a journal of this one. Raises UpgradeError: there is one."""
     journal = next((rig_data / "journals").glob("*.journal"), None)
     if journal is not None:
-        raise UpgradeError(f"{journal}: a test that was cut short; start the rig once, so that it is sealed, then go back")
+        raise UpgradeError(
+            f"{journal}: a test that was cut short; start the rig once, so that it is sealed, then go back"
+        )
 
 
 def notes(rig_data: Path, rig_file: Path | None, back: bool) -> list[str]:
@@ -76,7 +78,9 @@ def notes(rig_data: Path, rig_file: Path | None, back: bool) -> list[str]:
         return []
     told = [f"{name}: version 0.1 passes over this setting." for name in NEW_SETTINGS if name in os.environ]
     if (rig_data / "calibrated.json").exists():
-        told.append(f"{rig_data / 'calibrated.json'}: a calibration nobody has stored; it stays, version 0.1 passes over it.")
+        told.append(
+            f"{rig_data / 'calibrated.json'}: a calibration nobody has stored; it stays, version 0.1 passes over it."
+        )
     for key in _keys_of(rig_file):
         told.append(f"{rig_file}: {key}: version 0.1 refuses this key. Keep a copy, and take it out by hand.")
     return told

@@ -47,7 +47,9 @@ class Request:
     rig_file: Path | None = None
 
 
-def upgrade(settings: Settings, request: Request, clock: Clock, tell: Tell = lambda _share, _text: None) -> dict[str, Any]:
+def upgrade(
+    settings: Settings, request: Request, clock: Clock, tell: Tell = lambda _share, _text: None
+) -> dict[str, Any]:
     """Upgrade the data of a service and its rig, or go back; what was done, as `stimrig upgrade --json` has it.
 
     Raises UpgradeError: it cannot be done, and nothing was changed.
@@ -78,7 +80,14 @@ def _tried(settings: Settings, request: Request, clock: Clock) -> dict[str, Any]
         _or_refuse(lambda: copies.copy_database(path, copy))
         run = _Run(Settings(data_dir=Path(folder), database_url=f"sqlite:///{copy}"), request, clock, lambda *_: None)
         try:
-            return {"from": run.at, "to": run.to, "dry_run": True, "copy": None, "told": run.change_database(), "doubts": []}
+            return {
+                "from": run.at,
+                "to": run.to,
+                "dry_run": True,
+                "copy": None,
+                "told": run.change_database(),
+                "doubts": [],
+            }
         finally:
             run.engine.dispose()
 
@@ -195,7 +204,9 @@ def _counted(connection: Connection) -> dict[str, int]:
     """Rows of each table that both schemas have."""
     names = set(sa.inspect(connection).get_table_names()) - {"alembic_version", "schema_version", "set_aside"}
     count = sa.func.count()
-    return {name: connection.execute(sa.select(count).select_from(sa.table(name))).scalar_one() for name in sorted(names)}
+    return {
+        name: connection.execute(sa.select(count).select_from(sa.table(name))).scalar_one() for name in sorted(names)
+    }
 
 
 def _or_refuse(work: Callable[[], Any]) -> Any:

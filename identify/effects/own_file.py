@@ -72,7 +72,9 @@ class _Told(ModuleType):
 
     def __init__(self, module: ModuleType) -> None:
         super().__init__(module.__name__.removeprefix("stimrig."))
-        self.__dict__.update({name: getattr(module, name) for name in ("__path__", "__spec__") if hasattr(module, name)})
+        self.__dict__.update(
+            {name: getattr(module, name) for name in ("__path__", "__spec__") if hasattr(module, name)}
+        )
         self.__dict__["_module"] = module
 
     def __getattr__(self, name: str) -> Any:

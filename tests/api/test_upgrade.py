@@ -77,6 +77,10 @@ def people_of(data: Path) -> list[dict[str, Any]]:
     return list(rows_of(data)["participants"].values())
 
 
+def test_every_revision_since_has_its_way_back() -> None:
+    assert set(downgrades.STEPS) == {one for one in migrations.STEPS if one > downgrades.OLDEST}
+
+
 def test_the_copy_is_the_database_as_it_was_and_the_entry_fits(data: Path) -> None:
     before = rows_of(data)
     copy = Path(run(data)["copy"])
@@ -85,7 +89,9 @@ def test_the_copy_is_the_database_as_it_was_and_the_entry_fits(data: Path) -> No
     (data.parent / "restored/recordings").mkdir(parents=True)
     shutil.copy(copy, data.parent / "restored/stimrig.db")
     was = rows_of(data.parent / "restored")
-    assert {name: was[name] for name in was if name != "files"} == {name: before[name] for name in was if name != "files"}
+    assert {name: was[name] for name in was if name != "files"} == {
+        name: before[name] for name in was if name != "files"
+    }
     audit = list(rows_of(data)["audit"].values())
     assert audit[-1]["action"] == "upgrade" and audit[-1]["subject"] == f"0012 to {migrations.NEWEST}"
     assert run(data)["copy"] is None and len(rows_of(data)["audit"]) == len(audit), "a second call does nothing"
@@ -129,7 +135,9 @@ def test_a_placement_stays_aside_where_the_old_version_was_told_of_another_muscl
     with closing(sqlite3.connect(data / "stimrig.db")) as database, database:
         database.execute("UPDATE participants SET muscle = 'triceps brachii' WHERE code = 'N0'")
     told = run(data)["told"]
-    assert told == ["1 × placement of a participant's electrodes. It stays aside: what it belongs to was changed since."]
+    assert told == [
+        "1 × placement of a participant's electrodes. It stays aside: what it belongs to was changed since."
+    ]
     with closing(Store(f"sqlite:///{data}/stimrig.db")) as store:
         assert store.get(Participant, "N0").placement is None
 

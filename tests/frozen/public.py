@@ -63,15 +63,23 @@ def broken(before: Public, now: Public, told: Sequence[Deprecation], version: st
             if name not in now.get(part, {}):
                 lines.append(f"{place}: gone")
             else:
-                lines += [line for item, line in _changes(place, items, now[part][name]) if f"{place} {item}" not in gone]
+                lines += [
+                    line for item, line in _changes(place, items, now[part][name]) if f"{place} {item}" not in gone
+                ]
     return lines
 
 
 def new(before: Public, now: Public) -> list[str]:
     """What the kept list has not."""
-    flat = {part: {(name, item) for name, items in names.items() for item in ("", *items)} for part, names in now.items()}
-    old = {part: {(name, item) for name, items in names.items() for item in ("", *items)} for part, names in before.items()}
-    return [f"{part}/{name} {item}".rstrip() for part in flat for name, item in sorted(flat[part] - old.get(part, set()))]
+    flat = {
+        part: {(name, item) for name, items in names.items() for item in ("", *items)} for part, names in now.items()
+    }
+    old = {
+        part: {(name, item) for name, items in names.items() for item in ("", *items)} for part, names in before.items()
+    }
+    return [
+        f"{part}/{name} {item}".rstrip() for part in flat for name, item in sorted(flat[part] - old.get(part, set()))
+    ]
 
 
 def unwarned(told: Sequence[Deprecation], version: str, before: Public) -> list[str]:
@@ -85,7 +93,11 @@ def unwarned(told: Sequence[Deprecation], version: str, before: Public) -> list[
             lines.append(f"{one.name}: no such part")
         if part == "routes" and (one.since_on is None or one.gone_on is None):
             lines.append(f"{one.name}: a route's headers need since_on and gone_on")
-        listed = {f"{known} {item.rstrip('!')}".rstrip() for known, items in before.get(part, {}).items() for item in ("", *items)}
+        listed = {
+            f"{known} {item.rstrip('!')}".rstrip()
+            for known, items in before.get(part, {}).items()
+            for item in ("", *items)
+        }
         if _minor(one.gone_in) <= _minor(version) and name in listed:
             lines.append(f"{one.name}: gone by now, but still in the list; python -m tests.frozen public")
     return lines
@@ -165,7 +177,9 @@ def _properties(document: dict[str, Any], schema: dict[str, Any] | None) -> list
     """Of an object, or of the objects of a list: its members' names, and whether they must be there."""
     schema = schema or {}
     while "$ref" in schema or "items" in schema:
-        schema = schema["items"] if "items" in schema else document["components"]["schemas"][schema["$ref"].split("/")[-1]]
+        schema = (
+            schema["items"] if "items" in schema else document["components"]["schemas"][schema["$ref"].split("/")[-1]]
+        )
     parts = schema.get("anyOf") or schema.get("oneOf")
     if parts:
         return sorted({(name, False) for part in parts for name, _ in _properties(document, part)})
