@@ -2,8 +2,8 @@
 
     git worktree add /tmp/old c6ff60e && python -m bench.neighbours /tmp/old [--write]
 
-For each pair a centre and a rig's outbox run as processes of their version, over HTTP. Counted: items and files that the
-rig has to tell, and those that the centre has in the end. `--write` records the messages for the suite
+For each pair a centre and a rig's outbox run as processes of their version, over HTTP. Counted: items and files that
+the rig has to tell, and those that the centre has in the end. `--write` records the messages for the suite
 (`tests/api/neighbours`): what the old rig sends, and what the old centre answers.
 """
 
@@ -27,7 +27,7 @@ from typing import Any
 import httpx
 
 from bench.common import ROOT, parser, table, written_by
-from bench.upgrades import make_old, make_since, run
+from tests.harness.upgrades import make_old, make_since, run
 
 KEPT = ROOT / "tests/api/neighbours"
 PATIENCE_S = 90.0

@@ -1,4 +1,4 @@
-"""What an older version cannot hold, kept in the table `set_aside` of the same database until a newer one takes it back.
+"""What an older version cannot hold, kept in the table `set_aside` of the same database until a newer one has it.
 
 An older version neither reads nor changes this table. Content is JSON; bytes are written as base64.
 """
@@ -55,7 +55,7 @@ class Shelf:
             self.keep(held, row, dict(row), why, {})
 
     def replace(self, table: str, row: Mapping[str, Any], new: Mapping[str, Any], why: str) -> None:
-        """Give a row other values, as long as the older version has it; if it leaves them so, the old ones come back."""
+        """Give a row other values while the older version has it; if it leaves them so, the old ones come back."""
         held = reflected(self.connection, table)
         self.keep(held, row, {name: row[name] for name in new}, why, new)
         self.connection.execute(held.update().where(*_at(held, _key(held, row))).values(**new))

@@ -1,7 +1,7 @@
 """The way back to the schema of version 0.1, revision by revision, in one transaction.
 
 What the older schema can hold stays, what was made since included. What it cannot hold is set aside
-(`stimrig.api.store.aside`) and comes back with the next upgrade. A new revision of `migrations` needs its way back here.
+(`stimrig.api.store.aside`) and comes back with the next upgrade. A new revision needs its way back here.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _0015(op: Operations, shelf: Shelf) -> None:
 
 
 def _joint_models(shelf: Shelf) -> None:
-    """Under a hash that is none, version 0.1 takes the file for damaged: nobody can approve it, no controller gets it."""
+    """Under a hash that is none, version 0.1 takes the file for damaged: nobody approves it, no controller gets it."""
     held = aside.reflected(shelf.connection, "models")
     for row in shelf.connection.execute(sa.select(held)).mappings():
         document = bytes(row["document"])

@@ -81,9 +81,8 @@ def notes(rig_data: Path, rig_file: Path | None, back: bool) -> list[str]:
         told.append(
             f"{rig_data / 'calibrated.json'}: a calibration nobody has stored; it stays, version 0.1 passes over it."
         )
-    for key in _keys_of(rig_file):
-        told.append(f"{rig_file}: {key}: version 0.1 refuses this key. Keep a copy, and take it out by hand.")
-    return told
+    refused = "version 0.1 refuses this key. Keep a copy, and take it out by hand."
+    return told + [f"{rig_file}: {key}: {refused}" for key in _keys_of(rig_file)]
 
 
 def _keys_of(rig_file: Path | None) -> list[str]:

@@ -16,8 +16,6 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 
-from bench import upgrades
-from bench.upgrades import lost_between, make_old, make_since, rows_of
 from stimrig.api.cli import main
 from stimrig.api.clock import Clock
 from stimrig.api.settings import Settings
@@ -25,7 +23,9 @@ from stimrig.api.store import Store, copies, downgrades, migrations
 from stimrig.api.store.holds import HeldError, ServiceLock
 from stimrig.api.store.tables import Approval, Model, Participant
 from stimrig.api.upgrade import Request, UpgradeError, upgrade
+from tests.harness import upgrades
 from tests.harness.postgres import Cluster
+from tests.harness.upgrades import lost_between, make_old, make_since, rows_of
 
 pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
@@ -166,14 +166,14 @@ def test_an_error_at_each_step_leaves_the_old_or_the_new_state(data: Path, monke
 @pytest.mark.slow
 def test_killed_before_any_statement_nothing_is_lost_or_half(tmp_path: Path) -> None:
     """In a process of its own: it forks."""
-    command = [sys.executable, "-m", "bench.upgrades", "--people", "2", "--recordings", "2", "--moments", "6"]
+    words = "import json, pathlib, sys; from tests.harness.upgrades import campaign; "
+    words += "print(json.dumps(campaign(pathlib.Path(sys.argv[1]), 2, 2, 6, True)))"
     done = subprocess.run(
-        [*command, "--by-statement", "--json", str(tmp_path / "found.json")],
-        cwd=ROOT, capture_output=True, text=True, timeout=300, env={**os.environ, "TMPDIR": str(tmp_path)},
-    )  # fmt: skip
+        [sys.executable, "-c", words, str(tmp_path / "data")], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads((tmp_path / "found.json").read_text())
-    assert found["killed"] == {"upgrade": 6, "back": 6} and found["lost"] == found["half"] == []
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["killed"] == {"upgrade": 6, "back": 6} and found["lost"] == found["half"] == [] and found["whole"]
 
 
 def test_the_measure_finds_what_is_lost_and_what_is_half(data: Path) -> None:
@@ -205,7 +205,7 @@ def test_nobody_starts_meanwhile_and_it_does_not_start_while_somebody_runs(data:
     lock.release()
     with (data / "rig.lock").open("a+") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        with pytest.raises(UpgradeError, match="a rig .* uses it; stop it first"):
+        with pytest.raises(UpgradeError, match=r"a rig .* uses it; stop it first"):
             run(data, back=True)
     assert revision(data) == migrations.NEWEST
 

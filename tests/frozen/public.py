@@ -1,8 +1,8 @@
 """What is public, by name: a list that is kept (`public.toml`), and what of this tree does not hold to it.
 
 An item that ends in `!` must be given. A name or an item that is gone, one that must be given now and need not before,
-and a new one that must be given break what somebody built on it. They are refused, unless `stimrig.deprecations` told of
-the name one minor version before; what is new is taken into the list by `python -m tests.frozen public`.
+and a new one that must be given break what somebody built on it. They are refused, unless `stimrig.deprecations` told
+of the name one minor version before; what is new is taken into the list by `python -m tests.frozen public`.
 """
 
 from __future__ import annotations
