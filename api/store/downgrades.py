@@ -75,7 +75,7 @@ def _joint_models(shelf: Shelf) -> None:
         document = bytes(row["document"])
         if b'"kind"' in document[:500] and json.loads(document).get("kind"):
             why = "hash of a model of several muscles: version 0.1 cannot read it, and is kept from serving it."
-            shelf.replace("models", row, {"etag": f"set aside {row['id']}"}, why)
+            shelf.replace("models", dict(row), {"etag": f"set aside {row['id']}"}, why)
 
 
 def _0014(op: Operations, shelf: Shelf) -> None:
@@ -106,7 +106,7 @@ def _plain_profiles(shelf: Shelf) -> None:
         profile = row["profile"] or {}
         if "angle_set_at_utc" in profile:
             plain = {name: value for name, value in profile.items() if name != "angle_set_at_utc"}
-            shelf.replace("participants", row, {"profile": plain}, "time at which an angle's range was said.")
+            shelf.replace("participants", dict(row), {"profile": plain}, "time at which an angle's range was said.")
 
 
 STEPS: dict[str, Callable[[Operations, Shelf], None]] = {

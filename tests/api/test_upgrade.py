@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import sqlalchemy as sa
+from sqlalchemy.exc import OperationalError
 
 from stimrig.api.cli import main
 from stimrig.api.clock import Clock
@@ -149,7 +149,7 @@ def test_an_error_at_each_step_leaves_the_old_or_the_new_state(data: Path, monke
     before, broken = rows_of(data), ("0013", "0014", "0015", "0016")
 
     def fail(*_: object) -> None:
-        raise sa.exc.OperationalError("", {}, Exception("disk I/O error"))
+        raise OperationalError("", {}, Exception("disk I/O error"))
 
     for steps, back in ((migrations.STEPS, False), (downgrades.STEPS, True)):
         for name in broken:

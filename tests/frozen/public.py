@@ -18,7 +18,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-import click
 import typer
 from fastapi import FastAPI
 
@@ -133,7 +132,7 @@ def _verbs() -> Iterator[tuple[str, list[str]]]:
     yield from _commands(typer.main.get_command(build()), "")
 
 
-def _commands(command: click.Command, name: str) -> Iterator[tuple[str, list[str]]]:
+def _commands(command: Any, name: str) -> Iterator[tuple[str, list[str]]]:
     inside = getattr(command, "commands", None)
     if inside is not None:
         for word, one in inside.items():
@@ -175,15 +174,14 @@ def _operations(document: dict[str, Any], prefix: str) -> Iterator[tuple[str, li
 
 def _properties(document: dict[str, Any], schema: dict[str, Any] | None) -> list[tuple[str, bool]]:
     """Of an object, or of the objects of a list: its members' names, and whether they must be there."""
-    schema = schema or {}
-    while "$ref" in schema or "items" in schema:
-        schema = (
-            schema["items"] if "items" in schema else document["components"]["schemas"][schema["$ref"].split("/")[-1]]
-        )
-    parts = schema.get("anyOf") or schema.get("oneOf")
+    found: Any = schema or {}
+    named = document.get("components", {}).get("schemas", {})
+    while "$ref" in found or "items" in found:
+        found = found["items"] if "items" in found else named[found["$ref"].split("/")[-1]]
+    parts = found.get("anyOf") or found.get("oneOf")
     if parts:
         return sorted({(name, False) for part in parts for name, _ in _properties(document, part)})
-    return [(name, name in schema.get("required", ())) for name in schema.get("properties", {})]
+    return [(name, name in found.get("required", ())) for name in found.get("properties", {})]
 
 
 def _schemas() -> Iterator[tuple[str, list[str]]]:
