@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
@@ -16,8 +18,10 @@ from alembic.operations import Operations
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, Engine, inspect, text
 
-from stimrig.api.store import centre_tables
+from stimrig.api.store import aside, centre_tables, copies
 
+BEFORE = "before-upgrade"
+"""Folder beside a SQLite database for copies of it, made before an upgrade."""
 WRITES = {"stimrig_writes": True}
 """Execution option of a transaction that writes."""
 METADATA = centre_tables.Table.metadata
@@ -41,28 +45,62 @@ def bring_up(engine: Engine) -> None:
     Raises SchemaError: the database is newer than the software, or lacks a column that no revision adds.
     """
     with engine.connect() as connection:
-        at = MigrationContext.configure(connection).get_current_revision()
+        at = found_revision(connection)
         connection.rollback()
         if at == NEWEST:
             _refuse_lacking(connection)
             return
-    with engine.execution_options(**WRITES).begin() as writer:  # one service at a time, and only once
-        _upgrade(writer)
-        _refuse_lacking(writer)
+    with _copied_before(engine.url.database, at), engine.execution_options(**WRITES).begin() as writer:
+        upgrade(writer)  # one service at a time, and only once
 
 
-def _upgrade(connection: Connection) -> None:
-    context = MigrationContext.configure(connection)
-    at = context.get_current_revision() or _numbered(connection)
-    if at is not None and at not in STEPS:
-        raise _newer(at)
-    with Operations.context(context) as op:
+@contextmanager
+def _copied_before(database: str | None, at: str | None) -> Iterator[None]:
+    """Keep a copy of a SQLite database as it was, unless it stays so. Raises SchemaError: none can be made."""
+    path = Path(database or "")
+    if at is None or not path.is_file():  # new, in memory, or PostgreSQL: its backup is made by its own programs
+        yield
+        return
+    copy = copies.free_name(path.parent / BEFORE, f"{path.stem}-{at}")
+    try:
+        copies.copy_database(path, copy)
+        yield
+    except BaseException as error:
+        copy.unlink(missing_ok=True)
+        if isinstance(error, copies.CopyError):
+            raise SchemaError(f"it is of version {at} and is upgraded only with a copy: {error}") from error
+        raise
+
+
+def upgrade(connection: Connection) -> list[str]:
+    """Upgrade in the caller's transaction; a line for what was set aside once and cannot come back.
+
+    Raises SchemaError: see `bring_up`.
+    """
+    at, stays = found_revision(connection), []
+    with Operations.context(MigrationContext.configure(connection)) as op:
         for revision, step in STEPS.items():
             if at is None or revision > at:
                 step(op)
+                stays += aside.bring_back(connection, revision)
+    set_revision(connection, NEWEST)
+    _refuse_lacking(connection)
+    return stays
+
+
+def found_revision(connection: Connection) -> str | None:
+    """The revision at which a database stands; None: a new one. Raises SchemaError: it is newer than the software."""
+    at = MigrationContext.configure(connection).get_current_revision() or _numbered(connection)
+    if at is not None and at not in STEPS:
+        raise _newer(at)
+    return at
+
+
+def set_revision(connection: Connection, revision: str) -> None:
+    """Write down where the database stands now."""
     VERSION.create(connection, checkfirst=True)
     connection.execute(VERSION.delete())
-    connection.execute(VERSION.insert().values(version_num=NEWEST))
+    connection.execute(VERSION.insert().values(version_num=revision))
 
 
 def _numbered(connection: Connection) -> str | None:

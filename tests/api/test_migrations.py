@@ -68,7 +68,7 @@ def test_a_new_database_is_at_the_newest_revision_and_holds_the_tables_of_today(
         assert database.execute("SELECT version_num FROM alembic_version").fetchone() == (migrations.NEWEST,)
 
 
-@pytest.mark.parametrize("name", ["unversioned", "2", "3", "4", "5", "6"])
+@pytest.mark.parametrize("name", ["unversioned", "2", "3", "4", "5", "6", "12"])
 def test_a_database_of_each_older_version_is_upgraded_and_keeps_its_rows(tmp_path: Path, name: str) -> None:
     path = old(tmp_path / "stimrig.db", name)
     for _ in range(2):  # the second time there is nothing to do

@@ -1,0 +1,63 @@
+"""A copy of a SQLite database: one consistent state, whole or not there, also while a service writes."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from stimrig.api import owner_only
+from stimrig.api.whole_file import sha256_of
+
+
+class CopyError(OSError):
+    """The copy could not be made, or does not hold; one line."""
+
+
+def copy_database(source: Path, to: Path) -> str:
+    """Copy a database by SQLite's own backup, check the copy and bring it to the disk; its SHA-256.
+
+    Raises CopyError: there is no room, or what was copied is damaged. Nothing is left then.
+    """
+    part = to.with_name(f".{to.name}.new")
+    try:
+        owner_only.folder(to.parent)
+        part.unlink(missing_ok=True)
+        owner_only.file(part)
+        with (
+            closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True, timeout=10)) as old,
+            closing(sqlite3.connect(part)) as new,
+        ):
+            old.backup(new)
+            new.execute("PRAGMA journal_mode=DELETE")
+            answer = new.execute("PRAGMA quick_check").fetchone()[0]
+        if answer != "ok":
+            raise CopyError(f"{source}: damaged ({answer}); restore it from a backup")
+        _to_disk(part)
+        part.replace(to)
+        _to_disk(to.parent)
+    except (OSError, sqlite3.Error) as error:
+        if isinstance(error, CopyError):
+            raise
+        why = error.strerror if isinstance(error, OSError) else error
+        raise CopyError(f"{to}: no copy of the database could be made ({why}); free some disk space") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return sha256_of(to)
+
+
+def free_name(folder: Path, stem: str) -> Path:
+    """A file name in a folder that nothing has yet."""
+    number = 1
+    while (place := folder / f"{stem}-{number}.db").exists():
+        number += 1
+    return place
+
+
+def _to_disk(path: Path) -> None:
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
