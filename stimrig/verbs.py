@@ -87,17 +87,19 @@ def export(
     data: Sequence[str | Path],
     parquet: str | Path | None = None,
     bids: str | Path | None = None,
+    format: str = "",
+    output: str | Path | None = None,
     select: str = "",
     no_dates: bool = False,
     shift_days: int = 0,
     map: Sequence[str] = (),
     token: str = "",
 ) -> Report:
-    """Recordings as Parquet, or as a BIDS-style folder. One that is cut off goes on with the same call."""
+    """Recordings as Parquet, BIDS, NWB, FHIR, REDCap or MATLAB. One that is cut off goes on with the same call."""
     from stimrig.api.cli.commands.export import exported
 
-    folders = {name: Path(path) for name, path in (("parquet", parquet), ("bids", bids)) if path is not None}
-    given = {"select": select, "no_dates": no_dates, "shift_days": shift_days, "columns": list(map), "token": token}
+    folders = {name: Path(path) for name, path in (("parquet", parquet), ("bids", bids), ("output", output)) if path is not None}
+    given = {"format": format, "select": select, "no_dates": no_dates, "shift_days": shift_days, "columns": list(map), "token": token}
     return Report("export", exported([str(place) for place in data], **folders, **given))
 
 

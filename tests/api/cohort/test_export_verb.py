@@ -23,10 +23,10 @@ import pytest
 from stimrig import identify
 from stimrig.api.cli import main
 from stimrig.api.cli.commands import export as export_verb
-from stimrig.api.cohort import parquet as parquet_files
+from stimrig.api.exchange.outward import parquet as parquet_files
 from stimrig.api.cohort.export import ERRORS, Days, Export, Writer
 from stimrig.api.cohort.export_state import FOLDER, State
-from stimrig.api.cohort.parquet import STATUS
+from stimrig.api.exchange.outward.parquet import STATUS
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import sources_of
 from stimrig.api.cohort.tally import Tell
