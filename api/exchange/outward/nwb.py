@@ -69,7 +69,9 @@ def _file(record: WholeRecord, who: Who) -> Any:
         keywords=["functional electrical stimulation", "torque", "muscle"],
         experiment_description=str(record.about.get("kind") or "test"),
         was_generated_by=[["stimrig", software_version()]],
-        subject=Subject(subject_id=who.participant, species="Homo sapiens", sex="U", description="known by code only"),
+        subject=Subject(  # NWB wants an age: a range from 0 without an end says nothing
+            subject_id=who.participant, species="Homo sapiens", sex="U", age="P0D/", description="known by code only"
+        ),
     )
     for name, model in _told.devices(record).items():
         file.create_device(name=name, description=model)
