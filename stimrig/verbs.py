@@ -87,20 +87,22 @@ def export(
     data: Sequence[str | Path],
     parquet: str | Path | None = None,
     bids: str | Path | None = None,
-    format: str = "",
-    output: str | Path | None = None,
     select: str = "",
     no_dates: bool = False,
     shift_days: int = 0,
     map: Sequence[str] = (),
     token: str = "",
+    format: str = "",
+    output: str | Path | None = None,
 ) -> Report:
     """Recordings as Parquet, BIDS, NWB, FHIR, REDCap or MATLAB. One that is cut off goes on with the same call."""
     from stimrig.api.cli.commands.export import exported
 
-    folders = {name: Path(path) for name, path in (("parquet", parquet), ("bids", bids), ("output", output)) if path is not None}
-    given = {"format": format, "select": select, "no_dates": no_dates, "shift_days": shift_days, "columns": list(map), "token": token}
-    return Report("export", exported([str(place) for place in data], **folders, **given))
+    given = {"parquet": parquet, "bids": bids, "output": output}
+    folders = {name: Path(path) for name, path in given.items() if path is not None}
+    options = {"format": format, "select": select, "no_dates": no_dates, "shift_days": shift_days, "token": token}
+    told = exported([str(place) for place in data], **folders, **options, columns=list(map))  # pyright: ignore
+    return Report("export", told)
 
 
 def import_recording(

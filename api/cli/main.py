@@ -60,7 +60,8 @@ def _overview() -> typer.Typer:
     app, groups = _empty(), {}
     for name in VERBS:
         tree = ast.parse((Path(commands.__path__[0]) / f"{FILES[name]}.py").read_text("utf-8"))
-        does = {node.name.rstrip("_"): ast.get_docstring(node) for node in tree.body if isinstance(node, ast.FunctionDef)}
+        defined = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+        does = {node.name.rstrip("_"): ast.get_docstring(node) for node in defined}
         if name in does:
             app.command(name, help=does[name])(_nothing)
         else:

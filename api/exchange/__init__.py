@@ -1,1 +1,1 @@
-"""Files of others: `outward` writes them (`stimrig export`), `inward` reads them (`stimrig import`); a file a format."""
+"""Files of others, one module a format: `outward` writes them (`stimrig export`), `inward` reads them."""

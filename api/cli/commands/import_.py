@@ -17,7 +17,9 @@ from stimrig.identify.errors import BadRequest
 File = Annotated[Path, typer.Argument(help="NWB, BIDS, XDF, Parquet or FHIR file", metavar="FILE", show_default=False)]
 Output = Annotated[Path, typer.Option("-o", "--output", help="CSV file to write", show_default=False)]
 Segments = Annotated[str, typer.Option(help="what names the segments in it, or none", show_default=False)]
-Sign = Annotated[str, typer.Option(help="+1 or -1: the sign that the stimulated muscle's torque has", show_default=False)]
+Sign = Annotated[
+    str, typer.Option(help="+1 or -1: the sign that the stimulated muscle's torque has", show_default=False)
+]
 
 
 def import_(
@@ -77,7 +79,9 @@ def _asked(option: str, question: str, choices: Sequence[str]) -> str:
 
 def _refused(option: str, question: str, choices: Sequence[str]) -> str:
     """Nobody is there: one line with the option to give, and the choices."""
-    listed = f"; there are: {', '.join(choices[:MOST_SHOWN])}{', …' if len(choices) > MOST_SHOWN else ''}" if choices else ""
+    listed = (
+        f"; there are: {', '.join(choices[:MOST_SHOWN])}{', …' if len(choices) > MOST_SHOWN else ''}" if choices else ""
+    )
     raise BadRequest(question.rstrip("?"), place="not known", fix=f"Give {option}{listed}.")
 
 

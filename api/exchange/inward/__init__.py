@@ -25,7 +25,7 @@ class Reader(Protocol):
 
     NAME: str
 
-    def reads(self, path: Path, head: bytes) -> bool:
+    def reads(self, path: Path, head: bytes, /) -> bool:
         """Whether it is the format of a file with this name and these first bytes."""
         ...
 

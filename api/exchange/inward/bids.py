@@ -23,7 +23,7 @@ ENDS = tuple(f"_{kind}.tsv.gz" for kind in KINDS)
 FIX = "Give the .tsv.gz of a BIDS folder, its .json beside it."
 
 
-def reads(path: Path, head: bytes) -> bool:
+def reads(path: Path, _head: bytes) -> bool:
     """By its name, which BIDS prescribes."""
     return path.name.endswith(ENDS)
 
@@ -40,7 +40,7 @@ def read(path: Path, content: bytes) -> Foreign:
         if kind == first or place.exists():
             head = _head(place)
             heads = heads or head
-            signals += _signals(place, head, content if kind == first else bounds.content_of(place), kind)
+            signals += _signals(place, head, content if kind == first else bounds.content_of(place))
     events = path.with_name(f"{stem}_events.tsv")
     rows = _rows(events) if events.exists() else []
     named: dict[str, int] = {}
@@ -64,7 +64,7 @@ def _head(place: Path) -> dict[str, Any]:
     return head
 
 
-def _signals(place: Path, head: dict[str, Any], content: bytes, kind: str) -> list[Signal]:
+def _signals(place: Path, head: dict[str, Any], content: bytes) -> list[Signal]:
     names = [str(name) for name in head["Columns"]]
     values = _table(_unpacked(content, place), len(names), place)
     columns = dict(zip(names, values.T, strict=True))
@@ -136,4 +136,9 @@ def _own(head: dict[str, Any], signals: list[Signal], spans: Spans | None) -> di
     if not {"torque_nm", "pulse_width_us"} <= there.keys() or "RecordingID" not in head or "PulseRate" not in head:
         return {}
     own = {name: f"{name}:{unit}" if unit else name for name, unit in there.items() if name != "sync"}
-    return {**own, "sign": "+1", "segments": "events" if spans else "none", "pulse-rate-hz": repr(float(head["PulseRate"]))}
+    return {
+        **own,
+        "sign": "+1",
+        "segments": "events" if spans else "none",
+        "pulse-rate-hz": repr(float(head["PulseRate"])),
+    }

@@ -19,7 +19,7 @@ OWN = {"torque_nm": "torque_nm:Nm", "pulse_width_us": "pulse_width_us:us", "segm
 INTERVALS_MS = {"ms": 1.0, "s": 1000.0, "us": 1e-3}
 
 
-def reads(path: Path, head: bytes) -> bool:
+def reads(_path: Path, head: bytes) -> bool:
     """Whether it is JSON that says what resource it is near its beginning."""
     return head.lstrip()[:1] == b"{" and b'"resourceType"' in head
 
@@ -31,13 +31,15 @@ def read(path: Path, content: bytes) -> Foreign:
     except BadJson as error:
         raise BadRecord(f"no JSON ({error})", place=str(path), fix="Give the whole file.") from None
     entries = document.get("entry") or []
-    resources = [one.get("resource") or {} for one in entries] if document.get("resourceType") == "Bundle" else [document]
+    resources = (
+        [one.get("resource") or {} for one in entries] if document.get("resourceType") == "Bundle" else [document]
+    )
     found = [one for one in resources if one.get("resourceType") == "Observation"]
     if len(found) != 1:
         message = f"{len(found)} observations in it"
         raise BadRecord(message, place=str(path), fix="Give a file for each observation with SampledData.")
     parts = [found[0], *(found[0].get("component") or [])]
-    signals, start_s = _columns(parts, path)
+    signals = _columns(parts, path)
     spans = Spans("segments", tuple(_segments(parts)))
     numbers = {code: value["value"] for code, value in _values(parts, "valueQuantity")}
     about = {_kind(one): one.get("value") for one in found[0].get("identifier") or []}
@@ -63,13 +65,15 @@ def _values(parts: list[dict[str, Any]], kind: str) -> Iterator[tuple[str, dict[
             yield _code(part), part[kind]
 
 
-def _columns(parts: list[dict[str, Any]], path: Path) -> tuple[list[Signal], float]:
+def _columns(parts: list[dict[str, Any]], path: Path) -> list[Signal]:
     """Columns with their times; a component that goes on with a code before it is the same column."""
     blocks: dict[str, list[dict[str, Any]]] = {}
     for code, sampled in _values(parts, "valueSampledData"):
         blocks.setdefault(code, []).append(sampled)
     start_s = next((float(value["value"]) for code, value in _values(parts, "valueQuantity") if code == "start_s"), 0.0)
-    columns = {code: np.concatenate([_numbers(one, f"{path}, {code}") for one in those]) for code, those in blocks.items()}
+    columns = {
+        code: np.concatenate([_numbers(one, f"{path}, {code}") for one in those]) for code, those in blocks.items()
+    }
     own_s = columns.pop("time_s", None)
     found = []
     for code, values in columns.items():
@@ -84,7 +88,7 @@ def _columns(parts: list[dict[str, Any]], path: Path) -> tuple[list[Signal], flo
         there = np.isfinite(time_s) & np.isfinite(columns.get("torque_nm", values))[: values.size]
         unit = plain(str((first.get("origin") or {}).get("code") or (first.get("origin") or {}).get("unit") or ""))
         found.append(Signal(code, time_s[there], values[there], unit))
-    return found, start_s
+    return found
 
 
 def _numbers(sampled: dict[str, Any], place: str) -> np.ndarray:
@@ -95,7 +99,9 @@ def _numbers(sampled: dict[str, Any], place: str) -> np.ndarray:
         values = np.array([float("nan") if text in ("E", "U", "L") else float(text) for text in texts])
         origin, factor = float((sampled.get("origin") or {}).get("value") or 0), float(sampled.get("factor") or 1)
     except ValueError:
-        raise BadRecord("data that are no decimal numbers", place=place, fix="Give SampledData as FHIR has it.") from None
+        raise BadRecord(
+            "data that are no decimal numbers", place=place, fix="Give SampledData as FHIR has it."
+        ) from None
     return values if (origin, factor) == (0.0, 1.0) else values * factor + origin
 
 
@@ -112,4 +118,6 @@ def _kind(identifier: dict[str, Any]) -> str:
 
 def _participant(resources: list[dict[str, Any]]) -> str | None:
     people = [one for one in resources if one.get("resourceType") == "Patient"]
-    return next((str(one["value"]) for person in people for one in person.get("identifier") or [] if "value" in one), None)
+    return next(
+        (str(one["value"]) for person in people for one in person.get("identifier") or [] if "value" in one), None
+    )

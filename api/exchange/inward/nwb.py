@@ -154,7 +154,9 @@ def _own(file: NwbFile, signals: tuple[Signal, ...], spans: tuple[Spans, ...]) -
         return {}
     there = {one.name for one in (*signals, *spans)} | {"+1"}
     units = {one.name: one.unit for one in signals}
-    own = {option: f"{name}:{units[name]}" if units.get(name) else name for option, name in OWN.items() if name in there}
+    own = {
+        option: f"{name}:{units[name]}" if units.get(name) else name for option, name in OWN.items() if name in there
+    }
     return {**own, "pulse-rate-hz": repr(rate_hz)} if {"torque_nm", "pulse_width_us"} <= own.keys() else {}
 
 

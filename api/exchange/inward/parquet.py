@@ -21,7 +21,7 @@ UNPACKED_BYTES = 4 * LARGEST_FILE_BYTES
 TEXTS = ("record_id", "participant")
 
 
-def reads(path: Path, head: bytes) -> bool:
+def reads(_path: Path, head: bytes) -> bool:
     """By its first bytes."""
     return head.startswith(MAGIC)
 
@@ -44,7 +44,9 @@ def read(path: Path, content: bytes) -> Foreign:
     names = [field.name for field in schema if _is_number(field.type)]
     factor = columns.unit_factor("time_s", _unit(schema.field(time)) or "s") or 1.0
     time_s = _numbers(file, time) * factor
-    signals = tuple(Signal(name, time_s, _numbers(file, name), _unit(schema.field(name))) for name in names if name != time)
+    signals = tuple(
+        Signal(name, time_s, _numbers(file, name), _unit(schema.field(name))) for name in names if name != time
+    )
     spans = tuple(_spans(file, field.name, time_s) for field in schema if field.name.lower() in ("segment", "segments"))
     about = {name: _first(file, name) for name in TEXTS if name in schema.names}
     return Foreign(NAME, signals, spans, _own(path, signals, about) if own else {}, about)
@@ -86,14 +88,18 @@ def _spans(file: Any, name: str, time_s: np.ndarray) -> Spans:
     coded = file.read(columns=[name]).column(0).combine_chunks().dictionary_encode()
     names = [str(one) for one in coded.dictionary.to_pylist()]
     if len(names) > MOST_SEGMENTS:
-        raise BadRecord(f"{len(names)} different names in {name}", place="segments", fix="Name segments by what they are.")
+        raise BadRecord(
+            f"{len(names)} different names in {name}", place="segments", fix="Name segments by what they are."
+        )
     return spans_of_rows(name, time_s, coded.indices.fill_null(-1).to_numpy(zero_copy_only=False), names)
 
 
 def _own(path: Path, signals: tuple[Signal, ...], about: dict[str, Any]) -> dict[str, str]:
     """The answers, where our export wrote the file; the pulse rate stands in `records.parquet` above it."""
     there = {one.name: one for one in signals if not np.isnan(one.values).all()}
-    own = {name: f"{name}:{there[name].unit}" if there[name].unit else name for name in columns.TARGETS if name in there}
+    own = {
+        name: f"{name}:{there[name].unit}" if there[name].unit else name for name in columns.TARGETS if name in there
+    }
     return {**own, **_rate(path, str(about.get("record_id"))), "segments": "segment", "sign": "+1"}
 
 

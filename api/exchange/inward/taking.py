@@ -13,20 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.api.exchange.inward.foreign import Foreign, Signal, Spans, plain
+from stimrig.api.exchange.inward.foreign import Foreign, Signal, plain
+from stimrig.api.exchange.inward.timing import between, coded, held, pulse_rate, pulses_in_force, same
 from stimrig.api.whole_file import sha256_of
 from stimrig.identify.errors import BadRecord, BadRequest
 from stimrig.identify.records import bounds, columns
 from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.file_content import FileContent, check_numbers, check_widths, without_holes
-from stimrig.identify.records.pulse_times import (
-    LEAST_LATE_S,
-    RESTS,
-    SENT_AND_ACKNOWLEDGED,
-    Sent,
-    in_force,
-    locate_pulses,
-)
 from stimrig.identify.records.record import Record, Source
 
 Ask = Callable[[str, str, Sequence[str]], str]
@@ -112,7 +105,9 @@ class Taking:
         found, unit = (by_name[said], "") if said in by_name else (by_name.get(asked.name), asked.unit)
         if found is None:
             here = ", ".join(list(by_name)[:MOST_SHOWN])
-            raise BadRequest(f"no signal is called {asked.name!r}", place=f"{self.path}, --map {target}", fix=f"It has: {here}.")
+            raise BadRequest(
+                f"no signal is called {asked.name!r}", place=f"{self.path}, --map {target}", fix=f"It has: {here}."
+            )
         unit = plain(unit or found.unit)
         known = columns.SHOWN.get(target)
         if known and not unit and not np.isnan(found.values).all():
@@ -124,7 +119,9 @@ class Taking:
         factor = columns.unit_factor(target, unit)
         if factor is None:
             known = ", ".join(columns.SHOWN[target])
-            raise BadRequest(f"the unit {unit!r} is not known", place=f"--map {target}", fix=f"Give NAME:UNIT, one of {known}.")
+            raise BadRequest(
+                f"the unit {unit!r} is not known", place=f"--map {target}", fix=f"Give NAME:UNIT, one of {known}."
+            )
         return factor
 
     def _torque(self) -> tuple[Signal, np.ndarray]:
@@ -137,7 +134,9 @@ class Taking:
             factor = force * arm_m
         else:
             factor = self._factor("torque_nm", unit)
-        sign = self.answer("sign", "is the torque of the stimulated muscle positive (+1) or negative (-1) in it?", ("+1", "-1"))
+        sign = self.answer(
+            "sign", "is the torque of the stimulated muscle positive (+1) or negative (-1) in it?", ("+1", "-1")
+        )
         if sign not in ("+1", "-1", "1"):
             raise BadRequest(f"{sign!r} is no sign", place="--sign", fix="Give +1 or -1.")
         self.taken["torque_nm"] |= {"factor": factor, "sign": int(sign)}
@@ -152,7 +151,7 @@ class Taking:
                 found, unit = self.signal(target, "")
                 factor = 1.0 if target == "doubted" else self._factor(target, unit)
                 values = found.values * factor if factor != 1 else found.values
-                made[target] = values if _same(found, torque) else _between(found.time_s, values, torque.time_s)
+                made[target] = values if same(found, torque) else between(found.time_s, values, torque.time_s)
         return made
 
     def _segments(self, torque: Signal) -> tuple[list[str], np.ndarray | None]:
@@ -164,21 +163,25 @@ class Taking:
             said = self.answer("segments", "what names the segments (rows of `validate` are held out)?", choices)
         if said != NONE and said not in spans:
             here = ", ".join((*spans, NONE))
-            raise BadRequest(f"no segments are called {said!r}", place=f"{self.path}, --segments", fix=f"Give one of: {here}.")
+            raise BadRequest(
+                f"no segments are called {said!r}", place=f"{self.path}, --segments", fix=f"Give one of: {here}."
+            )
         self.taken["segments"] = said if said != NONE else "none: found from the pulse widths, nothing is held out"
         if said == NONE:
             return [], None
         if spans[said].clock != torque.clock:
             message = f"{said} and {torque.name} have clocks of their own"
             raise BadRequest(message, place=f"{self.path}, --segments", fix="Give --segments none.")
-        return _coded(spans[said], torque.time_s)
+        return coded(spans[said], torque.time_s)
 
     def _widths(self, torque: Signal) -> tuple[float, dict[str, np.ndarray]]:
-        """The pulse rate; and the width in force at each sample of the torque, with what it was late where it is known."""
+        """The pulse rate; the width in force at each sample of the torque, and what it was late where that is known."""
         found, unit = self.signal("pulse_width_us", "which signal is the pulse width (NAME:UNIT)?")
         time_s = found.time_s + self._offset(found, torque)
         if np.isnan(found.values).all():
-            width = self.number("pulse-width-us", f"{found.name} has marks without widths: how wide is a pulse, µs?", 1, 1e4)
+            width = self.number(
+                "pulse-width-us", f"{found.name} has marks without widths: how wide is a pulse, µs?", 1, 1e4
+            )
             values = np.full(time_s.size, width)
         else:
             factor = self._factor("pulse_width_us", unit)
@@ -186,7 +189,7 @@ class Taking:
         if not found.events:
             rate_hz = self.number("pulse-rate-hz", "how many pulses a second?", *bounds.PULSE_RATES_HZ)
             self.taken["pulse_rate_hz"] = rate_hz
-            return rate_hz, {"pulse_width_us": values if _same(found, torque) else _held(time_s, values, torque.time_s)}
+            return rate_hz, {"pulse_width_us": values if same(found, torque) else held(time_s, values, torque.time_s)}
         return self._events(time_s, values, torque)
 
     def _offset(self, found: Signal, torque: Signal) -> float:
@@ -202,56 +205,21 @@ class Taking:
         good = np.isfinite(time_s) & np.isfinite(width_us)
         time_s, width_us = time_s[good], width_us[good]
         if time_s.size < 2 or not (np.diff(time_s) > 0).all():
-            raise BadRecord("pulses do not follow one another", place=f"{self.path}, {self.taken['pulse_width_us']['signal']}", fix="Give each pulse once, in the order of time.")
+            raise BadRecord(
+                "pulses do not follow one another",
+                place=f"{self.path}, {self.taken['pulse_width_us']['signal']}",
+                fix="Give each pulse once, in the order of time.",
+            )
         said = self.given.get("pulse-rate-hz") or self.foreign.own.get("pulse-rate-hz")
-        rate_hz = pulse_rate(time_s) if said is None else self.number("pulse-rate-hz", "pulses a second?", *bounds.PULSE_RATES_HZ)
+        rate_hz = (
+            pulse_rate(time_s)
+            if said is None
+            else self.number("pulse-rate-hz", "pulses a second?", *bounds.PULSE_RATES_HZ)
+        )
         bounds.check_rate(rate_hz, f"{self.path}, pulse rate")
         self.taken["pulse_rate_hz"], self.taken["pulses"] = rate_hz, int(time_s.size)
-        slot = np.round((time_s - time_s[0]) * rate_hz).astype(np.int64)
-        if slot[-1] > bounds.LARGEST_ROWS or (np.diff(slot) < 1).any():
-            raise BadRecord(f"two pulses in one interval of {rate_hz:g} pulses/s", place=str(self.path), fix="Give the true --pulse-rate-hz.")
-        planned_s = time_s[0] + np.arange(slot[-1] + 1) / rate_hz
-        widths, written = np.zeros(planned_s.size), np.full(planned_s.size, np.nan)
-        widths[slot], written[slot] = width_us, time_s
-        status = np.where(np.isnan(written), RESTS, SENT_AND_ACKNOWLEDGED)
-        sent = Sent(planned_s, widths, written, written, status, 1 / rate_hz)
-        pulses, _ = locate_pulses(sent, torque.time_s, np.full(torque.time_s.size, 255.0))
-        in_force_us, late_s = in_force(pulses, torque.time_s, rate_hz)
-        return rate_hz, {"pulse_width_us": in_force_us, **({"late_s": late_s} if late_s.any() else {})}
-
-
-def pulse_rate(time_s: np.ndarray) -> float:
-    """Pulses a second by their times, rests left out; a whole number where that is as good over the whole record."""
-    slot = np.r_[0, np.cumsum(np.round(np.diff(time_s) / np.median(np.diff(time_s))))]
-    from_zero = time_s - time_s[0]
-    rate_hz = 1 / float(np.polyfit(slot, from_zero, 1)[0])
-    drift_s = abs(rate_hz - round(rate_hz)) / rate_hz * float(from_zero[-1])
-    return float(round(rate_hz)) if drift_s < LEAST_LATE_S and round(rate_hz) else rate_hz
-
-
-def _same(one: Signal, other: Signal) -> bool:
-    return one.time_s is other.time_s or np.array_equal(one.time_s, other.time_s)
-
-
-def _held(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """The last value before each time; 0 before the first."""
-    if not time_s.size:
-        return np.zeros(at_s.size)
-    last = np.searchsorted(time_s, at_s + 1e-9, side="right") - 1
-    return np.where(last >= 0, values[np.maximum(last, 0)], 0.0)
-
-
-def _between(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """Values on a straight line between their times; none outside."""
-    good = np.isfinite(values) & np.isfinite(time_s)
-    if not good.any():
-        return np.full(at_s.size, np.nan)
-    return np.interp(at_s, time_s[good], values[good], np.nan, np.nan)
-
-
-def _coded(spans: Spans, time_s: np.ndarray) -> tuple[list[str], np.ndarray]:
-    names = list(dict.fromkeys(name for name, _, _ in spans.rows))
-    code = np.full(time_s.size, -1)
-    for name, start_s, end_s in spans.rows:
-        code[(time_s >= start_s) & (time_s < end_s + 1e-9)] = names.index(name)  # as of a sealed recording
-    return names, code
+        found = pulses_in_force(time_s, width_us, rate_hz, torque.time_s)
+        if found is None:
+            message = f"two pulses in one interval of {rate_hz:g} pulses/s"
+            raise BadRecord(message, place=str(self.path), fix="Give the true --pulse-rate-hz.")
+        return rate_hz, found

@@ -1,4 +1,4 @@
-"""XDF of LabRecorder in: streams brought to one clock by their own measurements, none made even, with what was lost told.
+"""XDF of LabRecorder in: streams on one clock by their own measurements, none made even, with what was lost told.
 
 Each chunk is looked at before the library takes memory for what it declares. Streams of one host have one clock; where
 the clocks of two were not measured against each other, the offset is asked for.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ FIX = "Give the whole file, as LabRecorder wrote it."
 MOST_CHANNELS = 256
 
 
-def reads(path: Path, head: bytes) -> bool:
+def reads(_path: Path, head: bytes) -> bool:
     """By its first bytes."""
     return head.startswith(MAGIC)
 
@@ -163,7 +164,9 @@ def _own(
     zero_s, mark = starts[0]
     end_s = ends[0] if ends else float("inf")
     told.append("cut to the test by its marks; time 0 is its start")
-    cut = [Signal(one.name, one.time_s[kept] - zero_s, one.values[kept], one.unit, one.events, one.clock) for one in signals
-           if (kept := (one.time_s >= zero_s) & (one.time_s <= end_s)) is not None]  # fmt: skip
+    cut = []
+    for one in signals:
+        kept = (one.time_s >= zero_s) & (one.time_s <= end_s)
+        cut.append(replace(one, time_s=one.time_s[kept] - zero_s, values=one.values[kept]))
     own = {"torque_nm": f"{torque}:Nm", "pulse_width_us": f"{width}:us", "segments": "none", "sign": "+1"}
     return cut, own, {key: mark.get(key) for key in ("recording_id", "participant", "kind")}

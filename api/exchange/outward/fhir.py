@@ -1,8 +1,8 @@
 """FHIR R4 and R5: a bundle a record in each: torque as SampledData of an Observation, devices, a DiagnosticReport.
 
 The resources are written as JSON. A participant is a code in `identifier`, and nothing else. What R4 and R5 differ in
-stands in `Release`; R4B defines these resources as R4 does. A text of FHIR has at most 2^20 signs: long columns go on in
-the next component of the same code.
+stands in `Release`; R4B defines these resources as R4 does. A text of FHIR has at most 2^20 signs: a long column goes
+on in the next component of the same code.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
     return record_row(record, who)
 
 
-def finish(state: State, put: Put) -> None:
+def finish(_state: State, _put: Put) -> None:
     """Nothing is made of all files."""
 
 
@@ -93,7 +93,7 @@ def _entries(record: WholeRecord, who: Who, found: dict[str, Any], release: Rele
     yield entry("DiagnosticReport", who.key, {
         "identifier": [_identifier("recording", who.record_id)],
         "status": "preliminary",  # no person has looked at it
-        "code": _code("plain-model", "plain model of the muscle, fitted by stimrig at export"), "subject": whose, **when,
+        "code": _code("plain-model", "plain model of the muscle, fitted at export"), "subject": whose, **when,
         "result": [{"reference": measured}], "conclusion": f"Plain model: {verdict}. No diagnosis of a disease.",
     })  # fmt: skip
 

@@ -53,7 +53,7 @@ def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
     return record_row(record, who)
 
 
-def finish(state: State, put: Put) -> None:
+def finish(_state: State, put: Put) -> None:
     """The script that reads a file."""
     with put("read_stimrig.m") as file:
         file.write(SCRIPT.encode())
@@ -80,7 +80,7 @@ def _variables(record: WholeRecord, who: Who) -> dict[str, Any]:
         "TimeUnit": "seconds", "InterSample": "zoh", "held_out": held_out, "segments": np.array(segments, object),
         **columns, "segment": np.array([names[k] for k in index[inside]] or [""]),
         **{f"{name}_of_sensor": column for name, column in record.angle.items()},
-        "pulses": {name: column for name, column in record.pulses.items()} or np.zeros((0, 0)),
+        "pulses": dict(record.pulses) or np.zeros((0, 0)),
         "pulse_rate_hz": record.about["pulse_rate_hz"], "participant": who.participant, "session": who.session,
         "recording": who.record_id, "metadata": _told.metadata(record),
     }  # fmt: skip

@@ -1,13 +1,14 @@
 """NWB 2: a file a record. Torque is an acquisition, pulses are a stimulus, segments are intervals.
 
-Every series has times, not a rate: a recording has gaps, and its times are exact. Where NWB wants what is not to be told
-(the start of a session), `UNDATED` stands for it, and the session's description says so.
+Every series has times, not a rate: a recording has gaps, and its times are exact. NWB wants the start of a session:
+where that is not to be told `UNDATED` stands for it, and the description says so.
 """
 
 from __future__ import annotations
 
 import io
 from datetime import UTC, datetime
+from importlib import import_module
 from typing import Any
 
 import h5py
@@ -39,27 +40,24 @@ SAYS = {column.name: column.meaning.replace("null", "NaN") for column in COLUMNS
 
 def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
     """The record's file; its row."""
-    from pynwb import NWBHDF5IO
-
+    pynwb: Any = import_module("pynwb")  # its classes are made when it is loaded
     packed = io.BytesIO()
-    with h5py.File(packed, "w") as file, NWBHDF5IO(file=file, mode="w") as out:
+    with h5py.File(packed, "w") as file, pynwb.NWBHDF5IO(file=file, mode="w") as out:
         out.write(_file(record, who))
     with put(f"sub-{who.label}/sub-{who.label}_ses-{who.session}_{who.key}.nwb") as target:
         target.write(packed.getbuffer())
     return record_row(record, who)
 
 
-def finish(state: State, put: Put) -> None:
+def finish(_state: State, _put: Put) -> None:
     """Nothing is made of all files."""
 
 
 def _file(record: WholeRecord, who: Who) -> Any:
-    from pynwb import NWBFile
-    from pynwb.file import Subject
-
+    pynwb: Any = import_module("pynwb")  # its classes are made when it is loaded
     begun = datetime.fromisoformat(who.begun_utc) if who.begun_utc else UNDATED
     told = "" if who.begun_utc else f" The day is not told: {UNDATED.date()} stands for it."
-    file = NWBFile(
+    file = pynwb.NWBFile(
         session_description=f"Torque at a joint while a muscle is stimulated electrically.{told}",
         identifier=f"{who.record_id} {who.key}",
         session_start_time=begun,
@@ -69,7 +67,7 @@ def _file(record: WholeRecord, who: Who) -> Any:
         keywords=["functional electrical stimulation", "torque", "muscle"],
         experiment_description=str(record.about.get("kind") or "test"),
         was_generated_by=[["stimrig", software_version()]],
-        subject=Subject(  # NWB wants an age: a range from 0 without an end says nothing
+        subject=pynwb.file.Subject(  # NWB wants an age: a range from 0 without an end says nothing
             subject_id=who.participant, species="Homo sapiens", sex="U", age="P0D/", description="known by code only"
         ),
     )
@@ -82,10 +80,9 @@ def _file(record: WholeRecord, who: Who) -> Any:
 
 
 def _series(name: str, data: Any, unit: str, times: Any, says: str, factor: float = 1.0) -> Any:
-    from pynwb import H5DataIO, TimeSeries
-
-    kept = H5DataIO(data, compression="gzip", shuffle=True)
-    return TimeSeries(name=name, data=kept, unit=unit, conversion=factor, timestamps=times, description=says)
+    pynwb: Any = import_module("pynwb")
+    kept = pynwb.H5DataIO(data, compression="gzip", shuffle=True)
+    return pynwb.TimeSeries(name=name, data=kept, unit=unit, conversion=factor, timestamps=times, description=says)
 
 
 def _add_samples(file: Any, record: WholeRecord) -> None:

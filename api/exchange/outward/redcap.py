@@ -6,7 +6,7 @@ No recording goes to REDCap: it keeps figures.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from stimrig.api.cohort.export import Put, Who
@@ -76,7 +76,7 @@ FIELDS = (
 )  # fmt: skip
 
 
-def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
+def write(record: WholeRecord, who: Who, _put: Put) -> dict[str, Any]:
     """The record's row; its figures are fitted now."""
     row, found = record_row(record, who), _told.fitted(record)
     verdict = found.pop("verdict").replace(" ", "_")
@@ -102,14 +102,14 @@ def finish(state: State, put: Put) -> None:
     _table(put, "data_dictionary.csv", [DICTIONARY, *(field.row() for field in FIELDS)])
     first, *others = (field.name for field in FIELDS)
     header = (first, "redcap_repeat_instrument", "redcap_repeat_instance", *others, f"{FORM}_complete")
-    found = []
+    found: list[tuple[Any, ...]] = []
     for participant, _, row in state.rows():
         values = row["fields"]
         number = state.number(participant, values["recording_id"])
         found.append((participant, FORM, number, *(values[name] for name in others), 2))
-    _table(put, "import.csv", [header, *sorted(found, key=lambda row: row[:3])])
+    _table(put, "import.csv", [header, *sorted(found, key=lambda row: (row[0], row[2]))])
 
 
-def _table(put: Put, name: str, rows: Iterable[Iterable[Any]]) -> None:
+def _table(put: Put, name: str, rows: Sequence[Sequence[Any]]) -> None:
     with put(name) as file:
         file.writelines(line.encode() for line in lines(rows))
