@@ -18,6 +18,7 @@ from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, MO
 from stimrig.identify.records.cells import as_written
 
 NAME = "BIDS"
+OWN_TIMES = "time_s"
 KINDS = ("physio", "stim", "motion")
 ENDS = tuple(f"_{kind}.tsv.gz" for kind in KINDS)
 FIX = "Give the .tsv.gz of a BIDS folder, its .json beside it."
@@ -33,14 +34,16 @@ def read(path: Path, content: bytes) -> Foreign:
     stem = path.name.rpartition("_")[0]
     first, kinds = path.name.removeprefix(f"{stem}_").partition(".")[0], [*KINDS]
     kinds.sort(key=lambda kind: kind != first)
-    signals: list[Signal] = []
-    heads: dict[str, Any] = {}
+    tables = []
     for kind in kinds:
         place = path.with_name(f"{stem}_{kind}.tsv.gz")
         if kind == first or place.exists():
             head = _head(place)
-            heads = heads or head
-            signals += _signals(place, head, content if kind == first else bounds.content_of(place))
+            text = _unpacked(content if kind == first else bounds.content_of(place), place)
+            tables.append((head, _table(text, len(head["Columns"]), place)))
+    heads = tables[0][0]
+    own_s = [values[:, head["Columns"].index(OWN_TIMES)] for head, values in tables if OWN_TIMES in head["Columns"]]
+    signals = [signal for head, values in tables for signal in _signals(head, values, own_s)]
     events = path.with_name(f"{stem}_events.tsv")
     rows = _rows(events) if events.exists() else []
     named: dict[str, int] = {}
@@ -64,18 +67,18 @@ def _head(place: Path) -> dict[str, Any]:
     return head
 
 
-def _signals(place: Path, head: dict[str, Any], content: bytes) -> list[Signal]:
-    names = [str(name) for name in head["Columns"]]
-    values = _table(_unpacked(content, place), len(names), place)
-    columns = dict(zip(names, values.T, strict=True))
+def _signals(head: dict[str, Any], values: np.ndarray, own_s: list[np.ndarray]) -> list[Signal]:
+    """The columns at their times: of the even grid, or those that ours has where the grid does not give them back."""
+    columns = dict(zip([str(name) for name in head["Columns"]], values.T, strict=True))
     time_s = float(head["StartTime"]) + np.arange(len(values)) / float(head["SamplingFrequency"])
-    own_s = columns.pop("time_s", None)
-    lost = np.isnan(values).all(1)
-    if own_s is not None:  # ours: where the grid does not give the times back
-        time_s, lost = own_s, np.isnan(own_s)
+    time_s = next((times for times in own_s if times.size == time_s.size), time_s)
+    lost = np.isnan(time_s) | np.isnan(values).all(1)
     said = {name: head[name] if isinstance(head.get(name), dict) else {} for name in columns}
-    units = {name: plain(str(said[name].get("Units") or "")) for name in columns}
-    return [Signal(name, time_s[~lost], column[~lost], units[name]) for name, column in columns.items()]
+    return [
+        Signal(name, time_s[~lost], column[~lost], plain(str(said[name].get("Units") or "")))
+        for name, column in columns.items()
+        if name != OWN_TIMES
+    ]
 
 
 def _unpacked(content: bytes, place: Path) -> bytes:

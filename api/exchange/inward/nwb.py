@@ -140,9 +140,14 @@ def read(path: Path, content: bytes) -> Foreign:
         raise BadRecord("no NWB file of version 2", place=str(path), fix="Convert it with pynwb first.")
     signals = tuple(signal for room in ROOMS for signal in _series(file, room))
     spans = tuple(_spans(file))
-    about = {"participant": file.scalar("/general/subject/subject_id"), "identifier": file.scalar("/identifier"),
-             "session_start_time": file.scalar("/session_start_time")}  # fmt: skip
-    return Foreign(NAME, signals, spans, _own(file, signals, spans), {k: v for k, v in about.items() if v})
+    own = _own(file, signals, spans)
+    identity = str(file.scalar("/identifier") or "")
+    about = {
+        "participant": file.scalar("/general/subject/subject_id"),
+        "recording_id": identity.rpartition(" ")[0] if own else identity,
+        "session_start_time": file.scalar("/session_start_time"),
+    }
+    return Foreign(NAME, signals, spans, own, {key: value for key, value in about.items() if value})
 
 
 def _own(file: NwbFile, signals: tuple[Signal, ...], spans: tuple[Spans, ...]) -> dict[str, str]:

@@ -18,7 +18,7 @@ NAME = "Parquet"
 MAGIC = b"PAR1"
 OWN = ("time_s", "torque_nm", "pulse_width_us", "segment", "held_out", "late_s", "doubted", "record_id")
 UNPACKED_BYTES = 4 * LARGEST_FILE_BYTES
-TEXTS = ("record_id", "participant")
+TEXTS = {"record_id": "recording_id", "participant": "participant"}
 
 
 def reads(_path: Path, head: bytes) -> bool:
@@ -48,7 +48,7 @@ def read(path: Path, content: bytes) -> Foreign:
         Signal(name, time_s, _numbers(file, name), _unit(schema.field(name))) for name in names if name != time
     )
     spans = tuple(_spans(file, field.name, time_s) for field in schema if field.name.lower() in ("segment", "segments"))
-    about = {name: _first(file, name) for name in TEXTS if name in schema.names}
+    about = {called: _first(file, name) for name, called in TEXTS.items() if name in schema.names}
     return Foreign(NAME, signals, spans, _own(path, signals, about) if own else {}, about)
 
 
@@ -100,7 +100,7 @@ def _own(path: Path, signals: tuple[Signal, ...], about: dict[str, Any]) -> dict
     own = {
         name: f"{name}:{there[name].unit}" if there[name].unit else name for name in columns.TARGETS if name in there
     }
-    return {**own, **_rate(path, str(about.get("record_id"))), "segments": "segment", "sign": "+1"}
+    return {**own, **_rate(path, str(about.get("recording_id"))), "segments": "segment", "sign": "+1"}
 
 
 def _rate(path: Path, record_id: str) -> dict[str, str]:

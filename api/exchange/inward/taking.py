@@ -145,13 +145,13 @@ class Taking:
 
     def _further(self, torque: Signal) -> dict[str, np.ndarray]:
         """Columns that are taken only where somebody says so, at the times of the torque."""
-        made = {}
+        made, outside = {}, None if self.foreign.own else np.nan  # ours says in `doubted` where no angle is known
         for target in ("angle_rad", "velocity_rad_s", "late_s", "doubted"):
             if target in self.given or target in self.foreign.own:
                 found, unit = self.signal(target, "")
                 factor = 1.0 if target == "doubted" else self._factor(target, unit)
                 values = found.values * factor if factor != 1 else found.values
-                made[target] = values if same(found, torque) else between(found.time_s, values, torque.time_s)
+                made[target] = values if same(found, torque) else between(found.time_s, values, torque.time_s, outside)
         return made
 
     def _segments(self, torque: Signal) -> tuple[list[str], np.ndarray | None]:

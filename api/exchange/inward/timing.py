@@ -26,7 +26,7 @@ def pulses_in_force(
     slot = np.round((time_s - time_s[0]) * rate_hz).astype(np.int64)
     if slot[-1] > bounds.LARGEST_ROWS or (np.diff(slot) < 1).any():
         return None
-    planned_s = time_s[0] + np.arange(slot[-1] + 1) / rate_hz
+    planned_s = time_s[0] + np.arange(slot[-1] + 2) / rate_hz  # a rest behind the last
     widths, written = np.zeros(planned_s.size), np.full(planned_s.size, np.nan)
     widths[slot], written[slot] = width_us, time_s
     status = np.where(np.isnan(written), RESTS, SENT_AND_ACKNOWLEDGED)
@@ -57,12 +57,12 @@ def held(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray
     return np.where(last >= 0, values[np.maximum(last, 0)], 0.0)
 
 
-def between(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    """Values on a straight line between their times; none outside."""
+def between(time_s: np.ndarray, values: np.ndarray, at_s: np.ndarray, elsewhere: float | None) -> np.ndarray:
+    """Values on a straight line between their times; outside as given, None: as at the nearest."""
     good = np.isfinite(values) & np.isfinite(time_s)
     if not good.any():
         return np.full(at_s.size, np.nan)
-    return np.interp(at_s, time_s[good], values[good], np.nan, np.nan)
+    return np.interp(at_s, time_s[good], values[good], elsewhere, elsewhere)
 
 
 def coded(spans: Spans, time_s: np.ndarray) -> tuple[list[str], np.ndarray]:

@@ -21,11 +21,12 @@ from stimrig.api.exchange.outward.parquet import record_row
 from stimrig.identify.records.record import HELD_OUT
 
 NAME: str = "mat"
+HEADER = b"MATLAB 5.0 MAT-file, written by stimrig export"  # scipy would tell today's date
 SCRIPT = """\
 function data = read_stimrig(name)
 % READ_STIMRIG  A file of `stimrig export --format mat` as an iddata object (System Identification Toolbox).
 %
-%   data = read_stimrig('sub-P001_ses-20260105_0123456789abcdef.mat')
+%   data = read_stimrig('sub-LABEL_ses-SESSION_KEY.mat')
 %
 % Output: torque (N*m). Input: pulse width in force (us). Lost samples are NaN: see misdata.
 % Rows of the segment `validate` are held out: data.UserData.held_out. Without the toolbox (or in Octave) a struct
@@ -49,7 +50,7 @@ def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
     packed = io.BytesIO()
     savemat(packed, _variables(record, who), do_compression=True, long_field_names=True, oned_as="column")
     with put(f"sub-{who.label}_ses-{who.session}_{who.key}.mat") as target:
-        target.write(packed.getbuffer())
+        target.write(HEADER.ljust(116) + packed.getvalue()[116:])
     return record_row(record, who)
 
 

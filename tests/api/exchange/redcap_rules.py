@@ -81,7 +81,11 @@ def broken_in_import(path: Path, dictionary: Path) -> list[str]:
     if len(set(keys)) < len(keys):
         found.append("two rows of one instance")
     for row in rows:
-        if row["redcap_repeat_instrument"] not in forms or not row["redcap_repeat_instance"].isdigit() or not row[first]:
+        if (
+            row["redcap_repeat_instrument"] not in forms
+            or not row["redcap_repeat_instance"].isdigit()
+            or not row[first]
+        ):
             found.append(f"an instance: {row}")
         for name, value in row.items():
             if name in fields and value:

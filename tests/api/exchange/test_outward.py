@@ -136,7 +136,12 @@ def test_redcaps_rules_are_noticed(out: Path, tmp_path: Path) -> None:
         wrong.write_text(text.replace(old, new, 1))
         assert redcap_rules.broken_in_dictionary(wrong), new
     table = (out / "redcap" / "import.csv").read_text()
-    for old, new in (("2026-01-05 09:00:00", "05.01.2026"), ("completed", "done"), (",1,R-", ",one,R-"), ("kind", "sort")):
+    for old, new in (
+        ("2026-01-05 09:00:00", "05.01.2026"),
+        ("completed", "done"),
+        (",1,R-", ",one,R-"),
+        ("kind", "sort"),
+    ):
         wrong.write_text(table.replace(old, new, 1))
         assert redcap_rules.broken_in_import(wrong, out / "redcap" / "data_dictionary.csv"), new
 
@@ -190,7 +195,9 @@ def test_the_script_reads_it_in_octave(out: Path) -> None:
         pytest.skip("octave is not installed")
     (path,) = (out / "mat").glob("*.mat")
     line = f"d = read_stimrig('{path.name}'); printf('%.17g %.17g %d %s', d.y(7), d.Ts, sum(d.held_out), d.segments{{1}}.name)"
-    done = subprocess.run([octave, "--no-gui", "--norc", "--eval", line], cwd=path.parent, capture_output=True, text=True)
+    done = subprocess.run(
+        [octave, "--no-gui", "--norc", "--eval", line], cwd=path.parent, capture_output=True, text=True
+    )
     found = loadmat(path, simplify_cells=True)
     y, step_s, held_out, name = done.stdout.split()
     assert (float(y), float(step_s)) == (found["y"][6], found["Ts"]), done.stderr
