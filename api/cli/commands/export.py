@@ -82,7 +82,9 @@ def _format(parquet: Path | None, bids: Path | None, format: str, output: Path |
     pairs = (("parquet", parquet), ("bids", bids), (format, output))
     given = [(name, folder) for name, folder in pairs if folder is not None]
     if len(given) != 1 or bool(format) != (output is not None):
-        raise InputError(f"give --parquet FOLDER, --bids FOLDER, or --format ({', '.join(NAMES)}) with -o FOLDER.")
+        raise InputError(
+            f"give --parquet FOLDER, --bids FOLDER, or --format ({', '.join(NAMES)}) with -o FOLDER; one of them."
+        )
     ((name, folder),) = given
     try:
         return writer(name), folder

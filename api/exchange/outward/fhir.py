@@ -18,7 +18,7 @@ import numpy as np
 from stimrig.api.cohort.export import Put, Who
 from stimrig.api.cohort.export_state import State
 from stimrig.api.cohort.whole_record import WholeRecord
-from stimrig.api.exchange.outward import _told
+from stimrig.api.exchange.outward import _figures
 from stimrig.api.exchange.outward.bids import grid
 from stimrig.api.exchange.outward.parquet import record_row
 
@@ -57,7 +57,7 @@ RELEASES = (Release("r4"), Release("r5"))
 
 def write(record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
     """The record's bundles; its row."""
-    found = _told.fitted(record)
+    found = _figures.fitted(record)
     for release in RELEASES:
         bundle = {"resourceType": "Bundle", "type": "collection", "entry": list(_entries(record, who, found, release))}
         with put(f"{release.name}/sub-{who.label}/ses-{who.session}/{who.key}.json") as file:
@@ -79,7 +79,7 @@ def _entries(record: WholeRecord, who: Who, found: dict[str, Any], release: Rele
     person, whose = url("Patient", who.participant), {"reference": url("Patient", who.participant)}
     yield {"fullUrl": person, "resource": {
         "resourceType": "Patient", "identifier": [_identifier("participant", who.participant)]}}  # fmt: skip
-    for name, version in _told.devices(record).items():
+    for name, version in _figures.devices(record).items():
         yield entry("Device", f"{who.key} {name}", release.device(name, version))
     when = {"effectiveDateTime": who.begun_utc} if who.begun_utc else {}
     measured = url("Observation", who.key)
@@ -87,7 +87,7 @@ def _entries(record: WholeRecord, who: Who, found: dict[str, Any], release: Rele
         "identifier": [_identifier("recording", who.record_id), _identifier("sha256", record.sha256)],
         "status": "final", "code": _code("recording", "torque at a joint under electrical stimulation"),
         "subject": whose, **when, "device": {"reference": url("Device", f"{who.key} load cell")},
-        "component": [*_sampled(record, release), *_segments(record), *_figures(record, found)],
+        "component": [*_sampled(record, release), *_segments(record), *_quantities(record, found)],
     })  # fmt: skip
     verdict = found["verdict"]
     yield entry("DiagnosticReport", who.key, {
@@ -138,10 +138,10 @@ def _segments(record: WholeRecord) -> Iterator[dict[str, Any]]:
                "valueRange": {"low": quantity(start_s, "s"), "high": quantity(end_s, "s")}}  # fmt: skip
 
 
-def _figures(record: WholeRecord, found: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _quantities(record: WholeRecord, found: dict[str, Any]) -> Iterator[dict[str, Any]]:
     rate_hz = record.about.get("pulse_rate_hz")
     numbers = {"pulse_rate_hz": (rate_hz, "Hz", "pulses a second")}
-    numbers |= {one.name: (found.get(one.name), one.ucum, one.says) for one in _told.FIGURES}
+    numbers |= {one.name: (found.get(one.name), one.ucum, one.says) for one in _figures.FIGURES}
     for name, (value, ucum, says) in numbers.items():
         if value is not None:
             yield {"code": _code(name, says), "valueQuantity": quantity(value, ucum)}

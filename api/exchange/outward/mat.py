@@ -15,7 +15,7 @@ from scipy.io import savemat
 from stimrig.api.cohort.export import NoExport, Put, Who
 from stimrig.api.cohort.export_state import State
 from stimrig.api.cohort.whole_record import WholeRecord
-from stimrig.api.exchange.outward import _told
+from stimrig.api.exchange.outward import _figures
 from stimrig.api.exchange.outward.bids import grid
 from stimrig.api.exchange.outward.parquet import record_row
 from stimrig.identify.records.record import HELD_OUT
@@ -83,7 +83,7 @@ def _variables(record: WholeRecord, who: Who) -> dict[str, Any]:
         **{f"{name}_of_sensor": column for name, column in record.angle.items()},
         "pulses": dict(record.pulses) or np.zeros((0, 0)),
         "pulse_rate_hz": record.about["pulse_rate_hz"], "participant": who.participant, "session": who.session,
-        "recording": who.record_id, "metadata": _told.metadata(record),
+        "recording": who.record_id, "metadata": _figures.metadata(record),
     }  # fmt: skip
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from stimrig.api.cohort.export import Put, Who
 from stimrig.api.cohort.export_state import State
 from stimrig.api.cohort.whole_record import WholeRecord
-from stimrig.api.exchange.outward import _told
+from stimrig.api.exchange.outward import _figures
 from stimrig.api.exchange.outward.parquet import COLUMNS, STATUS, record_row
 from stimrig.api.version import software_version
 from stimrig.identify.records.record import HELD_OUT
@@ -63,7 +63,7 @@ def _file(record: WholeRecord, who: Who) -> Any:
         session_start_time=begun,
         file_create_date=[begun],  # nothing tells when it was exported
         session_id=who.session,
-        notes=_told.metadata(record),
+        notes=_figures.metadata(record),
         keywords=["functional electrical stimulation", "torque", "muscle"],
         experiment_description=str(record.about.get("kind") or "test"),
         was_generated_by=[["stimrig", software_version()]],
@@ -71,7 +71,7 @@ def _file(record: WholeRecord, who: Who) -> Any:
             subject_id=who.participant, species="Homo sapiens", sex="U", age="P0D/", description="known by code only"
         ),
     )
-    for name, model in _told.devices(record).items():
+    for name, model in _figures.devices(record).items():
         file.create_device(name=name, description=model)
     _add_samples(file, record)
     _add_pulses(file, record)

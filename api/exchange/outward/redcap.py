@@ -13,7 +13,7 @@ from stimrig.api.cohort.export import Put, Who
 from stimrig.api.cohort.export_state import State
 from stimrig.api.cohort.select import LABELS
 from stimrig.api.cohort.whole_record import WholeRecord
-from stimrig.api.exchange.outward import _told
+from stimrig.api.exchange.outward import _figures
 from stimrig.api.exchange.outward.parquet import record_row
 from stimrig.identify.records.cells import lines
 
@@ -71,14 +71,14 @@ FIELDS = (
     Field("torque_range_nm", "Largest less smallest torque", "number", "N·m", lowest="0"),
     Field("verdict", "Plain model", choices=VERDICTS),
     Field("no_model_reason", "Why there is no model"),
-    *(Field(one.name, one.says[:1].upper() + one.says[1:], "number", one.unit) for one in _told.FIGURES),
+    *(Field(one.name, one.says[:1].upper() + one.says[1:], "number", one.unit) for one in _figures.FIGURES),
     Field("sha256", "SHA-256 of the file"),
 )  # fmt: skip
 
 
 def write(record: WholeRecord, who: Who, _put: Put) -> dict[str, Any]:
     """The record's row; its figures are fitted now."""
-    row, found = record_row(record, who), _told.fitted(record)
+    row, found = record_row(record, who), _figures.fitted(record)
     verdict = found.pop("verdict").replace(" ", "_")
     known = verdict in VERDICTS
     torque_nm = record.samples["torque_nm"]

@@ -18,7 +18,7 @@ from stimrig import identify
 from stimrig.api.cli import main
 from stimrig.api.cohort.export import Who
 from stimrig.api.cohort.whole_record import WholeRecord
-from stimrig.api.exchange.outward import _told, bids, fhir, nwb
+from stimrig.api.exchange.outward import _figures, bids, fhir, nwb
 from stimrig.errors import BadRequest
 from stimrig.identify.records.columns import parsed
 from tests.api.test_schemas import unmet
@@ -102,7 +102,7 @@ def test_any_numbers_come_back(
     record = WholeRecord("0" * 64, about, columns, segments=[(name, float(time_s[0]), float(time_s[-1]) + 0.005)])
     folder = tmp_path_factory.mktemp("any")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_told, "fitted", lambda _: {"verdict": "usable"})
+        patch.setattr(_figures, "fitted", lambda _: {"verdict": "usable"})
         for module in (nwb, fhir, bids):
             written = in_memory(record, Who(name, "P", "undated", "R", "0123456789abcdef", None), module, folder)
             for path in (one for one in written if one.suffix in (".nwb", ".json", ".gz") and one.parent.name != "r5"):
