@@ -270,7 +270,8 @@ def strange(offset_s: float, measured: bool = True) -> bytes:
     sent = WIDTHS_US > 0
     edges = np.r_[0.0, 10.0, 20.0] + offset_s
     return foreign_files.xdf([
-        Stream("Biodex", "Torque", 200.0, (("torque", ""),), TIME_S[kept], FORCE_N[kept, None], "a", none if measured else ()),
+        Stream("Biodex", "Torque", 200.0, (("torque", ""),), TIME_S[kept], FORCE_N[kept, None], "a",
+               none if measured else ()),
         Stream("Stim", "Stimulation", 0.0, (("pw", "us"),), PULSES_S[sent] + offset_s, WIDTHS_US[sent, None], "b",
                at if measured else ()),
         Stream("Trigger", "Markers", 0.0, (("m", ""),), PULSES_S[sent] + offset_s, ["T"] * int(sent.sum()), "b",

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 
 def test_every_format_is_found_by_its_file() -> None:
     assert set(FORMATS) == set(outward.NAMES)
-    assert all(outward.writer(name).NAME == name for name in FORMATS)
+    assert all(name == outward.writer(name).NAME for name in FORMATS)
     with pytest.raises(LookupError, match="edf"):
         outward.writer("edf")
 
@@ -131,8 +131,14 @@ def test_redcap_takes_dictionary_and_table(out: Path, data: Path, tmp_path: Path
 def test_redcaps_rules_are_noticed(out: Path, tmp_path: Path) -> None:
     text = (out / "redcap" / "data_dictionary.csv").read_text()
     wrong = tmp_path / "wrong.csv"
-    for old, new in (("begun,", "Begun,"), ("dropdown", "radios"), ("datetime_seconds_ymd", "datetime"),
-                     ("stopped, stopped", "completed, stopped"), ("Field Note", "Note"), ("record_id", "sha256")):  # fmt: skip
+    for old, new in (
+        ("begun,", "Begun,"),
+        ("dropdown", "radios"),
+        ("datetime_seconds_ymd", "datetime"),
+        ("stopped, stopped", "completed, stopped"),
+        ("Field Note", "Note"),
+        ("record_id", "sha256"),
+    ):
         wrong.write_text(text.replace(old, new, 1))
         assert redcap_rules.broken_in_dictionary(wrong), new
     table = (out / "redcap" / "import.csv").read_text()
@@ -194,7 +200,8 @@ def test_the_script_reads_it_in_octave(out: Path) -> None:
     if octave is None:
         pytest.skip("octave is not installed")
     (path,) = (out / "mat").glob("*.mat")
-    line = f"d = read_stimrig('{path.name}'); printf('%.17g %.17g %d %s', d.y(7), d.Ts, sum(d.held_out), d.segments{{1}}.name)"
+    shown = "d.y(7), d.Ts, sum(d.held_out), d.segments{1}.name"
+    line = f"d = read_stimrig('{path.name}'); printf('%.17g %.17g %d %s', {shown})"
     done = subprocess.run(
         [octave, "--no-gui", "--norc", "--eval", line], cwd=path.parent, capture_output=True, text=True
     )
@@ -223,7 +230,7 @@ def texts(path: Path) -> str:
         with h5py.File(path) as file:
             found: list[str] = []
             file.visititems(lambda name, one: found.append(f"{name} {dict(one.attrs)}"))
-            file.visititems(lambda name, one: isinstance(one, h5py.Dataset) and found.append(repr(one[()])))
+            file.visititems(lambda _, one: isinstance(one, h5py.Dataset) and found.append(repr(one[()])))
         text += " ".join(found)
     return text
 
