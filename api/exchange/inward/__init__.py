@@ -55,6 +55,9 @@ def read_foreign(path: Path) -> Foreign:
         return whole(reader.read(path, content), str(path))
     except IdentifyError:
         raise
+    except ImportError as error:
+        fix = f"Needs `pip install stimrig[files]` ({error.name} is missing)."
+        raise BadRecord(f"a file of {reader.NAME}", place=str(path), fix=fix) from None
     except MemoryError:
         raise BadRecord("it takes more memory than there is", place=str(path), fix="Cut the recording.") from None
     except Exception as error:  # a library's reader at a damaged file: whatever it raises

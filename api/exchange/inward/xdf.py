@@ -33,10 +33,7 @@ def reads(_path: Path, head: bytes) -> bool:
 
 def read(path: Path, content: bytes) -> Foreign:
     """What the streams hold. Raises BadRecord."""
-    try:
-        import pyxdf
-    except ImportError:
-        raise BadRecord("XDF needs `pip install stimrig[files]`", place=str(path)) from None
+    import pyxdf
 
     whole = _check_chunks(content, str(path))
     streams, _ = pyxdf.load_xdf(io.BytesIO(content), dejitter_timestamps=False, handle_clock_resets=True, verbose=False)

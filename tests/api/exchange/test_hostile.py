@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import struct
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -200,6 +201,21 @@ def test_each_is_refused_in_one_line(
     assert code == 2 and len(lines) == 1, said
     assert "unexpected" not in said and len(lines[0]) < 600 and lines[0].endswith((".", ")")), said
     assert SECRET not in said and not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "needed"), [("x.xdf", b"XDF:", "pyxdf"), ("x.parquet", b"PAR1", "pyarrow")]
+)
+def test_without_a_library_it_says_what_to_install(
+    name: str, content: bytes, needed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    for module in [one for one in sys.modules if one.partition(".")[0] == needed]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, needed, None)
+    (tmp_path / name).write_bytes(content)
+    assert main.run(["import", str(tmp_path / name), "-o", str(tmp_path / "out.csv")]) == 2
+    assert "pip install stimrig[files]" in capsys.readouterr().err
 
 
 def test_a_cut_stream_is_taken_as_far_as_it_goes_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
