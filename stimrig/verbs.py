@@ -92,13 +92,56 @@ def export(
     shift_days: int = 0,
     map: Sequence[str] = (),
     token: str = "",
+    format: str = "",
+    output: str | Path | None = None,
 ) -> Report:
-    """Recordings as Parquet, or as a BIDS-style folder. One that is cut off goes on with the same call."""
+    """Recordings as Parquet, BIDS, NWB, FHIR, REDCap or MATLAB. One that is cut off goes on with the same call."""
     from stimrig.api.cli.commands.export import exported
 
-    folders = {name: Path(path) for name, path in (("parquet", parquet), ("bids", bids)) if path is not None}
-    given = {"select": select, "no_dates": no_dates, "shift_days": shift_days, "columns": list(map), "token": token}
-    return Report("export", exported([str(place) for place in data], **folders, **given))
+    given = {"parquet": parquet, "bids": bids, "output": output}
+    folders = {name: Path(path) for name, path in given.items() if path is not None}
+    options = {"format": format, "select": select, "no_dates": no_dates, "shift_days": shift_days, "token": token}
+    told = exported([str(place) for place in data], **folders, **options, columns=list(map))  # pyright: ignore
+    return Report("export", told)
+
+
+def import_recording(
+    path: str | Path,
+    map: Mapping[str, str] | None = None,
+    segments: str = "",
+    sign: int | None = None,
+    lever_arm_m: float | None = None,
+    pulse_width_us: float | None = None,
+    pulse_rate_hz: float | None = None,
+    clock_offset_s: float | None = None,
+) -> identify.Record:
+    """A record from another tool's file (NWB, BIDS, XDF, Parquet, FHIR); its `notes` say what was taken.
+
+    Parameters
+    ----------
+    map : mapping, optional
+        The signal that a column is, and its unit: `{"torque_nm": "Dynamometer/torque:Nm"}`.
+    segments : str
+        What names the segments in the file, or "none".
+    sign : int, optional
+        1 where the torque of the stimulated muscle is positive, -1 where it is negative.
+    lever_arm_m : float, optional
+        Of a force.
+    pulse_width_us, pulse_rate_hz : float, optional
+        Of pulses that are only marked; of widths that are a signal.
+    clock_offset_s : float, optional
+        What is added to the pulses' times.
+
+    Raises
+    ------
+    BadRecord, BadRequest
+        The file cannot be read; it does not say something that was not given either.
+    """
+    from stimrig.api.cli.commands.import_ import answers, taken
+
+    numbers = {"sign": sign, "lever_arm_m": lever_arm_m, "pulse_width_us": pulse_width_us,
+               "pulse_rate_hz": pulse_rate_hz, "clock_offset_s": clock_offset_s}  # fmt: skip
+    return taken(Path(path), answers(map, segments, numbers))[0]
 
 
 def recover(journal: str | Path, folder: str | Path | None = None) -> Report:

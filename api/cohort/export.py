@@ -90,11 +90,11 @@ class Writer(Protocol):
 
     NAME: str
 
-    def write(self, record: WholeRecord, who: Who, put: Put) -> dict[str, Any]:
+    def write(self, record: WholeRecord, who: Who, put: Put, /) -> dict[str, Any]:
         """Write a record's files; its row for `finish`. Raises NoExport."""
         ...
 
-    def finish(self, state: State, put: Put) -> None: ...
+    def finish(self, state: State, put: Put, /) -> None: ...
 
 
 def hidden(record: WholeRecord, days: Days) -> WholeRecord:

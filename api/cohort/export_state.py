@@ -19,6 +19,7 @@ CREATE UNIQUE INDEX IF NOT EXISTS done_content ON done (sha256);
 CREATE INDEX IF NOT EXISTS done_order ON done (participant, session);
 CREATE TABLE IF NOT EXISTS failed (address TEXT PRIMARY KEY, kind TEXT NOT NULL, reason TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS labels (label TEXT PRIMARY KEY, code TEXT NOT NULL UNIQUE);
+CREATE TABLE IF NOT EXISTS numbers (code TEXT, record TEXT, number INTEGER NOT NULL, PRIMARY KEY (code, record));
 """
 
 
@@ -108,6 +109,14 @@ class State:
         with self._db:
             self._db.execute("INSERT OR IGNORE INTO labels VALUES (?, ?)", (label, code))
         return label
+
+    def number(self, code: str, record: str) -> int:
+        """The number of a record among those of a code, from 1: the same for ever, whatever comes later."""
+        given = "SELECT number FROM numbers WHERE code = ? AND record = ?"
+        with self._db:
+            count = "(SELECT count(*) + 1 FROM numbers WHERE code = ?)"
+            self._db.execute(f"INSERT OR IGNORE INTO numbers VALUES (?, ?, {count})", (code, record, code))
+        return int(self._db.execute(given, (code, record)).fetchone()[0])
 
     def labels(self) -> Iterator[tuple[str, str]]:
         yield from self._db.execute("SELECT label, code FROM labels ORDER BY label")

@@ -27,6 +27,7 @@ PULSES = (
 """What a recording holds of its torque's samples, and of its pulses."""
 NUMBERS = ("pulse_rate_hz", "sample_rate_hz", "sample_rate_measured_hz", "current_ma")
 TEXTS = ("reason", "content_sha256", "journal_note", "ended_by", "laid", "events", "configuration")
+ANGLE = ("time_s", "angle_rad", "velocity_rad_s")
 ALIGNMENT = ("error_ms", "delay_ms", "rate_ppm")
 NO_SYNC = 255
 
@@ -44,6 +45,9 @@ class WholeRecord:
     """Shape (P,); what was planned, sent and heard of each pulse; empty for a record without a list of its pulses."""
     segments: list[tuple[str, float, float]] = field(default_factory=list)  # end exclusive
     notes: tuple[str, ...] = ()  # what was assumed when it was read
+    angle: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Shape (A,); an angle sensor's own `time_s`, `angle_rad`, `velocity_rad_s`; empty where the rig had none."""
+    record: Any = None  # as `identify` reads it, for what is computed of it
 
     @property
     def sample_rate_hz(self) -> float:
@@ -68,7 +72,7 @@ def read_whole(content: bytes, path: Path, known: Known, columns: Sequence[str] 
         "bytes": len(content),
         "format": "sealed recording" if sealed else "table",
     }
-    found = WholeRecord(hashlib.sha256(content).hexdigest(), said, {}, notes=tuple(record.notes))
+    found = WholeRecord(hashlib.sha256(content).hexdigest(), said, {}, notes=tuple(record.notes), record=record)
     if sealed:
         _sealed(found, record, content, path)
     else:
@@ -101,6 +105,8 @@ def _sealed(found: WholeRecord, record: Any, content: bytes, path: Path) -> None
     for name in PULSES:
         if file.has(place := f"/pulses/{name}") and len(column := file.numbers(place)) == len(planned):
             found.pulses[name] = column
+    if file.has("/angle"):
+        found.angle = dict(zip(ANGLE, file.columns("/angle", ANGLE, "columns of different lengths"), strict=True))
     names = tuple(record.segment_names)
     rows = zip(
         file.names("/segments/name"), file.numbers("/segments/start_s"), file.numbers("/segments/end_s"), strict=True

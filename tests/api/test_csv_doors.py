@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from stimrig import identify
 from stimrig.api import record_files
 from stimrig.api.cli import main
-from stimrig.api.cohort import bids, parquet
+from stimrig.api.exchange.outward import bids, parquet
 from stimrig.api.models import inverted
 from stimrig.api.web.routes import trend
 from stimrig.identify.records import cells
@@ -37,7 +37,7 @@ DOORS: dict[str, tuple[int, str]] = {
     "api/web/routes/trend.py": (2, "test_a_trend"),
     "api/web/routes/recordings.py": (4, "names the kind of what a worker wrote, and of files as they came"),
     "api/web/pages/widths_view.py": (1, "names the kind of what api/models/inverted.py wrote"),
-    "api/cohort/bids.py": (3, "test_an_export"),
+    "api/exchange/outward/bids.py": (3, "test_an_export"),
     "api/models/inverted.py": (1, ONLY_NUMBERS),
     "api/cli/commands/predict.py": (2, ONLY_NUMBERS),
     "api/models/analyses.py": (1, "no table: names of effects in the database"),

@@ -37,7 +37,8 @@ def test_every_document_and_every_table_has_it(name: str) -> None:
     assert name in SessionTest.__annotations__ and Labels.model_fields[name].description
     assert FIELDS[name].attribute == name and name in SAID
     pytest.importorskip("pyarrow")
-    from stimrig.api.cohort import bids, parquet, table
+    from stimrig.api.cohort import table
+    from stimrig.api.exchange.outward import bids, parquet
 
     assert {name} <= set(table.SCHEMA.names) & set(parquet.SCHEMAS["records"].names)
     assert name in bids.SCANS or name == "participant"

@@ -126,6 +126,7 @@ def cohort_runs(verb: str) -> Callable[[Path, Path], None]:
 def exports(at: Path, new: Path) -> None:
     assert stimrig.export([at / "record.csv"], parquet=new / "parquet")["written"] == 1
     assert stimrig.export([at / "record.csv"], bids=new / "bids")["written"] == 1
+    assert stimrig.export([at / "record.csv"], format="mat", output=new / "mat")["format"] == "mat"
     with pytest.raises(InputError, match="one of them"):
         stimrig.export([at / "record.csv"])
 
@@ -140,10 +141,18 @@ def emulates(_at: Path, new: Path) -> None:
         gone.health()
 
 
+def imports(at: Path, new: Path) -> None:
+    stimrig.export([at / "record.csv"], format="fhir", output=new / "fhir")
+    (path,) = (new / "fhir" / "r5").rglob("*.json")
+    taken, given = stimrig.import_recording(path), stimrig.read(at / "record.csv")
+    assert list(taken.torque_nm) == list(given.torque_nm) and taken.segment_names == given.segment_names
+
+
 REST: dict[str, Callable[[Path, Path], Any]] = {
     "predict": predicts,
     "recover": recovers,
     "export": exports,
+    "import": imports,
     "cohort fit": cohort_runs("fit"),
     "cohort diagnose": cohort_runs("diagnose"),
     "cohort improve": cohort_runs("improve"),

@@ -21,7 +21,7 @@ COMMAND_ONLY = {
     "upgrade": "it changes the data of a service that is stopped",
     "serve": "it runs until it is ended, and may own a rig; `Client` talks to it",
 }  # fmt: skip
-ELSEWHERE = {"test": "Client.run_test"}
+ELSEWHERE = {"test": "Client.run_test", "import": "import_recording"}
 MORE = ("read", "join", "save", "carry", "next_experiment", "track", "plot", "Client")
 """What the page of the service and options of verbs do: `-o`, `--carry`, several DATA, what decides, trials."""
 

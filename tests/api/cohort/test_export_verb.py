@@ -23,14 +23,14 @@ import pytest
 from stimrig import identify
 from stimrig.api.cli import main
 from stimrig.api.cli.commands import export as export_verb
-from stimrig.api.cohort import parquet as parquet_files
 from stimrig.api.cohort.export import ERRORS, Days, Export, Writer
 from stimrig.api.cohort.export_state import FOLDER, State
-from stimrig.api.cohort.parquet import STATUS
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import sources_of
 from stimrig.api.cohort.tally import Tell
 from stimrig.api.cohort.tasks import CohortError, CutOffError
+from stimrig.api.exchange.outward import parquet as parquet_files
+from stimrig.api.exchange.outward.parquet import STATUS
 from stimrig.rig import archive, assembly, journal
 from tests.api.test_schemas import unmet
 from tests.harness.cohort_records import Session, broken, write

@@ -16,9 +16,9 @@ import numpy as np
 
 from stimrig.api.cohort.export import ERRORS, NoExport, Put, Who
 from stimrig.api.cohort.export_state import FOLDER, State
-from stimrig.api.cohort.parquet import COLUMNS, STATUS, Column, record_row, segment_at
 from stimrig.api.cohort.select import LABELS
 from stimrig.api.cohort.whole_record import WholeRecord
+from stimrig.api.exchange.outward.parquet import COLUMNS, STATUS, Column, record_row, segment_at
 from stimrig.api.version import software_version
 from stimrig.identify.records.cells import cell_text
 

@@ -1,0 +1,1 @@
+"""Files of others, one module a format: `outward` writes them (`stimrig export`), `inward` reads them."""
