@@ -1,0 +1,76 @@
+"""A train on each channel: every pulse is acknowledged and flows."""
+
+from __future__ import annotations
+
+from stimrig.rig.check.bench import Bench, Train
+from stimrig.rig.check.finding import Fault, Finding, failed, passed
+
+ORDER, TITLE, NEEDED = 55, "pulses", True
+TRAIN_S = 2.0
+LEAST_SHARE = 0.9
+"""Of the pulses: a busy computer drops some, and that is no fault of a wire."""
+FAULTS = {
+    "open_electrode": Fault(
+        "the stimulator says that the circuit is open: the load is not connected, or a cable is broken",
+        "put the load on both cables of this output, and try another cable",
+    ),
+    "stop_dead": Fault(
+        "the stimulator does not obey the stop: it did not confirm the end of stimulation",
+        "connect nobody. Change the stimulator's cable and check again; if it stays so, it needs its maker",
+    ),
+    "pulse_unanswered": Fault(
+        "the stimulator does not answer each pulse in time",
+        "change its cable, connect it without a USB hub, and look at the latency timer of an FTDI chip",
+    ),
+    "pulses_dropped": Fault(
+        "many pulses were dropped: the computer is too slow or too busy",
+        "close other programs, and see `stimrig doctor` for real-time priority",
+    ),
+    "torque_follows": Fault(
+        "torque follows the pulses: somebody is connected instead of the dummy load, or the cell picks the pulses up",
+        "take every electrode off the person, put the dummy load on, and keep the cell's cable off the electrodes'",
+    ),
+    "high_voltage": Fault(
+        "the stimulator's source of high voltage, or its module, fails",
+        "switch it off and on; if it says so again, it needs its maker",
+    ),
+    "train_ended": Fault(
+        "the rig ended the train for another reason",
+        "the reason says what to look at",
+    ),
+}
+REASONS = {
+    "end of stimulation is not confirmed": "stop_dead",
+    "electrode error": "open_electrode",
+    "emergency switch": "open_electrode",
+    "not acknowledged": "pulse_unanswered",
+    "torque ": "torque_follows",
+    "high voltage": "high_voltage",
+    "module error": "high_voltage",
+}
+"""Words of a train's end, the first that fits, and which fault they tell."""
+
+
+async def look(bench: Bench) -> Finding:
+    figures = []
+    for name in bench.outputs:
+        train = await bench.play(TRAIN_S, name)
+        bench.first = bench.first or train
+        found = judged(train, name)
+        if found.outcome == "failed":
+            await bench.go_on(train, provoked=False)
+            return found
+        figures.append(found.figure)
+    return passed("; ".join(figures), f"at least {100 * LEAST_SHARE:.0f} %, no error")
+
+
+def judged(train: Train, name: str) -> Finding:
+    """Of one channel's train."""
+    planned, got = max(1, sum(one.status != 1 for one in train.pulses)), len(train.acknowledged)
+    figure = f"{name + ': ' if name else ''}{got} of {planned} pulses acknowledged"
+    bound = f"at least {100 * LEAST_SHARE:.0f} %, no error"
+    if train.finished.outcome != "completed":
+        reason = train.finished.reason
+        fault = next((fault for words, fault in REASONS.items() if words in reason), "train_ended")
+        return failed(fault, f"{figure}; {reason}", bound)
+    return failed("pulses_dropped", figure, bound) if not (got >= LEAST_SHARE * planned) else passed(figure, bound)
