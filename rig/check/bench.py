@@ -32,7 +32,7 @@ calibration."""
 MOST_TORQUE_NM = 2.0
 """Above the offset: on a dummy load nothing pulls, so torque would say that somebody is connected after all."""
 EMULATED_TORQUE_NM = 30.0
-REST_S, TAIL_S, AFTER_S = 0.4, 0.25, 0.3
+REST_S, TAIL_S, AFTER_S = 0.4, 0.25, 1.1
 
 
 class NotDone(Exception):
@@ -101,27 +101,27 @@ class Bench:
 
     # -- the person
 
-    async def answer(self, name: str, **words: Any) -> str:
+    async def answer(self, question: str, /, **words: Any) -> str:
         """What the person says. Raises NotDone: nothing."""
-        answer = await self.tasks.work(lambda: self._person.ask(name, **words))
+        answer = await self.tasks.work(lambda: self._person.ask(question, **words))
         if answer is None:
-            raise NotDone(f"nobody answered the question {name!r}")
+            raise NotDone(f"nobody answered the question {question!r}")
         return answer
 
-    async def ask(self, name: str, **words: Any) -> str:
+    async def ask(self, question: str, /, **words: Any) -> str:
         """The same, where no is as good as nothing."""
-        answer = await self.answer(name, **words)
+        answer = await self.answer(question, **words)
         if answer.lower() in ("no", "skip", "n"):
-            raise NotDone(f"the answer to the question {name!r} was no")
+            raise NotDone(f"the answer to the question {question!r} was no")
         return answer
 
-    async def number(self, name: str, **words: Any) -> float:
+    async def number(self, question: str, /, **words: Any) -> float:
         """The same as a number."""
-        answer = await self.ask(name, **words)
+        answer = await self.ask(question, **words)
         try:
             return float(answer.replace(",", "."))
         except ValueError:
-            raise NotDone(f"{name}: {answer!r} is no number") from None
+            raise NotDone(f"{question}: {answer!r} is no number") from None
 
     async def tell(self, what: str) -> None:
         await self.tasks.work(lambda: self._person.tell(what))

@@ -39,8 +39,3 @@ def failed(fault: str, figure: str, bound: str = "") -> Finding:
 
 def not_done(why: str) -> Finding:
     return Finding("not done", why)
-
-
-def within(value: float, lo: float, hi: float, fault: str, figure: str, bound: str) -> Finding:
-    """Passed if the value is a number from `lo` to `hi`."""
-    return failed(fault, figure, bound) if not (lo <= value <= hi) else passed(figure, bound)

@@ -1,4 +1,4 @@
-"""What only a person can do or see, as questions: answered at a terminal, by options, or on the emulator by its hands."""
+"""What only a person can do or see, as questions, and who answers them: a terminal, options, the emulator's hands."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ QUESTIONS = {
     "by": "Who does this check?",
     "load": "Nobody may be connected to the stimulator. Put a resistor of {ohm:g} Ω (2 W) on each pair of cables. Then "
     "type the output on which the load is, as the stimulator's case names it ({example})",
-    "weight_on": "Take everything off the lever; then hang a weight on it that makes {weight_nm:g} N·m in the direction "
-    "of flexion. Type yes when it hangs still",
+    "weight_on": "Take everything off the lever; then hang a weight on it that makes {weight_nm:g} N·m in the "
+    "direction of flexion. Type yes when it hangs still",
     "weight_off": "Take the weight off. Type yes when it is off",
-    "bend": "Bend the joint (or the sensor's lever) by 30° or more in the direction of flexion. Type yes when it is bent",
+    "bend": "Bend the joint (or the sensor's lever) by 30° or more in the direction of flexion. Type yes when it is",
     "unplug": "Take the load off the channel {name} alone. Type yes when it is off",
     "plug": "Put the load back on the channel {name}. Type yes when it is on",
     "scope": "Have you an oscilloscope over the load? Pulses flow for 2 s after your answer. Type yes, or nothing",
@@ -33,7 +33,7 @@ QUESTIONS = {
 class Person(Protocol):
     """Whoever stands at the rig. Its methods may block: they are called as work of another thread."""
 
-    def ask(self, name: str, **words: Any) -> str | None:
+    def ask(self, question: str, /, **words: Any) -> str | None:
         """The answer to one of `QUESTIONS`; None: nobody answers, so that what needs it is not done."""
         ...
 
@@ -45,17 +45,17 @@ class Person(Protocol):
 class Scripted:
     """Answers of options; whom to ask for the others.
 
-    `answers`: by names of `QUESTIONS`, or by `NAME:CHANNEL`.
+    `answers`: by names of `QUESTIONS`, or by `QUESTION:CHANNEL`.
     """
 
     def __init__(self, answers: Mapping[str, str], other: Person | None = None) -> None:
         self._answers, self._other = answers, other
 
-    def ask(self, name: str, **words: Any) -> str | None:
-        for key in (f"{name}:{words.get('name', '')}", name):
+    def ask(self, question: str, /, **words: Any) -> str | None:
+        for key in (f"{question}:{words.get('name', '')}", question):
             if key in self._answers:
                 return self._answers[key] or None
-        return self._other.ask(name, **words) if self._other else None
+        return self._other.ask(question, **words) if self._other else None
 
     def tell(self, what: str) -> None:
         if self._other:
@@ -65,8 +65,8 @@ class Scripted:
 class AtTerminal:
     """Asks on standard error, reads standard input."""
 
-    def ask(self, name: str, **words: Any) -> str | None:
-        print(f"? {QUESTIONS[name].format(**words)}: ", end="", file=sys.stderr, flush=True)
+    def ask(self, question: str, /, **words: Any) -> str | None:
+        print(f"? {QUESTIONS[question].format(**words)}: ", end="", file=sys.stderr, flush=True)
         return sys.stdin.readline().strip() or None
 
     def tell(self, what: str) -> None:
@@ -85,8 +85,8 @@ class Hands:
         self._control, self._outputs = control, outputs
         self._seen = 0
 
-    def ask(self, name: str, **words: Any) -> str | None:
-        do = getattr(self, f"_{name}", None)
+    def ask(self, question: str, /, **words: Any) -> str | None:
+        do = getattr(self, f"_{question}", None)
         return "yes" if do is None else do(**words)
 
     def tell(self, what: str) -> None:

@@ -44,8 +44,13 @@ class Surroundings:
         return None
 
     def holder(self, path: str) -> str:
-        """Another process that has it open, in words; empty: none that this user may see."""
+        """Another process that has it open, in words; empty: none that this user may see.
+
+        Of a pseudo-terminal the emulator holds both ends, so there it says nothing.
+        """
         real = self.real(path)
+        if real.startswith("/dev/pts/"):
+            return ""
         for place in Path("/proc").glob("[0-9]*/fd/*"):
             with contextlib.suppress(OSError):
                 pid = place.parts[2]

@@ -40,7 +40,8 @@ class Calibrations:
         """Open a guided calibration; nothing is sent yet.
 
         Raises BusyError, LatchedError, UncertainError, DeviceError: as for a test. PlanError, RefusedError: wrong name
-        or id; step, train, current or rate outside the limits, or too small to stimulate. CheckNeededError: the rig file requires a check of the rig that is not there.
+        or id; step, train, current or rate outside the limits, or too small to stimulate. CheckNeededError: the rig was
+        not checked.
         """
         state, latch = self._state, self._state.latch
         async with state.in_turn():

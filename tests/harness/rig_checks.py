@@ -58,7 +58,14 @@ class System:
         self._planted = planted
 
     def __getattr__(self, name: str) -> Callable[[str], Any]:
-        sound = {"real": None, "exists": True, "may_use": True, "holder": "", "latency_ms": None, "can_link": {"up": True}}
+        sound = {
+            "real": None,
+            "exists": True,
+            "may_use": True,
+            "holder": "",
+            "latency_ms": None,
+            "can_link": {"up": True},
+        }
 
         def look(path: str) -> Any:
             planted = self._planted.get(name, {})
@@ -135,7 +142,10 @@ class Checked:
     def _config(self) -> config.RigConfig:
         slcan = self.settings.transport == "slcan"
         bus = {"interface": "slcan", "channel": ADAPTER} if slcan else {"interface": "socketcan", "channel": "can0"}
-        named = [{"name": NAMES[n], "muscle": NAMES[n], "side": "right", "channel": c} for n, c in enumerate(self.planted.channels)]
+        named = [
+            {"name": NAMES[n], "muscle": NAMES[n], "side": "right", "channel": c}
+            for n, c in enumerate(self.planted.channels)
+        ]
         content: dict[str, Any] = {
             "stimulator": {"device": self.settings.stimulator, "port": STIMULATOR},
             "load_cell": {
@@ -152,7 +162,9 @@ class Checked:
         return config.check(content, "rig.toml", data_dir=FOLDER, socket=FOLDER / "socket")
 
     def _hands(self) -> Person:
-        outputs = {name: (0, n) for n, name in enumerate(NAMES[: len(self.planted.channels)])} or {"": self.settings.wired[0]}
+        outputs = {name: (0, n) for n, name in enumerate(NAMES[: len(self.planted.channels)])} or {
+            "": self.settings.wired[0]
+        }
         return Hands(self._control, outputs)
 
     def _control(self, cmd: str, **request: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ ORDER, TITLE, NEEDED = 66, "channels", True
 TRAIN_S = 0.5
 FAULTS = {
     "channels_swapped": Fault(
-        "pulses of a channel leave by another channel's cable: the cables, or their channels in the rig file, are swapped",
+        "pulses of a channel leave by another channel's cable: the cables, or the rig file's channels, are swapped",
         "exchange the cables, or `channel` and `connector` of the two in [[stimulator.channels]]",
     )
 }

@@ -54,7 +54,9 @@ def _serial(bench: Bench) -> dict[str, str]:
     for kind, settings in config.devices().items():
         values = settings.model_dump()
         bus = values.get("bus") or {}
-        port = values.get("port") or (bus.get("channel", "").partition("@")[0] if bus.get("interface") == "slcan" else "")
+        port = values.get("port") or (
+            bus.get("channel", "").partition("@")[0] if bus.get("interface") == "slcan" else ""
+        )
         if port and kind != "angle_sensor":
             found[kind] = str(port)
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stimrig.rig.check.bench import Bench
+from stimrig.rig.check.bench import Bench, NotDone
 from stimrig.rig.check.finding import Fault, Finding, failed, passed
 
 ORDER, TITLE, NEEDED = 64, "width and current at the load", False
@@ -24,6 +24,8 @@ async def look(bench: Bench) -> Finding:
     await bench.ask("scope")
     train = await bench.play(TRAIN_S)
     await bench.go_on(train, provoked=False)
+    if bench.halted:
+        raise NotDone(bench.halted)
     width_us = await bench.number("scope_width_us")
     current_ma = 1000 * await bench.number("scope_voltage_v", ohm=bench.ohm) / bench.ohm
     asked_us, asked_ma = bench.width_us, bench.rig.pair.steps.current(bench.current_ma)

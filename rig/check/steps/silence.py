@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from stimrig.rig.check.bench import Bench
+from stimrig.rig.check.bench import Bench, NotDone
 from stimrig.rig.check.finding import Fault, Finding, failed, passed
 
 ORDER, TITLE, NEEDED = 80, "watchdog", True
@@ -28,6 +28,8 @@ async def look(bench: Bench) -> Finding:
     train = await bench.play(TRAIN_S, during=be_silent)
     ended = train.finished.outcome == "fault" and "blocked" in train.finished.reason
     await bench.go_on(train, provoked=ended)
+    if train.finished.outcome != "completed" and not ended:
+        raise NotDone(bench.halted)
     bound = f"at most {MOST_PULSES} pulses more than were sent, and the train ends"
     if bench.cell.get("sync"):
         extra = train.heard.edges - train.sent
@@ -40,4 +42,3 @@ async def look(bench: Bench) -> Finding:
         bench.halted = "the stimulator goes on when the computer is silent"
         return failed("goes_on", figure, bound)
     return passed(figure, bound) if ended else failed("rig_went_on", figure, bound)
-

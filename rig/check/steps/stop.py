@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from stimrig.rig.acquire.evidence import NO_SIGNAL
 from stimrig.rig.check.bench import Bench
 from stimrig.rig.check.finding import Fault, Finding, failed, passed
 from stimrig.rig.messages import StopEvidence
@@ -14,6 +15,10 @@ FAULTS = {
     "stop_unconfirmed": Fault(
         "the stimulator does not confirm the stop",
         "connect nobody. Change the stimulator's cable and check again; if it stays so, it needs its maker",
+    ),
+    "torque_unseen": Fault(
+        "the device has stopped, but no torque came that shows it: the CAN adapter or this computer is too slow",
+        "close other programs, connect the adapter without a hub, and check again",
     ),
     "stop_late": Fault(
         "pulses flow after the stop",
@@ -39,7 +44,7 @@ async def look(bench: Bench) -> Finding:
     bound = f"confirmed, no pulse later than {MOST_MS:g} ms"
     await bench.go_on(train, provoked=evidence.confirmed)
     if not evidence.confirmed:
-        return failed("stop_unconfirmed", figure, bound)
+        return failed("torque_unseen" if NO_SIGNAL in evidence.detail else "stop_unconfirmed", figure, bound)
     if not (after_ms <= MOST_MS and extra <= 1):
         bench.halted = "pulses flow after the stop"
         return failed("stop_late", f"{figure}, {max(0, extra)} more edges than pulses", bound)

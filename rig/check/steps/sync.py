@@ -10,7 +10,7 @@ MOST_OFF = 0.05
 FAULTS = {
     "sync_unwired": Fault(
         "no edge of the sync line comes with the pulses: it is not wired to the cell",
-        'wire the stimulator\'s sync output to the cell\'s input, or write sync = "" in the rig file',
+        "wire the stimulator's sync output to the cell's input, or write sync = \"\" in the rig file",
     ),
     "sync_wrong": Fault(
         "the sync line has fewer edges than there are pulses, or more",
@@ -29,4 +29,6 @@ async def look(bench: Bench) -> Finding:
     figure, bound = f"{edges} edges for {pulses} pulses", f"as many, within {100 * MOST_OFF:.0f} %"
     if edges == 0:
         return failed("sync_unwired", figure, bound)
-    return failed("sync_wrong", figure, bound) if not (abs(edges - pulses) <= MOST_OFF * pulses) else passed(figure, bound)
+    return (
+        failed("sync_wrong", figure, bound) if not (abs(edges - pulses) <= MOST_OFF * pulses) else passed(figure, bound)
+    )
