@@ -109,7 +109,9 @@ class Bench:
         return answer
 
     async def ask(self, question: str, /, **words: Any) -> str:
-        """The same, where no is as good as nothing."""
+        """The same, where no is as good as nothing; nobody is asked where nothing would be done with it."""
+        if self.halted:
+            raise NotDone(self.halted)
         answer = await self.answer(question, **words)
         if answer.lower() in ("no", "skip", "n"):
             raise NotDone(f"the answer to the question {question!r} was no")

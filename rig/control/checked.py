@@ -16,6 +16,7 @@ CHECK_FILE = "check.json"
 OF_THE_PLACE = "data_dir", "socket", "clock_speed", "require_calibration", "require_check"
 """Keys that say where and how a rig is used, not of what it is made."""
 
+NEVER = CheckStatus.model_validate({})
 log = logging.getLogger("rig.checked")
 
 
@@ -45,6 +46,7 @@ class Checked:
                 due_at_utc=content["due_at_utc"],
                 by=str(content["by"]),
                 same_rig=content["rig"] == self._rig,
+                due="",
             )
             datetime.fromisoformat(self._found.due_at_utc or "")
         except FileNotFoundError:
@@ -55,14 +57,14 @@ class Checked:
 
     def status(self) -> CheckStatus | None:
         """The last check, and why another one is due; None: there is none, and none is expected."""
-        found = self._found or (CheckStatus() if self._told else None)
+        found = self._found or (NEVER if self._told else None)
         return found and found.model_copy(update={"due": self._due(found)})
 
     def refuse(self) -> None:
         """Raise CheckNeededError if the rig file requires a valid check and there is none."""
         if not self._required:
             return
-        due = self._due(self._found or CheckStatus())
+        due = self._due(self._found or NEVER)
         if due:
             raise CheckNeededError(f"require_check: {due}; stop the rig and run `stimrig rig check`")
 

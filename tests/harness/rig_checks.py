@@ -16,6 +16,7 @@ from stimrig.rig.check.bench import Bench
 from stimrig.rig.check.finding import Finding
 from stimrig.rig.check.person import Hands, Person
 from stimrig.rig.check.running import run
+from stimrig.rig.check.surroundings import Surroundings
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Bus
 from tests.simulator.disk import SimulatedDisk
@@ -51,13 +52,15 @@ class Planted:
     dead_switch: bool = False
 
 
-class System:
-    """See `Surroundings`: a sound one, but for what is planted."""
+class System(Surroundings):
+    """A sound one, but for what is planted."""
 
     def __init__(self, planted: Mapping[str, Any]) -> None:
         self._planted = planted
 
-    def __getattr__(self, name: str) -> Callable[[str], Any]:
+    def __getattribute__(self, name: str) -> Any:
+        if name.startswith("_"):
+            return super().__getattribute__(name)
         sound = {
             "real": None,
             "exists": True,
@@ -113,7 +116,7 @@ class Checked:
         self.process = Process(self.computer, self.disk, self.wires)
         self.bench = Bench(
             self.config, self.process, self._hands(), System(planted.system), self.computer.pause, emulated=False
-        )  # type: ignore[arg-type]
+        )
         self.report = self._run()
 
     @property
@@ -131,7 +134,7 @@ class Checked:
                 done.append(error)
                 raise
 
-        self.process.post(lambda: self.process.tasks.spawn(check(), "check"))
+        self.process.post(lambda: None if self.process.tasks.spawn(check(), "check") else None)
         while not done and self.world.now_s < LONGEST_S:
             self.world.run(self.world.now_s + 0.5)
         assert done, (self.world.now_s, self.told)

@@ -24,7 +24,7 @@ async def look(bench: Bench) -> Finding:
         try:
             train = await bench.play(TRAIN_S, name)
         finally:
-            await bench.ask("plug", name=name)
+            await bench.answer("plug", name=name)
         silent = "electrode error" in train.finished.reason
         await bench.go_on(train, provoked=silent)
         if not silent:

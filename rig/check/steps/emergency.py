@@ -23,7 +23,7 @@ async def look(bench: Bench) -> Finding:
         await bench.tell("emergency")
 
     train = await bench.play(TRAIN_S, during=press)
-    await bench.ask("release")
+    await bench.answer("release")
     reason, bound = train.finished.reason, "ends the train"
     if train.finished.outcome == "completed":
         return failed("emergency_dead", f"all {train.sent} pulses flowed", bound)

@@ -33,7 +33,7 @@ async def look(bench: Bench) -> Finding:
         loaded = await bench.listen(SETTLE_S + MEAN_S)
     finally:
         try:
-            await bench.ask("weight_off")
+            await bench.answer("weight_off")
         except NotDone:
             bench.halted = "the weight is still on the lever"
     await bench.tasks.sleep(SETTLE_S)
