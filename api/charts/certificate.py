@@ -28,7 +28,7 @@ def certificate(report: Mapping[str, Any]) -> bytes:
     page.set_creator("stimrig")
     page.add_page()
     _line(page, "Check of a stimulation rig", TITLE_PT, "B")
-    _line(page, VERDICTS.get(report["verdict"], report["verdict"]), SIZE_PT + 2, "B")
+    _line(page, VERDICTS[report["verdict"]], SIZE_PT + 2, "B")
     if report.get("emulated"):
         _line(page, EMULATED, SIZE_PT, "B")
     for name, value in facts(report):

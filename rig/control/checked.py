@@ -64,18 +64,16 @@ class Checked:
         """Raise CheckNeededError if the rig file requires a valid check and there is none."""
         if not self._required:
             return
-        due = self._due(self._found or NEVER)
-        if due:
-            raise CheckNeededError(f"require_check: {due}; stop the rig and run `stimrig rig check`")
+        if due := self._due(self._found or NEVER):
+            raise CheckNeededError(f"{due}; stop the rig and run `stimrig rig check`")
 
     def _due(self, found: CheckStatus) -> str:
         """Why a check is due, in words; empty: it is not."""
         if found.verdict is None or found.due_at_utc is None:
             return "the rig was never checked"
         if found.verdict != "sound":
-            return f"the last check of the rig found it not sound ({found.verdict})"
+            return "the last check of the rig found it not sound"
         if not found.same_rig:
             return "the rig file has changed since the last check of the rig"
-        if not (self._machine.tasks.clock.unix_s() < datetime.fromisoformat(found.due_at_utc).timestamp()):
-            return f"check of the rig due since {found.due_at_utc:.10}"
-        return ""
+        due_s = datetime.fromisoformat(found.due_at_utc).timestamp()
+        return "" if self._machine.tasks.clock.unix_s() < due_s else "the check of the rig is due again"

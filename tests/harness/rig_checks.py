@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from stimrig.hardware_sim.settings import Settings
 from stimrig.rig import config
 from stimrig.rig.check.bench import Bench
 from stimrig.rig.check.finding import Finding
-from stimrig.rig.check.person import Hands, Person
+from stimrig.rig.check.person import Hands, Person, Scripted
 from stimrig.rig.check.running import run
 from stimrig.rig.check.surroundings import Surroundings
 from stimrig.rig.errors import DeviceError
@@ -98,9 +97,11 @@ class NamedWires(Wires):
 class Checked:
     """One check of a planted rig, lived through at once; `report` is its result."""
 
-    def __init__(self, planted: Planted, seed: int = 1, noise_nm: float = 0.05) -> None:
+    def __init__(
+        self, planted: Planted, seed: int = 1, noise_nm: float = 0.05, answers: Mapping[str, str] | None = None
+    ) -> None:
         self.planted, self.world = planted, World(seed)
-        values = {"noise_seed": seed, "noise_nm": noise_nm, "rate_hz": 400.0, **planted.settings}
+        values = {"noise_seed": seed, "noise_nm": noise_nm, "rate_hz": 200.0, **planted.settings}
         self.settings = Settings(**values)
         self.devices: Devices = make_devices(self.settings, planted.arm, epoch_us=1_700_000_000_000_000)
         if planted.channels:
@@ -112,6 +113,7 @@ class Checked:
             self.devices.faults.on(name, dict(settings))
         planted.world(self)
         self.told: list[tuple[str, Finding]] = []
+        self.answers = answers or {}
         self.config = self._config()
         self.process = Process(self.computer, self.disk, self.wires)
         self.bench = Bench(
@@ -134,7 +136,10 @@ class Checked:
                 done.append(error)
                 raise
 
-        self.process.post(lambda: None if self.process.tasks.spawn(check(), "check") else None)
+        def begin() -> None:
+            self.process.tasks.spawn(check(), "check")
+
+        self.process.post(begin)
         while not done and self.world.now_s < LONGEST_S:
             self.world.run(self.world.now_s + 0.5)
         assert done, (self.world.now_s, self.told)
@@ -168,7 +173,7 @@ class Checked:
         outputs = {name: (0, n) for n, name in enumerate(NAMES[: len(self.planted.channels)])} or {
             "": self.settings.wired[0]
         }
-        return Hands(self._control, outputs)
+        return Scripted(self.answers, Hands(self._control, outputs))
 
     def _control(self, cmd: str, **request: Any) -> dict[str, Any]:
         """As the emulator's control line answers."""
@@ -187,7 +192,3 @@ class Checked:
                 devices.faults.off(name)
         return {}
 
-
-def sound_again(planted: Planted) -> Planted:
-    """The same rig without its fault."""
-    return dataclasses.replace(planted, fault="", faults={}, system={}, world=lambda _: None, dead_switch=False)
