@@ -16,6 +16,7 @@ from stimrig.rig import config, devices
 from stimrig.rig.adapters.machine import LocalMachine
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.errors import ConfigError, RigError
+from stimrig.rig.limits import HARD_LIMITS, check
 from stimrig.rig.setup import found
 from stimrig.rig.setup.questions import Question, questions
 from stimrig.rig.setup.written import rig_file
@@ -59,18 +60,23 @@ def _answers(asked: list[Question], options: argparse.Namespace) -> dict[str, st
         if answer is None and not silent:
             print(f"? {question.words} [{default}]: ", end="", file=sys.stderr, flush=True)
             answer = sys.stdin.readline().strip() or None
-        answers[question.option] = found_text = default if answer is None else answer
+        answers[question.option] = default if answer is None else answer
         if question.number:
-            _number(question.option, found_text)
+            _check_number(question.option, answers[question.option])
     return answers
 
 
-def _number(option: str, text: str) -> None:
+def _check_number(option: str, text: str) -> None:
+    """A number; a limit is tighter than the hard one. Raises ConfigError."""
     try:
-        if not math.isfinite(float(text)):
+        value = float(text)
+        if not math.isfinite(value):
             raise ValueError
     except ValueError:
         raise ConfigError(f"--{option} {text}: this must be a number") from None
+    row = HARD_LIMITS.get(option.removeprefix("limit-").replace("-", "_"))
+    if row is not None and (refusal := check(row, value)) is not None:
+        raise ConfigError(f"--{option} {text}: not tighter than the hard limit: {refusal}")
 
 
 def _write(path: Path, text: str) -> None:

@@ -34,7 +34,7 @@ def serial_ports() -> list[Found]:
     """Those that the system lists, under the name by udev where there is one."""
     names = {os.path.realpath(place): str(place) for place in sorted(_names())}
     found = []
-    for port in sorted(list_ports.comports()):
+    for port in sorted(list_ports.comports(), key=lambda port: port.device):
         number = "" if port.vid is None else f"{port.vid:04x}:{port.pid:04x}"
         kind, words = KINDS.get(number, ("", port.description or "unknown"))
         serial = f", serial number {port.serial_number}" if port.serial_number else ""

@@ -166,7 +166,7 @@ class Checked:
             content["stimulator"]["channels"] = named
         for key, value in self.planted.rig_file.items():
             table, _, name = key.partition(".")
-            content[table][name] = value
+            content.setdefault(table, {})[name] = value
         return config.check(content, "rig.toml", data_dir=FOLDER, socket=FOLDER / "socket")
 
     def _hands(self) -> Person:
