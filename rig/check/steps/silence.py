@@ -23,7 +23,7 @@ async def look(bench: Bench) -> Finding:
     async def be_silent() -> None:
         await bench.until_pulses(20)
         await bench.tell("silence")
-        bench.stand_still(STILL_S * bench.clock.speed)
+        bench.stand_still(STILL_S)
 
     train = await bench.play(TRAIN_S, during=be_silent)
     ended = train.finished.outcome == "fault" and "blocked" in train.finished.reason
