@@ -17,7 +17,7 @@ from stimrig.rig.adapters.machine import LocalMachine
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.errors import ConfigError, RigError
 from stimrig.rig.limits import HARD_LIMITS, check
-from stimrig.rig.setup import found
+from stimrig.rig.setup import ports as found
 from stimrig.rig.setup.questions import Question, questions
 from stimrig.rig.setup.written import rig_file
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from stimrig.rig import devices
 from stimrig.rig.errors import ConfigError
 from stimrig.rig.limits import HARD_LIMITS
-from stimrig.rig.setup.found import Found, proposed
+from stimrig.rig.setup.ports import Found, proposed
 
 
 class Question(NamedTuple):

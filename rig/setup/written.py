@@ -19,7 +19,13 @@ UNITS = {"pulse_width_us": "µs, a phase", "current_ma": "mA", "torque_nm": "N·
 def rig_file(answers: Mapping[str, str], path: str) -> str:
     """The file. Raises ConfigError: the channels cannot be read."""
     return "\n".join(
-        [HEAD.format(path=" ".join(path.split())), *_top(answers), *_stimulator(answers), *_cell(answers), *_limits(answers)]
+        [
+            HEAD.format(path=" ".join(path.split())),
+            *_top(answers),
+            *_stimulator(answers),
+            *_cell(answers),
+            *_limits(answers),
+        ]
     )
 
 

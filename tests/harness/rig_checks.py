@@ -191,4 +191,3 @@ class Checked:
             else:
                 devices.faults.off(name)
         return {}
-

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,8 +13,8 @@ import pytest
 
 from stimrig.rig import config
 from stimrig.rig.setup import __main__ as verb
-from stimrig.rig.setup import found
-from stimrig.rig.setup.found import Found, proposed
+from stimrig.rig.setup import ports as found
+from stimrig.rig.setup.ports import Found, proposed
 
 P24 = SimpleNamespace(device="/dev/ttyACM0", vid=0x0483, pid=0x5740, serial_number="A1", description="x")
 CANABLE = SimpleNamespace(device="/dev/ttyACM1", vid=0x16D0, pid=0x117E, serial_number=None, description="y")
@@ -28,7 +29,8 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setattr(found, "can_interfaces", lambda: has["links"])
     monkeypatch.setattr("serial.Serial.open", lambda *_: pytest.fail("a port was opened"))
     typed = SimpleNamespace(
-        isatty=lambda: has["lines"] is not None, readline=lambda: (has["lines"] or [""]).pop(0) if has["lines"] else "\n"
+        isatty=lambda: has["lines"] is not None,
+        readline=lambda: (has["lines"] or [""]).pop(0) if has["lines"] else "\n",
     )
     monkeypatch.setattr("sys.stdin", typed)
     return has
@@ -77,10 +79,15 @@ def test_of_two_alike_none_is_proposed() -> None:
 def test_a_person_answers(tmp_path: Path, machine: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     machine["lines"] = ["rehastim2\n", "/dev/stimrig/ftdi-A1\n", "biceps=1,triceps=5\n", *["\n"] * 30]
     content = made(tmp_path / "rig.toml", "--sync", "-", "--scale-nm", "0.25")
-    assert [(one["name"], one["channel"]) for one in content["stimulator"]["channels"]] == [("biceps", 1), ("triceps", 5)]
+    assert [(one["name"], one["channel"]) for one in content["stimulator"]["channels"]] == [
+        ("biceps", 1),
+        ("triceps", 5),
+    ]
     assert content["load_cell"]["sync"] == "" and content["load_cell"]["scale_nm"] == 0.25
     asked = capsys.readouterr().err
-    assert "Serial port of the stimulator" in asked and "sync" not in asked.split("found")[1].partition("Signal of the")[0]
+    assert (
+        "Serial port of the stimulator" in asked and "sync" not in asked.split("found")[1].partition("Signal of the")[0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,9 +121,21 @@ def test_nothing_is_overwritten(tmp_path: Path, machine: dict[str, Any], capsys:
     assert "No such file" in capsys.readouterr().err
 
 
-def test_what_is_typed_stays_one_value(tmp_path: Path, machine: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_typed_stays_one_value(
+    tmp_path: Path, machine: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "rig.toml"
     content = made(path, "--yes", "--port", '/dev/a"\n[limits]\ncurrent_ma = 99\x7f', "--data-dir", "/a\\b")
     assert content["stimulator"]["port"] == '/dev/a"\n[limits]\ncurrent_ma = 99\x7f'
     assert content["data_dir"] == "/a\\b" and content["limits"]["current_ma"] == 60
     assert json.loads(capsys.readouterr().out)["rig_file"] == str(path)
+
+
+def test_the_command_of_the_page(tmp_path: Path, machine: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "rig-check.md").read_text("utf-8")
+    (line,) = (line for line in page.splitlines() if line.startswith("stimrig rig init -o out/"))
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert verb.main(shlex.split(line)[3:]) == 0
+    content = tomllib.loads((tmp_path / "out" / "rig.toml").read_text("utf-8"))
+    assert content["stimulator"]["device"] == "rehastim2" and content["limits"]["current_ma"] == 40

@@ -8,7 +8,7 @@ from stimrig.rig.check.bench import Bench
 from stimrig.rig.check.finding import Fault, Finding, failed, passed
 
 ORDER, TITLE, NEEDED = 34, "torque at rest", True
-MOST_OFFSET_NM, MOST_NOISE_NM, MOST_DRIFT_NM = 2.0, 0.25, 0.15
+MOST_OFFSET_NM, MOST_NOISE_NM, MOST_DRIFT_NM = 2.0, 0.4, 0.15
 FAULTS = {
     "cell_fault": Fault(
         "the cell says that it is faulty, or gives no number",
