@@ -1,4 +1,4 @@
-"""`stimrig rig`: the verb's words, exit codes and certificate; a check that is due is told by page, doctor and metrics."""
+"""`stimrig rig`: words, exit codes, certificate; a check that is due is told by page, doctor and metrics."""
 
 from __future__ import annotations
 
@@ -21,17 +21,42 @@ from tests.api.test_doctor import rig_file
 from tests.api.test_schemas import unmet
 
 REPORT: dict[str, Any] = {
-    "format": "stimrig-rig-check", "format_version": 1, "verdict": "faults", "checked_at_utc": "2026-11-02T08:00:00.000Z",
-    "due_at_utc": "2026-12-02T08:00:00.000Z", "by": "Jörg", "rig": "ab" * 32, "software": "stimrig 1.0", "emulated": True,
-    "dummy_load_ohm": 1000.0, "rig_file": "rig.toml", "rig_file_sha256": "cd" * 32,
+    "format": "stimrig-rig-check",
+    "format_version": 1,
+    "verdict": "faults",
+    "checked_at_utc": "2026-11-02T08:00:00.000Z",
+    "due_at_utc": "2026-12-02T08:00:00.000Z",
+    "by": "Jörg",
+    "rig": "ab" * 32,
+    "software": "stimrig 1.0",
+    "emulated": True,
+    "dummy_load_ohm": 1000.0,
+    "rig_file": "rig.toml",
+    "rig_file_sha256": "cd" * 32,
     "devices": {"stimulator": {"device": "p24", "serial_number": "S-17"}, "load_cell": {"serial_number": "C-4"}},
     "steps": [
-        {"name": "stop", "title": "stop", "outcome": "failed", "figure": "−3 ms → late", "bound": "60 ms", "fault": "stop_late",
-         "cause": "pulses flow", "mend": "change 1 kΩ"},
-        {"name": "sync", "title": "sync line", "outcome": "passed", "figure": "80", "bound": "", "fault": "", "cause": "",
-         "mend": ""},
+        {
+            "name": "stop",
+            "title": "stop",
+            "outcome": "failed",
+            "figure": "−3 ms → late",
+            "bound": "60 ms",
+            "fault": "stop_late",
+            "cause": "pulses flow",
+            "mend": "change 1 kΩ",
+        },
+        {
+            "name": "sync",
+            "title": "sync line",
+            "outcome": "passed",
+            "figure": "80",
+            "bound": "",
+            "fault": "",
+            "cause": "",
+            "mend": "",
+        },
     ],
-}  # fmt: skip
+}
 
 
 def words(pdf: bytes) -> str:
@@ -43,8 +68,23 @@ def words(pdf: bytes) -> str:
 
 def test_the_certificate_says_what_was_checked() -> None:
     said = words(certificate(REPORT))
-    for text in ("FAULTS", "emulated", "2026-11-02", "2026-12-02", "ab" * 32, "cd" * 16, "stimrig 1.0", "S-17", "C-4", "-3 ms",
-                 "60 ms", "change", "kOhm", "Jörg", "Signature"):  # fmt: skip
+    for text in (
+        "FAULTS",
+        "emulated",
+        "2026-11-02",
+        "2026-12-02",
+        "ab" * 32,
+        "cd" * 16,
+        "stimrig 1.0",
+        "S-17",
+        "C-4",
+        "-3 ms",
+        "60 ms",
+        "change",
+        "kOhm",
+        "Jörg",
+        "Signature",
+    ):
         assert text in said, (text, said)
     sound = words(certificate({**REPORT, "verdict": "sound", "emulated": False}))
     assert "SOUND" in sound and "emulated" not in sound
@@ -69,9 +109,12 @@ def test_check_tells_a_fault_with_its_mend(tmp_path: Path, capfd: pytest.Capture
 @pytest.mark.slow
 def test_bad_input_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for asked in (
-        ["check"], ["check", "--rig", "a", "--emulator-json", "b"], ["check", "--rig", str(tmp_path / "no.toml")],
-        ["check", "--emulator-json", "{}"], ["init", "-o", str(tmp_path / "no" / "rig.toml"), "--yes"],
-    ):  # fmt: skip
+        ["check"],
+        ["check", "--rig", "a", "--emulator-json", "b"],
+        ["check", "--rig", str(tmp_path / "no.toml")],
+        ["check", "--emulator-json", "{}"],
+        ["init", "-o", str(tmp_path / "no" / "rig.toml"), "--yes"],
+    ):
         assert main.run(["rig", *asked]) == 2
         out, err = capfd.readouterr()
         assert out == "" and "Traceback" not in err
@@ -100,9 +143,13 @@ def test_init_writes_a_file_that_the_rig_reads(tmp_path: Path, capfd: pytest.Cap
 
 
 DUE = CheckStatus(
-    verdict="sound", checked_at_utc="2026-01-02T00:00:00.000Z", due_at_utc="2026-02-01T00:00:00.000Z", by="Jo",
-    same_rig=True, due="the check of the rig is due again",
-)  # fmt: skip
+    verdict="sound",
+    checked_at_utc="2026-01-02T00:00:00.000Z",
+    due_at_utc="2026-02-01T00:00:00.000Z",
+    by="Jo",
+    same_rig=True,
+    due="the check of the rig is due again",
+)
 
 
 def test_a_check_that_is_due_is_told(service: Service, client: httpx.Client, tmp_path: Path) -> None:

@@ -59,10 +59,26 @@ def test_a_sound_rig_passes(planted: Planted, seed: int, noise_nm: float) -> Non
 def test_every_fault_is_planted_or_cannot_be() -> None:
     """What the emulator cannot do: a person instead of the load, and what is only another word for the same."""
     others = {
-        "torque_follows", "train_ended", "rig_went_on", "same_port", "can_missing", "adapter_fails", "wrong_dbc",
-        "cell_constant", "cell_unmoved", "angle_unmoved", "angle_silent", "pulse_unanswered", "pulses_dropped",
-        "sync_wrong", "current_wrong", "stop_unconfirmed", "torque_unseen", "stop_late", "stimulator_faulty",
-    }  # fmt: skip
+        "torque_follows",
+        "train_ended",
+        "rig_went_on",
+        "same_port",
+        "can_missing",
+        "adapter_fails",
+        "wrong_dbc",
+        "cell_constant",
+        "cell_unmoved",
+        "angle_unmoved",
+        "angle_silent",
+        "pulse_unanswered",
+        "pulses_dropped",
+        "sync_wrong",
+        "current_wrong",
+        "stop_unconfirmed",
+        "torque_unseen",
+        "stop_late",
+        "stimulator_faulty",
+    }
     planted = {one.fault for one in PLANTED}
     assert planted | others == set(steps.faults()) and not planted & others
     assert len(planted) >= 20
@@ -218,11 +234,14 @@ def last_check(tmp_path: Path, content: dict[str, Any] | str | None, **keys: Any
     machine = VirtualMachine()
     rig = config.check(
         {
-            "data_dir": tmp_path, "socket": tmp_path / "s", "stimulator": {"device": "p24", "port": "/dev/x"},
-            "load_cell": {"device": "can_load_cell", "bus": {"interface": "socketcan", "channel": "can0"}}, **keys,
+            "data_dir": tmp_path,
+            "socket": tmp_path / "s",
+            "stimulator": {"device": "p24", "port": "/dev/x"},
+            "load_cell": {"device": "can_load_cell", "bus": {"interface": "socketcan", "channel": "can0"}},
+            **keys,
         },
         "rig.toml",
-    )  # fmt: skip
+    )
     if isinstance(content, dict):
         content = json.dumps({"rig": fingerprint(rig), **content})
     if content is not None:
@@ -233,8 +252,11 @@ def last_check(tmp_path: Path, content: dict[str, Any] | str | None, **keys: Any
 
 
 SOUND = {
-    "verdict": "sound", "checked_at_utc": "2023-11-01T00:00:00.000Z", "due_at_utc": "2023-12-01T00:00:00.000Z", "by": "Jo",
-}  # fmt: skip
+    "verdict": "sound",
+    "checked_at_utc": "2023-11-01T00:00:00.000Z",
+    "due_at_utc": "2023-12-01T00:00:00.000Z",
+    "by": "Jo",
+}
 """The virtual clock begins on 14 November 2023."""
 
 
@@ -295,10 +317,13 @@ def rig_file(tmp_path: Path) -> Path:
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(rig_file(tmp_path))
     for words in (
-        ["--config", "nowhere.toml"], ["--config", file, "--dummy-load-ohm", "-1"], ["--config", file, "--days", "nan"],
-        ["--config", file, "--weight-nm", "nan"], ["--config", file, "--answer", "colour=blue"],
+        ["--config", "nowhere.toml"],
+        ["--config", file, "--dummy-load-ohm", "-1"],
+        ["--config", file, "--days", "nan"],
+        ["--config", file, "--weight-nm", "nan"],
+        ["--config", file, "--answer", "colour=blue"],
         ["--config", file, "--no-questions"],
-    ):  # fmt: skip
+    ):
         assert verb.main(words) == 2
         out, err = capsys.readouterr()
         assert out == "" and len(err.strip().splitlines()) == 1 and err.startswith("check: "), err
