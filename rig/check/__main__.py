@@ -7,15 +7,17 @@ were found, or something that is needed was not done. 2: bad input, or another p
 from __future__ import annotations
 
 import argparse
-import asyncio
+import contextlib
 import json
 import logging
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from stimrig.rig import config as configuration
+from stimrig.rig.adapters.files import Files
 from stimrig.rig.adapters.machine import LocalMachine
 from stimrig.rig.check.bench import Bench
 from stimrig.rig.check.finding import Finding
@@ -25,6 +27,9 @@ from stimrig.rig.check.surroundings import Surroundings
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.errors import ConfigError, RigError
 
+CLOSED_WITHIN_S = 45.0
+"""Real seconds for the stop, its evidence and the sealing of a train that was interrupted."""
+INTERRUPTED = 130
 MARKS = {"passed": "ok", "failed": "FAULT", "not done": "--"}
 
 
@@ -43,6 +48,9 @@ def main(arguments: list[str] | None = None) -> int:
     except RigError as error:
         print(f"check: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("check: interrupted; the stimulator was stopped", file=sys.stderr)
+        return INTERRUPTED
     print(json.dumps(report, ensure_ascii=False))
     return 0 if report["verdict"] == "sound" else 1
 
@@ -60,43 +68,38 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _checked(config: configuration.RigConfig, options: argparse.Namespace) -> dict[str, Any]:
-    machine = LocalMachine(MonotonicClock(config.clock_speed))
-    person = _person(config, options)
-    if config.data_dir.exists():  # a rig process that uses the folder has it locked
-        lock = machine.disk.lock(config.data_dir) if _writable(config.data_dir) else None
-    else:
-        lock = None
-    bench = Bench(
-        config, machine, person, Surroundings(), time.sleep, options.config is None, options.dummy_load_ohm,
-        options.weight_nm,
-    )  # fmt: skip
-    try:
-        report = asyncio.run(_run(machine, bench, options.days))
-    finally:
-        machine.driver.end()
-        if lock is not None:
-            lock.__exit__(None, None, None)
+    """The report. After Ctrl-C the rig is stopped and closed before this ends."""
+    machine, person = LocalMachine(MonotonicClock(config.clock_speed)), _person(config, options)
+    about = dict[str, Any]()
     if options.config is not None:
-        report["rig_file"] = str(options.config)
-        report["rig_file_sha256"] = file_sha256(options.config.read_bytes())
-    return report
+        about = {"rig_file": str(options.config), "rig_file_sha256": file_sha256(options.config.read_bytes())}
+    with _nobody_else(config.data_dir):
+        bench = Bench(
+            config, machine, person, Surroundings(), time.sleep, options.config is None, options.dummy_load_ohm,
+            options.weight_nm,
+        )  # fmt: skip
+        ask = machine.driver.ask
+        try:
+            return ask(lambda: run(bench, options.days, about, _tell)).result()
+        except KeyboardInterrupt:
+            ask(bench.rig.close).result(CLOSED_WITHIN_S)
+            raise
+        finally:
+            machine.driver.end()
 
 
-async def _run(machine: LocalMachine, bench: Bench, days: float) -> dict[str, Any]:
-    return await asyncio.wrap_future(machine.driver.ask(lambda: run(bench, days, _tell)))
+@contextlib.contextmanager
+def _nobody_else(folder: Path) -> Iterator[None]:
+    """Lock the data folder as a rig process does. Raises BusyError: one uses it. Where it cannot be, a step says so."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            stack.enter_context(Files().lock(folder))
+        yield
 
 
 def _tell(title: str, finding: Finding) -> None:
     bound = f"  (must be: {finding.bound})" if finding.bound else ""
     print(f"{MARKS[finding.outcome]:6} {title}: {finding.figure}{bound}", file=sys.stderr, flush=True)
-
-
-def _writable(folder: Path) -> bool:
-    try:
-        with (folder / "rig.lock").open("a"):
-            return True
-    except OSError:
-        return False
 
 
 def _person(config: configuration.RigConfig, options: argparse.Namespace) -> Person:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -15,18 +15,20 @@ from stimrig.rig.check.finding import Finding, not_done
 from stimrig.rig.clock import utc_text
 from stimrig.rig.config import RigConfig
 from stimrig.rig.control.checked import CHECK_FILE, fingerprint
-from stimrig.rig.errors import ConfigError
+from stimrig.rig.errors import ConfigError, RigError
 
 FORMAT, FORMAT_VERSION = "stimrig-rig-check", 1
 DAY_S = 86_400.0
 log = logging.getLogger("rig.check")
 
 
-async def run(bench: Bench, days: float, tell: Callable[[str, Finding], None] = lambda *_: None) -> dict[str, Any]:
+async def run(
+    bench: Bench, days: float, about: Mapping[str, Any], tell: Callable[[str, Finding], None] = lambda *_: None
+) -> dict[str, Any]:
     """Do every step, close the rig, and keep the report in the data folder.
 
-    `days`: after so many the check is due again. `tell`: called after each step. Raises ConfigError: nobody says who
-    checks.
+    `days`: after so many the check is due again. `about`: what else the report says, of the rig file. `tell`: called
+    after each step. Raises ConfigError: nobody says who checks.
     """
     try:
         bench.by = await bench.answer("by")
@@ -40,7 +42,7 @@ async def run(bench: Bench, days: float, tell: Callable[[str, Finding], None] = 
     finally:
         if bench.rig.status().state != "disconnected":
             await bench.rig.close()
-    report = await _report(bench, found, days)
+    report = {**await _report(bench, found, days), **about}
     try:
         path = bench.given.data_dir / CHECK_FILE
         data = (json.dumps(report, ensure_ascii=False, indent=1) + "\n").encode()
@@ -54,6 +56,9 @@ async def _done(step: steps.Step, bench: Bench) -> Finding:
     try:
         return await step.look(bench)
     except NotDone as error:
+        return not_done(str(error))
+    except RigError as error:
+        bench.halted = bench.halted or str(error)
         return not_done(str(error))
 
 

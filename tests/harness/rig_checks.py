@@ -131,7 +131,7 @@ class Checked:
 
         async def check() -> None:
             try:
-                done.append(await run(self.bench, 30.0, lambda title, finding: self.told.append((title, finding))))
+                done.append(await run(self.bench, 30.0, {}, lambda title, finding: self.told.append((title, finding))))
             except BaseException as error:
                 done.append(error)
                 raise

@@ -60,6 +60,8 @@ def test_every_fault_is_planted_or_cannot_be() -> None:
     """What the emulator cannot do: a person instead of the load, and what is only another word for the same."""
     others = {
         "torque_follows",
+        "computer_busy",
+        "torque_stale",
         "train_ended",
         "rig_went_on",
         "same_port",
@@ -206,7 +208,7 @@ def live(checked: Checked, make: Any) -> Any:
     return done[0]
 
 
-PLAN = TestPlan(test_id="t", participant="P", profile=Profile(), segments=None)
+PLAN = TestPlan(test_id="t", participant="P", profile=Profile.model_validate({}), segments=None)
 
 
 def test_a_rig_file_may_require_a_check(sound: Checked) -> None:

@@ -6,6 +6,7 @@ Both are processes of the rig's own package, which this one starts: questions an
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.errors import InputError, LaunchError
+from stimrig.api.cli.errors import INTERRUPTED, InputError, LaunchError
 from stimrig.api.cli.terminal import Json, say, say_json, write
 
 INIT_SETTINGS = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -77,11 +78,18 @@ def told(report: dict[str, Any]) -> list[str]:
 
 
 def _child(module: str, name: str, words: list[str], capture: bool) -> str:
-    """Start a process of the rig; what it prints. Raises InputError, LaunchError, Exit."""
+    """Start a process of the rig; what it prints. Ctrl-C is that one's: it stops the stimulator before it ends.
+
+    Raises LaunchError, Exit.
+    """
     command = [sys.executable, "-m", module, *words]
-    ended = subprocess.run(command, stdout=subprocess.PIPE if capture else None, text=True)
-    if ended.returncode == 2:
-        raise typer.Exit(2)  # it has said why
+    before = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        ended = subprocess.run(command, stdout=subprocess.PIPE if capture else None, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if ended.returncode in (2, INTERRUPTED):
+        raise typer.Exit(ended.returncode)  # it has said why
     if ended.returncode and not (capture and ended.stdout):
         raise LaunchError(f"{name}: it ended without a result", 1)
     return ended.stdout or ""

@@ -28,6 +28,14 @@ FAULTS = {
         "the stimulator's source of high voltage, or its module, fails",
         "switch it off and on; if it says so again, it needs its maker",
     ),
+    "computer_busy": Fault(
+        "this computer stood still while pulses were due",
+        "close other programs, and see `stimrig doctor` for real-time priority; then check again",
+    ),
+    "torque_stale": Fault(
+        "the cell's samples stopped or came late while pulses flowed: a loose plug, or the adapter is too slow",
+        "fasten the plugs, connect the adapter without a hub, keep its cable off the electrodes', and check again",
+    ),
     "train_ended": Fault(
         "the rig ended the train for another reason",
         "the reason says what to look at",
@@ -38,6 +46,11 @@ REASONS = {
     "electrode error": "open_electrode",
     "emergency switch": "open_electrode",
     "not acknowledged": "pulse_unanswered",
+    "computer was blocked": "computer_busy",
+    "torque is stale": "torque_stale",
+    "no torque from the load cell": "torque_stale",
+    "load cell on": "torque_stale",
+    "load cell: ": "torque_stale",
     "torque ": "torque_follows",
     "high voltage": "high_voltage",
     "module error": "high_voltage",
