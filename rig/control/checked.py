@@ -36,10 +36,10 @@ class Checked:
         """Whether a rig that was never checked says so: one for persons does, an emulated one does not."""
         self._found: CheckStatus | None = None
 
-    async def recall(self) -> None:
-        """Read what the last check left; what cannot be read counts as none."""
+    def recall(self) -> None:
+        """Read what the last check left, as work of another thread; what cannot be read counts as none."""
         try:
-            content = json.loads(await self._machine.tasks.work(self._machine.disk.read, self._path))
+            content = json.loads(self._machine.disk.read(self._path))
             self._found = CheckStatus(
                 verdict=content["verdict"],
                 checked_at_utc=content["checked_at_utc"],

@@ -143,13 +143,12 @@ class Rig:
         """
         work = self._tasks.work
         try:
-            await work(self.store.make_folders)
+            await work(self._look_into_folder)
             self._folder_lock = await work(self._machine.disk.lock, self._data_dir)
         except OSError as error:
             raise ConfigError(f"data_dir: {error.filename or self._data_dir}: {error.strerror}") from None
         await self.joint.recall()
         await self._result.recall()
-        await self.checked.recall()
         remembered, reason = await self.state.file.read()
         if await self._recover("the rig process died during the test"):
             remembered = "running"
@@ -169,6 +168,10 @@ class Rig:
             if before == "uncertain":
                 phase = replace(phase, reason=f"{reason}; the stimulator, asked now: {self.pair.found_state}")
         self.state.change(phase)
+
+    def _look_into_folder(self) -> None:
+        self.store.make_folders()
+        self.checked.recall()
 
     async def close(self) -> None:
         """Stop a running test, wait until it is sealed, disconnect. A start that is under way does not begin."""

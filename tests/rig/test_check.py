@@ -249,7 +249,7 @@ def last_check(tmp_path: Path, content: dict[str, Any] | str | None, **keys: Any
     if content is not None:
         (tmp_path / "check.json").write_text(content)
     found = LastCheck(rig, machine)
-    machine.run(found.recall())
+    found.recall()
     return found
 
 
