@@ -140,7 +140,7 @@ def check_verb(words: str, line: str) -> None:
             return
         assert given[0] in command.commands, line
         command = command.commands[given.pop(0)]
-    if command.name == "emulate":  # its options are the emulator's own
+    if command.name in ("emulate", "init"):  # their options are those of the process behind them
         return
     known = {option for parameter in command.params for option in parameter.opts} | {"--help", "-h"}
     options = {word.split("=")[0].strip("[]`.,") for word in given if re.match(r"\[?-\S+$", word)}

@@ -7,7 +7,19 @@ from fpdf.svg import SVGObject
 
 from stimrig.api.charts.svg import Figures, svg
 
-WITHOUT = {"−": "-", "–": "-", "→": ">", "‹": "<", "›": ">", "ω": "w", "ζ": "z", "Δ": "D", "·": "\u00b7"}
+WITHOUT = {
+    "−": "-",
+    "–": "-",
+    "→": ">",
+    "‹": "<",
+    "›": ">",
+    "ω": "w",
+    "ζ": "z",
+    "Δ": "D",
+    "·": "\u00b7",
+    "Ω": "Ohm",
+    "…": "...",
+}
 """What the fonts that every reader of PDF has do not hold."""
 CAPTION_PT, PAGE_PT = 10.0, 760.0
 MARGIN_PT = 8.0
@@ -36,16 +48,17 @@ def paper(figures: Figures, name: str, kind: str, width: float = PAGE_PT) -> byt
     page.set_auto_page_break(False)
     page.add_page()
     page.set_creator("stimrig")
-    drawn = SVGObject(_plain(still))
+    drawn = SVGObject(plain(still))
     drawn.width, drawn.height = width, height
     drawn.draw_to_page(page, 0, 0)
     page.set_font("helvetica", size=CAPTION_PT)
     page.set_xy(MARGIN_PT, height + MARGIN_PT)
-    page.multi_cell(width - 2 * MARGIN_PT, 1.3 * CAPTION_PT, _plain(caption))
+    page.multi_cell(width - 2 * MARGIN_PT, 1.3 * CAPTION_PT, plain(caption))
     return bytes(page.output())
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
+    """The text in letters that these fonts hold."""
     for sign, other in WITHOUT.items():
         text = text.replace(sign, other)
     return str(text).encode("latin-1", "replace").decode("latin-1")

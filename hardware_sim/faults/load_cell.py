@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable
 
+from stimrig.hardware_sim.errors import FaultError
 from stimrig.hardware_sim.faults import (
     Target,
     Undo,
@@ -14,10 +15,11 @@ from stimrig.hardware_sim.faults import (
     fault,
     frames_sometimes,
     hooked,
+    replaced,
     sometimes,
     stuck,
 )
-from stimrig.hardware_sim.load_cells.frames import Frame
+from stimrig.hardware_sim.load_cells.frames import Frame, Sample
 
 BUS_OFF_CLASS, BUS_ERROR_CLASS = 0x20000040, 0x20000080
 """Ids of error frames as Linux reports them: the flag of error frames and the class."""
@@ -174,6 +176,91 @@ def delivery_jitter(target: Target, largest_s: float = 0.02) -> Undo:
             release()
 
     return undo
+
+
+@fault
+def wrong_bit_rate(target: Target) -> Undo:
+    """The adapter listens at another bit rate: instead of frames it reports errors of the bus."""
+    return _hooked_on_bus(target, lambda frame: (_error_instead(frame),))
+
+
+@fault
+def termination_missing(target: Target, probability: float = 0.2) -> Undo:
+    """A resistor at the bus's end is missing: frames are lost at random, and errors of the bus come instead."""
+    return _frame_fault(target, probability, lambda frame: (_error_instead(frame),))
+
+
+@fault
+def hung_weight(target: Target, torque_nm: float = 5.0) -> Undo:
+    """A weight hangs on the lever. It acts on the cell before every other fault of the reading does."""
+    hooks = target.load_cell.torque_hooks
+    hang = lambda reading_nm, _time_s: reading_nm + torque_nm  # noqa: E731
+    hooks.insert(0, hang)
+    return lambda: hooks.remove(hang)
+
+
+@fault
+def torque_scaled(target: Target, factor: float = 2.0) -> Undo:
+    """The amplifier's gain is another one than its data sheet says."""
+    return hooked(lambda torque_nm, _time_s: factor * torque_nm, target.load_cell.torque_hooks)
+
+
+@fault
+def torque_drift(target: Target, nm_per_s: float = 0.1) -> Undo:
+    """The zero of the reading drifts away from now on."""
+    begun_s = target.timeline.now_s
+    drift = lambda torque_nm, time_s: torque_nm + nm_per_s * (time_s - begun_s)  # noqa: E731
+    return hooked(drift, target.load_cell.torque_hooks)
+
+
+@fault
+def torque_noisy(target: Target, sd_nm: float = 1.0) -> Undo:
+    """More noise comes to the reading: a loose shield, mains hum."""
+    check_not_negative("torque_noisy", "sd_nm", sd_nm)
+    noisy = lambda torque_nm, _time_s: torque_nm + target.random.gauss(0.0, sd_nm)  # noqa: E731
+    return hooked(noisy, target.load_cell.torque_hooks)
+
+
+@fault
+def counter_stuck(target: Target) -> Undo:
+    """The counter stands still; the readings go on."""
+    stands_at = target.load_cell.counter
+    return _repacked(target, lambda one: one._replace(counter=stands_at))
+
+
+@fault
+def sync_unwired(target: Target) -> Undo:
+    """The stimulator's sync line does not reach the cell."""
+    return _repacked(target, lambda one: one._replace(sync=False))
+
+
+@fault
+def cell_reports_fault(target: Target) -> Undo:
+    """The cell says in its status that it is faulty (cells that send one reading and a status)."""
+    cell = target.load_cell.cell
+    if not cell.has_sync or cell.samples_per_frame > 1:
+        raise FaultError(f"the cell '{cell.name}' has no status in its frames")
+
+    def faulty(frame: Frame) -> Iterable[Frame]:
+        data = bytearray(frame.data)
+        data[STATUS_BYTE] |= FAULT_BIT
+        return (frame._replace(data=bytes(data)),)
+
+    return hooked(faulty, target.load_cell.frame_hooks)
+
+
+STATUS_BYTE, FAULT_BIT = 6, 0x80
+
+
+def _repacked(target: Target, change: Callable[[Sample], Sample]) -> Undo:
+    """The cell's frames are made of changed samples."""
+    cell = target.load_cell.cell
+    pack = cell.encode
+    return replaced(cell, "encode", lambda samples: pack([change(one) for one in samples]))
+
+
+def _error_instead(frame: Frame) -> Frame:
+    return frame._replace(can_id=BUS_ERROR_CLASS, data=bytes(8), error=True)
 
 
 def _hooked_on_bus(target: Target, change: Callable[[Frame], Iterable[Frame]]) -> Undo:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 from stimrig.hardware_sim.errors import FaultError
 from stimrig.hardware_sim.faults import Target, Undo, fault, hooked, replaced, sometimes
+from stimrig.hardware_sim.stimulators.board import Output, Point
 
 OUTPUTS_PER_CONNECTOR = 4
 HALF_A_FRAME = bytes.fromhex("f0815581")
@@ -103,6 +107,71 @@ def device_reset(target: Target, mid_frame: bool = False) -> Undo:
         target.board.write(HALF_A_FRAME)
     target.firmware.reset()
     return lambda: None
+
+
+@fault
+def pulse_width_wrong(target: Target, factor: float = 1.5) -> Undo:
+    """Pulses flow wider than they were asked for; no answer of the stimulator tells."""
+    electrodes = target.board.electrodes
+    fire = electrodes.fire
+
+    def wider(time_s: float, points: Sequence[Point], output: Output, source: str) -> bool:
+        return fire(time_s, [(round(factor * width_us), ma) for width_us, ma in points], output, source)
+
+    return replaced(electrodes, "fire", wider)
+
+
+@fault
+def stop_lost(target: Target, within_s: float = 5.0) -> Undo:
+    """A stop that comes within so many seconds of a pulse is lost, and nobody answers it."""
+    wire, log = target.firmware.wire(), target.board.electrodes.log
+
+    def lose(data: bytes) -> bytes | None:
+        now_s = target.timeline.now_s
+        if not any(packet.command in STOPS for packet in wire.feed(data, now_s)):
+            return data
+        return None if log and now_s - log[-1].time_s < within_s else data
+
+    return hooked(lose, target.board.incoming)
+
+
+@fault
+def goes_on(target: Target, after_s: float = 0.4, period_s: float = 0.025) -> Undo:
+    """The watchdog is dead: after so long a silence of the host, the last pulse is repeated until a command comes."""
+    electrodes, timeline = target.board.electrodes, target.timeline
+    fire, last, on = electrodes.fire, list[Any](), [True]
+    heard = [0]
+
+    def note(time_s: float, points: Sequence[Point], output: Output, source: str) -> bool:
+        last[:] = [points, output]
+        return fire(time_s, points, output, source)
+
+    def again(count: int) -> None:
+        if on[0] and last and count == heard[0]:
+            fire(timeline.now_s, last[0], last[1], "watchdog")
+            timeline.after(period_s, lambda: again(count))
+
+    def listen(data: bytes) -> bytes:
+        heard[0] += 1
+        count = heard[0]
+        timeline.after(after_s, lambda: again(count))
+        if any(packet.command in STOPS for packet in wire.feed(data, timeline.now_s)):
+            last.clear()
+        return data
+
+    wire = target.firmware.wire()
+    undo = hooked(listen, target.board.incoming), replaced(electrodes, "fire", note)
+
+    def end() -> None:
+        on[0] = False
+        for one in undo:
+            one()
+
+    return end
+
+
+STOPS = 4, 34
+"""Commands that stop stimulation, of ScienceMode 4's low level and of ScienceMode 2."""
 
 
 def _corrupted(target: Target, data: bytes, probability: float) -> bytes:

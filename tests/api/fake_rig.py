@@ -153,6 +153,7 @@ class FakeRig:
         self.device_back = True
         self._idle: asyncio.Task[None] | None = None
         self.require_calibration = False
+        self.check: m.CheckStatus | None = None
         self.limits = {
             "current_ma": m.Bound(lo=0, hi=60, unit="mA", owner="rig file"),
             "pulse_width_us": m.Bound(lo=0, hi=500, unit="µs", owner="hard limit"),
@@ -184,7 +185,7 @@ class FakeRig:
             load_cell={"device": "fake cell", "rate_hz": 400.0}, switch=self.switch,
             torque_age_s=self.torque_age_s, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
-            limits=self.limits, require_calibration=self.require_calibration,
+            limits=self.limits, require_calibration=self.require_calibration, check=self.check,
             finished=self.finished, angle=self.arm.status(self.elapsed_s),
         )  # fmt: skip
 

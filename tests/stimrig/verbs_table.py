@@ -19,6 +19,7 @@ COMMAND_ONLY = {
     "demo": "`emulate`, `Client.run_test` and `Client.approve` one after the other",
     "doctor": "it says what this machine lacks for stimulation",
     "upgrade": "it changes the data of a service that is stopped",
+    "rig": "it asks a person who stands at the rig",
     "serve": "it runs until it is ended, and may own a rig; `Client` talks to it",
 }  # fmt: skip
 ELSEWHERE = {"test": "Client.run_test", "import": "import_recording"}

@@ -9,7 +9,16 @@ from pydantic import Field
 from stimrig.api.client import documents
 from stimrig.api.web.responses.base import Document, Holder, ReachOut, SegmentOut, fields_of
 from stimrig.api.web.responses.models import SegmentSpan, VersionOut
-from stimrig.rig.messages import AngleStatus, Bound, CalibrationStatus, LiveEvent, ProtocolInfo, RigState, StopEvidence
+from stimrig.rig.messages import (
+    AngleStatus,
+    Bound,
+    CalibrationStatus,
+    CheckStatus,
+    LiveEvent,
+    ProtocolInfo,
+    RigState,
+    StopEvidence,
+)
 
 
 class DeviceOut(Document):
@@ -62,6 +71,7 @@ class RigOut(RigHealth):
     calibration: CalibrationStatus | None = None
     limits: dict[str, Bound] = Field({}, description="what this rig takes, by quantity")
     require_calibration: bool | None = None
+    check: CheckStatus | None = Field(None, description="the last check of the rig; None: none is expected")
 
 
 class StoppedOut(Document):

@@ -89,6 +89,9 @@ def figures(context: Context) -> Iterator[Metric]:
         ("stimrig_jobs_busy_seconds_total", "Time in analyses", context.pool.busy_s),
     ):
         yield CounterMetricFamily(name, words, value)
+    if rig.status is not None and rig.status.check is not None:
+        due = float(bool(rig.status.check.due))
+        yield GaugeMetricFamily("stimrig_rig_check_due", "1 where a check of the rig is due", due)
     yield from _centre(context)
 
 
