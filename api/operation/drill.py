@@ -13,7 +13,13 @@ from typing import Any
 
 from stimrig.api.operation.backup import recordings_named
 from stimrig.api.operation.copying import (
-    BackupError, Meter, manifest, read_only, refuse_no_room, row_counts, size_of,
+    BackupError,
+    Meter,
+    manifest,
+    read_only,
+    refuse_no_room,
+    row_counts,
+    size_of,
 )  # fmt: skip
 from stimrig.api.operation.restore import check_copy, restore
 from stimrig.api.whole_file import sha256_of

@@ -22,6 +22,7 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
+from stimrig.api.operation.counted import Counted
 from stimrig.api.sessions import channels, electrodes
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.electrodes import ElectrodeTests
@@ -71,7 +72,7 @@ class Runner(Playing):
     ) -> None:  # fmt: skip
         super().__init__(store, clock, rig)
         self.versions, self.pool, self.trials, self.follower = versions, pool, trials, follower
-        self.hub = Hub(clock)
+        self.hub, self.counted = Hub(clock), Counted()
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
         self.kinds = Kinds(
@@ -301,9 +302,12 @@ class Runner(Playing):
             request = requests.StopRequest(reason=reason or "stop pressed", by=by)
             evidence = await self.rig.ask_for(messages.StopEvidence, request, timeout_s=8.0)
         except ApiError as error:
+            self.counted.stopped("failed", 0.0)
             await self._note(by, "stop failed", subject, detail=error.detail)
             error.title, error.detail = NOT_CONFIRMED, f"{EMERGENCY} {error.title}: {error.detail}"
             raise
+        ended = "confirmed" if evidence.confirmed else "not-confirmed"
+        self.counted.stopped(ended, self.clock.monotonic_s() - self._halted_s)
         await self._note(by, "stop", subject, reason=reason, confirmed=evidence.confirmed)
         if not evidence.confirmed:
             detail = f"{EMERGENCY} The rig says: {evidence.detail}"

@@ -22,6 +22,7 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.models.trend import Trend
+from stimrig.api.operation.clock_watch import LOOK_S, ClockWatch
 from stimrig.api.outbox.feed import Feed
 from stimrig.api.outbox.receipts import note_hourly
 from stimrig.api.people.accounts import People
@@ -111,7 +112,7 @@ class Context(Parts):
         if settings.centre_url is not None:
             Feed(store, clock)  # hears of all that is written from here on
         super().__init__(settings, clock, store)
-        self.settings, self.lock = settings, lock
+        self.settings, self.lock, self.clock_watch = settings, lock, ClockWatch(clock)
         rig = self.rig = RigClient(settings.rig_socket, clock)
         pool = self.pool = Pool(settings.workers, worker, places(settings, store))
         self.analyses = Analyses(store, clock, pool, self.versions, settings)
@@ -133,11 +134,12 @@ class Context(Parts):
         """As `Parts`; the audit trail's head is noted hourly, where there is a file for it."""
         heads_file = self.settings.heads_file
         heads = [] if heads_file is None else [(FLUSH_S, lambda: note_hourly(self.store, self.clock, heads_file))]
-        return [*super().regular(), *heads]
+        return [*super().regular(), *heads, (LOOK_S, self.clock_watch.look)]
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open."""
         await asyncio.to_thread(uploads.settle, self.settings.recordings_dir, self.store)
+        await asyncio.to_thread(self.clock_watch.look)
         self.rig.start()
         self.pool.warm()
         for _ in range(20):  # a rig that is there answers within milliseconds

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from stimrig.api.operation import backup, copying, drill, state
+from stimrig.api.operation import backup, copying
 from stimrig.api.operation.copying import DATABASE, BackupError
 from stimrig.api.operation.restore import restore
 
