@@ -145,15 +145,15 @@ class Player:
         if not hmac.compare_digest(request.key.encode("utf-8", "replace"), self._key.encode("utf-8", "replace")):
             raise PlanError("extend.key: it is not the key with which this test was started")
         await run.score.extend(request.after, request.segments)
-        names = ", ".join(segment.name for segment in request.segments)
-        log.info("extended by %s, %.3f s are laid", names, run.score.duration_s, extra={"test_id": request.test_id})
+        laid = len(request.segments), run.score.duration_s
+        log.info("extended by %d segments, %.3f s are laid", *laid, extra={"test_id": request.test_id})
         return run.score.left(run.torque_time_nms)
 
     async def enough(self, request: EnoughRequest) -> Extended:
         """End the running test with its safe end. Raises TooLateError, PlanError, JournalError."""
         run = self._running(request.test_id)
         run.score.enough(request.by, request.at_once)
-        log.info("enough, by %s", request.by or "a client", extra={"test_id": request.test_id})
+        log.info("enough", extra={"test_id": request.test_id})
         return run.score.left(run.torque_time_nms)
 
     def _running(self, test_id: str) -> TestRun:
