@@ -77,7 +77,8 @@ def provider_to(endpoint: str) -> Any:
     resource = Resource({"service.name": "stimrig", "service.version": software_version()})
     provider = TracerProvider(resource=resource, id_generator=Prepared(), shutdown_on_exit=False)
     exporter = OTLPSpanExporter(endpoint=endpoint, timeout=SEND_S)
-    provider.add_span_processor(BatchSpanProcessor(exporter, max_queue_size=LONGEST_QUEUE))
+    queue = BatchSpanProcessor(exporter, max_queue_size=LONGEST_QUEUE, max_export_batch_size=min(LONGEST_QUEUE, 512))
+    provider.add_span_processor(queue)
     return provider
 
 
