@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import threading
 
 
 class JsonLines(logging.Formatter):
@@ -30,10 +31,11 @@ class JsonLines(logging.Formatter):
 
 
 def configure(process: str, level: int = logging.INFO) -> None:
-    """Send every logger's lines to standard error, warnings and the error by which a process ends included."""
+    """Send every logger's lines to standard error, also warnings, and the error that ends a process or a thread."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines(process))
     logging.basicConfig(level=level, handlers=[handler], force=True)
     logging.captureWarnings(True)
-    ended = logging.getLogger("rig")
-    sys.excepthook = lambda kind, error, trace: ended.critical("ended by an error", exc_info=(kind, error, trace))
+    log = logging.getLogger("rig")
+    sys.excepthook = lambda kind, error, trace: log.critical("ended by an error", exc_info=(kind, error, trace))
+    threading.excepthook = lambda told: log.critical("a thread ended by an error", exc_info=told.exc_value)
