@@ -247,7 +247,7 @@ class Reply(Message):
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
     """status, subscribe, start, rearm, calibrate-start, -step, -mark and -stored, angle_pose: a `Status`; preview: a
-    `Preview`; sequences: a `Sequences`; stop: a `StopEvidence`; withdraw: a `Withdrawn`; calibrate-finish: a
+    `Preview`; sequences: a `Sequences`; stop: a `StopAnswer`; withdraw: a `Withdrawn`; calibrate-finish: a
     `CalibrationResult`; extend and enough: an `Extended`."""
 
 
@@ -461,6 +461,11 @@ class StopEvidence(Message):
     pulse_may_follow: bool = Field(
         default=False, description="a pulse sent before the stop was not acknowledged and may still be felt"
     )
+
+
+class StopAnswer(StopEvidence):
+    """What a stop's request is answered by: the evidence, and times for who traces it."""
+
     traced: Traced | None = several(None, "of a stop with a trace context")
 
 

@@ -307,8 +307,8 @@ class Runner(Playing):
         try:
             with self.tracer.step("rig stop") as says:
                 asked = {"reason": reason or "stop pressed", "by": by, "traceparent": self.tracer.traceparent}
-                evidence = await self.rig.ask_for(messages.StopEvidence, requests.StopRequest(**asked), timeout_s=8.0)
-                evidence = steps.tell_stop(self.tracer, evidence, says)
+                answer = await self.rig.ask_for(messages.StopAnswer, requests.StopRequest(**asked), timeout_s=8.0)
+                evidence = steps.tell_stop(self.tracer, answer, says)
         except ApiError as error:
             self.counted.stopped("failed", 0.0)
             await self._note(by, "stop failed", subject, detail=error.detail)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig.api.traces import Span, Tracer, span_of
-from stimrig.rig.messages import FinishedEvent, StopEvidence, Traced
+from stimrig.rig.messages import FinishedEvent, StopAnswer, StopEvidence, Traced
 
 PARTS = (
     ("rig: plan check", "received", "checked"),
@@ -34,15 +34,15 @@ def tell_test(tracer: Tracer, event: FinishedEvent) -> Span | None:
     return whole or parent
 
 
-def tell_stop(tracer: Tracer, evidence: StopEvidence, says: dict[str, Any]) -> StopEvidence:
+def tell_stop(tracer: Tracer, answer: StopAnswer, says: dict[str, Any]) -> StopEvidence:
     """Tell a stop's steps; the evidence as people are shown it, without them."""
     says |= {
-        "stimrig.stop.confirmed": evidence.confirmed, "stimrig.stop.last_pulse_age_s": evidence.last_pulse_age_s
+        "stimrig.stop.confirmed": answer.confirmed, "stimrig.stop.last_pulse_age_s": answer.last_pulse_age_s
     }  # fmt: skip
-    told, parent = evidence.traced, span_of(evidence.traced and evidence.traced.traceparent)
+    told, parent = answer.traced, span_of(answer.traced and answer.traced.traceparent)
     if told is not None and parent is not None:
         _tell(tracer, told, parent, ("rig: stop to its evidence", "received", "confirmed"), {})
-    return evidence.model_copy(update={"traced": None})
+    return StopEvidence.model_construct(**{name: getattr(answer, name) for name in StopEvidence.model_fields})
 
 
 def _tell(

@@ -78,7 +78,7 @@ async def respond(request: Request, problem: ApiError) -> Response:
 
 def template_of(request: Request) -> str:
     """The route's address as logs have it: without the participant that it may name."""
-    return getattr(request.scope.get("route"), "path", "an address that is no route")
+    return getattr(request.scope.get("route"), "path", "?")
 
 
 def install(app: FastAPI) -> None:

@@ -13,7 +13,7 @@ import time
 
 from stimrig.rig.acquire.run import RunResult, TestRun
 from stimrig.rig.clock import Clock
-from stimrig.rig.messages import StopEvidence, Traced
+from stimrig.rig.messages import StopAnswer, StopEvidence, Traced
 
 log = logging.getLogger("rig")
 _TRACEPARENT = re.compile(r"00-(?!0{32})[0-9a-f]{32}-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
@@ -55,9 +55,10 @@ class Steps:
             return None
 
 
-def with_steps(evidence: StopEvidence, traceparent: object, received_unix_s: float) -> StopEvidence:
+def with_steps(evidence: StopEvidence, traceparent: object, received_unix_s: float) -> StopAnswer:
     """A stop's evidence, with its times where somebody traces it."""
+    answer = StopAnswer.model_construct(**dict(evidence))
     if not (known := sound(traceparent)):
-        return evidence
+        return answer
     at_unix_s = {"received": received_unix_s, "confirmed": time.time()}
-    return evidence.model_copy(update={"traced": Traced(traceparent=known, at_unix_s=at_unix_s)})
+    return answer.model_copy(update={"traced": Traced(traceparent=known, at_unix_s=at_unix_s)})

@@ -146,6 +146,7 @@ class FakeRig:
         self.stopped_by: str | None = None
         self.loses_ends = False
         self.finished: m.FinishedEvent | None = None
+        self.more_summary: dict[str, Any] = {}
         self.warnings: list[str] = []
         self.pauses: list[m.Pause] = []
         self.torque_age_s = 0.004
@@ -554,12 +555,12 @@ class FakeRig:
                 summary={
                     "duration_s": len(widths) / score.slots_hz, "samples": len(torque), "lost_samples": 0,
                     "pulses": sum(1 for w in widths if w), "dropped_pulses": 0,
-                    "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3},
-                    "ack_delay_ms": {"median": 1.1, "p99": 1.9, "max": 2.4}, "charge_uc": sum(widths) * 20 / 1000,
+                    "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3}, "charge_uc": sum(widths) * 20 / 1000,
                     "alignment": {"method": "sync", "error_ms": 0.02}, "sample_rate_hz": self.rate_hz,
                     "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0, "warnings": self.warnings,
                     "notes": [STOPPED] * len(self.pauses[:1]),
                     "ended_by": "stopped" if stopped else score.ended_by, **_by_name(plan, widths),
+                    **self.more_summary,
                 },
             )
         )  # fmt: skip
