@@ -75,7 +75,8 @@ def provider_to(endpoint: str) -> Any:
         ) from None
     # not `Resource.create`, which adds what the environment and the machine say of themselves
     resource = Resource({"service.name": "stimrig", "service.version": software_version()})
-    provider = TracerProvider(resource=resource, id_generator=Prepared(), shutdown_on_exit=False)
+    ids: Any = Prepared()  # what OpenTelemetry asks of a generator; its class is there only where it is installed
+    provider = TracerProvider(resource=resource, id_generator=ids, shutdown_on_exit=False)
     exporter = OTLPSpanExporter(endpoint=endpoint, timeout=SEND_S)
     queue = BatchSpanProcessor(exporter, max_queue_size=LONGEST_QUEUE, max_export_batch_size=min(LONGEST_QUEUE, 512))
     provider.add_span_processor(queue)
