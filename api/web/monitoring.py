@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
@@ -22,8 +20,6 @@ from stimrig.api.web.dependencies import Context
 from stimrig.rig.messages import RigState
 
 QUANTILES = {"median": "0.5", "p99": "0.99", "max": "1"}
-CHECKED = "rig_check.json"
-"""In the data folder, where `stimrig rig check` keeps its last result: `due_utc`."""
 
 
 @dataclass(frozen=True)
@@ -75,16 +71,14 @@ def _rig(context: Context) -> Iterator[Metric]:
         ("stimrig_rig_age_seconds", "Time since the rig spoke; -1: never", known(rig.age_s)),
         ("stimrig_rig_torque_age_seconds", "Age of the newest torque; -1: none", known(torque_s)),
         ("stimrig_rig_check_due_timestamp_seconds", "When the rig is to be checked; 0: not known",
-         check_due_unix_s(context.settings.data_dir)),
+         check_due_unix_s(rig.status)),
     ))  # fmt: skip
 
 
-def check_due_unix_s(data_dir: Path) -> float:
-    """When `stimrig rig check` is due again; 0: it was never made here, or cannot be read."""
-    try:
-        return unix_of(json.loads((data_dir / CHECKED).read_text("utf-8"))["due_utc"])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return 0.0
+def check_due_unix_s(told: Any) -> float:
+    """When the rig is to be checked again, by what its state tells of its last check; 0: it tells nothing."""
+    due_utc = getattr(getattr(told, "check", None), "due_at_utc", None)
+    return unix_of(due_utc) if due_utc else 0.0
 
 
 def _pulses(context: Context) -> Iterator[Metric]:
