@@ -1,36 +1,53 @@
-"""Logs as one JSON object a line on standard error."""
+"""Logs as one JSON object a line on standard error; docs/operation.md lists the fields. No line names a person."""
 
 from __future__ import annotations
 
 import json
 import logging
 import sys
+import threading
 from contextvars import ContextVar
 
+from stimrig.api.traces import current_span
+
+log = logging.getLogger("stimrig")
 current_test: ContextVar[str | None] = ContextVar("test_id", default=None)
 """The test that is being dealt with: every line that comes of it carries its id, whoever writes the line."""
 
 
 class JsonLines(logging.Formatter):
-    """One object a line: time, level, logger, message, and the test's id where there is one."""
+    """One object a line: time, level, process, logger, message; the test's id, the trace's and the step's where known.
+
+    `process`: which one writes it.
+    """
+
+    def __init__(self, process: str = "service") -> None:
+        super().__init__()
+        self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
         line = {
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
             "level": record.levelname.lower(),
+            "process": self._process,
             "logger": record.name,
             "message": record.getMessage(),
         }
         test_id = getattr(record, "test_id", None) or current_test.get()
         if test_id is not None:
             line["test_id"] = test_id
+        if (span := current_span.get()) is not None:
+            line |= {"trace_id": span.trace_id, "span_id": span.span_id}
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, ensure_ascii=False)
 
 
-def configure(level: int = logging.INFO) -> None:
-    """Send every logger's lines to standard error."""
+def configure(process: str = "service", level: int = logging.INFO) -> None:
+    """Send every logger's lines to standard error; also warnings, and the error that ends a process or a thread."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonLines())
+    handler.setFormatter(JsonLines(process))
     logging.basicConfig(level=level, handlers=[handler], force=True)
+    logging.captureWarnings(True)
+    sys.excepthook = lambda kind, error, trace: log.critical("ended by an error", exc_info=(kind, error, trace))
+    threading.excepthook = lambda told: log.critical("a thread ended by an error", exc_info=told.exc_value)

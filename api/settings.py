@@ -81,6 +81,9 @@ class Settings(ServerSettings):
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
     )
+    otlp_endpoint: str | None = Field(
+        default=None, description="OpenTelemetry collector that gets traces, as http://127.0.0.1:4318; default: nowhere"
+    )
     heads_file: Path | None = Field(
         default=None, description="file, best on another machine's disk, to which the audit trail's head goes hourly"
     )

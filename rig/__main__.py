@@ -22,7 +22,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from stimrig.rig import config as configuration
-from stimrig.rig import devices
+from stimrig.rig import devices, logs
 from stimrig.rig.adapters.machine import LocalMachine
 from stimrig.rig.adapters.server import Ask, Server
 from stimrig.rig.clock import MonotonicClock
@@ -91,9 +91,7 @@ BEAT_PERIOD_S = 0.5
 
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_JsonLines())
-    logging.basicConfig(level=logging.DEBUG if options.verbose else logging.INFO, handlers=[handler], force=True)
+    logs.configure("rig", logging.DEBUG if options.verbose else logging.INFO)
     try:
         overrides = {"data_dir": options.data, "socket": options.socket, "clock_speed": options.clock_speed}
         config = configuration.chosen(options, **overrides)
@@ -181,23 +179,6 @@ async def _trouble(rig: Rig, ask: Ask) -> str | None:
 async def _stop_by_key(rig: Rig) -> None:
     evidence = await rig.stop("a key in the terminal", "operator")
     log.info("stop by key: %s, %s", "confirmed" if evidence.confirmed else "NOT CONFIRMED", evidence.detail)
-
-
-class _JsonLines(logging.Formatter):
-    """One JSON object per line, with the test's id if there is one."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        line = {
-            "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
-            "level": record.levelname.lower(),
-            "logger": record.name,
-            "message": record.getMessage(),
-        }
-        if (test_id := getattr(record, "test_id", None)) is not None:
-            line["test_id"] = test_id
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False)
 
 
 if __name__ == "__main__":

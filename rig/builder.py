@@ -22,8 +22,10 @@ PR_SET_PDEATHSIG = 1
 
 def main(builds: str) -> int:
     _modest(5 if builds == "previews" else 0)
+    from stimrig.rig import logs
     from stimrig.rig.control import live, replies  # after the limits are set: importing numpy takes time
 
+    logs.configure(f"builder-{builds}")
     print(flush=True)
     {"previews": replies.serve, "live": live.serve}[builds](sys.stdin.buffer, sys.stdout.buffer)
     return 0

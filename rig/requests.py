@@ -7,7 +7,7 @@ accepts only `stop`, so that nothing on the first socket can delay a stop. A req
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -57,6 +57,11 @@ class SequencesRequest(Message):
     id: int = 0
 
 
+TRACEPARENT: Any = several(
+    None, "W3C trace context of who asks, for monitoring only; one that is none is ignored. See `messages.Traced`"
+)
+
+
 class StartRequest(Message):
     kind: Literal["start"] = "start"
     id: int = 0
@@ -64,6 +69,7 @@ class StartRequest(Message):
     key: str = Field(
         default="", description="of an adaptive test: only who knows it may extend it; it is stored nowhere"
     )
+    traceparent: Any = TRACEPARENT
 
 
 class ExtendRequest(Message):
@@ -110,6 +116,7 @@ class StopRequest(Message):
     id: int = 0
     reason: str
     by: str = ""
+    traceparent: Any = TRACEPARENT
 
 
 class RearmRequest(Message):

@@ -33,8 +33,8 @@ from stimrig.api.clock import unix_of
 from stimrig.api.errors import invalid, require_found
 from stimrig.api.store.centre_tables import CentreModel, CentreRecording
 from stimrig.api.web.dependencies import PROBLEM, Administrator, ModelReader
+from stimrig.api.web.monitoring import Figures
 from stimrig.api.web.responses.base import describe_answer
-from stimrig.api.web.routes.operation import Figures
 
 operation = APIRouter(tags=["operation"])
 v1 = APIRouter(prefix="/v1", responses=PROBLEM)

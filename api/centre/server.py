@@ -24,7 +24,7 @@ from stimrig.api.web import server
 
 
 def main() -> int:
-    logs.configure()
+    logs.configure("centre")
     try:
         app, listener = prepared(CentreSettings())
     except (ApiError, SettingsError, OSError) as error:

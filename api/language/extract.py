@@ -40,7 +40,7 @@ SENTENCES = (
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {
     "app.py", "openapi.py", "dependencies.py", "server.py", "static.py", "operation.py", "own_file.py",
-    "confinement.py", "child.py", "_can.py",
+    "confinement.py", "child.py", "_can.py", "monitoring.py", "steps.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
 NAMED = {"Effect": ("name", "main"), "Interplay": ("name",), "Parameter": ("about",), "Field": ("title",)}
@@ -57,6 +57,7 @@ NOT_SHOWN = {
     "inflated",
     "ngettext",
     "policy",
+    "step",
     "WireError",
 }
 """Calls whose texts no page shows: descriptions of the API, names of threads, what only a log says, plural forms."""

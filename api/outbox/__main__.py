@@ -24,7 +24,7 @@ NICENESS = 10
 
 
 def main() -> int:
-    logs.configure()
+    logs.configure("outbox")
     os.umask(os.umask(0o077) | 0o077)
     os.nice(NICENESS)
     clock = Clock()

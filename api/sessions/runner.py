@@ -22,7 +22,8 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.sessions import channels, electrodes
+from stimrig.api.operation.counted import Counted
+from stimrig.api.sessions import channels, electrodes, steps
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.electrodes import ElectrodeTests
 from stimrig.api.sessions.joint import JointTests
@@ -37,6 +38,7 @@ from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.tables import Participant, Test, Token
+from stimrig.api.traces import Span, Tracer, current_span
 from stimrig.api.workers.pool import Adviser, Pool, Tasks
 from stimrig.rig import messages, requests
 
@@ -67,11 +69,11 @@ class Runner(Playing):
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
-        adviser: Adviser, trials: Trials, recordings_dir: Path, follower: Follower,
+        adviser: Adviser, trials: Trials, recordings_dir: Path, follower: Follower, tracer: Tracer,
     ) -> None:  # fmt: skip
         super().__init__(store, clock, rig)
         self.versions, self.pool, self.trials, self.follower = versions, pool, trials, follower
-        self.hub = Hub(clock)
+        self.hub, self.counted, self.tracer = Hub(clock), Counted(), tracer
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
         self.kinds = Kinds(
@@ -146,10 +148,12 @@ class Runner(Playing):
         current_test.set(plan.test_id)
         self.pool.cancel_background()
         try:
-            preview = await self._previewed(plan)
+            with self.tracer.step("rig preview"):
+                preview = await self._previewed(plan)
             if confirmed is not None and not same(confirmed, preview):
                 raise not_what_was_seen()
-            row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant)
+            with self.tracer.step("intent is written down"):
+                row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant)
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
@@ -174,7 +178,10 @@ class Runner(Playing):
                     raise right_ended()
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.kinds[plan.kind].begin(planned)
-                await self.rig.ask(requests.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
+                with self.tracer.step("rig start") as says:
+                    says |= {"stimrig.test.id": plan.test_id, "stimrig.test.kind": plan.kind}
+                    asked = requests.StartRequest(plan=plan, key=key, traceparent=self.tracer.traceparent)
+                    await self.rig.ask(asked, timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self.stop_quietly(f"start of {plan.test_id} was not answered")
@@ -298,12 +305,17 @@ class Runner(Playing):
         self._halted_s = self.clock.monotonic_s()
         subject = self.current.test_id if self.current else "rig"
         try:
-            request = requests.StopRequest(reason=reason or "stop pressed", by=by)
-            evidence = await self.rig.ask_for(messages.StopEvidence, request, timeout_s=8.0)
+            with self.tracer.step("rig stop") as says:
+                asked = {"reason": reason or "stop pressed", "by": by, "traceparent": self.tracer.traceparent}
+                answer = await self.rig.ask_for(messages.StopAnswer, requests.StopRequest(**asked), timeout_s=8.0)
+                evidence = steps.tell_stop(self.tracer, answer, says)
         except ApiError as error:
+            self.counted.stopped("failed", 0.0)
             await self._note(by, "stop failed", subject, detail=error.detail)
             error.title, error.detail = NOT_CONFIRMED, f"{EMERGENCY} {error.title}: {error.detail}"
             raise
+        ended = "confirmed" if evidence.confirmed else "not-confirmed"
+        self.counted.stopped(ended, self.clock.monotonic_s() - self._halted_s)
         await self._note(by, "stop", subject, reason=reason, confirmed=evidence.confirmed)
         if not evidence.confirmed:
             detail = f"{EMERGENCY} The rig says: {evidence.detail}"
@@ -329,9 +341,9 @@ class Runner(Playing):
                         audit.write(session, self.clock.utc(), by, action, subject, **detail)
                     return
                 except SQLAlchemyError:
-                    log.exception("%s by %s could not yet be written into the audit trail", action, by)
+                    log.exception("%s could not yet be written into the audit trail", action)
                 time.sleep(wait_s)
-            log.error("%s by %s is not in the audit trail; the rig's journal has it", action, by)
+            log.error("%s is not in the audit trail; the rig's journal has it", action)
 
         noted = asyncio.get_running_loop().run_in_executor(self._notes, write)  # threads that nothing else can fill
         await asyncio.wait({noted}, timeout=NOTE_S)
@@ -344,7 +356,7 @@ class Runner(Playing):
                 self.hub.begin(event.test_id)  # another service began it
             self.hub.live(event)
         elif isinstance(event, messages.FinishedEvent):
-            self._follow(event.test_id, self._finish(event))
+            self._follow(event.test_id, self._finish(event), steps.tell_test(self.tracer, event))
         else:
             if event.status.state in HALTED:
                 self._halted_s = self.clock.monotonic_s()
@@ -372,16 +384,17 @@ class Runner(Playing):
                 self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"),
             )
 
-    def _follow(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
-        """Do what leads a test to its last state, in the background and under the one guard."""
-        self._tasks.begin(self._guarded(test_id, work))
+    def _follow(self, test_id: str, work: Coroutine[Any, Any, None], span: Span | None = None) -> None:
+        """Do what leads a test to its last state, in the background and under the one guard; `span`: a step of it."""
+        self._tasks.begin(self._guarded(test_id, work, span))
 
-    async def _guarded(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
+    async def _guarded(self, test_id: str, work: Coroutine[Any, Any, None], span: Span | None) -> None:
         """Follow a test to its last state: an unexpected error is told as its reason, and the rig is let go.
 
         Where the state cannot be written either, the next start of the service takes the test up.
         """
         current_test.set(test_id)
+        current_span.set(span)
         try:
             await work
         except Exception as error:
@@ -405,7 +418,8 @@ class Runner(Playing):
                 await self.trials.follow(row.id, event.last_sample_unix_s)
         if row.state == "identifying":
             self._release(event.test_id)
-            await self.lifecycle.identify(row.id, event.last_sample_unix_s)
+            with self.tracer.step("identification", root=current_span.get() is None):
+                await self.lifecycle.identify(row.id, event.last_sample_unix_s)
 
     def _release(self, test_id: str) -> None:
         """The rig is free again; the identification goes on beside it."""

@@ -158,7 +158,7 @@ class Trials(Kind):
                 for test_id in left:
                     await self.follow(test_id)
             except ApiError as error:  # a damaged model: the other participants' trials are followed all the same
-                log.warning("trials of %s are not followed: %s", approval.participant, error)
+                log.warning("trials with %s are not followed: %s", approval.model_id, error)
             await self._warm(approval.participant)
 
     def _left(self) -> list[tuple[Approval, list[str]]]:

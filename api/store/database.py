@@ -153,7 +153,7 @@ def _sqlite(url: URL) -> Engine:
     path = sqlite_file(url)
     if path is not None:
         close_to_others(path)
-    engine = create_engine(url)
+    engine = create_engine(url, hide_parameters=True)  # an error's words go to the log: no name, no code
     event.listen(engine, "connect", _durable_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
@@ -164,7 +164,7 @@ def _postgresql(url: URL) -> Engine:
     options = " ".join(f"-c {name}={value}" for name, value in SERVER_SETTINGS.items())
     try:
         engine = create_engine(
-            url.set(drivername="postgresql+psycopg"),
+            url.set(drivername="postgresql+psycopg"), hide_parameters=True,
             pool_pre_ping=True, pool_size=10, max_overflow=20, pool_timeout=POOL_S,
             connect_args={"connect_timeout": CONNECT_S, "options": options, **KEEPALIVES},
         )  # fmt: skip

@@ -22,6 +22,8 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.models.trend import Trend
+from stimrig.api.operation.clock_watch import LOOK_S, ClockWatch
+from stimrig.api.operation.telemetry import Telemetry
 from stimrig.api.outbox.feed import Feed
 from stimrig.api.outbox.receipts import note_hourly
 from stimrig.api.people.accounts import People
@@ -111,7 +113,8 @@ class Context(Parts):
         if settings.centre_url is not None:
             Feed(store, clock)  # hears of all that is written from here on
         super().__init__(settings, clock, store)
-        self.settings, self.lock = settings, lock
+        self.settings, self.lock, self.clock_watch = settings, lock, ClockWatch(clock)
+        self.tracer = Telemetry(settings)
         rig = self.rig = RigClient(settings.rig_socket, clock)
         pool = self.pool = Pool(settings.workers, worker, places(settings, store))
         self.analyses = Analyses(store, clock, pool, self.versions, settings)
@@ -122,7 +125,7 @@ class Context(Parts):
         trials = Trials(rig, store, clock, self.tracked, tracker)
         self.runner = Runner(
             store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
-            Follower(store, self.holds, settings.rig),
+            Follower(store, self.holds, settings.rig), self.tracer,
         )  # fmt: skip
         self.trend, self.jobs = Trend(store, clock, pool), Jobs(pool)
         self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
@@ -133,11 +136,12 @@ class Context(Parts):
         """As `Parts`; the audit trail's head is noted hourly, where there is a file for it."""
         heads_file = self.settings.heads_file
         heads = [] if heads_file is None else [(FLUSH_S, lambda: note_hourly(self.store, self.clock, heads_file))]
-        return [*super().regular(), *heads]
+        return [*super().regular(), *heads, (LOOK_S, self.clock_watch.look)]
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open."""
         await asyncio.to_thread(uploads.settle, self.settings.recordings_dir, self.store)
+        await asyncio.to_thread(self.clock_watch.look)
         self.rig.start()
         self.pool.warm()
         for _ in range(20):  # a rig that is there answers within milliseconds
@@ -152,6 +156,7 @@ class Context(Parts):
         for part in (self.runner, self.jobs, self.pool, self.rig):
             await part.close()
         self.holds.close()
+        await asyncio.to_thread(self.tracer.close)
         await super().close()
         self.lock.release()
 

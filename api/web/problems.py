@@ -76,6 +76,11 @@ async def respond(request: Request, problem: ApiError) -> Response:
     )
 
 
+def template_of(request: Request) -> str:
+    """The route's address as logs have it: without the participant that it may name."""
+    return getattr(request.scope.get("route"), "path", "?")
+
+
 def install(app: FastAPI) -> None:
     """Hang the mapping into the application."""
 
@@ -93,14 +98,14 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(ClientDisconnect)
     async def left(request: Request, error: ClientDisconnect) -> Response:  # noqa: ARG001
-        log.info("who asked for %s %s left before the whole of it was here", request.method, request.url.path)
+        log.info("who asked for %s %s left before the whole of it was here", request.method, template_of(request))
         return Response(status_code=400)
 
     @app.exception_handler(OperationalError)
     @app.exception_handler(InterfaceError)
     @app.exception_handler(PoolTimeout)
     async def no_database(request: Request, error: SQLAlchemyError) -> Response:
-        log.error("the database, in %s %s: %s", request.method, request.url.path, error)
+        log.error("the database, in %s %s: %s", request.method, template_of(request), error)
         return await respond(request, not_answering())
 
     @app.exception_handler(DataError)
@@ -110,6 +115,6 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:
-        log.exception("unexpected error in %s %s", request.method, request.url.path, exc_info=error)
+        log.exception("unexpected error in %s %s", request.method, template_of(request), exc_info=error)
         detail = "Nothing was lost. The service's log (logs/api.log in the data folder) says more."
         return await respond(request, ApiError(500, "internal", "Something unexpected went wrong here", detail))

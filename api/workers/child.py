@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import select
 import sys
@@ -17,9 +18,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
+from stimrig.api import logs
 from stimrig.api.workers import confinement
 from stimrig.identify.errors import IdentifyError
 
+log = logging.getLogger("stimrig.worker")
 PROCESSOR_S = 900.0
 """Of processor time for a call that names no other bound."""
 VERBS = "stimrig.api.workers.verbs"
@@ -27,6 +30,7 @@ VERBS = "stimrig.api.workers.verbs"
 
 def main() -> None:
     """Serve calls until the input closes, or nobody calls for long."""
+    logs.configure("worker")
     confinement.end_with_parent()
     out = own_output()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in `api.cli`: small matrices gain nothing from a second
@@ -89,8 +93,6 @@ def run(request: dict[str, Any], out: TextIO, verbs: str = VERBS) -> dict[str, A
 
 def describe(error: Exception) -> dict[str, Any]:
     """An error as the service shows it: expected ones in their own words, others by name."""
-    import traceback
-
     if isinstance(error, IdentifyError):
         return {"expected": True, "detail": one_line(error), "place": error.place, "fix": error.fix}
     if isinstance(error, MemoryError):
@@ -98,7 +100,7 @@ def describe(error: Exception) -> dict[str, Any]:
         fix = "Cut the record, or resample it to a lower rate."
         detail = f"it takes more than the {megabytes} MB that a worker may have. {fix}"
         return {"expected": True, "detail": detail, "place": None, "fix": fix}
-    traceback.print_exc(file=sys.stderr)
+    log.error("a call failed", exc_info=error)
     return {"expected": False, "detail": f"{type(error).__name__}: {one_line(error)}"}
 
 

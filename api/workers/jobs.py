@@ -84,7 +84,7 @@ class Jobs:
         except ApiError as error:
             job.state, job.problem = ("cancelled" if error.code == "cancelled" else "failed"), error
         except Exception as error:
-            log.exception("%s of %s failed", job.kind, job.subject)
+            log.exception("%s %s failed", job.kind, job.id)
             detail = f"{type(error).__name__}. Nothing was lost. See logs/api.log."
             job.state, job.problem = "failed", ApiError(500, "internal", "Something unexpected went wrong", detail)
         finally:

@@ -44,7 +44,7 @@ files() {
   put deploy/systemd/stimrig.tmpfiles.conf /usr/lib/tmpfiles.d/stimrig.conf
   put deploy/udev/70-stimrig.rules /usr/lib/udev/rules.d/70-stimrig.rules
   put deploy/rig.example.toml /usr/share/stimrig/rig.example.toml
-  put deploy/backup.py /usr/share/stimrig/backup.py
+  for path in deploy/monitoring/*; do put "$path" "/usr/share/stimrig/monitoring/${path##*/}"; done
   put deploy/deb/lintian-overrides /usr/share/lintian/overrides/stimrig
   put deploy/deb/copyright /usr/share/doc/stimrig/copyright
   for path in deploy/nginx/*.conf; do put "$path" "/usr/share/doc/stimrig/examples/${path##*/}"; done

@@ -108,7 +108,7 @@ class AngleCalibrating:
         found = self._of_two(before, pose, by, receiver.sensor.scale)
         await self._file.write({"sensor": self._sensor, "calibration": found.model_dump(mode="json")})
         self._first, self.calibration = None, found
-        log.info("angle sensor calibrated by %s: %s", by, found.model_dump_json())
+        log.info("angle sensor calibrated: %s", found.model_dump_json(exclude={"by"}))
         return True
 
     def _of_two(self, first: AnglePose, second: AnglePose, by: str, rig_file: AngleScale) -> AngleCalibration:

@@ -95,7 +95,7 @@ class Calibrations:
                     result = result.model_copy(update={"profile": None, "profiles": None})
             else:
                 result = await self._close(self._open(request.calibration_id), request.discard)
-            log.info("calibration %s by %s", "discarded" if request.discard else "done", request.by)
+            log.info("calibration %s", "discarded" if request.discard else "done")
             self._publish()
         return result
 

@@ -22,6 +22,7 @@ from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
 from stimrig.rig.control.replies import internal_error, refusal
 from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
+from stimrig.rig.control.trace import Steps
 from stimrig.rig.errors import ConfigError, DeviceError, LatchChangedError, PlanError, RigError
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
@@ -184,8 +185,8 @@ class Rig:
         await self.state.written()  # of a stop that came meanwhile
         self._folder_lock.__exit__(None, None, None)
 
-    async def start(self, request: TestPlan, key: str = "") -> Status:
-        """Start a test; `key` is what extensions of an adaptive test must know.
+    async def start(self, request: TestPlan, key: str = "", traceparent: object = None) -> Status:
+        """Start a test; `key` is what extensions of an adaptive test must know. `traceparent`: see `Steps`.
 
         Raises
         ------
@@ -200,7 +201,7 @@ class Rig:
         JournalError, RigError
             The journal or the latch file cannot be written.
         """
-        state = self.state
+        state, steps = self.state, Steps(traceparent, self._clock)
         state.phase.may_start()  # before its turn: a start that was asked for while stopped must not run later
         latch = state.latch
         await self.joint.await_angle(request)
@@ -225,8 +226,9 @@ class Rig:
             self.rest.check(test, table["rest_between_tests_s"])
             self.joint.check(request, table)
             self.player.refuse_withdrawn(request.test_id)
+            steps.passed("checked")
             # nothing is waited for from here until it can be halted
-            await self.player.launch(test, table, following, self.joint.described(), key)
+            await self.player.launch(test, table, following, self.joint.described(), key, steps)
         return self.status()
 
     async def angle_pose(self, request: AnglePoseRequest) -> Status:
@@ -275,7 +277,7 @@ class Rig:
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
-    async def rearm(self, by: str, latch: str) -> Status:
+    async def rearm(self, by: str, latch: str) -> Status:  # noqa: ARG002 - `by` stands in the service's audit trail
         """A person has checked participant and rig: ask both devices again, then be ready.
 
         Raises BusyError: a test is in progress. LatchChangedError: the rig was stopped since that person was shown
@@ -301,7 +303,7 @@ class Rig:
             except LatchChangedError:
                 await state.remember(state.phase)
                 raise
-            log.info("re-armed by %s after: %s", by, stopped.reason)
+            log.info("re-armed by a person")
             state.change(following)
         return self.status()
 
@@ -329,7 +331,7 @@ class Rig:
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
 _DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
-    "start": lambda rig, asked: rig.start(asked.plan, asked.key),
+    "start": lambda rig, asked: rig.start(asked.plan, asked.key, asked.traceparent),
     "stop": lambda rig, asked: rig.stop(asked.reason, asked.by),
     "withdraw": lambda rig, asked: rig.player.withdraw(asked),
     "extend": lambda rig, asked: rig.player.extend(asked),

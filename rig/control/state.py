@@ -89,7 +89,8 @@ class State:
         if not phase.calibrating:
             self.calibration = None
         if changed:
-            log.info("state %s %s", phase.state, phase.reason, extra={"test_id": phase.test_id})
+            # not the reason: it may name a person; of a fault it was logged
+            log.info("state %s", phase.state, extra={"test_id": phase.test_id})
             self._publish()
 
     def count_stop(self) -> None:

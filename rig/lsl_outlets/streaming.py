@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.rig import config as configuration
-from stimrig.rig import journal
+from stimrig.rig import journal, logs
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.errors import ConfigError, RecordingError, RigError
 from stimrig.rig.journal import MAGIC, Kind
@@ -329,7 +329,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, metavar="DIR", help="data folder of the rig; overrides the rig file")
     parser.add_argument("--name", default="stimrig", help="what the streams' names begin with (default: stimrig)")
     options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s lsl: %(message)s", stream=sys.stderr, force=True)
+    logs.configure("lsl")
     try:
         # the rig's socket is not used
         config = configuration.chosen(options, data_dir=options.data, socket=Path("none"))

@@ -146,6 +146,7 @@ class FakeRig:
         self.stopped_by: str | None = None
         self.loses_ends = False
         self.finished: m.FinishedEvent | None = None
+        self.more_summary: dict[str, Any] = {}
         self.warnings: list[str] = []
         self.pauses: list[m.Pause] = []
         self.torque_age_s = 0.004
@@ -560,6 +561,7 @@ class FakeRig:
                     "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0, "warnings": self.warnings,
                     "notes": [STOPPED] * len(self.pauses[:1]),
                     "ended_by": "stopped" if stopped else score.ended_by, **_by_name(plan, widths),
+                    **self.more_summary,
                 },
             )
         )  # fmt: skip

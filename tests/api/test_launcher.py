@@ -16,6 +16,7 @@ from stimrig.api.cli.launcher import Services
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
 from tests.api.conftest import TOKEN, soon, wait_done
+from tests.api.test_operation_wire import all_as_documented
 from tests.harness.looks_first import LooksFirst
 
 pytestmark = pytest.mark.wire
@@ -49,6 +50,7 @@ def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
         http.post(f"{document['model_url']}/approve", json={"reason": reason}).raise_for_status()
         assert http.post("/v1/preview", json={"participant": "P1"}).json()["torque_time_nms"] > 5
     assert [child.alive() for child in (services.rig, services.api)] == [False, False]
+    all_as_documented(tmp_path / "logs", document["id"], (TOKEN, "Nobody is stimulated"))
 
 
 def test_only_the_emulator_makes_an_emulated_rig(tmp_path: Path) -> None:

@@ -16,9 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from deploy import backup
+from stimrig.api.operation import backup, copying
+from stimrig.api.operation.copying import DATABASE, BackupError
+from stimrig.api.operation.restore import restore
 
-SCRIPT = Path(backup.__file__)
+STIMRIG = (sys.executable, "-m", "stimrig", "backup")
+"""The name that it had before 1.0."""
 
 
 class Machine:
@@ -66,15 +69,15 @@ def restored(machine: Machine, kept: Path, root: Path) -> Machine:
     """The backup on another machine's empty folders."""
     rig, api = root / "new" / "rig", root / "new" / "api"
     rig.parent.mkdir()
-    backup.restore(kept, rig, api, force=False)
+    restore(kept, rig, api, force=False)
     found = object.__new__(Machine)
     found.rig, found.api = rig, api
     return found
 
 
 def test_there_and_back(machine: Machine, tmp_path: Path) -> None:
-    kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
-    assert backup.verify(kept) == {"files": 5, "recordings": 3, "named_in_database": 3}
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
+    assert backup.check(kept) == {"files": 5, "recordings": 3, "named_in_database": 3}
     assert not list(kept.rglob(".half*"))
     assert kept.stat().st_mode & 0o077 == 0
     new = restored(machine, kept, tmp_path)
@@ -98,11 +101,11 @@ def test_the_rig_reads_the_latch_of_restored_data(machine: Machine, tmp_path: Pa
         return there.run(LatchFile(folder, there).read())
 
     (machine.rig / "latch.json").write_text('{"state": "running", "reason": "test t3"}')
-    kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
     assert read(restored(machine, kept, tmp_path).rig) == ("running", "test t3")
     (machine.rig / "latch.json").unlink()
-    kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
-    backup.restore(kept, machine.rig, machine.api, force=True)
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
+    restore(kept, machine.rig, machine.api, force=True)
     assert read(machine.rig)[0] == "latched"
 
 
@@ -123,13 +126,13 @@ def test_a_backup_while_the_service_writes_is_one_state(machine: Machine, tmp_pa
     writer = threading.Thread(target=write)
     writer.start()
     try:
-        kept = [backup.make(machine.rig, machine.api, tmp_path / "backups") for _ in range(5)]
+        kept = [backup.create(machine.rig, machine.api, tmp_path / "backups") for _ in range(5)]
     finally:
         end.set()
         writer.join()
     for path in kept:
-        backup.verify(path)
-        with closing(sqlite3.connect(path / backup.DATABASE)) as database:
+        backup.check(path)
+        with closing(sqlite3.connect(path / DATABASE)) as database:
             a, b = database.execute("SELECT a, b FROM pairs").fetchone()
         assert a == b
     assert a > 0
@@ -137,7 +140,7 @@ def test_a_backup_while_the_service_writes_is_one_state(machine: Machine, tmp_pa
 
 def test_a_test_that_ended_during_the_backup_is_restored_once(machine: Machine, tmp_path: Path) -> None:
     machine.record(machine.rig / "recordings" / "20260101T100000Z_t3.h5", b"sealed")
-    kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
     assert (kept / "rig/journals/t3.journal").exists()
     new = restored(machine, kept, tmp_path)
     assert not (new.rig / "journals" / "t3.journal").exists()
@@ -162,34 +165,34 @@ def test_a_test_that_ended_during_the_backup_is_restored_once(machine: Machine, 
     ],
 )
 def test_a_damaged_backup_is_not_restored(machine: Machine, tmp_path: Path, spoil, told: str) -> None:
-    kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
     before = machine.contents()
     spoil(kept)
-    with pytest.raises(backup.BackupError, match=told):
-        backup.restore(kept, machine.rig, machine.api, force=True)
+    with pytest.raises(BackupError, match=told):
+        restore(kept, machine.rig, machine.api, force=True)
     assert machine.contents() == before
 
 
 def test_a_recording_that_the_database_names_but_is_not_there_is_told(machine: Machine, tmp_path: Path) -> None:
     (machine.rig / "recordings" / "20260101T080000Z_t1.h5").write_bytes(b"bit rot")
-    with pytest.raises(backup.BackupError, match=r"t1\.h5 differs"):
-        backup.make(machine.rig, machine.api, tmp_path / "backups")
+    with pytest.raises(BackupError, match=r"t1\.h5 differs"):
+        backup.create(machine.rig, machine.api, tmp_path / "backups")
     (machine.rig / "recordings" / "20260101T080000Z_t1.h5").unlink()
-    with pytest.raises(backup.BackupError, match=r"t1\.h5 is not in the backup"):
-        backup.make(machine.rig, machine.api, tmp_path / "backups")
+    with pytest.raises(BackupError, match=r"t1\.h5 is not in the backup"):
+        backup.create(machine.rig, machine.api, tmp_path / "backups")
     assert all(path.suffix == ".partial" for path in (tmp_path / "backups").iterdir())
 
 
 def test_what_is_there_is_not_overwritten(machine: Machine, tmp_path: Path) -> None:
-    kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
     later = machine.rig / "recordings" / "20260102T080000Z_later.h5"
     machine.record(later, b"made after the backup")
     before = machine.contents()
-    with pytest.raises(backup.BackupError, match="--force"):
-        backup.restore(kept, machine.rig, machine.api, force=False)
+    with pytest.raises(BackupError, match="--force"):
+        restore(kept, machine.rig, machine.api, force=False)
     assert machine.contents() == before
     assert not (machine.rig / "rig.lock").exists()  # it would belong to the one who restores, and keep the rig out
-    words = backup.restore(kept, machine.rig, machine.api, force=True)
+    words = restore(kept, machine.rig, machine.api, force=True)
     assert not later.exists()
     [aside] = machine.rig.parent.glob("rig.before-*")
     assert (aside / "recordings" / later.name).read_bytes() == b"made after the backup"
@@ -197,13 +200,13 @@ def test_what_is_there_is_not_overwritten(machine: Machine, tmp_path: Path) -> N
 
 
 def test_nothing_is_restored_under_a_running_rig_or_service(machine: Machine, tmp_path: Path) -> None:
-    kept = backup.make(machine.rig, machine.api, tmp_path / "backups")
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
     with (machine.rig / "rig.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(backup.BackupError, match="a rig runs"):
-            backup.restore(kept, machine.rig, machine.api, force=True)
-    with machine.database(), pytest.raises(backup.BackupError, match="a service uses it"):
-        backup.restore(kept, machine.rig, machine.api, force=True)
+        with pytest.raises(BackupError, match="a rig runs"):
+            restore(kept, machine.rig, machine.api, force=True)
+    with machine.database(), pytest.raises(BackupError, match="a service uses it"):
+        restore(kept, machine.rig, machine.api, force=True)
 
 
 def test_one_folder_for_both(machine: Machine, tmp_path: Path) -> None:
@@ -211,33 +214,34 @@ def test_one_folder_for_both(machine: Machine, tmp_path: Path) -> None:
     with machine.database() as database:
         database.execute("DELETE FROM recordings WHERE path LIKE '%upload%'")
     (machine.api / "stimrig.db").rename(machine.rig / "stimrig.db")
-    kept = backup.make(machine.rig, machine.rig, tmp_path / "backups")
-    backup.restore(kept, tmp_path / "var", tmp_path / "var", force=False)
+    kept = backup.create(machine.rig, machine.rig, tmp_path / "backups")
+    restore(kept, tmp_path / "var", tmp_path / "var", force=False)
     assert (tmp_path / "var" / "stimrig.db").exists()
     assert (tmp_path / "var" / "recordings" / "20260101T080000Z_t1.h5").read_bytes() == b"first" * 1000
 
 
 def test_no_room_is_told_before_anything_is_written(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     usage = type("Usage", (), {"free": 1000})
-    monkeypatch.setattr(backup.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(backup.BackupError, match="0 MB free"):
-        backup.make(machine.rig, machine.api, tmp_path / "backups")
+    monkeypatch.setattr(copying.shutil, "disk_usage", lambda _: usage)
+    with pytest.raises(BackupError, match="0 MB free"):
+        backup.create(machine.rig, machine.api, tmp_path / "backups")
     assert list((tmp_path / "backups").iterdir()) == []
 
 
 def test_the_command_line(machine: Machine, tmp_path: Path) -> None:
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run([sys.executable, str(SCRIPT), *arguments], capture_output=True, text=True)
+        return subprocess.run([*STIMRIG, *arguments], capture_output=True, text=True)
 
     folders = ["--rig-data", str(machine.rig), "--api-data", str(machine.api)]
-    made = call("make", *folders, "--to", str(tmp_path / "backups"))
+    made = call("create", *folders, "--to", str(tmp_path / "backups"), "--json")
     assert made.returncode == 0, made.stderr
     kept = json.loads(made.stdout)["backup"]
-    assert json.loads(call("verify", kept).stdout)["recordings"] == 3
+    looked = call("verify", kept)  # what stands for recordings here is no HDF5
+    assert (looked.returncode, len(looked.stderr.splitlines())) == (1, 1) and "cannot be opened" in looked.stderr
     refused = call("restore", *folders, kept)
     assert (refused.returncode, len(refused.stderr.splitlines())) == (1, 1)
     assert call("restore", *folders, "--force", kept).returncode == 0
-    absent = call("make", "--api-data", str(tmp_path / "nowhere"), "--to", str(tmp_path / "b"))
+    absent = call("create", "--api-data", str(tmp_path / "nowhere"), "--to", str(tmp_path / "b"))
     assert absent.returncode == 2
     assert "no database" in absent.stderr
 
@@ -245,9 +249,9 @@ def test_the_command_line(machine: Machine, tmp_path: Path) -> None:
 @pytest.mark.parametrize("latch", [b"", b"\xff", b"[]", b"{}", b"3", b"[" * 100_000])
 def test_a_latch_that_cannot_be_read_is_no_hindrance_and_is_told(machine: Machine, tmp_path: Path, latch: bytes):
     (machine.rig / "latch.json").write_bytes(latch)
-    made = backup.make(machine.rig, machine.api, tmp_path / "backups")
+    made = backup.create(machine.rig, machine.api, tmp_path / "backups")
     rig, api = tmp_path / "new" / "rig", tmp_path / "new" / "api"
-    backup.restore(made, rig, api, force=False)
+    restore(made, rig, api, force=False)
     found = json.loads((rig / "latch.json").read_text())
     assert found["state"] == "latched" and "its latch could not be read" in found["reason"]
 
@@ -255,5 +259,5 @@ def test_a_latch_that_cannot_be_read_is_no_hindrance_and_is_told(machine: Machin
 @pytest.mark.parametrize("content", ['{"format": 1, "sha256": []}', "[]", "3", "[" * 100_000, '{"sha256": {"a": 1}}'])
 def test_a_manifest_of_nonsense_is_told_in_one_line(tmp_path: Path, content: str) -> None:
     (tmp_path / "manifest.json").write_text(content)
-    done = subprocess.run([sys.executable, SCRIPT, "verify", str(tmp_path)], capture_output=True, text=True)
+    done = subprocess.run([*STIMRIG, "verify", str(tmp_path)], capture_output=True, text=True)
     assert done.returncode in (1, 2) and len(done.stderr.splitlines()) == 1, done.stderr

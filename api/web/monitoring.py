@@ -1,0 +1,159 @@
+"""The service's figures for Prometheus; docs/operation.md lists them. No label holds anything of a person."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, get_args
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from stimrig.api.clock import unix_of
+from stimrig.api.operation import state
+from stimrig.api.outbox import status
+from stimrig.api.store.tables import Model, Participant, Test
+from stimrig.api.version import software_version
+from stimrig.api.web.dependencies import Context
+from stimrig.rig.messages import RigState, Status
+
+QUANTILES = {"median": "0.5", "p99": "0.99", "max": "1"}
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures that are read when they are asked for: `collect` gives one family after the other."""
+
+    collect: Callable[[], Iterator[Metric]]
+
+
+def figures(context: Context) -> Iterator[Metric]:
+    """The service's figures, one family after the other."""
+    for part in (_tests, _rig, _pulses, _store, _jobs, _operation, _centre):
+        yield from part(context)
+    yield from context.runner.counted.collect()
+
+
+def gauges(rows: Iterable[tuple[str, str, float]]) -> Iterator[Metric]:
+    """Gauges without labels: name, words, value."""
+    for name, words, value in rows:
+        yield GaugeMetricFamily(name, words, value)
+
+
+def by_label(name: str, words: str, label: str, values: dict[str, float]) -> Metric:
+    """A gauge with one label."""
+    family = GaugeMetricFamily(name, words, labels=[label])
+    for key, value in values.items():
+        family.add_metric([key], value)
+    return family
+
+
+def known(value: float | None) -> float:
+    """A number, as Prometheus has no other: -1 where it is not known."""
+    return -1.0 if value is None else float(value)
+
+
+def _tests(context: Context) -> Iterator[Metric]:
+    states = Counter(row.state for row in context.store.all(Test))
+    yield by_label("stimrig_tests", "Tests by state", "state", dict(sorted(states.items())))
+
+
+def _rig(context: Context) -> Iterator[Metric]:
+    rig = context.rig
+    now = rig.status.state if rig.status and rig.connected else "disconnected"
+    states = {name: float(name == now) for name in get_args(RigState)}
+    yield by_label("stimrig_rig_state", "1 for the state that the rig is in", "state", states)
+    torque_s = rig.status.torque_age_s if rig.status else None
+    yield from gauges((
+        ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
+        ("stimrig_rig_age_seconds", "Time since the rig spoke; -1: never", known(rig.age_s)),
+        ("stimrig_rig_torque_age_seconds", "Age of the newest torque; -1: none", known(torque_s)),
+        ("stimrig_rig_check_due_timestamp_seconds", "When the rig is to be checked; 0: not known",
+         check_due_unix_s(rig.status)),
+    ))  # fmt: skip
+    if rig.status is not None and rig.status.check is not None:
+        due = float(bool(rig.status.check.due))
+        yield GaugeMetricFamily("stimrig_rig_check_due", "1 where a check of the rig is due", due)
+
+
+def check_due_unix_s(status: Status | None) -> float:
+    """When the rig is to be checked again, by what its state tells of its last check; 0: it tells nothing."""
+    due_utc = status.check.due_at_utc if status is not None and status.check is not None else None
+    return unix_of(due_utc) if due_utc else 0.0
+
+
+def _pulses(context: Context) -> Iterator[Metric]:
+    """Of the newest test: what is lost while it runs, and how late its pulses were once it has ended."""
+    newest, rig = context.runner.hub.newest, context.rig.status
+    summary = rig.finished.summary if rig and rig.finished else {}
+    for name, words, key in (
+        ("stimrig_pulse_lateness_seconds", "Of the pulses of the newest test that ended", "lateness_ms"),
+        ("stimrig_pulse_acknowledgement_seconds", "From a pulse to its acknowledgement, in it", "ack_delay_ms"),
+    ):
+        found = summary.get(key) or {}
+        values = {QUANTILES[one]: 1e-3 * found[one] for one in QUANTILES if isinstance(found.get(one), float | int)}
+        yield by_label(name, words, "quantile", values)
+    yield from gauges((
+        ("stimrig_live_listeners", "Open live channels", context.runner.hub.listeners),
+        ("stimrig_lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
+        ("stimrig_dropped_pulses", "Dropped in it", newest.dropped_pulses if newest else 0),
+    ))  # fmt: skip
+
+
+def _store(context: Context) -> Iterator[Metric]:
+    approved = context.versions.all_approved(context.store.all(Participant.code))
+    yield from gauges((
+        ("stimrig_models", "Model versions", len(context.store.all(Model.id))),
+        ("stimrig_approved_models", "Participants with one approved today", len(approved)),
+        ("stimrig_audit_entries", "Entries of the audit trail", context.store.seen(context.clock).entry),
+        ("stimrig_free_disk_bytes", "Free where the data lie", shutil.disk_usage(context.settings.data_dir).free),
+    ))  # fmt: skip
+
+
+def _jobs(context: Context) -> Iterator[Metric]:
+    pool = context.pool
+    yield GaugeMetricFamily("stimrig_jobs_queued", "Analyses waiting", len(pool.queue))
+    for name, words, value in (
+        ("stimrig_jobs_done_total", "Analyses done", pool.done_count),
+        ("stimrig_jobs_failed_total", "Analyses failed", pool.failed_count),
+        ("stimrig_jobs_busy_seconds_total", "Time in analyses", pool.busy_s),
+    ):
+        yield CounterMetricFamily(name, words, value)
+
+
+def _operation(context: Context) -> Iterator[Metric]:
+    """The process, its machine's clock, and the backups."""
+    kept, watch = state.read(context.settings.data_dir), context.clock_watch
+    by_service, error_s = watch.synchronised.by_service, watch.synchronised.error_s
+    yield by_label("stimrig_build_info", "1; the label names the release", "version", {software_version(): 1.0})
+    yield from gauges((
+        ("stimrig_up_seconds", "Time since start", time.monotonic() - context.started_s),
+        ("stimrig_backup_created_timestamp_seconds", "When the newest backup was made; 0: never", kept.created_unix_s),
+        ("stimrig_backup_bytes", "Its size", kept.created_bytes),
+        ("stimrig_backup_verified_timestamp_seconds", "When one was last restored for trial, and held; 0: never",
+         kept.verified_unix_s),
+        ("stimrig_backup_failed", "1 where the last trial found something wrong", float(bool(kept.problem))),
+        ("stimrig_clock_synchronised", "1: a time service sets the clock; 0: none; -1: not known",
+         known(by_service)),
+        ("stimrig_clock_error_seconds", "The kernel's bound for its error; -1: not known",
+         known(error_s)),
+        ("stimrig_clock_jump_seconds", "How far the clock jumped last; 0: it has not", watch.last_jump_s),
+    ))  # fmt: skip
+    yield CounterMetricFamily("stimrig_clock_jumps_total", "Jumps of the clock by more than 2 s", watch.jumps)
+
+
+def _centre(context: Context) -> Iterator[Metric]:
+    """How telling the centre goes; nothing where there is none."""
+    now_s = context.clock.unix_s()
+    told = status.read(context.settings, now_s)
+    if told is None:
+        return
+    since_s = told.since_contact_s(now_s)
+    yield from gauges((
+        ("stimrig_outbox_items_waiting", "Items that the centre lacks", told.items_waiting),
+        ("stimrig_outbox_files_waiting", "Files that it is known to lack", told.files_waiting),
+        ("stimrig_outbox_files_damaged", "Files that cannot be sent to it", told.damaged_count),
+        ("stimrig_outbox_contact_age_seconds", "Time since it answered; -1: never", known(since_s)),
+    ))  # fmt: skip
