@@ -46,6 +46,9 @@ FOR_PROGRAMMERS = {
 NAMED = {"Effect": ("name", "main"), "Interplay": ("name",), "Parameter": ("about",), "Field": ("title",)}
 """Calls with arguments (of a dictionary its values) that pages show although they may be a single word."""
 NOT_SHOWN = {
+    "NotAcceptedError",
+    "SettingsError",
+    "hold",
     "Field",
     "several",
     "Query",
