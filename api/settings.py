@@ -135,6 +135,18 @@ class Settings(ServerSettings):
     heads_file: Path | None = Field(
         default=None, description="file, best on another machine's disk, to which the audit trail's head goes hourly"
     )
+    retention_participants_days: Annotated[float, Field(ge=1)] | None = Field(
+        default=None, description="days after the last test, then all of a participant goes; default: kept"
+    )
+    retention_recordings_days: Annotated[float, Field(ge=1)] | None = Field(
+        default=None, description="days after which a recording's file goes, and its row stays; default: kept"
+    )
+    retention_logs_days: Annotated[float, Field(ge=1)] | None = Field(
+        default=None, description="days after which a log that nobody writes goes; default: kept"
+    )
+    retention_hold: Annotated[tuple[str, ...], NoDecode] = Field(
+        default=(), description="participants of whom nothing is deleted, by whatever rule; comma-separated"
+    )
     centre_url: str | None = Field(default=None, description="where the centre answers; default: there is none")
     centre_key: SecretStr | None = Field(
         default=None, validate_default=True, description="this rig's key, as the centre has made it"
@@ -152,6 +164,12 @@ class Settings(ServerSettings):
         if odd is not None:
             raise ValueError(f"{odd} is no effect's id (see `stimrig effects`); give ids, separated by commas")
         return tuple(dict.fromkeys(named))
+
+    @field_validator("retention_hold", mode="before")
+    @classmethod
+    def _held(cls, given: object) -> object:
+        """A comma-separated text, as it stands in the environment."""
+        return tuple(part.strip() for part in given.split(",") if part.strip()) if isinstance(given, str) else given
 
     @field_validator("centre_url")
     @classmethod

@@ -92,7 +92,7 @@ def verify(backup: Path) -> dict[str, int]:
         answer = database.execute("PRAGMA integrity_check").fetchone()[0]
         if answer != "ok":
             raise BackupError(f"{backup / DATABASE}: {answer}")
-        named = database.execute("SELECT path, file_sha256 FROM recordings").fetchall()
+        named = database.execute("SELECT path, file_sha256 FROM recordings WHERE path != ''").fetchall()
     for path, digest in named:
         found = recordings.get(Path(path).name)
         if found != digest:

@@ -18,6 +18,7 @@ COMMAND_ONLY = {
     "centre": "it runs a server of its own",
     "demo": "`emulate`, `Client.run_test` and `Client.approve` one after the other",
     "doctor": "it says what this machine lacks for stimulation",
+    "retention": "it deletes, alone with the data folder; it is asked for by a person, or by a timer",
     "serve": "it runs until it is ended, and may own a rig; `Client` talks to it",
 }  # fmt: skip
 ELSEWHERE = {"test": "Client.run_test"}
