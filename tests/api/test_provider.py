@@ -26,7 +26,7 @@ PUBLIC = "https://rig.example.org"
 ROLES = "stim-clinicians=clinician, stim-readers=reader"
 
 
-def settings_for(issuer: str, **more: Any) -> dict[str, Any]:
+def settings_for(issuer: str, **more: Any) -> Any:
     return {
         "oidc_issuer": issuer, "oidc_public_url": PUBLIC, "oidc_client_id": CLIENT, "oidc_client_secret": SECRET,
         "oidc_name": "the clinic", "oidc_roles": ROLES, **more,
@@ -523,12 +523,14 @@ def test_through_a_real_provider(tmp_path: Path, short_dir: Path, real: str) -> 
 
 def test_a_centre_through_a_real_provider(tmp_path: Path, real: str) -> None:
     for centre in run_centre(tmp_path, **settings_for(real)):
-        centre.clock.unix = time.time()
         with httpx.Client(base_url=centre.url, headers=HTML, timeout=PATIENCE_S, verify=NO_TLS) as visitor:
             answer = through_the_real_one(visitor)
             assert answer.status_code == 200, answer.text
             assert visitor.get("/participants").status_code == 200
             assert [user["name"] for user in centre.app.state.context.people.documents()] == ["Ada"]
+            centre.clock.later_s = 7200.0
+            late = through_the_real_one(visitor)
+            assert late.status_code == 401, "with a clock that is wrong nobody is signed in"
 
 
 def test_a_browser_goes_there_and_comes_back(tmp_path: Path, short_dir: Path, browser: Any, real: str) -> None:
