@@ -110,6 +110,11 @@ class Bucket:
             self.trouble = f"{self.url}: {GONE}"
             raise BucketError(self.trouble) from missing
 
+    def remove(self, sha256: str) -> None:
+        """Take a file away, if it is there. Raises BucketError: it stays."""
+        with contextlib.suppress(MissingError), self._told():
+            self.fs.rm_file(self.name(sha256))
+
     @contextlib.contextmanager
     def _told(self):
         try:

@@ -39,13 +39,16 @@ SENTENCES = (
 )  # fmt: skip
 """Modules whose sentences reach a page without `_`, since what they make is stored, or answered in English."""
 FOR_PROGRAMMERS = {
-    "app.py", "openapi.py", "dependencies.py", "server.py", "static.py", "operation.py", "own_file.py",
-    "confinement.py", "child.py", "_can.py", "monitoring.py", "steps.py",
+    "app.py", "erasure.py", "openapi.py", "dependencies.py", "server.py", "static.py", "operation.py",
+    "own_file.py", "confinement.py", "child.py", "_can.py", "monitoring.py", "steps.py",
 }  # fmt: skip
 """Modules of those folders whose texts no page shows."""
 NAMED = {"Effect": ("name", "main"), "Interplay": ("name",), "Parameter": ("about",), "Field": ("title",)}
 """Calls with arguments (of a dictionary its values) that pages show although they may be a single word."""
 NOT_SHOWN = {
+    "NotAcceptedError",
+    "SettingsError",
+    "hold",
     "Field",
     "several",
     "Query",
@@ -85,6 +88,8 @@ VOCABULARY = (
     # a sentence without the figure that `stimrig.api.structure.worded` takes away; made by `format`
     "%(test)s should separate %(those)s.", "%(test)s is the best test to separate %(those)s, but it may not be enough.",
     "pulse widths of %(range)s µs", "%(range)s pulses/s",
+    # what was erased: the entries of the trail that say so
+    "erase participant", "delete recordings",
     # what was not found, what ran
     "file", "job", "model", "participant", "recording", "schema", "test", "token", "user", "comparison", "diagnosis",
     "identification", "prediction",

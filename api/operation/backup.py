@@ -106,7 +106,7 @@ def recordings_named(database: Path) -> list[tuple[str, str]]:
             answer = str(error)
         if answer != "ok":
             raise BackupError(f"{database}: {answer}")
-        return opened.execute("SELECT path, file_sha256 FROM recordings").fetchall()
+        return opened.execute("SELECT path, file_sha256 FROM recordings WHERE path != ''").fetchall()
 
 
 def _copy_database(source: Path, target: Path) -> None:

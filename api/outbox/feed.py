@@ -188,7 +188,7 @@ def _test(row: Test) -> dict[str, Any]:
 
 def _recording(row: Recording) -> Telling:
     body = _bounded({**_without(row, "path", "site"), "name": Path(row.path).name})
-    if not SHA256.fullmatch(row.file_sha256):
+    if not row.path or not SHA256.fullmatch(row.file_sha256):  # no path: a rule took the file
         return Telling("recording", row.id, body)
     return Telling("recording", row.id, body, row.file_sha256, length_of(Path(row.path)))
 

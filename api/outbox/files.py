@@ -110,7 +110,7 @@ class Files:
             return Source(sha256, None, body, len(body)) if hashlib.sha256(body).hexdigest() == sha256 else None
         path = Path(row.path)
         seen = _signature(path)
-        if seen is None:
+        if seen is None or not row.path:
             return None
         if self._whole != (sha256, path, seen):
             try:

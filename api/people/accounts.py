@@ -23,7 +23,7 @@ from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.audit import digest
-from stimrig.api.store.tables import Confirmation, KnownPlace, Token, User
+from stimrig.api.store.tables import Confirmation, Identity, KnownPlace, PageSession, Token, User
 
 CONFIRMED_S = 120.0
 """How long a password given once more is good for one approval."""
@@ -43,16 +43,20 @@ class People:
         return await asyncio.to_thread(self._add, name, await self.passwords.hash(password), scopes, by)
 
     def _add(self, name: str, hashed: str, scopes: list[Scope], by: str) -> User:
-        now = self.clock.utc()
         with self.store.write() as session:
-            taken = _user_named(session, name)
+            taken = user_named(session, name)
             if taken is not None:
                 raise ApiError(409, "exists", "The name is taken", f"User {taken.name!r} exists. Take another name.")
-            token = self.auth.token_of_person(session, name, scopes)
-            row = User(name=name, folded_name=folded_name(name), password_hash=hashed, token_hash=token.hash)
-            row.created_utc = row.changed_utc = now
-            session.add(row)
-            audit.write(session, now, by, "add user", name, scopes=token.scopes)
+            return self.put(session, name, scopes, hashed, by)
+
+    def put(self, session: Session, name: str, scopes: list[Scope], hashed: str, by: str) -> User:
+        """The rows of a new person, in a transaction in which the name is free."""
+        token = self.auth.token_of_person(session, name, scopes)
+        row = User(name=name, folded_name=folded_name(name), password_hash=hashed, token_hash=token.hash)
+        row.created_utc = row.changed_utc = now = self.clock.utc()
+        session.add(row)
+        session.flush()
+        audit.write(session, now, by, "add user", name, scopes=token.scopes)
         return row
 
     async def sign_in(self, name: str, password: str, address: str) -> str:
@@ -80,7 +84,7 @@ class People:
 
     def _look_up(self, name: str, place: str) -> tuple[User | None, bool]:
         with self.store.read() as session:
-            row = _user_named(session, name)
+            row = user_named(session, name)
             return row, row is not None and session.get(KnownPlace, (row.name, place)) is not None
 
     def _remember(self, name: str, place: str) -> None:
@@ -137,6 +141,20 @@ class People:
             raise unauthorized("The page stays locked. Enter it again.", "wrong-password", title)
         await asyncio.to_thread(self.auth.idle.unlock, held.hash, principal.name)
 
+    def signed_in_again(self, session_hash: str, token_hash: str, name: str) -> None:
+        """The person of a page session has just signed in at the provider once more: as good as the password.
+
+        Raises ApiError: 403 it was somebody else, or the session has ended.
+        """
+        row: PageSession | None = self.store.get(PageSession, session_hash)
+        if row is None or row.token_hash != token_hash or row.expires_unix_s <= self.clock.unix_s():
+            detail = "Another person signed in than the one whose page it is. Nothing was confirmed or unlocked."
+            raise ApiError(403, "another-person", "Another person", detail)
+        if self.auth.idle.locked(row):
+            self.auth.idle.unlock(session_hash, name)
+        else:
+            self._confirm(session_hash)
+
     def _confirm(self, session_hash: str) -> None:
         with self.store.write() as session:
             session.merge(Confirmation(session_hash=session_hash, at_unix_s=self.clock.unix_s()))
@@ -186,7 +204,7 @@ class People:
 
     def _change_password(self, name: str, hashed: str, who: Principal) -> str | None:
         with self.store.write() as session:
-            row = _known_user(session, name)
+            row = known_user(session, name)
             seen.check(session, seen.account(row.name))
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
@@ -197,19 +215,20 @@ class People:
     def remove(self, name: str, by: str) -> None:
         """Let nobody sign in under this name any more; the name stays taken, as the audit trail speaks of it."""
         with self.store.write() as session:
-            row = _known_user(session, name)
+            row = known_user(session, name)
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             self.auth.end_sessions(session, row.token_hash)
             self.auth.revoke_within(session, row.token_hash[:16], by)
 
     def documents(self) -> list[dict[str, Any]]:
         """All users, without their hashes."""
-        found = []
+        found, subjects = [], {row.name: row.subject for row in self.store.all(Identity)}
         for row in self.store.all(User, order=User.name):
             token = self.store.get(Token, row.token_hash)
             found.append(
-                {"name": row.name, "scopes": token.scopes, "removed": token.revoked, "created_utc": row.created_utc}
-            )
+                {"name": row.name, "scopes": token.scopes, "removed": token.revoked, "created_utc": row.created_utc,
+                 "subject": subjects.get(row.name)}
+            )  # fmt: skip
         return found
 
     def close(self) -> None:
@@ -218,11 +237,11 @@ class People:
 
     def _store_password(self, name: str, hashed: str) -> None:
         with self.store.write() as session:
-            row = _known_user(session, name)
+            row = known_user(session, name)
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
 
 
-def _user_named(session: Session, name: str) -> User | None:
+def user_named(session: Session, name: str) -> User | None:
     """The person of a name as it was typed; the exact one first, as names from before were told apart by case."""
     if "\0" in name:  # PostgreSQL takes no such text, and nobody is called so
         return None
@@ -230,8 +249,8 @@ def _user_named(session: Session, name: str) -> User | None:
     return session.get(User, name) or session.scalars(same).first()
 
 
-def _known_user(session: Session, name: str) -> User:
-    return require_found(_user_named(session, name), "user", name, "GET /v1/users lists them.")
+def known_user(session: Session, name: str) -> User:
+    return require_found(user_named(session, name), "user", name, "GET /v1/users lists them.")
 
 
 MOST_STRANGERS, MOST_KNOWN = 8, 64
@@ -253,7 +272,8 @@ class Passwords:
 
     def __init__(self) -> None:
         self.hasher = PasswordHasher()  # argon2id, RFC 9106's parameters for little memory
-        self._nobody = self.hasher.hash(secrets.token_hex(16))
+        self.nobody = self.hasher.hash(secrets.token_hex(16))
+        """Of a password that nobody knows."""
         self._strangers, self._known = Lane("passwords", MOST_STRANGERS), Lane("known-passwords", MOST_KNOWN)
 
     @contextmanager
@@ -275,7 +295,7 @@ class Passwords:
 
         def check() -> bool:
             try:
-                return self.hasher.verify(hashed or self._nobody, password) and hashed is not None
+                return self.hasher.verify(hashed or self.nobody, password) and hashed is not None
             except (Argon2Error, InvalidHashError):
                 return False
 

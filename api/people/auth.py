@@ -199,7 +199,7 @@ class Auth:
             raise outside(who.participant)
         return self.open_session(digest(token_text), who.name)
 
-    def open_session(self, token_hash: str, name: str) -> str:
+    def open_session(self, token_hash: str, name: str, **detail: str) -> str:
         """Open a page session for the holder of a token; its cookie."""
         cookie, now = secrets.token_urlsafe(32), self.clock.unix_s()
         with self.store.write() as session:
@@ -212,7 +212,7 @@ class Auth:
                     expires_unix_s=now + self.session_s,
                 )
             )
-            audit.write(session, self.clock.utc(), name, "sign in", "page")
+            audit.write(session, self.clock.utc(), name, "sign in", "page", **detail)
         return cookie
 
     def token_of_person(self, session: Session, name: str, scopes: list[Scope]) -> Token:

@@ -41,12 +41,37 @@ def write(session: Session, at_utc: str, who: str, action: str, subject: str, **
         written.append(fields["seq"])
 
 
+ERASED, ERASE = "(erased)", "erase participant"
+"""Subject of an entry whose content was taken away, and the action of the entry that vouches for what is left of it."""
+
+
+def left_of(entries: list[AuditEntry]) -> str:
+    """Digest of what stays of entries whose content is taken away."""
+    return digest(canonical([[one.seq, one.at_utc, one.who, one.action, one.hash] for one in entries]))
+
+
+def vouched(entries: list[AuditEntry]) -> set[int]:
+    """Numbers of the entries that a later, sound one says it has left as they are now."""
+    found: set[int] = set()
+    for entry in entries:
+        if entry.action == ERASE and entry.hash == entry_hash(entry.as_dict()):
+            blanked = [one for one in entries if one.seq < entry.seq and blank(one) == entry.seq]
+            if len(blanked) == entry.detail.get("entries") and left_of(blanked) == entry.detail.get("kept"):
+                found |= {one.seq for one in blanked}
+    return found
+
+
+def blank(entry: AuditEntry) -> int | None:
+    """By which entry it was blanked; None: it has its content."""
+    return entry.detail["erased"] if entry.subject == ERASED and list(entry.detail) == ["erased"] else None
+
+
 def first_broken(entries: list[AuditEntry]) -> int | None:
     """The sequence number of the first entry that does not hold, or None if the chain is whole."""
-    previous = GENESIS
+    previous, erased = GENESIS, vouched(entries)
     for number, entry in enumerate(entries, start=1):
-        fields = entry.as_dict()
-        if entry.seq != number or entry.previous_hash != previous or entry.hash != entry_hash(fields):
+        sound = entry.seq in erased or entry.hash == entry_hash(entry.as_dict())
+        if entry.seq != number or entry.previous_hash != previous or not sound:
             return entry.seq
         previous = entry.hash
     return None

@@ -395,6 +395,14 @@ def _0016(op: Operations) -> None:
         created_utc string, closed_by string?, closed_utc string?""")  # fmt: skip
 
 
+def _0017(op: Operations) -> None:
+    """Whom a provider signs in; nobody is linked yet. What is erased is written down before it is done."""
+    _table(op, "identities", """issuer string key, subject string key, name string index > users.name,
+        by_group boolean, linked_by string, linked_utc string""")  # fmt: skip
+    _table(op, "erasures", """id string key, of string, reason text, asked_by string, asked_utc string, files json,
+        done_utc string?""")  # fmt: skip
+
+
 STEPS: dict[str, Callable[[Operations], None]] = {
     name[1:]: step for name, step in globals().items() if re.fullmatch("_[0-9]{4}", name)
 }

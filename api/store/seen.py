@@ -25,7 +25,7 @@ About = ColumnElement[bool]
 """Which entries of the trail a decision rests on."""
 SETTINGS = ("create participant", "set profile", "set muscle", "archive", "unarchive", "finish calibration")
 DECISIONS = ("approve", "reject")
-ACCOUNTS = ("add user", "change password", "revoke token")
+ACCOUNTS = ("add user", "change password", "revoke token", "link sign-in", "change role")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
 RIGHTS = (*DECISIONS, "revoke token", "set muscle", "archive")
 """Entries with which a right ends that a controller plays by."""

@@ -249,6 +249,19 @@ class User(Table):
     changed_utc: Mapped[str] = mapped_column(String)
 
 
+class Identity(Table):
+    """Whom a provider calls by this subject; nobody is found by a name or an address."""
+
+    __tablename__ = "identities"
+    issuer: Mapped[str] = mapped_column(String, primary_key=True)
+    subject: Mapped[str] = mapped_column(String, primary_key=True)
+    name: Mapped[str] = mapped_column(ForeignKey("users.name"), index=True)
+    by_group: Mapped[bool] = mapped_column(Boolean)
+    """Whether a group of the provider's made the account: then its groups say the role at each sign-in."""
+    linked_by: Mapped[str] = mapped_column(String)
+    linked_utc: Mapped[str] = mapped_column(String)
+
+
 class KnownPlace(Table):
     """Where a person has signed in from: guesses from elsewhere do not hold them back there."""
 
@@ -264,6 +277,21 @@ class Confirmation(Table):
     __tablename__ = "confirmations"
     session_hash: Mapped[str] = mapped_column(String, primary_key=True)
     at_unix_s: Mapped[float] = mapped_column(Float)
+
+
+class Erasure(Table):
+    """What is taken away for good: written down with the rows that go, before the first file does."""
+
+    __tablename__ = "erasures"
+    id: Mapped[str] = mapped_column(String, primary_key=True)
+    of: Mapped[str] = mapped_column(String)
+    """A participant's code until it is done, or `retention`."""
+    reason: Mapped[str] = mapped_column(Text)
+    asked_by: Mapped[str] = mapped_column(String)
+    asked_utc: Mapped[str] = mapped_column(String)
+    files: Mapped[list[str]] = mapped_column(JSON)
+    """Paths that are still to be removed."""
+    done_utc: Mapped[str | None] = mapped_column(String, default=None)
 
 
 class Secret(Table):

@@ -28,7 +28,9 @@ from stimrig.api.outbox.feed import Feed
 from stimrig.api.outbox.receipts import note_hourly
 from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock, Principal, Scope
+from stimrig.api.people.identities import Identities
 from stimrig.api.people.pace import Guesses
+from stimrig.api.people.provider import Provider
 from stimrig.api.sessions.lifecycle import Follower
 from stimrig.api.sessions.notes import Notes
 from stimrig.api.sessions.questions import Questions
@@ -38,7 +40,7 @@ from stimrig.api.sessions.stops import StopLog, StopRights
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import ServerSettings, Settings
 from stimrig.api.store import Store, holds, uploads
-from stimrig.api.store.holds import LIMITS_TURN, ServiceLock
+from stimrig.api.store.holds import LIMITS_TURN, ServiceLock, shared_secret
 from stimrig.api.store.tables import Model, Recording
 from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, require
 from stimrig.api.web.openapi import problem
@@ -69,6 +71,10 @@ class Parts:
             settings.admin_token.get_secret_value() if settings.admin_token else None
         )
         self.people = People(store, clock, self.auth, guesses)
+        self.provider = self.identities = None
+        if settings.oidc_issuer is not None:
+            self.provider = Provider(settings, clock, shared_secret(store, "provider"))
+            self.identities = Identities(self.people, clock, settings.oidc_issuer, settings.oidc_roles)
         self.versions = Versions(store, clock)
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -129,7 +135,7 @@ class Context(Parts):
         )  # fmt: skip
         self.trend, self.jobs = Trend(store, clock, pool), Jobs(pool)
         self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
-        stop_key = holds.shared_secret(store, "stop-right", settings.data_dir / "stop-right.key")
+        stop_key = shared_secret(store, "stop-right", settings.data_dir / "stop-right.key")
         self.stop_rights = StopRights(stop_key, clock)
 
     def regular(self) -> list[tuple[float, Callable[[], object]]]:
@@ -187,7 +193,7 @@ def make_folders(settings: Settings) -> None:
 
 def places(settings: Settings, store: Store) -> Places:
     """The folders that workers may reach: those of recordings, known ones of a rig that runs by itself included."""
-    reads = {settings.recordings_dir, *(Path(path).parent for path in store.all(Recording.path))}
+    reads = {settings.recordings_dir, *(Path(path).parent for path in store.all(Recording.path, Recording.path != ""))}
     reads |= {settings.effects_dir} if settings.effects_dir else set()
     return Places(reads, [settings.exports_dir])
 

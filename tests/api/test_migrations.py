@@ -117,7 +117,8 @@ def test_a_service_goes_on_with_an_older_database(tmp_path: Path, short_dir: Pat
         http.post(f"/v1/models/{model}/approve", json={"reason": "good"})
     change(
         tmp_path / "stimrig.db", "DROP TABLE alembic_version", "DROP TABLE schema_version", "DROP TABLE confirmations",
-        "DROP TABLE known_places", "DROP TABLE users", "DROP TABLE notes", "DROP TABLE tracked", "DROP TABLE searches",
+        "DROP TABLE known_places", "DROP TABLE identities", "DROP TABLE erasures",
+        "DROP TABLE users", "DROP TABLE notes", "DROP TABLE tracked", "DROP TABLE searches",
         "DROP TABLE secrets",
         "DROP TABLE outbox", "DROP INDEX ix_audit_subject",
         *(f"DROP TABLE {table}" for table in Table.metadata.tables if table.startswith("centre_")),

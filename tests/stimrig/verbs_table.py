@@ -21,6 +21,7 @@ COMMAND_ONLY = {
     "doctor": "it says what this machine lacks for stimulation",
     "upgrade": "it changes the data of a service that is stopped",
     "rig": "it asks a person who stands at the rig",
+    "retention": "it deletes, alone with the data folder; it is asked for by a person, or by a timer",
     "serve": "it runs until it is ended, and may own a rig; `Client` talks to it",
 }  # fmt: skip
 ELSEWHERE = {"test": "Client.run_test", "import": "import_recording"}

@@ -43,6 +43,7 @@ def register(app: typer.Typer) -> None:
     centre.command("add-rig")(add_rig)
     centre.command("revoke-rig")(revoke_rig)
     centre.command("check")(check)
+    centre.command("erase")(erase)
     app.add_typer(centre)
 
 
@@ -170,6 +171,32 @@ def check(
         say(f"{count} files checked, {len(lost)} differ" + ("; their rigs are asked for them again" if lost else ""))
     if lost:
         raise typer.Exit(1)
+
+
+def erase(
+    context: typer.Context,
+    code: Annotated[str, typer.Argument(help="the participant's code")],
+    reason: Annotated[str, typer.Option(help="why, as it stands in the audit trail: no name, no code")],
+    data: DataOption = None,
+    database: DatabaseOption = None,
+    files: FilesOption = None,
+) -> None:
+    """Delete what all rigs have told of a participant, with the files; erase at the rigs first."""
+    from stimrig.api.centre import erasure
+    from stimrig.api.centre.bucket import BucketError
+    from stimrig.api.centre.context import open_store, ready_bucket
+    from stimrig.api.clock import Clock
+
+    if not reason.strip() or code in reason:
+        raise InputError("--reason: say why, in words that stay in the audit trail and do not name the participant.")
+    settings = _settings(context, data, database)
+    settings = settings.model_copy(update={"files": files}) if files else settings
+    with closing(open_store(settings)) as store:
+        try:
+            found = erasure.erase(store, ready_bucket(settings), Clock(), code, reason.strip()[:500], WHO)
+        except BucketError as error:
+            raise CommandError(f"{error}; give the same command once more: it goes on with the files") from error
+    say(f"{code}: deleted with {found['files']} files, as erasure {found['erasure']}; backups still have it")
 
 
 RIGS = (("Ward 1", "paper", "P001"), ("Ward 2", "calcium", "P002"))

@@ -74,7 +74,8 @@ async def show_page(
             "array": electrodes.array_of(context.rig.status),
         }
 
-    return page(request, "participant.html", status, **await asyncio.to_thread(gather))
+    ask_password = not await context.people.is_confirmed(who.session_hash)
+    return page(request, "participant.html", status, ask_password=ask_password, **await asyncio.to_thread(gather))
 
 
 def channel_cards(

@@ -1,0 +1,94 @@
+"""Taking away what a centre keeps of a participant: rows, what items said, and files that nobody else's item names."""
+
+from __future__ import annotations
+
+import secrets
+from typing import Any
+
+from sqlalchemy import delete, func, select
+from sqlalchemy.orm import Session
+
+from stimrig.api.centre.bucket import Bucket
+from stimrig.api.clock import Clock
+from stimrig.api.errors import require_found
+from stimrig.api.store import Store, audit
+from stimrig.api.store.centre_tables import (
+    CentreDecision,
+    CentreEffect,
+    CentreFile,
+    CentreItem,
+    CentreModel,
+    CentreParticipant,
+    CentreRecording,
+    CentreSession,
+    CentreTest,
+    CentreWanted,
+)
+from stimrig.api.store.tables import Erasure
+
+OF_PERSON = (
+    CentreEffect, CentreDecision, CentreModel, CentreRecording, CentreTest, CentreSession,
+)  # fmt: skip
+KEYED = {"recording": CentreRecording.recording_id, "model": CentreModel.id, "test": CentreTest.id}
+
+
+def erase(store: Store, bucket: Bucket, clock: Clock, code: str, reason: str, by: str) -> dict[str, Any]:
+    """Take it away; how many rows and files went. Cut off, the same command goes on with the files.
+
+    Raises NotFoundError: no such participant, and nothing that was begun. BucketError: a file cannot be removed.
+    """
+    with store.write() as session:
+        there = session.scalars(select(CentreParticipant).where(CentreParticipant.code == code)).first()
+        if there is not None:
+            _rows(session, code, reason, by, clock.utc())
+        begun = list(session.scalars(select(Erasure).where(Erasure.of == code, Erasure.done_utc.is_(None))))
+    require_found(begun or None, "participant", code, "GET /v1/participants lists them.")
+    for row in begun:
+        for sha256 in row.files:
+            bucket.remove(sha256)
+        with store.write() as session:
+            done = session.get(Erasure, row.id)
+            if done is not None:  # the code goes with the last file
+                done.files, done.of, done.done_utc = [], audit.ERASED, clock.utc()
+    return {"erasure": begun[-1].id, "files": sum(len(row.files) for row in begun)}
+
+
+def _rows(session: Session, code: str, reason: str, by: str, now_utc: str) -> None:
+    """The rows, and an intent with the files that nobody else's item names."""
+    items = _items(session, code)
+    files = {item.file for item in items if item.file}
+    for item in items:
+        item.body, item.key = None, audit.ERASED
+    session.flush()
+    places = {(item.rig_id, item.chain, item.seq) for item in items}
+    others = select(CentreItem.rig_id, CentreItem.chain, CentreItem.seq, CentreItem.file)
+    for rig_id, chain, seq, file in session.execute(others.where(CentreItem.file.in_(files))).all():
+        if (rig_id, chain, seq) not in places:
+            files.discard(file)
+    counts = {"items": len(items)}
+    for table in OF_PERSON:
+        own = table.participant == code
+        counts[table.__tablename__] = session.scalar(select(func.count()).select_from(table).where(own)) or 0
+        session.execute(delete(table).where(own))
+    session.execute(delete(CentreParticipant).where(CentreParticipant.code == code))
+    session.execute(delete(CentreWanted).where(CentreWanted.sha256.in_(files)))
+    session.execute(delete(CentreFile).where(CentreFile.sha256.in_(files)))
+    row = Erasure(id=secrets.token_hex(6), of=code, reason=reason, asked_by=by, asked_utc=now_utc, files=sorted(files))
+    session.add(row)
+    session.flush()
+    audit.write(session, now_utc, by, audit.ERASE, row.id, reason=reason, rows=counts)
+
+
+def _items(session: Session, code: str) -> list[CentreItem]:
+    """All items that tell of the participant, by their keys or, of decisions and trials, by what they say."""
+    found = {}
+    for kind, column in {**KEYED, "participant": None}.items():
+        own = None if column is None else select(column).where(column.class_.participant == code)
+        keys = [code] if own is None else list(session.scalars(own))
+        kinds = ("test", "tracked") if kind == "test" else (kind,)
+        for item in session.scalars(select(CentreItem).where(CentreItem.kind.in_(kinds), CentreItem.key.in_(keys))):
+            found[item.rig_id, item.chain, item.seq] = item
+    said = CentreItem.body.contains(f'"participant":"{code}"', autoescape=True)
+    for item in session.scalars(select(CentreItem).where(said)):
+        found[item.rig_id, item.chain, item.seq] = item
+    return list(found.values())
