@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 from stimrig.api.clock import Clock, utc_label
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.outbox import chain
-from stimrig.api.store import Store, audit, seen
+from stimrig.api.store import Store, audit, migrations, seen
 from stimrig.api.store.tables import (
     OPEN_STATES,
     Analysis,
@@ -101,7 +101,13 @@ class Eraser:
             for folder in self.folders:
                 for pattern in (f"recordings/*Z_{name}.*", f"journals/{name}.*"):
                     found |= {str(path) for path in folder.glob(pattern)}
-        return sorted(found | {place for path in found for place in self._elsewhere(path)})
+        return sorted(found | {place for path in found for place in self._elsewhere(path)} | self._copies())
+
+    def _copies(self) -> set[str]:
+        """Of the database as it was before an upgrade: they hold everybody."""
+        database = self.store.engine.url.database
+        folder = Path(database or "").parent / migrations.BEFORE
+        return {str(path) for path in folder.glob("*")} if database and not self.store.several else set()
 
     def _elsewhere(self, path: str) -> Iterator[str]:
         """The rig's own place of a file that the service sees in another one (a bind mount of its unit)."""
