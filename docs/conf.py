@@ -14,8 +14,11 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+os.environ |= {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
+"""Of the notebooks' kernels: they show this checkout, whatever is installed."""
 
 import generators  # noqa: E402
+import numpydoc.xref  # noqa: E402
 
 from stimrig.api.version import software_version  # noqa: E402
 
@@ -27,9 +30,9 @@ root_doc = "docs/index"
 language = "en"
 
 extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_nb"]
-PAGES = {"docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "CODE_OF_CONDUCT.md"}
-include_patterns = [name if name.endswith(".md") else f"{name}/**" for name in sorted(PAGES)]
-exclude_patterns = [*sorted({path.name for path in ROOT.iterdir()} - PAGES), "docs/paper", "**/.*"]
+include_patterns = ["*.md", "docs/**", "tests/README.md", "tests/frozen/README.md"]
+TOP = {"docs", "tests"} | {path.name for path in ROOT.glob("*.md")}
+exclude_patterns = [*sorted({path.name for path in ROOT.iterdir()} - TOP), "docs/paper", "**/.*"]
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
@@ -37,11 +40,13 @@ nb_execution_mode = os.environ.get("NOTEBOOKS", "force")
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
+nb_output_stderr = "remove"  # progress bars
 nb_mime_priority_overrides = [("*", "text/html", 5), ("*", "image/svg+xml", 6)]
 nb_ipywidgets_js = {}  # they would come from another host
 
 autodoc_typehints = "none"  # numpydoc's sections say the types
 autodoc_member_order = "bysource"
+numpydoc.xref.DEFAULT_LINKS.clear()  # they lead to other hosts
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = True
 numpydoc_xref_aliases = generators.links()
