@@ -15,7 +15,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import stimrig
 from stimrig import identify
 
 MODULES = ("stimrig", "stimrig.cohort", "stimrig.effects", "stimrig.errors")

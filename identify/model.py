@@ -81,7 +81,17 @@ class Model(Summarised):
     software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))
 
     def predict(self, record: Record) -> np.ndarray:
-        """Free-run torque at the record's samples, N·m, shape (N,)."""
+        """Free-run torque at the record's samples, N·m, shape (N,).
+
+        Parameters
+        ----------
+        record : Record
+            Whose pulse widths are played.
+
+        Returns
+        -------
+        ndarray
+        """
         from stimrig.identify.simulation.predict import predict  # here: reading a model does not import numba
 
         return predict(self, record)
@@ -90,6 +100,10 @@ class Model(Summarised):
         """Threshold, plateau, saturation, and of a second-order block its parameters: `value`, `sd` and `unit` of each.
 
         An `sd` is None if the model has no covariance.
+
+        Returns
+        -------
+        dict
         """
         found = landmarks(self.recruitment, self.curve_covariance)
         if isinstance(self.linear, SecondOrder):
@@ -108,7 +122,12 @@ class Model(Summarised):
         return known.matrix[np.ix_(rows, rows)]
 
     def to_dict(self) -> dict[str, Any]:
-        """MODEL.json as a dict of lists, numbers and texts."""
+        """MODEL.json as a dict of lists, numbers and texts.
+
+        Returns
+        -------
+        dict
+        """
         width, torque = self.recruitment.table()
         level, needed = self.recruitment.inverse()
         rate = self.sample_rate_hz if isinstance(self.linear, SecondOrder) else 1.0 / self.linear.step_s
@@ -157,12 +176,32 @@ class Model(Summarised):
         )
 
     def to_json(self, indent: int | None = 1) -> str:
-        """MODEL.json as text."""
+        """MODEL.json as text.
+
+        Parameters
+        ----------
+        indent : int, optional
+            Spaces for each level; None: one line.
+
+        Returns
+        -------
+        str
+        """
         return json.dumps(self.to_dict(), indent=indent, ensure_ascii=False, allow_nan=False)
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Model:
-        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid."""
+        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid.
+
+        Parameters
+        ----------
+        data : dict
+            What `to_dict` gave.
+
+        Returns
+        -------
+        Model
+        """
         if not isinstance(data, dict):
             raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
         version = str(data.get("schema_version", ""))[:20]
@@ -188,6 +227,15 @@ class Model(Summarised):
         """The model in a MODEL.json text.
 
         Raises BadModel: not JSON, too long, too deep, with a duplicate key or an invalid number, or not a model.
+
+        Parameters
+        ----------
+        text : str or bytes
+            Of a MODEL.json.
+
+        Returns
+        -------
+        Model
         """
         if len(text) > LARGEST_TEXT:
             raise BadModel(f"more than {LARGEST_TEXT} characters", fix="Give a file written by `stimrig fit -o`.")
@@ -197,7 +245,17 @@ class Model(Summarised):
             raise BadModel(str(error), fix=model_schema.FIX) from error
 
     def with_(self, **changes: Any) -> Model:
-        """A copy of the model with some fields changed."""
+        """A copy of the model with some fields changed.
+
+        Parameters
+        ----------
+        **changes
+            Fields with their new values.
+
+        Returns
+        -------
+        Model
+        """
         return replace(self, **changes)
 
     def _sheet(self) -> Sheet:

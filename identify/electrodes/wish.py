@@ -64,7 +64,21 @@ class Wish:
             raise BadRequest("the least torque must be above 0 and below the wanted one", place="least_nm")
 
     def utility(self, torque_nm: np.ndarray, spill: np.ndarray, comfort: np.ndarray) -> np.ndarray:
-        """Utility, N·m; arrays of one shape. 0 is a choice that is out."""
+        """Utility, N·m; arrays of one shape. 0 is a choice that is out.
+
+        Parameters
+        ----------
+        torque_nm : ndarray
+            What a choice gives, N·m.
+        spill : ndarray
+            How much of it goes elsewhere.
+        comfort : ndarray
+            How it felt.
+
+        Returns
+        -------
+        ndarray
+        """
         torque = np.where(np.asarray(torque_nm) < self.least_nm, 0.0, torque_nm)
         torque = np.minimum(torque, self.wanted_nm or np.inf)
         left = 1.0 - np.array([0.0, self.slight_price, self.strong_price])[np.asarray(spill, dtype=int)]

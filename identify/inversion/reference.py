@@ -71,6 +71,10 @@ class Reference:
         name : str
             How the torque is called in messages.
 
+        Returns
+        -------
+        Reference
+
         Raises
         ------
         BadRequest

@@ -74,7 +74,12 @@ class JointInversion(Result):
         return Sheet(f"Pulse widths of {len(self.pulse_width_us)} channels for a torque: {fit}", tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """As JSON.
+
+        Returns
+        -------
+        dict
+        """
         reference = self.reference
         apart = ("reference", "predicted_nm", "muscle_nm", "unreachable")
         told = {name: value for name, value in vars(self).items() if name not in apart}
@@ -113,6 +118,12 @@ def invert(
         Of each channel, or by channel; one that is not named has none.
     whole : bool
         Whole µs.
+    bound_nm : float, optional
+        Torque up to which "stiffness" keeps both muscles active, N·m.
+
+    Returns
+    -------
+    JointInversion
 
     Raises
     ------

@@ -42,7 +42,12 @@ class JointDiagnosis(Result):
     notes: tuple[str, ...]  # what was assumed of the record
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON, without the model."""
+        """As JSON, without the model.
+
+        Returns
+        -------
+        dict
+        """
         return {key: value for key, value in super().to_dict().items() if key != "model"}
 
     def _sheet(self) -> Sheet:
