@@ -1,4 +1,4 @@
-"""Pages of the reference that are made from the code: names to import, routes, verbs. Called by conf.py."""
+"""Parts of the reference that are made from the code: names to import, routes, verbs. Called by conf.py."""
 
 from __future__ import annotations
 
@@ -12,78 +12,63 @@ import textwrap
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from stimrig import identify
 
 MODULES = ("stimrig", "stimrig.cohort", "stimrig.effects", "stimrig.errors")
-
-
-def rooms() -> list[str]:
-    """`stimrig.identify` and its packages."""
-    return [
-        "stimrig.identify",
-        *(f"stimrig.identify.{found.name}" for found in pkgutil.iter_modules(identify.__path__) if found.ispkg),
-    ]
-
-
-def names_of(module: ModuleType) -> list[str]:
-    """What a module offers: its `__all__`, else what is defined in it without an underscore."""
-    defined = (name for name, one in vars(module).items() if getattr(one, "__module__", "") == module.__name__)
-    return [name for name in getattr(module, "__all__", [*defined]) if not name.startswith("_")]
+ROOMS = (
+    "stimrig.identify",
+    *(f"stimrig.identify.{m.name}" for m in pkgutil.iter_modules(identify.__path__) if m.ispkg),
+)
 
 
 @cache
 def public() -> dict[str, Any]:
     """Every public function and class by the name under which it is imported, each once."""
     found: dict[str, Any] = {}
-    for place in (*MODULES, *rooms()):
+    for place in (*MODULES, *ROOMS):
         module = importlib.import_module(place)
-        for name in names_of(module):
-            one = inspect.getattr_static(module, name, None) if place == "stimrig.effects" else getattr(module, name)
-            ours = str(getattr(one, "__module__", "")).startswith("stimrig") and (
-                inspect.isfunction(one) or inspect.isclass(one)
-            )
-            if ours and not any(one is other for other in found.values()):
+        own = [name for name, one in vars(module).items() if getattr(one, "__module__", "") == place]
+        for name in getattr(module, "__all__", own):
+            one = getattr(module, name)
+            one = identify.effects.library if one is importlib.import_module("stimrig.effects") else one
+            ours = str(getattr(one, "__module__", "")).startswith("stimrig") and name[0] != "_"
+            if ours and (inspect.isfunction(one) or inspect.isclass(one)) and one not in found.values():
                 found[f"{place}.{name}"] = one
     return found
 
 
+def family(one: type) -> list[type]:
+    """A class and those of ours that it is made of, the first one last."""
+    return [parent for parent in reversed(one.__mro__) if parent.__module__.startswith("stimrig")]
+
+
 def members(one: type) -> dict[str, Any]:
-    """Public methods and properties of a class, those that it inherits from ours included."""
+    """Public methods and properties of a class, inherited ones included."""
     found: dict[str, Any] = {}
-    for parent in reversed([parent for parent in one.__mro__ if parent.__module__.startswith("stimrig")]):
-        for name, value in vars(parent).items():
-            bare = getattr(value, "__func__", getattr(value, "func", value))
-            if not name.startswith("_") and (inspect.isfunction(bare) or isinstance(value, property)):
-                found[name] = bare
+    for name, value in (item for parent in family(one) for item in vars(parent).items() if item[0][0] != "_"):
+        bare = getattr(value, "__func__", getattr(value, "func", value))
+        if inspect.isfunction(bare) or isinstance(value, property):
+            found[name] = bare
     return found
 
 
-def fields(one: type) -> dict[str, str]:
-    """The public fields of a class, each with what stands beside it: a comment, or a text below."""
-    told: dict[str, str] = {}
-    for parent in reversed([parent for parent in one.__mro__ if parent.__module__.startswith("stimrig")]):
+def attributes(one: type) -> list[str]:
+    """The public fields of a class as a section of numpydoc's, with what stands beside each in the code."""
+    told: dict[str, list[str]] = {}
+    for parent in family(one):
         source = textwrap.dedent(inspect.getsource(parent))
-        lines, tree = source.splitlines(), ast.parse(source).body[0]
+        (tree,) = ast.parse(source).body
         assert isinstance(tree, ast.ClassDef)
         for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
-            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id[0] != "_":
+            if isinstance(node, ast.AnnAssign) and (name := ast.unparse(node.target))[0] != "_":
                 below = after.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else None
-                comment = lines[(node.end_lineno or 0) - 1][node.end_col_offset :].partition("#")[2]
-                told[node.target.id] = str(below.value) if below else comment.lstrip(":").strip()
-    return told
-
-
-def attributes(one: type) -> list[str]:
-    """The fields of a class as a section of numpydoc's."""
-    rows = [
-        line
-        for name, words in fields(one).items()
-        for line in (name, *textwrap.indent(words or "…", "    ").splitlines())
-    ]
-    return ["", "Attributes", "----------", *rows, ""] if rows else []
+                comment = source.splitlines()[(node.end_lineno or 0) - 1].partition("  # ")[2]
+                words = str(below.value) if below else comment
+                told[name] = [f"{name} : {ast.unparse(node.annotation)}", textwrap.indent(words, "    "), ""]
+    rows = "\n".join(line for lines in told.values() for line in lines).splitlines()
+    return ["", "Attributes", "----------", *rows] if rows else []
 
 
 @cache
@@ -92,31 +77,25 @@ def links() -> dict[str, str]:
     return {name.rpartition(".")[2]: name for name, one in reversed(public().items()) if inspect.isclass(one)}
 
 
-def directives(place: str) -> Iterator[str]:
-    """The public names of a module, as autodoc takes them."""
-    for name, one in public().items():
-        if name.rpartition(".")[0] == place:
-            kind = "function" if inspect.isfunction(one) else "exception" if issubclass(one, BaseException) else "class"
-            yield f".. auto{kind}:: {name}"
-            if inspect.isclass(one) and members(one):
-                yield f"   :members: {', '.join(members(one))}"
-            yield ""
-
-
 def python(places: tuple[str, ...] = MODULES) -> str:
     """The reference of modules: a heading, its first words, its names."""
     parts = []
     for place in places:
-        told = list(directives(place))
+        told = []
+        for name, one in public().items():
+            if name.rpartition(".")[0] == place:
+                kind = "class" if inspect.isclass(one) else "function"
+                kind = "exception" if inspect.isclass(one) and issubclass(one, Exception) else kind
+                methods = members(one) if inspect.isclass(one) else {}
+                told += [f".. auto{kind}:: {name}", *([f"   :members: {', '.join(methods)}"] if methods else []), ""]
         words = str(importlib.import_module(place).__doc__).partition("\n\n")[0]
-        if told:
-            parts.append("\n".join([f"## {place}", "", words, "", "```{eval-rst}", *told, "```", ""]))
+        parts += [f"## {place}", "", words, "", "```{eval-rst}", *told, "```", ""] if told else []
     return "\n".join(parts)
 
 
 def python_identify() -> str:
     """The same of the packages of `identify`."""
-    return python(tuple(rooms()))
+    return python(ROOMS)
 
 
 def command_line() -> str:
@@ -127,24 +106,16 @@ def command_line() -> str:
     from stimrig.api.cli.main import build
 
     def told(name: str, command: Any) -> Iterator[str]:
-        below = getattr(command, "commands", {})
-        if below and not command.params:
-            for word, one in below.items():
-                yield from told(f"{name} {word}", one)
-            return
-        text = command.get_help(Context(command, info_name=name)).replace("```", "")
-        yield f"## {name}\n\n```text\n{text}\n```\n"
+        yield f"## {name}\n\n```text\n{command.get_help(Context(command, info_name=name))}\n```\n"
+        for word, one in sorted(getattr(command, "commands", {}).items()):
+            yield from told(f"{name} {word}", one)
 
-    return "\n".join(
-        part
-        for name, command in sorted(get_command(build()).commands.items())
-        for part in told(f"stimrig {name}", command)
-    )
+    return "\n".join(told("stimrig", get_command(build())))
 
 
 @cache
 def document() -> dict[str, Any]:
-    """The OpenAPI document of a service that is made for it in an empty folder."""
+    """The OpenAPI document of a service in an empty folder."""
     from stimrig.api.settings import Settings
     from stimrig.api.web.app import create_app
 
@@ -161,21 +132,18 @@ def type_of(schema: dict[str, Any]) -> str:
         return " or ".join(dict.fromkeys(type_of(way) for way in ways))
     if "enum" in schema or "const" in schema:
         return " or ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
-    if schema.get("type") == "array":
-        return f"list of {type_of(schema.get('items', {}))}"
-    kind = schema.get("type", "any")
-    return kind if isinstance(kind, str) else " or ".join(kind)
+    return f"list of {type_of(schema['items'])}" if "items" in schema else str(schema.get("type", "any"))
 
 
-def cell(words: Any) -> str:
-    """A text for a cell of a table, as it stands."""
-    return re.sub(r"\s+", " ", str(words or "")).replace("|", "\\|").replace("<", "&lt;")
+def cell(words: str) -> str:
+    """A text for a cell of a table."""
+    return re.sub(r"\s+", " ", words).replace("|", r"\|").replace("<", "&lt;")
 
 
-def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """A table of Markdown; nothing where it has no rows."""
-    lines = [f"| {' | '.join(row)} |" for row in (head, tuple("---" for _ in head), *rows)]
-    return "\n".join([*lines, "\n"]) if rows else ""
+def table(head: str, rows: list[tuple[str, dict[str, Any], str]]) -> str:
+    """A table of names with their type and meaning; nothing where there are none."""
+    lines = [f"| {name} | {type_of(schema)} | {cell(words)} |" for name, schema, words in rows]
+    return "\n".join([f"| {head} | type | is |", "|---|---|---|", *lines, "\n"]) if rows else ""
 
 
 def rest_routes() -> str:
@@ -183,24 +151,22 @@ def rest_routes() -> str:
     parts = []
     for path, methods in sorted(document()["paths"].items()):
         for method, found in methods.items():
-            parts.append(f"## {method.upper()} {path}\n\n{found.get('description') or found.get('summary', '')}\n")
-            given = [
-                (f"`{p['name']}`", p["in"], type_of(p.get("schema", {})), cell(p.get("description")))
+            bodies = found.get("requestBody", {}).get("content", {}).items()
+            rows = [
+                (f"`{p['name']}` ({p['in']})", p["schema"], p.get("description", ""))
                 for p in found.get("parameters", [])
             ]
-            bodies = found.get("requestBody", {}).get("content", {}).items()
-            given += [("body", kind, type_of(body.get("schema", {})), "") for kind, body in bodies]
-            parts.append(table(("takes", "in", "type", "is"), given))
-            answers = [
-                (
-                    code,
-                    ", ".join(type_of(body.get("schema", {})) for body in one.get("content", {}).values()),
-                    cell(one.get("description")),
-                )
-                for code, one in sorted(found["responses"].items())
-            ]
-            parts.append(table(("answer", "type", "is"), answers))
-    return "\n".join(parts)
+            rows += [(f"body ({kind})", body.get("schema", {}), "") for kind, body in bodies]
+            done = [
+                (f"{code} {kind}", body.get("schema", {}), one["description"])
+                for code, one in found["responses"].items() if code < "4"
+                for kind, body in (one.get("content") or {"": {"schema": {"type": "nothing"}}}).items()
+            ]  # fmt: skip
+            refused = ", ".join(sorted(code for code in found["responses"] if code >= "4"))
+            told = found.get("description") or found.get("summary", "")
+            parts += [f"## {method.upper()} {path}", told, table("takes", rows), table("answers", done)]
+            parts += [f"Refusals: {refused}."] if refused else []
+    return "\n\n".join(parts)
 
 
 def rest_models() -> str:
@@ -208,9 +174,9 @@ def rest_models() -> str:
     parts = []
     for name, schema in sorted(document()["components"]["schemas"].items()):
         needed = schema.get("required", [])
+        keys = schema.get("properties", {}).items()
         rows = [
-            (f"`{key}`{'' if key in needed else ' (may be missing)'}", type_of(one), cell(one.get("description")))
-            for key, one in schema.get("properties", {}).items()
+            (f"`{key}`{'' if key in needed else ' (optional)'}", one, one.get("description", "")) for key, one in keys
         ]
-        parts.append(f"### {name}\n\n{cell(schema.get('description'))}\n\n{table(('key', 'type', 'is'), rows)}")
-    return "\n".join(parts)
+        parts += [f"### {name}", schema.get("description", ""), table("key", rows)]
+    return "\n\n".join(parts)

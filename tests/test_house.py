@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 FIXED_TOP_LEVEL = {"pyproject.toml", "rig", "identify", "api", "hardware_sim", "tests", "deploy"}
 BESIDE = {
     "README.md", "CONTRIBUTING.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
-    ".ci", ".gitignore", ".pre-commit-config.yaml",
+    ".ci", ".gitignore", ".pre-commit-config.yaml", "CHANGELOG.md", "SECURITY.md", "CODE_OF_CONDUCT.md", "CITATION.cff",
 }  # fmt: skip
 
 

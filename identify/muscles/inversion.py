@@ -58,7 +58,7 @@ class JointInversion(Result):
     reference: Reference  # what was asked for
     co_contraction: str  # one of `CO_CONTRACTIONS`
     level: float  # of each muscle's largest torque, that is kept
-    bound_nm: float  # up to which |torque| `stiffness` keeps it
+    bound_nm: float  # torque of either sign up to which `stiffness` keeps it
     pulse_width_us: dict[str, np.ndarray]  # by channel
     predicted_nm: np.ndarray  # of the joint above rest, mean in each pulse's period
     muscle_nm: dict[str, np.ndarray]  # of each muscle by itself, before the joint takes what co-contraction costs
@@ -109,7 +109,7 @@ def invert(
         Torque of the joint above rest, one for each pulse period, N·m.
     co_contraction : str
         "none": each torque by the muscles of one sign, with a smooth change at 0. "constant": while the joint is
-        active every muscle keeps `level` of its largest torque. "stiffness": the same, but only where |torque| is
+        active every muscle keeps `level` of its largest torque. "stiffness": the same, but only where the torque is
         below `bound_nm`, by default 15 % of the weaker side's largest, and gone at twice that. It is the muscles'
         activity that is kept: how stiff the joint is then, no torque of a joint at rest tells.
     level : float
