@@ -10,7 +10,7 @@ import re
 import tempfile
 import textwrap
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +48,8 @@ def members(one: type) -> dict[str, Any]:
     """Public methods and properties of a class, inherited ones included."""
     found: dict[str, Any] = {}
     for name, value in (item for parent in family(one) for item in vars(parent).items() if item[0][0] != "_"):
-        bare = getattr(value, "__func__", getattr(value, "func", value))
-        if inspect.isfunction(bare) or isinstance(value, property):
+        bare = getattr(value, "__func__", value)
+        if inspect.isfunction(bare) or isinstance(value, property | cached_property):
             found[name] = bare
     return found
 
