@@ -58,27 +58,27 @@ class Model(Summarised):
     recruitment: Curve  # f(u), N·m
     linear: Linear  # G, unit gain at DC
     pulse_rate_hz: float  # of the fitted record
-    sample_rate_hz: float
+    sample_rate_hz: float  # of the fitted record
     baseline_nm: float = 0.0  # torque at rest
     initial: tuple[float, float] = (0.0, 0.0)
     """Torque above the baseline, N·m, and its rate, N·m/s, at the first pulse of the fitted record."""
-    noise: Noise = field(default_factory=Noise)
+    noise: Noise = field(default_factory=Noise)  # what the fit assumes
     effects: tuple[dict[str, Any], ...] = ()  # each {"id", "form", "parameters", …}; empty for the plain structure
     covariance: Covariance | None = None  # of all parameters; None if the method gives none
     fit: dict[str, Any] = field(default_factory=dict)
     """fit_percent, held_out_fit_percent, rms_nm, held_out_rms_nm, ceiling_percent, noise_sd_nm and more."""
-    residual_tests: dict[str, Any] = field(default_factory=dict)
-    valid_for: dict[str, Any] = field(default_factory=dict)
-    quality: dict[str, Any] = field(default_factory=dict)
-    bands: dict[str, Any] = field(default_factory=dict)
-    data: dict[str, Any] = field(default_factory=dict)
+    residual_tests: dict[str, Any] = field(default_factory=dict)  # whether what is left looks like noise
+    valid_for: dict[str, Any] = field(default_factory=dict)  # pulse widths, torques and rates that were fitted
+    quality: dict[str, Any] = field(default_factory=dict)  # the verdict, its reasons and its gates
+    bands: dict[str, Any] = field(default_factory=dict)  # of both curves, 95 %
+    data: dict[str, Any] = field(default_factory=dict)  # the recording: its name, id and SHA-256
     joint: dict[str, Any] = field(default_factory=dict)
     """g(x, ẋ) and h(x, ẋ) as tables with bands (`simulation.joint_surface`); empty where the joint was held."""
     reasons: tuple[str, ...] = ()  # for the structure, the number of knots and the noise model
-    extra: dict[str, Any] = field(default_factory=dict)
-    model_id: str = ""
-    created: str = ""
-    software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))
+    extra: dict[str, Any] = field(default_factory=dict)  # what the method adds
+    model_id: str = ""  # of this version
+    created: str = ""  # UTC, ISO 8601
+    software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))  # name and version
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,).

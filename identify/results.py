@@ -206,7 +206,7 @@ class Explanation(Result):
     """Where a model fails, what is missing, how the error falls with it, and why that ends."""
 
     diagnosis: Diagnosis  # of the first model
-    improvement: Improvement
+    improvement: Improvement  # the models, one effect more each
     left: Diagnosis  # of the last model
     before: Comparison  # of the first model with the record
     after: Comparison  # of the last model

@@ -31,7 +31,7 @@ class Parameter:
 
     name: str  # ends in its unit, if it has one
     unit: str  # such as µs, s, N·m; "1" for a pure number
-    lower: float
+    lower: float  # bound
     upper: float
     """Bounds. They set the width of the prior, and so the evidence: choose them as physiology allows, not wider."""
     neutral: float = 0.0
@@ -97,7 +97,7 @@ class Scene:
     step_s: float  # pulse interval, s
     scale_nm: float  # the record's largest torque, N·m; a constant, not a parameter
     largest_us: float  # largest pulse width, µs
-    angle_rad: np.ndarray | None = None
+    angle_rad: np.ndarray | None = None  # of the joint, shape (K,)
     velocity_rad_s: np.ndarray | None = None
     """Shape (K,); joint angle, rad, and velocity, rad/s, if the record has them."""
     acceleration_rad_s2: np.ndarray | None = None  # shape (K,); angular acceleration, rad/s², from the velocity

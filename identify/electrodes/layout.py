@@ -18,7 +18,7 @@ Elements = tuple[int, ...]
 class Layout:
     """Where the elements lie on the skin, mm; the first is element 1. Raises BadRequest: no such array."""
 
-    positions_mm: tuple[tuple[float, float], ...]
+    positions_mm: tuple[tuple[float, float], ...]  # of the elements
 
     def __post_init__(self) -> None:
         where = np.asarray(self.positions_mm, dtype=float)

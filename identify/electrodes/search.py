@@ -33,19 +33,19 @@ SCHEMA = 1
 class Proposal:
     """The next choice to stimulate."""
 
-    elements: Elements
-    why: str
+    elements: Elements  # the choice to try
+    why: str  # in words
     expected: float
     """Utility, N·m."""
-    sd: float
+    sd: float  # of what is expected
 
 
 @dataclass(frozen=True)
 class Stop:
     """Why no further stimulus is worth it. `elements` is None where no element moves the joint."""
 
-    reason: str
-    elements: Elements | None
+    reason: str  # in words
+    elements: Elements | None  # the best choice
     probability: float
     """That the best known choice is within 10 % of the best; or that no choice is of use."""
 

@@ -19,7 +19,7 @@ class Seen:
 
     torque_nm: float
     """Positive is the wanted direction."""
-    spill: int
+    spill: int  # what else moved
     comfort: float
     """0 unbearable .. 10 unnoticed."""
 
@@ -48,7 +48,7 @@ class Wish:
     """Share of the torque that a slight spill-over costs."""
     strong_price: float = 1.0
     """The same of a strong one; 1 is never acceptable."""
-    comfort_weight: float = 0.5
+    comfort_weight: float = 0.5  # how much comfort counts
     comfort_limit: float = 4.0
     """A choice that feels worse is out."""
     least_nm: float = 0.1

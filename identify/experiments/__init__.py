@@ -35,7 +35,7 @@ class Experiment(Result):
 
     rivals: tuple[str, ...]  # ids of the effects
     segments: tuple[Mapping[str, Any], ...]  # `name`, `sequence`, `settings` of each, as `POST /v1/tests` takes them
-    duration_s: float
+    duration_s: float  # of the whole test
     dose: Mapping[str, float]  # `pulses`, `pulse_width_sum_us` and `torque_time_nm_s`
     expected_log_evidence: float  # how clearly the test is expected to decide: of the pair with the smallest
     decides: bool  # whether that is enough

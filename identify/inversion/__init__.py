@@ -69,7 +69,7 @@ class Inversion(Result):
     """Pulse widths for a reference; arrays of shape (K,)."""
 
     reference: Reference  # what was asked for
-    pulse_width_us: np.ndarray
+    pulse_width_us: np.ndarray  # one for each pulse, shape (K,)
     predicted_nm: np.ndarray  # torque above rest that the model predicts for them, mean in each pulse's period
     unreachable: tuple[Stretch, ...]  # where it is not reached, in order of time
     fit_percent: float | None  # best fit where it can be reached; None if the reference does not change there

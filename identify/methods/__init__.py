@@ -26,7 +26,7 @@ class Method:
     id: str  # as users write it: `two-stage`
     summary: str  # one line
     options: Mapping[str, str]  # each option's name and what it does
-    fit: Callable[..., Model]
+    fit: Callable[..., Model]  # the function that fits
 
 
 @cache

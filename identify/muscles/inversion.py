@@ -45,9 +45,9 @@ NEAR_ZERO = 0.15
 class Limits:
     """Of one channel; as of one muscle's `invert`."""
 
-    largest_us: float | None = None
-    rise_us: float | None = None
-    shortest_us: float = 0.0
+    largest_us: float | None = None  # widest pulse
+    rise_us: float | None = None  # largest rise from pulse to pulse
+    shortest_us: float = 0.0  # narrowest pulse
     dose_us: float = np.inf  # largest sum of its widths, its charge over its current; the demand is scaled down to it
 
 

@@ -37,20 +37,20 @@ class JointModel(Summarised):
     other. Each muscle's delay counts from its own pulses.
     """
 
-    channels: tuple[Channel, ...]
+    channels: tuple[Channel, ...]  # the muscles, each with its model
     models: tuple[Model, ...]  # of each channel, in order
     interplay: tuple[dict[str, Any], ...] = ()
     """Each {"id", "from", "to", "form", "equation", "parameters"}; `from` and `to` are missing where it is of the
     joint."""
     fit: dict[str, Any] = field(default_factory=dict)
     """As of one model, and `alone` by channel and `both`: the error on held-out pulses while those muscles moved."""
-    quality: dict[str, Any] = field(default_factory=dict)
-    valid_for: dict[str, Any] = field(default_factory=dict)
-    data: dict[str, Any] = field(default_factory=dict)
-    reasons: tuple[str, ...] = ()
-    model_id: str = ""
-    created: str = ""
-    software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))
+    quality: dict[str, Any] = field(default_factory=dict)  # the verdict and its reasons
+    valid_for: dict[str, Any] = field(default_factory=dict)  # what was fitted
+    data: dict[str, Any] = field(default_factory=dict)  # the recording
+    reasons: tuple[str, ...] = ()  # for the structure
+    model_id: str = ""  # of this version
+    created: str = ""  # UTC, ISO 8601
+    software: dict[str, Any] = field(default_factory=lambda: dict(SOFTWARE))  # name and version
 
     @property
     def names(self) -> tuple[str, ...]:

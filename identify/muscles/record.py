@@ -33,10 +33,10 @@ HAIR_S = 1e-6
 class Channel:
     """One output of the stimulator, with its electrodes."""
 
-    name: str
-    muscle: str = ""
-    side: str = ""
-    electrode: str = ""
+    name: str  # of the channel
+    muscle: str = ""  # as "biceps brachii"
+    side: str = ""  # "left" or "right"
+    electrode: str = ""  # where it lies
     offset_s: float = 0.0  # by how much later than those of the first channel its pulses come, s
 
     def to_dict(self) -> dict[str, str | float]:
@@ -56,8 +56,8 @@ class JointRecord:
     The widths of a channel stand on the slots of the first one: `Channel.offset_s` says how much later they come.
     """
 
-    channels: tuple[Channel, ...]
-    records: tuple[Record, ...]
+    channels: tuple[Channel, ...]  # what is known of each
+    records: tuple[Record, ...]  # one for each channel
 
     @classmethod
     def from_arrays(

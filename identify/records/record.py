@@ -83,7 +83,7 @@ class Record(Summarised):
     torque_nm: np.ndarray  # shape (N,); measured torque, N·m
     segment: np.ndarray  # shape (N,); index into `segment_names` for each sample
     segment_names: tuple[str, ...]  # one name for each contiguous run of rows; a name may occur several times
-    angle_rad: np.ndarray | None = None
+    angle_rad: np.ndarray | None = None  # of the joint, shape (N,)
     velocity_rad_s: np.ndarray | None = None
     """Shape (N,); joint angle, rad, and angular velocity, rad/s, as they were recorded: `motion` is what is reckoned
     with."""

@@ -84,8 +84,8 @@ class Curve:
 class FixedShape:
     """A gain times a given curve, as a basis: for steps that estimate only the dynamics."""
 
-    curve: Curve
-    size: int = field(default=1, init=False)
+    curve: Curve  # the shape
+    size: int = field(default=1, init=False)  # of coefficients: 1
 
     @property
     def largest_us(self) -> float:

@@ -78,7 +78,7 @@ class Step:
     after: State  # what is known after it
     coming: State  # what is expected of the next trial: of this the controller is told
     distance: float | None  # squared, of what was seen from what was expected, in sd; None if it moved nothing
-    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+    effects: dict[str, dict[str, float]] = field(default_factory=dict)  # their states
 
     @property
     def disturbed_s(self) -> list[list[float]]:

@@ -54,9 +54,9 @@ USUAL = Rates(
 class Values:
     """Gain and time scale as factors on the approved model's, the shift of its threshold in µs."""
 
-    gain: float = 1.0
-    threshold_shift_us: float = 0.0
-    time_scale: float = 1.0
+    gain: float = 1.0  # 1: as approved
+    threshold_shift_us: float = 0.0  # 0: as approved
+    time_scale: float = 1.0  # 1: as approved
 
     @classmethod
     def of(cls, levels: np.ndarray) -> Values:
@@ -87,8 +87,8 @@ class State:
     approved curve, N·m.
     """
 
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: np.ndarray  # of levels and trends
+    covariance: np.ndarray  # of the same
     trials: int = 0  # that it was learnt from
     odd: np.ndarray | None = None  # how far the last trial would have moved the levels, if it was odd
     unexplained: int = 0  # trials since the last one that gain, threshold and speed explained
