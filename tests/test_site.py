@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from functools import cache
 from html import unescape
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -93,6 +94,18 @@ def test_everything_public_has_a_docstring_with_its_sections() -> None:
         names
     )
     assert [told for name, one in names.items() if (told := lacking(name, one))] == []
+
+
+def test_each_field_of_a_public_class_is_explained() -> None:
+    made, names, bare = generators(), 0, []
+    for name, one in made.public().items():
+        rows = made.attributes(one)[3:] if inspect.isclass(one) else []
+        for row, below in pairwise([*rows, ""]):
+            if row and row[0] != " ":
+                names += 1
+                bare += [] if below.startswith("    ") else [f"{name}: {row}"]
+    assert names > 200
+    assert bare == []
 
 
 def test_a_docstring_that_lacks_something_is_noticed() -> None:

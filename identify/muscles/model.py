@@ -37,7 +37,7 @@ class JointModel(Summarised):
     other. Each muscle's delay counts from its own pulses.
     """
 
-    channels: tuple[Channel, ...]  # the muscles, each with its model
+    channels: tuple[Channel, ...]  # what is known of each
     models: tuple[Model, ...]  # of each channel, in order
     interplay: tuple[dict[str, Any], ...] = ()
     """Each {"id", "from", "to", "form", "equation", "parameters"}; `from` and `to` are missing where it is of the
