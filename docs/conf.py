@@ -32,7 +32,7 @@ language = "en"
 extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_nb"]
 include_patterns = ["*.md", "docs/**", "tests/README.md", "tests/frozen/README.md"]
 TOP = {"docs", "tests"} | {path.name for path in ROOT.glob("*.md")}
-exclude_patterns = [*sorted({path.name for path in ROOT.iterdir()} - TOP), "docs/paper", "**/.*"]
+exclude_patterns = [*sorted({path.name for path in ROOT.iterdir()} - TOP), "**/.*"]
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
