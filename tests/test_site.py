@@ -55,7 +55,7 @@ def test_every_page_is_in_one_list_of_the_site() -> None:
         new = [below for page in new for below in listed(page)]
         entries += new
     assert len(entries) == len(set(entries)), "a page is listed twice"
-    pages = {page for page in DOCS.rglob("*.md")} | set(ROOT.glob("*.md"))
+    pages = set(DOCS.rglob("*.md")) | set(ROOT.glob("*.md"))
     missing = sorted(str(page.relative_to(ROOT)) for page in pages - set(entries))
     assert missing == [], "list it in the toctree of docs/how-to/index.md, reference/, explanation/ or tutorials/"
 
@@ -210,20 +210,16 @@ def test_notebooks_are_small_and_name_the_units_of_their_axes() -> None:
 # ---- files of the project, and the paper
 
 
+CHANGES = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+
+
 def test_the_changelog_has_its_form() -> None:
     text = (ROOT / "CHANGELOG.md").read_text("utf-8")
     heads = re.findall(r"^## \[(.+?)\](?: - (\d{4}-\d{2}-\d{2}))?$", text, re.M)
     assert heads[0] == ("Unreleased", "") and ("1.0.0", "2026-11-29") in heads
     dates = [date for _, date in heads[1:]]
     assert all(dates) and dates == sorted(dates, reverse=True)
-    assert set(re.findall(r"^### (.+)$", text, re.M)) <= {
-        "Added",
-        "Changed",
-        "Deprecated",
-        "Removed",
-        "Fixed",
-        "Security",
-    }
+    assert set(re.findall(r"^### (.+)$", text, re.M)) <= CHANGES
 
 
 def test_who_may_be_told_of_a_fault_is_said_without_an_address_that_is_made_up() -> None:
