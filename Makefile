@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: demo centre test frozen check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help packages setup setup-test setup-centre simulate
+.PHONY: docs demo centre test frozen check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help packages setup setup-test setup-centre simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -40,6 +40,10 @@ changed-types: setup-test
 
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
+
+docs: setup-test ## the site of the documentation, in build/site; its notebooks are run (NOTEBOOKS=off: not), a warning is an error
+	@$(BIN)/python -m sphinx -c docs -W -n --keep-going -q -d build/doctrees . build/site
+	@echo "build/site/index.html"
 
 soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.md)
 	@$(BIN)/python -m bench.soak --minutes 60

@@ -56,6 +56,10 @@ def fit(
     **options
         Options of the method: see `identify.methods.methods()[id].options`.
 
+    Returns
+    -------
+    Model
+
     Raises
     ------
     BadRequest

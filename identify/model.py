@@ -72,30 +72,40 @@ class Model(Summarised):
     recruitment: Curve  # f(u), N·m
     linear: Linear  # G, unit gain at DC
     pulse_rate_hz: float  # of the fitted record
-    sample_rate_hz: float
+    sample_rate_hz: float  # of the fitted record
     baseline_nm: float = 0.0  # torque at rest
     initial: tuple[float, float] = (0.0, 0.0)
     """Torque above the baseline, N·m, and its rate, N·m/s, at the first pulse of the fitted record."""
-    noise: Noise = field(default_factory=Noise)
+    noise: Noise = field(default_factory=Noise)  # what the fit assumes
     effects: tuple[dict[str, Any], ...] = ()  # each {"id", "form", "parameters", …}; empty for the plain structure
     covariance: Covariance | None = None  # of all parameters; None if the method gives none
     fit: dict[str, Any] = field(default_factory=dict)
     """fit_percent, held_out_fit_percent, rms_nm, held_out_rms_nm, ceiling_percent, noise_sd_nm and more."""
-    residual_tests: dict[str, Any] = field(default_factory=dict)
-    valid_for: dict[str, Any] = field(default_factory=dict)
-    quality: dict[str, Any] = field(default_factory=dict)
-    bands: dict[str, Any] = field(default_factory=dict)
-    data: dict[str, Any] = field(default_factory=dict)
+    residual_tests: dict[str, Any] = field(default_factory=dict)  # whether what is left looks like noise
+    valid_for: dict[str, Any] = field(default_factory=dict)  # pulse widths, torques and rates that were fitted
+    quality: dict[str, Any] = field(default_factory=dict)  # the verdict, its reasons and its gates
+    bands: dict[str, Any] = field(default_factory=dict)  # of both curves, 95 %
+    data: dict[str, Any] = field(default_factory=dict)  # the recording: its name, id and SHA-256
     joint: dict[str, Any] = field(default_factory=dict)
     """g(x, ẋ) and h(x, ẋ) as tables with bands (`simulation.joint_surface`); empty where the joint was held."""
     reasons: tuple[str, ...] = ()  # for the structure, the number of knots and the noise model
-    extra: dict[str, Any] = field(default_factory=dict)
-    model_id: str = ""
-    created: str = ""
-    software: dict[str, Any] = field(default_factory=made_by)
+    extra: dict[str, Any] = field(default_factory=dict)  # what the method adds
+    model_id: str = ""  # of this version
+    created: str = ""  # UTC, ISO 8601
+    software: dict[str, Any] = field(default_factory=made_by)  # name and version
 
     def predict(self, record: Record) -> np.ndarray:
-        """Free-run torque at the record's samples, N·m, shape (N,)."""
+        """Free-run torque at the record's samples, N·m, shape (N,).
+
+        Parameters
+        ----------
+        record : Record
+            Whose pulse widths are played.
+
+        Returns
+        -------
+        ndarray
+        """
         from stimrig.identify.simulation.predict import predict  # here: reading a model does not import numba
 
         return predict(self, record)
@@ -104,6 +114,10 @@ class Model(Summarised):
         """Threshold, plateau, saturation, and of a second-order block its parameters: `value`, `sd` and `unit` of each.
 
         An `sd` is None if the model has no covariance.
+
+        Returns
+        -------
+        dict
         """
         found = landmarks(self.recruitment, self.curve_covariance)
         if isinstance(self.linear, SecondOrder):
@@ -122,7 +136,12 @@ class Model(Summarised):
         return known.matrix[np.ix_(rows, rows)]
 
     def to_dict(self) -> dict[str, Any]:
-        """MODEL.json as a dict of lists, numbers and texts."""
+        """MODEL.json as a dict of lists, numbers and texts.
+
+        Returns
+        -------
+        dict
+        """
         width, torque = self.recruitment.table()
         level, needed = self.recruitment.inverse()
         rate = self.sample_rate_hz if isinstance(self.linear, SecondOrder) else 1.0 / self.linear.step_s
@@ -171,12 +190,32 @@ class Model(Summarised):
         )
 
     def to_json(self, indent: int | None = 1) -> str:
-        """MODEL.json as text."""
+        """MODEL.json as text.
+
+        Parameters
+        ----------
+        indent : int, optional
+            Spaces for each level; None: one line.
+
+        Returns
+        -------
+        str
+        """
         return json.dumps(self.to_dict(), indent=indent, ensure_ascii=False, allow_nan=False)
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Model:
-        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid."""
+        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid.
+
+        Parameters
+        ----------
+        data : dict
+            What `to_dict` gave.
+
+        Returns
+        -------
+        Model
+        """
         if not isinstance(data, dict):
             raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
         version = str(data.get("schema_version", ""))[:20]
@@ -202,6 +241,15 @@ class Model(Summarised):
         """The model in a MODEL.json text.
 
         Raises BadModel: not JSON, too long, too deep, with a duplicate key or an invalid number, or not a model.
+
+        Parameters
+        ----------
+        text : str or bytes
+            Of a MODEL.json.
+
+        Returns
+        -------
+        Model
         """
         if len(text) > LARGEST_TEXT:
             raise BadModel(f"more than {LARGEST_TEXT} characters", fix="Give a file written by `stimrig fit -o`.")
@@ -211,7 +259,17 @@ class Model(Summarised):
             raise BadModel(str(error), fix=model_schema.FIX) from error
 
     def with_(self, **changes: Any) -> Model:
-        """A copy of the model with some fields changed."""
+        """A copy of the model with some fields changed.
+
+        Parameters
+        ----------
+        **changes
+            Fields with their new values.
+
+        Returns
+        -------
+        Model
+        """
         return replace(self, **changes)
 
     def _sheet(self) -> Sheet:

@@ -39,7 +39,12 @@ class Result(Summarised):
     """A dataclass that is shown, and written as JSON."""
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as dicts, lists, numbers and texts; None for a number that is not finite."""
+        """All fields as dicts, lists, numbers and texts; None for a number that is not finite.
+
+        Returns
+        -------
+        dict
+        """
         return {
             name: [model.to_dict() for model in value] if name == "models" else json_value(value)
             for name, value in vars(self).items()
@@ -135,7 +140,12 @@ class Diagnosis(Result):
         return conclude(vars(self))
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields, and `conclusion`."""
+        """All fields, and `conclusion`.
+
+        Returns
+        -------
+        dict
+        """
         return super().to_dict() | {"conclusion": asdict(self.conclusion)}
 
     def _sheet(self) -> Sheet:
@@ -196,13 +206,18 @@ class Explanation(Result):
     """Where a model fails, what is missing, how the error falls with it, and why that ends."""
 
     diagnosis: Diagnosis  # of the first model
-    improvement: Improvement
+    improvement: Improvement  # the models, one effect more each
     left: Diagnosis  # of the last model
     before: Comparison  # of the first model with the record
     after: Comparison  # of the last model
 
     def to_dict(self) -> dict[str, Any]:
-        """The keys of `explain --json`: no models, and no series for plots."""
+        """The keys of `explain --json`: no models, and no series for plots.
+
+        Returns
+        -------
+        dict
+        """
         improvement = self.improvement.to_dict()
         del improvement["models"]
         before, after = self.before.to_dict(), self.after.to_dict()
@@ -257,7 +272,12 @@ class Carried(Result):
         return self.models[-1 if self.offered == "carried" else 0]
 
     def finding(self) -> dict[str, Any]:
-        """What was found, as `to_dict()`, without the models."""
+        """What was found, as `to_dict()`, without the models.
+
+        Returns
+        -------
+        dict
+        """
         found = self.to_dict()
         del found["models"]
         return found

@@ -69,7 +69,12 @@ class Summarised:
         raise NotImplementedError
 
     def summary(self) -> str:
-        """A summary of about ten lines."""
+        """A summary of about ten lines.
+
+        Returns
+        -------
+        str
+        """
         return self._sheet().text()
 
     def __str__(self) -> str:

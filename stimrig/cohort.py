@@ -21,22 +21,76 @@ def _run(verb: str, data: Sequence[str | Path], output: str | Path, options: dic
 
 
 def fit(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
-    """Fit a model to every selected record; one row each in Parquet."""
+    """Fit a model to every selected record; one row each in Parquet.
+
+    Parameters
+    ----------
+    data : sequence of path
+        Files, folders, buckets, centres.
+    output : path
+        Parquet file to write; one that was cut off goes on.
+    **options
+        Those of the command line.
+
+    Returns
+    -------
+    Report
+    """
     return _run("fit", data, output, options)
 
 
 def diagnose(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
-    """What is missing in the plain structure, for every selected record; one row each in Parquet."""
+    """What is missing in the plain structure, for every selected record; one row each in Parquet.
+
+    Parameters
+    ----------
+    data : sequence of path
+        Files, folders, buckets, centres.
+    output : path
+        Parquet file to write; one that was cut off goes on.
+    **options
+        Those of the command line.
+
+    Returns
+    -------
+    Report
+    """
     return _run("diagnose", data, output, options)
 
 
 def improve(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
-    """Add effects as long as the evidence lasts, for every selected record; one row each in Parquet."""
+    """Add effects as long as the evidence lasts, for every selected record; one row each in Parquet.
+
+    Parameters
+    ----------
+    data : sequence of path
+        Files, folders, buckets, centres.
+    output : path
+        Parquet file to write; one that was cut off goes on.
+    **options
+        Those of the command line.
+
+    Returns
+    -------
+    Report
+    """
     return _run("improve", data, output, options)
 
 
 def changed(old: str | Path, new: str | Path) -> Report:
-    """Whose results differ between two runs, and why."""
+    """Whose results differ between two runs, and why.
+
+    Parameters
+    ----------
+    old : path
+        Results of the earlier run.
+    new : path
+        Results of the later one.
+
+    Returns
+    -------
+    Report
+    """
     from stimrig.api.cli.commands.cohort import need_extra
 
     need_extra()
@@ -46,7 +100,19 @@ def changed(old: str | Path, new: str | Path) -> Report:
 
 
 def figures(results: str | Path, html: str | Path) -> Report:
-    """Draw a cohort into an HTML file: effects by prevalence, parameters over sessions, errors by reason."""
+    """Draw a cohort into an HTML file: effects by prevalence, parameters over sessions, errors by reason.
+
+    Parameters
+    ----------
+    results : path
+        The Parquet file of a run.
+    html : path
+        File to write.
+
+    Returns
+    -------
+    Report
+    """
     from stimrig.api.cli.commands.cohort import drawn
 
     return Report("cohort figures", drawn(Path(results), Path(html)))

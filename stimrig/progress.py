@@ -25,13 +25,49 @@ def fit(
     progress: Progress = True,
     **options: Any,
 ) -> identify.Model:
-    """Fit a model to a record: `method`, `effects=["fatigue"]`, `fit_on=["prbs"]`; see `stimrig.identify.fit`."""
+    """Fit a model to a record: `method`, `effects=["fatigue"]`, `fit_on=["prbs"]`; see `stimrig.identify.fit`.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    method : str
+        Id of the method.
+    effects : sequence of str
+        Ids of effects, as "fatigue" or "fatigue:fitness".
+    fit_on : sequence of str, optional
+        Segments that are fitted; default: all but `validate`.
+    progress : bool or callable
+        True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
+        line of text.
+    **options
+        Of the method.
+
+    Returns
+    -------
+    Model
+    """
     with _telling(progress) as tell:
         return identify.fit(record, method, effects, fit_on, tell, **options)
 
 
 def carry(record: identify.Record, model: identify.Model, progress: Progress = True) -> identify.Carried:
-    """The structure of an earlier model fitted to a new record, beside the plain one; see `stimrig.identify.carry`."""
+    """The structure of an earlier model fitted to a new record, beside the plain one; see `stimrig.identify.carry`.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    model : Model
+        The earlier model.
+    progress : bool or callable
+        True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
+        line of text.
+
+    Returns
+    -------
+    Carried
+    """
     with _telling(progress) as tell:
         return identify.carry(record, model, tell)
 
@@ -39,7 +75,22 @@ def carry(record: identify.Record, model: identify.Model, progress: Progress = T
 def diagnose(
     record: identify.Record, model: identify.Model | None = None, progress: Progress = True
 ) -> identify.Diagnosis:
-    """What is missing in the plain model of a record, or in a `model`; see `stimrig.identify.diagnose`."""
+    """What is missing in the plain model of a record, or in a `model`; see `stimrig.identify.diagnose`.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    model : Model, optional
+        Whose structure is asked about; default: the plain one.
+    progress : bool or callable
+        True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
+        line of text.
+
+    Returns
+    -------
+    Diagnosis
+    """
     with _telling(progress) as tell:
         return identify.diagnose(record, model, tell)
 
@@ -51,7 +102,26 @@ def improve(
     force: Sequence[str] = (),
     model: identify.Model | None = None,
 ) -> identify.Improvement:
-    """Add what is missing, one effect at a time, while the evidence asks for it; see `stimrig.identify.improve`."""
+    """Add what is missing, one effect at a time, while the evidence asks for it; see `stimrig.identify.improve`.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    progress : bool or callable
+        True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
+        line of text.
+    max_effects : int, optional
+        So many at most.
+    force : sequence of str
+        Ids of effects that are added whatever the evidence.
+    model : Model, optional
+        To begin with; default: the plain one.
+
+    Returns
+    -------
+    Improvement
+    """
     with _telling(progress) as tell:
         return identify.improve(record, tell, max_effects, force, model)
 
@@ -59,7 +129,22 @@ def improve(
 def explain(
     record: identify.Record, model: identify.Model | None = None, progress: Progress = True
 ) -> identify.Explanation:
-    """The whole story: where a model fails, what is missing, how the error falls with it, why that ends."""
+    """The whole story: where a model fails, what is missing, how the error falls with it, why that ends.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    model : Model, optional
+        To begin with; default: the plain one.
+    progress : bool or callable
+        True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
+        line of text.
+
+    Returns
+    -------
+    Explanation
+    """
     with _telling(progress) as tell:
         return identify.explain(record, tell, model)
 

@@ -42,6 +42,17 @@ def join(data: Iterable[str | Path], map: Sequence[str] | None = None) -> identi
     """Several recordings of one muscle as one record, in the order of time, as each verb joins its DATA.
 
     `map` as of `read`. Raises BadRecord: a file cannot be read, or they do not go together.
+
+    Parameters
+    ----------
+    data : iterable of path
+        Files.
+    map : sequence of str, optional
+        Names of columns of other tools, as "torque_nm=Drehmoment:Nm".
+
+    Returns
+    -------
+    Record
     """
     from stimrig.api import record_files
 
@@ -65,6 +76,16 @@ def invert(
         `angle_rad`, where it moves).
     largest_us, rise_us : float or None
         Widest pulse, and largest rise from pulse to pulse, µs.
+    model : Model
+        The model.
+    time_s : sequence of float, optional
+        Of the reference, s.
+    angle_rad : sequence of float, optional
+        Of the joint at each of them, rad.
+
+    Returns
+    -------
+    Inversion
 
     Raises
     ------
@@ -95,7 +116,36 @@ def export(
     format: str = "",
     output: str | Path | None = None,
 ) -> Report:
-    """Recordings as Parquet, BIDS, NWB, FHIR, REDCap or MATLAB. One that is cut off goes on with the same call."""
+    """Recordings as Parquet, BIDS, NWB, FHIR, REDCap or MATLAB. One that is cut off goes on with the same call.
+
+    Parameters
+    ----------
+    data : sequence of path
+        Files, folders, buckets, centres.
+    parquet : path, optional
+        Folder for Parquet files.
+    bids : path, optional
+        Folder in the style of BIDS.
+    select : str
+        Which recordings, as `participant == "P001"`.
+    no_dates : bool
+        Leave out all days and times of the day.
+    shift_days : int
+        Move all days by so many.
+    map : sequence of str
+        As of `read`.
+    token : str
+        For a centre.
+    format : str
+        One of `stimrig export --format`, in place of `parquet` or `bids`.
+    output : path, optional
+        Folder for files of that format.
+
+    Returns
+    -------
+    Report
+        How many were written, and where.
+    """
     from stimrig.api.cli.commands.export import exported
 
     given = {"parquet": parquet, "bids": bids, "output": output}
@@ -119,6 +169,8 @@ def import_recording(
 
     Parameters
     ----------
+    path : path
+        The file, or a BIDS recording's `.tsv.gz`.
     map : mapping, optional
         The signal that a column is, and its unit: `{"torque_nm": "Dynamometer/torque:Nm"}`.
     segments : str
@@ -131,6 +183,10 @@ def import_recording(
         Of pulses that are only marked; of widths that are a signal.
     clock_offset_s : float, optional
         What is added to the pulses' times.
+
+    Returns
+    -------
+    Record
 
     Raises
     ------
@@ -145,14 +201,36 @@ def import_recording(
 
 
 def recover(journal: str | Path, folder: str | Path | None = None) -> Report:
-    """A sealed recording from a journal of the rig, which may be damaged; the journal is kept."""
+    """A sealed recording from a journal of the rig, which may be damaged; the journal is kept.
+
+    Parameters
+    ----------
+    journal : path
+        Its file.
+    folder : path, optional
+        For the recording; default: beside the journal.
+
+    Returns
+    -------
+    Report
+    """
     from stimrig.api.cli.commands.recover import sealed
 
     return Report("recover", json.loads(sealed(Path(journal), None if folder is None else Path(folder))))
 
 
 def table1(trials: int = 100) -> Report:
-    """The paper's Table I, ours beside theirs."""
+    """The paper's Table I, ours beside theirs.
+
+    Parameters
+    ----------
+    trials : int
+        Fits for each noise level and method.
+
+    Returns
+    -------
+    Report
+    """
     from stimrig.identify import paper
 
     with progress_bar() as progress:
@@ -169,6 +247,11 @@ def emulate(options: str = "", data: str | Path | None = None) -> Iterator[Clien
         Of the emulator, as "--patient calcium".
     data : path, optional
         Folder for its recordings and models; default: one that is deleted at the end.
+
+    Yields
+    ------
+    Client
+        Of the running service.
 
     Raises
     ------

@@ -30,7 +30,7 @@ from stimrig.rig.limits import HARD_LIMITS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 FOLDERS = {path.name for path in ROOT.iterdir() if path.is_dir()} - {"var"}
 PACKAGES = ("rig", "identify", "api", "hardware_sim", "bench", "tests", "stimrig", "examples")

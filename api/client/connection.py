@@ -121,6 +121,15 @@ class Connection:
     def request(self, method: str, path: str, **more: Any) -> httpx.Response:
         """Send a request, once. `more` goes to httpx: `json`, `params`, `content`, `headers`, `timeout`.
 
+        Parameters
+        ----------
+        method : str
+            As "GET".
+        path : str
+            Path of the service, as "/v1/rig".
+        **more
+            For httpx.
+
         Returns
         -------
         httpx.Response
@@ -141,6 +150,17 @@ class Connection:
     def content(self, path: str, most_bytes: int) -> bytes:
         """The content at a path; of a longer one no more than its beginning: a service may be anybody.
 
+        Parameters
+        ----------
+        path : str
+            Path of the service, as "/v1/rig".
+        most_bytes : int
+            So much is kept at most, B.
+
+        Returns
+        -------
+        bytes
+
         Raises
         ------
         Unreachable, Refused
@@ -159,15 +179,49 @@ class Connection:
         return bytes(content)
 
     def get(self, path: str, **more: Any) -> Any:
-        """The JSON document at a path."""
+        """The JSON document at a path.
+
+        Parameters
+        ----------
+        path : str
+            Path of the service, as "/v1/rig".
+        **more
+            For httpx, as `params`.
+
+        Returns
+        -------
+        object
+        """
         return self.request("GET", path, **more).json()
 
     def post(self, path: str, **more: Any) -> Any:
-        """Send, and return the JSON document of the answer."""
+        """Send, and return the JSON document of the answer.
+
+        Parameters
+        ----------
+        path : str
+            Path of the service, as "/v1/rig".
+        **more
+            For httpx, as `json`.
+
+        Returns
+        -------
+        object
+        """
         return self.request("POST", path, **more).json()
 
     def messages(self, path: str) -> Iterator[dict[str, Any]]:
         """JSON messages of a WebSocket until the service closes it.
+
+        Parameters
+        ----------
+        path : str
+            Path of the service, as "/v1/rig".
+
+        Yields
+        ------
+        dict
+            Each message.
 
         Raises
         ------

@@ -28,7 +28,17 @@ OF_VERB = {
 
 
 def load(name: str) -> dict[str, Any]:
-    """A schema by its name, or by the verb that prints it. Raises KeyError where there is none."""
+    """A schema by its name, or by the verb that prints it. Raises KeyError where there is none.
+
+    Parameters
+    ----------
+    name : str
+        As "fit" or "model".
+
+    Returns
+    -------
+    dict
+    """
     return json.loads(FILES[OF_VERB.get(name, name)].read_text("utf-8"))
 
 

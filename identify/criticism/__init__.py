@@ -271,7 +271,17 @@ MOST = 5
 
 
 def direction_of(record: Record) -> np.ndarray:
-    """+1 where the pulse width rose over the last 0.3 s, -1 where it fell, 0 where it was held; shape (N,)."""
+    """+1 where the pulse width rose over the last 0.3 s, -1 where it fell, 0 where it was held; shape (N,).
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+
+    Returns
+    -------
+    ndarray
+    """
     u = record.pulse_width_us
     back = max(round(0.3 * record.sample_rate_hz), 1)
     change = u - np.r_[np.full(back, u[0]), u[:-back]]
@@ -285,6 +295,22 @@ def worst_places(
     """The stretches with most of the error above the noise, among some rows.
 
     As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    residual_nm : ndarray
+        Measured less predicted, N·m, shape (N,).
+    noise_sd_nm : float
+        White noise of a sample, N·m.
+    rows : ndarray
+        Rows that count, bool, shape (N,).
+
+    Returns
+    -------
+    list of dict
+        Worst first.
     """
     length = max(round(STRETCH_S * record.sample_rate_hz), 1)
     rising, pieces = direction_of(record), []

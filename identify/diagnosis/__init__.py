@@ -59,6 +59,15 @@ def structure_of(model: Model | None) -> list[str]:
     """The effects of a model as `search_effects` takes them ("id:form"); an empty list for the plain structure.
 
     Raises BadRequest: the model's dynamics are not of second order.
+
+    Parameters
+    ----------
+    model : Model, optional
+        None: the plain structure.
+
+    Returns
+    -------
+    list of str
     """
     if model is None:
         return []
@@ -104,7 +113,19 @@ def next_experiment(about: Record | Diagnosis, rivals: Sequence[str] = ()) -> Ex
 
 
 def planned(missing: Sequence[Mapping[str, Any]], further: Mapping[str, Any] | None = None) -> Experiment | None:
-    """The `further` experiment, for what is left; else that of the first missing effect with rivals; or None."""
+    """The `further` experiment, for what is left; else that of the first missing effect with rivals; or None.
+
+    Parameters
+    ----------
+    missing : Sequence[mapping]
+        As `Diagnosis.missing`.
+    further : mapping, optional
+        What would teach most about what is left.
+
+    Returns
+    -------
+    Experiment or None
+    """
     if further:
         return Experiment(rivals=(), **further)
     for row in missing:

@@ -103,7 +103,21 @@ def explain(record: Record, progress: Progress | None = None, model: Model | Non
 def diagnose_and_improve(
     record: Record, progress: Progress | None = None, model: Model | None = None
 ) -> tuple[Diagnosis, Improvement]:
-    """What `diagnose` and `improve` give, with one search. Parameters and errors are those of `improve`."""
+    """What `diagnose` and `improve` give, with one search. Parameters and errors are those of `improve`.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    progress : callable, optional
+        Called with a share of 0 to 1 and a line of text; what it raises ends the work.
+    model : Model, optional
+        To begin with; default: the plain one.
+
+    Returns
+    -------
+    tuple[Diagnosis, Improvement]
+    """
     structure = structure_of(model)
     grid, raw = prepare(record)
     search, verdict = searched(grid, raw, progress, structure=structure)

@@ -67,12 +67,26 @@ def registry() -> dict[str, Effect]:
     """All effects by id: the library's, those of entry points, those in the user's folder.
 
     Raises BadEffect: a user's folder is not there, or one of the files cannot be loaded or used.
+
+    Returns
+    -------
+    dict
     """
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 
 
 def find_effect(effect_id: str) -> Effect:
-    """One effect by its id. Raises BadRequest: no effect has this id."""
+    """One effect by its id. Raises BadRequest: no effect has this id.
+
+    Parameters
+    ----------
+    effect_id : str
+        Id of an effect.
+
+    Returns
+    -------
+    Effect
+    """
     effects = registry()
     if effect_id not in effects:
         known = ", ".join(sorted(effects))
@@ -82,24 +96,59 @@ def find_effect(effect_id: str) -> Effect:
 
 
 def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
-    """The effect and the form of a model's row; None if either is unknown here."""
+    """The effect and the form of a model's row; None if either is unknown here.
+
+    Parameters
+    ----------
+    entry : mapping
+        As in `Model.effects`.
+
+    Returns
+    -------
+    tuple[Effect, Form] or None
+    """
     effect, name = registry().get(entry["id"]), entry.get("form", "")
     forms = effect.forms if effect else ()
     return next(((effect, form) for form in forms if effect and name in ("", form.name)), None)
 
 
 def depend_on_joint(names: Iterable[str]) -> bool:
-    """Whether one of some effects depends on the angle or the velocity of the joint."""
+    """Whether one of some effects depends on the angle or the velocity of the joint.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Ids of effects.
+
+    Returns
+    -------
+    bool
+    """
     return any(find_effect(name).moves_with_joint for name in names)
 
 
 def any_free(names: Iterable[str]) -> bool:
-    """Whether one of some effects is free: it describes and names no cause."""
+    """Whether one of some effects is free: it describes and names no cause.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Ids of effects.
+
+    Returns
+    -------
+    bool
+    """
     return any(find_effect(name).shape for name in names)
 
 
 def library() -> list[dict[str, Any]]:
-    """The library as dicts, for `stimrig effects` and the page."""
+    """The library as dicts, for `stimrig effects` and the page.
+
+    Returns
+    -------
+    list of dict
+    """
     return [effect.to_dict() for effect in registry().values()]
 
 

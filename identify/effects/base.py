@@ -31,7 +31,7 @@ class Parameter:
 
     name: str  # ends in its unit, if it has one
     unit: str  # such as µs, s, N·m; "1" for a pure number
-    lower: float
+    lower: float  # bound
     upper: float
     """Bounds. They set the width of the prior, and so the evidence: choose them as physiology allows, not wider."""
     neutral: float = 0.0
@@ -46,7 +46,17 @@ class Parameter:
     about: str = ""  # one line for people
 
     def on(self, scene: Scene) -> Parameter:
-        """The parameter with its bounds in absolute units."""
+        """The parameter with its bounds in absolute units.
+
+        Parameters
+        ----------
+        scene : Scene
+            The record on its grid of pulses.
+
+        Returns
+        -------
+        Parameter
+        """
         if not self.relative:
             return self
         unit = {"width": scene.largest_us, "span": scene.span_s}.get(self.relative, scene.scale_nm)
@@ -61,7 +71,12 @@ class Parameter:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As the library tells it."""
+        """As the library tells it.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "name": self.name,
             "unit": self.unit,
@@ -82,7 +97,7 @@ class Scene:
     step_s: float  # pulse interval, s
     scale_nm: float  # the record's largest torque, N·m; a constant, not a parameter
     largest_us: float  # largest pulse width, µs
-    angle_rad: np.ndarray | None = None
+    angle_rad: np.ndarray | None = None  # of the joint, shape (K,)
     velocity_rad_s: np.ndarray | None = None
     """Shape (K,); joint angle, rad, and velocity, rad/s, if the record has them."""
     acceleration_rad_s2: np.ndarray | None = None  # shape (K,); angular acceleration, rad/s², from the velocity
@@ -150,7 +165,17 @@ class Scene:
         return np.clip((2.0 * angle_rad - low - high) / max(high - low, LEAST_RANGE_RAD), -1.0, 1.0)
 
     def bends(self, degrees: int) -> np.ndarray:
-        """Chebyshev polynomials of `place`, of degrees 1 to `degrees`, all 0 at the reference angle, shape (n, K)."""
+        """Chebyshev polynomials of `place`, of degrees 1 to `degrees`, all 0 at the reference angle, shape (n, K).
+
+        Parameters
+        ----------
+        degrees : int
+            The highest.
+
+        Returns
+        -------
+        ndarray
+        """
         home = self._placed(float(self.angle[0] - self.away_rad[0]))
         return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
 
@@ -219,7 +244,17 @@ class Form:
     `state(x, p, scene)`, called as a batched `apply` is, returns it after the last interval, shape (M,)."""
 
     def to_dict(self, source: str) -> dict[str, Any]:
-        """As the library tells it; `source` is that of the effect."""
+        """As the library tells it; `source` is that of the effect.
+
+        Parameters
+        ----------
+        source : str
+            Of the effect.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "name": self.name,
             "stage": self.stage,
@@ -229,14 +264,38 @@ class Form:
         }
 
     def starts(self, scene: Scene) -> list[dict[str, float]]:
-        """Starting values, one dict per run."""
+        """Starting values, one dict per run.
+
+        Parameters
+        ----------
+        scene : Scene
+            The record on its grid of pulses.
+
+        Returns
+        -------
+        list of dict
+        """
         on = [p.on(scene) for p in self.parameters]
         runs = max((len(p.start) for p in on), default=1)
         listed = [{p.name: p.start[min(i, len(p.start) - 1)] for p in on} for i in range(runs)]
         return listed + [dict(start) for start in self.restarts]
 
     def call(self, x: Any, p: dict[str, np.ndarray], scene: Scene) -> Any:
-        """`apply` for M rows of parameters: x of shape (M, K), a tuple of such arrays, or None; p of shape (M, 1)."""
+        """`apply` for M rows of parameters: x of shape (M, K), a tuple of such arrays, or None; p of shape (M, 1).
+
+        Parameters
+        ----------
+        x : object
+            What comes into the stage.
+        p : dict
+            Parameters by name, each of shape (M, 1).
+        scene : Scene
+            The record on its grid of pulses.
+
+        Returns
+        -------
+        object
+        """
         assert self.apply is not None
         if self.batched:
             return self.apply(x, p, scene)
@@ -319,14 +378,29 @@ class Effect:
         return {"pulse_width": "f", "gain": "f", "additive": "", "sensor": "", "output": ""}.get(self.stage, "G")
 
     def form(self, name: str) -> Form:
-        """A form by its name; the first form if the name is empty."""
+        """A form by its name; the first form if the name is empty.
+
+        Parameters
+        ----------
+        name : str
+            Of the form; empty: the first.
+
+        Returns
+        -------
+        Form
+        """
         for form in self.forms:
             if form.name == name or not name:
                 return form
         raise KeyError(name)
 
     def to_dict(self) -> dict[str, Any]:
-        """As the library tells it; without forms of a great many parameters."""
+        """As the library tells it; without forms of a great many parameters.
+
+        Returns
+        -------
+        dict
+        """
         first = self.forms[0]
         return {
             "id": self.id,
@@ -348,7 +422,25 @@ class Effect:
 
 
 def form(stage: str, equation: str, *parameters: Parameter, name: str = "", **more: Any) -> Callable[[Apply], Form]:
-    """Decorator that makes a function of all rows at once (`batched`) a form, which is called as the function is."""
+    """Decorator that makes a function of all rows at once (`batched`) a form, which is called as the function is.
+
+    Parameters
+    ----------
+    stage : str
+        Where it acts.
+    equation : str
+        In words and signs.
+    *parameters
+        Those that are fitted.
+    name : str
+        Of the form.
+    **more
+        Other fields of `Form`.
+
+    Returns
+    -------
+    callable
+    """
 
     def made(apply: Apply) -> Form:
         found = Form(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)

@@ -18,7 +18,7 @@ Elements = tuple[int, ...]
 class Layout:
     """Where the elements lie on the skin, mm; the first is element 1. Raises BadRequest: no such array."""
 
-    positions_mm: tuple[tuple[float, float], ...]
+    positions_mm: tuple[tuple[float, float], ...]  # of the elements
 
     def __post_init__(self) -> None:
         where = np.asarray(self.positions_mm, dtype=float)
@@ -42,7 +42,17 @@ class Layout:
         return float(np.sqrt(np.mean(np.sum(self.centred_mm**2, axis=1))))
 
     def checked(self, elements: Sequence[int]) -> Elements:
-        """The choice with its elements in rising order. Raises BadRequest: an element that is not there."""
+        """The choice with its elements in rising order. Raises BadRequest: an element that is not there.
+
+        Parameters
+        ----------
+        elements : sequence of int
+            Numbers of elements of the array.
+
+        Returns
+        -------
+        Elements
+        """
         chosen = tuple(sorted(elements))
         for element in chosen:
             if isinstance(element, bool) or int(element) != element or not 1 <= element <= len(self.positions_mm):
@@ -54,7 +64,19 @@ class Layout:
 
 
 def choices(layout: Layout, farthest_mm: float | None = None) -> list[Elements]:
-    """All single elements, then all pairs that lie no farther apart than `farthest_mm` (None: all pairs)."""
+    """All single elements, then all pairs that lie no farther apart than `farthest_mm` (None: all pairs).
+
+    Parameters
+    ----------
+    layout : Layout
+        Of the array.
+    farthest_mm : float, optional
+        Largest distance of a pair, mm.
+
+    Returns
+    -------
+    list of Elements
+    """
     where = layout.centred_mm
     numbers = range(1, len(where) + 1)
     far = np.inf if farthest_mm is None else farthest_mm * (1 + 1e-9)

@@ -33,19 +33,19 @@ SCHEMA = 1
 class Proposal:
     """The next choice to stimulate."""
 
-    elements: Elements
-    why: str
+    elements: Elements  # the choice to try
+    why: str  # in words
     expected: float
     """Utility, N·m."""
-    sd: float
+    sd: float  # of what is expected
 
 
 @dataclass(frozen=True)
 class Stop:
     """Why no further stimulus is worth it. `elements` is None where no element moves the joint."""
 
-    reason: str
-    elements: Elements | None
+    reason: str  # in words
+    elements: Elements | None  # the best choice
     probability: float
     """That the best known choice is within 10 % of the best; or that no choice is of use."""
 
@@ -69,7 +69,15 @@ class Search:
         self.seen: list[tuple[Elements, Seen]] = []
 
     def add(self, elements: Sequence[int], seen: Seen) -> None:
-        """Keep what a stimulus gave. Raises BadRequest: elements that are not there."""
+        """Keep what a stimulus gave. Raises BadRequest: elements that are not there.
+
+        Parameters
+        ----------
+        elements : sequence of int
+            Numbers of those that were stimulated.
+        seen : Seen
+            What came of it.
+        """
         self.seen.append((self._known(elements), seen))
         self.__dict__.pop("_draws", None)
 
@@ -115,12 +123,22 @@ class Search:
         return None if best is None or np.mean(self._draws["utility"][:, best] > 0) < 0.5 else best
 
     def best(self) -> Elements | None:
-        """The best choice of those that were stimulated; None while none is of use."""
+        """The best choice of those that were stimulated; None while none is of use.
+
+        Returns
+        -------
+        Elements or None
+        """
         at = self._best_index()
         return None if at is None else self.choices[at]
 
     def sure(self) -> float | None:
-        """Probability that the best known choice is within 10 % of the best; None while none is of use."""
+        """Probability that the best known choice is within 10 % of the best; None while none is of use.
+
+        Returns
+        -------
+        float or None
+        """
         utility, at = self._draws["utility"], self._best_index()
         return None if at is None else float(np.mean(utility[:, at] >= NEAR * utility.max(axis=1)))
 
@@ -128,6 +146,15 @@ class Search:
         """The choice from which most is to be gained: the largest expected improvement (Jones et al. 1998).
 
         `left_out`: choices that are not to be proposed.
+
+        Parameters
+        ----------
+        left_out : collection of Elements
+            Choices that are not proposed.
+
+        Returns
+        -------
+        Proposal
         """
         utility, at = self._draws["utility"], self._best_index()
         known = np.zeros((len(utility), 1)) if at is None else utility[:, [at]]
@@ -149,7 +176,12 @@ class Search:
         return f"{name}: probability {better:.0%} to beat {best}."
 
     def enough(self) -> Stop | None:
-        """Whether to stop, and why; None: go on."""
+        """Whether to stop, and why; None: go on.
+
+        Returns
+        -------
+        Stop or None
+        """
         utility, at = self._draws["utility"], self._best_index()
         top = utility.max(axis=1)
         if at is None:
@@ -175,7 +207,12 @@ class Search:
         return Stop(reason, None, nothing)
 
     def map(self) -> list[dict[str, Any]]:
-        """For each choice its elements, whether it was stimulated, and mean and sd of each quantity."""
+        """For each choice its elements, whether it was stimulated, and mean and sd of each quantity.
+
+        Returns
+        -------
+        list of dict
+        """
         done = {elements for elements, _ in self.seen}
         rows = [{"elements": list(each), "stimulated": each in done} for each in self.choices]
         for name in QUANTITIES:
@@ -184,7 +221,12 @@ class Search:
         return rows
 
     def to_dict(self) -> dict[str, Any]:
-        """All that the search is, as JSON holds it."""
+        """All that the search is, as JSON holds it.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "schema_version": SCHEMA,
             "positions_mm": [list(map(float, each)) for each in self.layout.positions_mm],
@@ -198,7 +240,17 @@ class Search:
 
     @classmethod
     def from_dict(cls, kept: Mapping[str, Any]) -> Search:
-        """The search that `to_dict` wrote. Raises BadRequest: not such a dict."""
+        """The search that `to_dict` wrote. Raises BadRequest: not such a dict.
+
+        Parameters
+        ----------
+        kept : mapping
+            What `to_dict` gave.
+
+        Returns
+        -------
+        Search
+        """
         try:
             layout = Layout(tuple((float(x), float(y)) for x, y in kept["positions_mm"]))
             made = cls(layout, Wish(**kept["wish"]), kept["width_us"], kept["current_ma"], kept["prior"],

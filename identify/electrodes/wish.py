@@ -19,7 +19,7 @@ class Seen:
 
     torque_nm: float
     """Positive is the wanted direction."""
-    spill: int
+    spill: int  # what else moved
     comfort: float
     """0 unbearable .. 10 unnoticed."""
 
@@ -48,7 +48,7 @@ class Wish:
     """Share of the torque that a slight spill-over costs."""
     strong_price: float = 1.0
     """The same of a strong one; 1 is never acceptable."""
-    comfort_weight: float = 0.5
+    comfort_weight: float = 0.5  # how much comfort counts
     comfort_limit: float = 4.0
     """A choice that feels worse is out."""
     least_nm: float = 0.1
@@ -64,7 +64,21 @@ class Wish:
             raise BadRequest("the least torque must be above 0 and below the wanted one", place="least_nm")
 
     def utility(self, torque_nm: np.ndarray, spill: np.ndarray, comfort: np.ndarray) -> np.ndarray:
-        """Utility, N·m; arrays of one shape. 0 is a choice that is out."""
+        """Utility, N·m; arrays of one shape. 0 is a choice that is out.
+
+        Parameters
+        ----------
+        torque_nm : ndarray
+            What a choice gives, N·m.
+        spill : ndarray
+            How much of it goes elsewhere.
+        comfort : ndarray
+            How it felt.
+
+        Returns
+        -------
+        ndarray
+        """
         torque = np.where(np.asarray(torque_nm) < self.least_nm, 0.0, torque_nm)
         torque = np.minimum(torque, self.wanted_nm or np.inf)
         left = 1.0 - np.array([0.0, self.slight_price, self.strong_price])[np.asarray(spill, dtype=int)]

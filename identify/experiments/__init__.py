@@ -35,7 +35,7 @@ class Experiment(Result):
 
     rivals: tuple[str, ...]  # ids of the effects
     segments: tuple[Mapping[str, Any], ...]  # `name`, `sequence`, `settings` of each, as `POST /v1/tests` takes them
-    duration_s: float
+    duration_s: float  # of the whole test
     dose: Mapping[str, float]  # `pulses`, `pulse_width_sum_us` and `torque_time_nm_s`
     expected_log_evidence: float  # how clearly the test is expected to decide: of the pair with the smallest
     decides: bool  # whether that is enough
@@ -59,6 +59,17 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     """The shortest test that separates rivals, each simulated as it was fitted to a record.
 
     `record`: the record that does not separate the rivals; `fits`: by effect id, or `NOTHING`.
+
+    Parameters
+    ----------
+    record : Record
+        Which does not separate the rivals.
+    fits : mapping
+        By effect id, or `NOTHING`.
+
+    Returns
+    -------
+    Experiment
     """
     largest_us = float(record.pulse_width_us.max())
     rows = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(largest_us)]
@@ -95,6 +106,17 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
     of level while stimulated are what the paper's test lacks. A further ramp taught muscles of other physics nothing.
 
     `record`: in which structure is left; `fitted`: the last model of it.
+
+    Parameters
+    ----------
+    record : Record
+        In which structure is left.
+    fitted : Fitted
+        The last model.
+
+    Returns
+    -------
+    Experiment
     """
     largest_us, rate_hz = float(record.pulse_width_us.max()), record.pulse_rate_hz
     # the smallest width with a tenth of the largest torque
@@ -141,7 +163,21 @@ def _text(design: Design, duration_s: float, gain: float, names: tuple[str, ...]
 
 
 def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[str, Fitted]) -> float:
-    """Log evidence by which a test of such widths separates that pair of rivals which it separates least."""
+    """Log evidence by which a test of such widths separates that pair of rivals which it separates least.
+
+    Parameters
+    ----------
+    width_us : ndarray
+        Of the new test, µs, one for each pulse.
+    record : Record
+        Which does not separate the rivals.
+    fits : mapping
+        By effect id, or `NOTHING`.
+
+    Returns
+    -------
+    float
+    """
     simulated = _blank(record, width_us)
     return float(min(separation(fits[one], fits[other], simulated) for one, other in permutations(fits, 2)))
 
@@ -158,6 +194,19 @@ def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
     """Log evidence by which a rival is expected to lose in a new test, if `truth` is true.
 
     The rival is fitted again to the new test, with its fit to the old record as prior.
+
+    Parameters
+    ----------
+    truth : Fitted
+        The fit that is taken for true.
+    rival : Fitted
+        The other one.
+    record : Record
+        The new test.
+
+    Returns
+    -------
+    float
     """
     true_mean = _simulate(truth, record, False)[0]
     rival_mean, slopes = _simulate(rival, record, True)

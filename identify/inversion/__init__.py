@@ -69,7 +69,7 @@ class Inversion(Result):
     """Pulse widths for a reference; arrays of shape (K,)."""
 
     reference: Reference  # what was asked for
-    pulse_width_us: np.ndarray
+    pulse_width_us: np.ndarray  # one for each pulse, shape (K,)
     predicted_nm: np.ndarray  # torque above rest that the model predicts for them, mean in each pulse's period
     unreachable: tuple[Stretch, ...]  # where it is not reached, in order of time
     fit_percent: float | None  # best fit where it can be reached; None if the reference does not change there
@@ -83,7 +83,12 @@ class Inversion(Result):
         return Sheet(f"Pulse widths for a torque: {self.pulse_width_us.size} pulses, {fit}", tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """As JSON.
+
+        Returns
+        -------
+        dict
+        """
         reference = self.reference
         return json_value(
             {
@@ -131,6 +136,10 @@ def invert(
         Whole µs. What rounding takes is given back by the pulses after.
     shortest_us : float
         The stimulator's shortest pulse, µs: a narrower one is not sent, so it is 0 here.
+
+    Returns
+    -------
+    Inversion
 
     Raises
     ------
@@ -210,7 +219,21 @@ def _judged(
 
 
 def stretches_of(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float) -> tuple[Stretch, ...]:
-    """Where it is not reached, in order of time; `reasons`: what `reasons_of` gives, `error_nm`: positive."""
+    """Where it is not reached, in order of time; `reasons`: what `reasons_of` gives, `error_nm`: positive.
+
+    Parameters
+    ----------
+    reasons : ndarray
+        Of each pulse.
+    error_nm : ndarray
+        Of each pulse, N·m.
+    pulse_rate_hz : float
+        Pulses a second, Hz.
+
+    Returns
+    -------
+    tuple[Stretch, ...]
+    """
     stretches = [
         Stretch(float(run.start / pulse_rate_hz), float(run.stop / pulse_rate_hz), reason, float(np.max(error_nm[run])))
         for index, reason in enumerate(REASONS)
@@ -220,7 +243,19 @@ def stretches_of(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float
 
 
 def best_fit(wanted: np.ndarray, got: np.ndarray) -> float | None:
-    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper."""
+    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper.
+
+    Parameters
+    ----------
+    wanted : ndarray
+        y, shape (K,).
+    got : ndarray
+        ŷ, shape (K,).
+
+    Returns
+    -------
+    float or None
+    """
     spread = float(np.linalg.norm(wanted - wanted.mean())) if wanted.size else 0.0
     return None if spread < 1e-9 else 100.0 * (1.0 - float(np.linalg.norm(wanted - got)) / spread)
 
@@ -237,7 +272,27 @@ def _joined(rows: np.ndarray) -> np.ndarray:
 def reasons_of(
     plant: Plant, wanted: np.ndarray, demand: np.ndarray, missed: np.ndarray, short: np.ndarray, tolerance_nm: float
 ) -> np.ndarray:
-    """Index into `REASONS` for each pulse, -1 where it is reached; shape (K,)."""
+    """Index into `REASONS` for each pulse, -1 where it is reached; shape (K,).
+
+    Parameters
+    ----------
+    plant : Plant
+        The model with its bounds.
+    wanted : ndarray
+        Torque that is asked for, N·m, shape (K,).
+    demand : ndarray
+        Before the dynamics, N·m, shape (K,).
+    missed : ndarray
+        Where it is missed, bool, shape (K,).
+    short : ndarray
+        Where the narrowest pulse decides, bool, shape (K,).
+    tolerance_nm : float
+        What counts as reached, N·m.
+
+    Returns
+    -------
+    ndarray
+    """
     lasting = np.zeros(wanted.size, bool)
     for run in runs(demand >= (1.0 - NOTHING) * plant.largest_nm):
         lasting[run.start + plant.settled : run.stop] = True  # the muscle gives all that it has by then

@@ -38,7 +38,7 @@ class Reference:
     """
 
     torque_nm: np.ndarray  # with the sign that the record of the model has, shape (K,)
-    pulse_rate_hz: float = 40.0
+    pulse_rate_hz: float = 40.0  # pulses a second
     angle_rad: np.ndarray | None = None  # of the joint, where it moves, mean over each pulse interval, shape (K,)
 
     @property
@@ -70,6 +70,10 @@ class Reference:
             Pulses per second.
         name : str
             How the torque is called in messages.
+
+        Returns
+        -------
+        Reference
 
         Raises
         ------

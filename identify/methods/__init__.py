@@ -26,19 +26,34 @@ class Method:
     id: str  # as users write it: `two-stage`
     summary: str  # one line
     options: Mapping[str, str]  # each option's name and what it does
-    fit: Callable[..., Model]
+    fit: Callable[..., Model]  # the function that fits
 
 
 @cache
 def methods() -> dict[str, Method]:
-    """Every method by its id."""
+    """Every method by its id.
+
+    Returns
+    -------
+    dict
+    """
     modules = [import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
     found = [module.METHOD for module in modules if isinstance(getattr(module, "METHOD", None), Method)]
     return {method.id: method for method in sorted(found, key=lambda method: method.id)}
 
 
 def method_of(name: str) -> Method:
-    """The method with this id. Raises BadRequest: no method has this id."""
+    """The method with this id. Raises BadRequest: no method has this id.
+
+    Parameters
+    ----------
+    name : str
+        Id of a method.
+
+    Returns
+    -------
+    Method
+    """
     if name not in methods():
         raise BadRequest(f"unknown method {name!r}", place="method", fix=f"Known: {', '.join(methods())}.")
     return methods()[name]
@@ -48,6 +63,13 @@ def check_options(chosen: Method, options: Mapping[str, Any]) -> None:
     """Refuse options that a method does not have.
 
     Raises BadRequest: with the name of the option, and the known ones.
+
+    Parameters
+    ----------
+    chosen : Method
+        The method.
+    options : mapping
+        By name.
     """
     for name in options:
         if name not in chosen.options:

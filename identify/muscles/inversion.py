@@ -45,9 +45,9 @@ NEAR_ZERO = 0.15
 class Limits:
     """Of one channel; as of one muscle's `invert`."""
 
-    largest_us: float | None = None
-    rise_us: float | None = None
-    shortest_us: float = 0.0
+    largest_us: float | None = None  # widest pulse
+    rise_us: float | None = None  # largest rise from pulse to pulse
+    shortest_us: float = 0.0  # narrowest pulse
     dose_us: float = np.inf  # largest sum of its widths, its charge over its current; the demand is scaled down to it
 
 
@@ -58,7 +58,7 @@ class JointInversion(Result):
     reference: Reference  # what was asked for
     co_contraction: str  # one of `CO_CONTRACTIONS`
     level: float  # of each muscle's largest torque, that is kept
-    bound_nm: float  # up to which |torque| `stiffness` keeps it
+    bound_nm: float  # torque of either sign up to which `stiffness` keeps it
     pulse_width_us: dict[str, np.ndarray]  # by channel
     predicted_nm: np.ndarray  # of the joint above rest, mean in each pulse's period
     muscle_nm: dict[str, np.ndarray]  # of each muscle by itself, before the joint takes what co-contraction costs
@@ -74,7 +74,12 @@ class JointInversion(Result):
         return Sheet(f"Pulse widths of {len(self.pulse_width_us)} channels for a torque: {fit}", tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """As JSON.
+
+        Returns
+        -------
+        dict
+        """
         reference = self.reference
         apart = ("reference", "predicted_nm", "muscle_nm", "unreachable")
         told = {name: value for name, value in vars(self).items() if name not in apart}
@@ -104,7 +109,7 @@ def invert(
         Torque of the joint above rest, one for each pulse period, N·m.
     co_contraction : str
         "none": each torque by the muscles of one sign, with a smooth change at 0. "constant": while the joint is
-        active every muscle keeps `level` of its largest torque. "stiffness": the same, but only where |torque| is
+        active every muscle keeps `level` of its largest torque. "stiffness": the same, but only where the torque is
         below `bound_nm`, by default 15 % of the weaker side's largest, and gone at twice that. It is the muscles'
         activity that is kept: how stiff the joint is then, no torque of a joint at rest tells.
     level : float
@@ -113,6 +118,12 @@ def invert(
         Of each channel, or by channel; one that is not named has none.
     whole : bool
         Whole µs.
+    bound_nm : float, optional
+        Torque up to which "stiffness" keeps both muscles active, N·m.
+
+    Returns
+    -------
+    JointInversion
 
     Raises
     ------

@@ -37,20 +37,20 @@ class JointModel(Summarised):
     other. Each muscle's delay counts from its own pulses.
     """
 
-    channels: tuple[Channel, ...]
+    channels: tuple[Channel, ...]  # what is known of each
     models: tuple[Model, ...]  # of each channel, in order
     interplay: tuple[dict[str, Any], ...] = ()
     """Each {"id", "from", "to", "form", "equation", "parameters"}; `from` and `to` are missing where it is of the
     joint."""
     fit: dict[str, Any] = field(default_factory=dict)
     """As of one model, and `alone` by channel and `both`: the error on held-out pulses while those muscles moved."""
-    quality: dict[str, Any] = field(default_factory=dict)
-    valid_for: dict[str, Any] = field(default_factory=dict)
-    data: dict[str, Any] = field(default_factory=dict)
-    reasons: tuple[str, ...] = ()
-    model_id: str = ""
-    created: str = ""
-    software: dict[str, Any] = field(default_factory=made_by)
+    quality: dict[str, Any] = field(default_factory=dict)  # the verdict and its reasons
+    valid_for: dict[str, Any] = field(default_factory=dict)  # what was fitted
+    data: dict[str, Any] = field(default_factory=dict)  # the recording
+    reasons: tuple[str, ...] = ()  # for the structure
+    model_id: str = ""  # of this version
+    created: str = ""  # UTC, ISO 8601
+    software: dict[str, Any] = field(default_factory=made_by)  # name and version
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -68,13 +68,28 @@ class JointModel(Summarised):
         return self.models[0].pulse_rate_hz
 
     def of(self, name: str) -> Model:
-        """The model of a channel. Raises BadRequest: there is none of that name."""
+        """The model of a channel. Raises BadRequest: there is none of that name.
+
+        Parameters
+        ----------
+        name : str
+            Of a channel.
+
+        Returns
+        -------
+        Model
+        """
         if name not in self.names:
             raise BadRequest(f"no channel {name!r}", place="channel", fix=f"Use one of {', '.join(self.names)}.")
         return self.models[self.names.index(name)]
 
     def acting(self) -> list[tuple[Acting, dict[str, float]]]:
-        """Each interplay with its parameters."""
+        """Each interplay with its parameters.
+
+        Returns
+        -------
+        list[tuple[Acting, dict]
+        """
         found = []
         for entry in self.interplay:
             ends = f":{entry['from']}>{entry['to']}" if "from" in entry else ""
@@ -83,11 +98,26 @@ class JointModel(Summarised):
         return found
 
     def predict(self, record: JointRecord) -> np.ndarray:
-        """Free-run torque at the record's samples, N·m, shape (N,)."""
+        """Free-run torque at the record's samples, N·m, shape (N,).
+
+        Parameters
+        ----------
+        record : JointRecord
+            The measurement.
+
+        Returns
+        -------
+        ndarray
+        """
         return predict(self, record)
 
     def to_dict(self) -> dict[str, Any]:
-        """As a file of a joint model holds it."""
+        """As a file of a joint model holds it.
+
+        Returns
+        -------
+        dict
+        """
         channels = [
             channel.to_dict() | {"model": model.to_dict()}
             for channel, model in zip(self.channels, self.models, strict=True)
@@ -99,12 +129,32 @@ class JointModel(Summarised):
         return json_value(whole)
 
     def to_json(self, indent: int | None = 1) -> str:
-        """The same as text."""
+        """The same as text.
+
+        Parameters
+        ----------
+        indent : int, optional
+            Spaces for each level; None: one line.
+
+        Returns
+        -------
+        str
+        """
         return json.dumps(self.to_dict(), indent=indent, ensure_ascii=False, allow_nan=False)
 
     @classmethod
     def from_dict(cls, data: Any) -> JointModel:
-        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid."""
+        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid.
+
+        Parameters
+        ----------
+        data : object
+            What `to_dict` gave.
+
+        Returns
+        -------
+        JointModel
+        """
         if not is_joint_model(data):
             raise BadModel("not the model of a joint", place="kind", fix="Give a file of several muscles.")
         try:
@@ -160,7 +210,17 @@ class JointModel(Summarised):
 
     @classmethod
     def from_json(cls, text: str | bytes) -> JointModel:
-        """The model in a text. Raises BadModel: not JSON, too long or too deep, or not the model of a joint."""
+        """The model in a text. Raises BadModel: not JSON, too long or too deep, or not the model of a joint.
+
+        Parameters
+        ----------
+        text : str or bytes
+            Of a MODEL.json.
+
+        Returns
+        -------
+        JointModel
+        """
         if len(text) > MOST_TEXTS * LARGEST_TEXT:
             raise BadModel("too long a text", fix=model_schema.FIX)
         try:
@@ -169,11 +229,26 @@ class JointModel(Summarised):
             raise BadModel(str(error), fix=model_schema.FIX) from error
 
     def with_(self, **changes: Any) -> JointModel:
-        """A copy with some fields changed."""
+        """A copy with some fields changed.
+
+        Parameters
+        ----------
+        **changes
+            Fields with their new values.
+
+        Returns
+        -------
+        JointModel
+        """
         return replace(self, **changes)
 
     def named(self) -> JointModel:
-        """With a new id, and made now."""
+        """With a new id, and made now.
+
+        Returns
+        -------
+        JointModel
+        """
         return self.with_(model_id=str(uuid4()), created=datetime.now(UTC).isoformat(timespec="seconds"))
 
     def _sheet(self) -> Sheet:
@@ -220,7 +295,17 @@ def _parameters_of(acting: Acting) -> Sequence[Any]:
 
 
 def is_joint_model(data: Any) -> bool:
-    """Whether a JSON document is the model of a joint."""
+    """Whether a JSON document is the model of a joint.
+
+    Parameters
+    ----------
+    data : object
+        A JSON document.
+
+    Returns
+    -------
+    bool
+    """
     return isinstance(data, dict) and data.get("kind") == KIND
 
 
@@ -233,17 +318,52 @@ def predict(model: JointModel, record: JointRecord) -> np.ndarray:
     """Torque that the model predicts for the record's pulse widths, N·m, shape (N,). No measured torque is used.
 
     Raises BadModel: as `stimrig.identify.predict`. BadRequest: the record has other channels.
+
+    Parameters
+    ----------
+    model : JointModel
+        The model.
+    record : JointRecord
+        The measurement.
+
+    Returns
+    -------
+    ndarray
     """
     return whole_and_parts(model, record)[0]
 
 
 def parts(model: JointModel, record: JointRecord) -> dict[str, np.ndarray]:
-    """Torque of each muscle by itself, without the zero, N·m, shape (N,)."""
+    """Torque of each muscle by itself, without the zero, N·m, shape (N,).
+
+    Parameters
+    ----------
+    model : JointModel
+        The model.
+    record : JointRecord
+        The measurement.
+
+    Returns
+    -------
+    dict
+    """
     return whole_and_parts(model, record)[1]
 
 
 def whole_and_parts(model: JointModel, record: JointRecord) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Both at once. Raises as `predict`."""
+    """Both at once. Raises as `predict`.
+
+    Parameters
+    ----------
+    model : JointModel
+        The model.
+    record : JointRecord
+        The measurement.
+
+    Returns
+    -------
+    tuple[ndarray, dict[str, ndarray]]
+    """
     problem, theta = _problem(model, record)
     whole, own = problem.whole_and_parts(theta)
     return whole, dict(zip(model.names, own, strict=True))

@@ -33,14 +33,19 @@ HAIR_S = 1e-6
 class Channel:
     """One output of the stimulator, with its electrodes."""
 
-    name: str
-    muscle: str = ""
-    side: str = ""
-    electrode: str = ""
+    name: str  # of the channel
+    muscle: str = ""  # as "biceps brachii"
+    side: str = ""  # "left" or "right"
+    electrode: str = ""  # where it lies
     offset_s: float = 0.0  # by how much later than those of the first channel its pulses come, s
 
     def to_dict(self) -> dict[str, str | float]:
-        """As the files tell it."""
+        """As the files tell it.
+
+        Returns
+        -------
+        dict
+        """
         return dict(vars(self))
 
 
@@ -51,8 +56,8 @@ class JointRecord:
     The widths of a channel stand on the slots of the first one: `Channel.offset_s` says how much later they come.
     """
 
-    channels: tuple[Channel, ...]
-    records: tuple[Record, ...]
+    channels: tuple[Channel, ...]  # what is known of each
+    records: tuple[Record, ...]  # one for each channel
 
     @classmethod
     def from_arrays(
@@ -67,6 +72,25 @@ class JointRecord:
         """Build it from arrays, shape (N,); `pulse_width_us`: by the channel's name, held from its pulse on, µs.
 
         Raises BadRecord: as `Record.from_arrays`, or a channel without widths.
+
+        Parameters
+        ----------
+        channels : sequence of Channel
+            What is known of each.
+        time_s : ndarray
+            Rising times, s, shape (N,).
+        pulse_width_us : mapping
+            By the channel's name, µs, shape (N,).
+        torque_nm : ndarray
+            Torque of the joint, N·m, shape (N,).
+        segment : sequence of str, optional
+            Name of the segment of each row.
+        pulse_rate_hz : float
+            Pulses a second of each channel, Hz.
+
+        Returns
+        -------
+        JointRecord
         """
         records = []
         for channel in channels:
@@ -124,15 +148,45 @@ class JointRecord:
         )
 
     def with_torque(self, torque_nm: np.ndarray) -> JointRecord:
-        """The same with another torque, N·m, shape (N,)."""
+        """The same with another torque, N·m, shape (N,).
+
+        Parameters
+        ----------
+        torque_nm : ndarray
+            Torque, N·m, shape (N,).
+
+        Returns
+        -------
+        JointRecord
+        """
         return replace(self, records=tuple(record.with_torque(torque_nm) for record in self.records))
 
     def take(self, rows: np.ndarray) -> JointRecord:
-        """Some of its rows."""
+        """Some of its rows.
+
+        Parameters
+        ----------
+        rows : ndarray
+            Of the record: bool of shape (N,), or rising indices.
+
+        Returns
+        -------
+        JointRecord
+        """
         return replace(self, records=tuple(record.take(rows) for record in self.records))
 
     def moving(self, memory_s: float = 1.0) -> dict[str, np.ndarray]:
-        """bool, shape (N,), by channel: samples up to `memory_s` after a pulse of it."""
+        """bool, shape (N,), by channel: samples up to `memory_s` after a pulse of it.
+
+        Parameters
+        ----------
+        memory_s : float
+            How long a pulse acts, s.
+
+        Returns
+        -------
+        dict
+        """
         reach = max(round(memory_s * self.records[0].sample_rate_hz), 1)
         found = {}
         for channel, record in zip(self.channels, self.records, strict=True):
@@ -142,7 +196,21 @@ class JointRecord:
 
 
 def held_later(time_s: np.ndarray, width_us: np.ndarray, later_s: float) -> np.ndarray:
-    """Widths, shape (N,), as they are held if their pulses come so much later, or earlier; 0 before the first."""
+    """Widths, shape (N,), as they are held if their pulses come so much later, or earlier; 0 before the first.
+
+    Parameters
+    ----------
+    time_s : ndarray
+        Of the samples, s, shape (N,).
+    width_us : ndarray
+        As held, µs, shape (N,).
+    later_s : float
+        So much later, s.
+
+    Returns
+    -------
+    ndarray
+    """
     if later_s == 0.0:
         return width_us
     last = np.searchsorted(time_s, time_s - later_s + HAIR_S, side="right") - 1
@@ -153,6 +221,15 @@ def is_joint(path: str | Path) -> bool:
     """Whether a file holds the pulses of several channels; a pipe, which can be read once, does not.
 
     Raises BadRecord: it cannot be read.
+
+    Parameters
+    ----------
+    path : path
+        Of the file.
+
+    Returns
+    -------
+    bool
     """
     path = Path(path)
     if path.exists() and not path.is_file():
@@ -180,6 +257,17 @@ def read(path: str | Path, pulse_rate_hz: float | None = None) -> JointRecord:
     In a table the changes of width tell how much later a channel's pulses come.
 
     Raises BadRecord: as `stimrig.identify.read`, or the file holds one channel.
+
+    Parameters
+    ----------
+    path : path
+        Of the file.
+    pulse_rate_hz : float, optional
+        Pulses a second, Hz; default: as the file says.
+
+    Returns
+    -------
+    JointRecord
     """
     from stimrig.identify.records import read as read_one
 

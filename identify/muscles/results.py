@@ -29,7 +29,7 @@ def name_of(key: str) -> str:
 class JointDiagnosis(Result):
     """What the model of several muscles lacks."""
 
-    noise_sd_nm: float
+    noise_sd_nm: float  # white noise of a sample
     base: Row  # errors of the examined model, as `JointModel.fit`
     verdict: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
     missing: tuple[Row, ...]
@@ -42,7 +42,12 @@ class JointDiagnosis(Result):
     notes: tuple[str, ...]  # what was assumed of the record
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON, without the model."""
+        """As JSON, without the model.
+
+        Returns
+        -------
+        dict
+        """
         return {key: value for key, value in super().to_dict().items() if key != "model"}
 
     def _sheet(self) -> Sheet:
@@ -58,10 +63,10 @@ class JointDiagnosis(Result):
 class JointImprovement(Result):
     """The models of several muscles, each with one thing more."""
 
-    noise_sd_nm: float
-    verdict: str
+    noise_sd_nm: float  # white noise of a sample
+    verdict: str  # of the last model
     steps: tuple[Row, ...]  # `added`, `name`, `model_id`, `reason`, and the errors
-    models: tuple[JointModel, ...]
+    models: tuple[JointModel, ...]  # one thing more each
     refused: tuple[Row, ...]  # `effect`, `log_evidence_gain`, `reason`
 
     def _sheet(self) -> Sheet:

@@ -44,6 +44,10 @@ def fit(
     progress : callable, optional
         Called with the share done, 0 to 1, and a line of text; it may raise `Cancelled`.
 
+    Returns
+    -------
+    JointModel
+
     Raises
     ------
     BadRequest
@@ -143,6 +147,19 @@ def diagnose(record: JointRecord, model: JointModel | None = None, progress: Pro
     """What a model of several muscles lacks; without a model, what the plain structure of the record lacks.
 
     Raises BadRequest, BadRecord, NotIdentifiable: as `fit`. Cancelled: `progress` asked to stop.
+
+    Parameters
+    ----------
+    record : JointRecord
+        The measurement.
+    model : JointModel, optional
+        None: the plain structure.
+    progress : callable, optional
+        Called with a share of 0 to 1 and a line of text; what it raises ends the work.
+
+    Returns
+    -------
+    JointDiagnosis
     """
     return diagnosis_of(searched(record, model, progress))
 
@@ -202,6 +219,17 @@ def compare(model: JointModel, record: JointRecord) -> dict[str, Any]:
     """The model's error on a record, by segment, and on held-out pulses of each muscle alone and of both.
 
     Raises BadModel, BadRequest: as `predict`.
+
+    Parameters
+    ----------
+    model : JointModel
+        The model.
+    record : JointRecord
+        The measurement.
+
+    Returns
+    -------
+    dict
     """
     return errors_of(record, predict(model, record))
 
@@ -215,7 +243,21 @@ def errors_of(record: JointRecord, predicted_nm: np.ndarray) -> dict[str, Any]:
 
 
 def improve(record: JointRecord, model: JointModel | None = None, progress: Progress | None = None) -> JointImprovement:
-    """Fit models of several muscles, each with one thing more, while something is needed. Raises as `diagnose`."""
+    """Fit models of several muscles, each with one thing more, while something is needed. Raises as `diagnose`.
+
+    Parameters
+    ----------
+    record : JointRecord
+        The measurement.
+    model : JointModel, optional
+        To begin with; None: the plain structure.
+    progress : callable, optional
+        Called with a share of 0 to 1 and a line of text; what it raises ends the work.
+
+    Returns
+    -------
+    JointImprovement
+    """
     return improvement_of(searched(record, model, progress))
 
 

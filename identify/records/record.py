@@ -83,7 +83,7 @@ class Record(Summarised):
     torque_nm: np.ndarray  # shape (N,); measured torque, N·m
     segment: np.ndarray  # shape (N,); index into `segment_names` for each sample
     segment_names: tuple[str, ...]  # one name for each contiguous run of rows; a name may occur several times
-    angle_rad: np.ndarray | None = None
+    angle_rad: np.ndarray | None = None  # of the joint, shape (N,)
     velocity_rad_s: np.ndarray | None = None
     """Shape (N,); joint angle, rad, and angular velocity, rad/s, as they were recorded: `motion` is what is reckoned
     with."""
@@ -121,6 +121,39 @@ class Record(Summarised):
         names.
 
         Raises BadRecord: lengths differ, there is nothing, or an optional column is not finite.
+
+        Parameters
+        ----------
+        time_s : ndarray
+            Rising times, s, shape (N,).
+        pulse_width_us : ndarray
+            Width held since the last pulse, µs, shape (N,).
+        torque_nm : ndarray
+            Torque, N·m, shape (N,).
+        segment : sequence of str, optional
+            Name of the segment of each row, or its index.
+        segment_names : sequence of str, optional
+            Names, where `segment` holds indices.
+        angle_rad : ndarray, optional
+            Angle of the joint, rad, shape (N,).
+        velocity_rad_s : ndarray, optional
+            Its velocity, rad/s, shape (N,).
+        late_s : ndarray, optional
+            How much later than planned the pulse of each row came, s, shape (N,).
+        doubted : ndarray, optional
+            Rows where it is not known which pulses acted, bool, shape (N,).
+        pulses : Pulses, optional
+            Pulses as the device confirmed them.
+        pulse_rate_hz : float
+            Pulses a second, Hz.
+        source : Source, optional
+            Where the record comes from.
+        parts : sequence of Part
+            Of a joined record.
+
+        Returns
+        -------
+        Record
         """
         time_s = np.ascontiguousarray(time_s, float)
         size = time_s.size
@@ -170,16 +203,36 @@ class Record(Summarised):
         return Sheet(f"Record {self.source.name or 'without a name'}: {long}, {rates}", tuple(rows))
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The optional columns that this record has, by name."""
+        """The optional columns that this record has, by name.
+
+        Returns
+        -------
+        dict
+        """
         found = {name: getattr(self, name) for name in OPTIONAL}
         return {name: column for name, column in found.items() if column is not None}
 
     def samples(self) -> dict[str, np.ndarray]:
-        """Times, pulse widths, torques and the optional columns, by name."""
+        """Times, pulse widths, torques and the optional columns, by name.
+
+        Returns
+        -------
+        dict
+        """
         return {name: getattr(self, name) for name in NEEDED} | self.columns()
 
     def take(self, rows: np.ndarray) -> Record:
-        """The record of some of its rows (bool or indices, rising), with every column it has, and its pulses."""
+        """The record of some of its rows (bool or indices, rising), with every column it has, and its pulses.
+
+        Parameters
+        ----------
+        rows : ndarray
+            Of the record: bool of shape (N,), or rising indices.
+
+        Returns
+        -------
+        Record
+        """
         return Record.from_arrays(
             **{name: column[rows] for name, column in self.samples().items()},
             segment=self.segment[rows],
@@ -223,7 +276,17 @@ class Record(Summarised):
         return JointMotion.of(self.time_s, self.angle_rad, [part.first for part in self.parts])
 
     def knows(self, name: str) -> bool:
-        """Whether it has an optional column; the velocity of the joint follows from its angle."""
+        """Whether it has an optional column; the velocity of the joint follows from its angle.
+
+        Parameters
+        ----------
+        name : str
+            As "angle_rad".
+
+        Returns
+        -------
+        bool
+        """
         return getattr(self, name) is not None or (name == "velocity_rad_s" and self.angle_rad is not None)
 
     @cached_property
@@ -251,7 +314,17 @@ class Record(Summarised):
         return tuple(dict.fromkeys((*self.source.notes, *of_parts)))
 
     def with_torque(self, torque_nm: np.ndarray) -> Record:
-        """The same record with another torque, N·m, shape (N,)."""
+        """The same record with another torque, N·m, shape (N,).
+
+        Parameters
+        ----------
+        torque_nm : ndarray
+            Torque, N·m, shape (N,).
+
+        Returns
+        -------
+        Record
+        """
         return replace(self, torque_nm=np.ascontiguousarray(torque_nm, float))
 
 

@@ -26,6 +26,17 @@ class Curve:
         """Pulse widths, µs, and torques, N·m, dense enough for linear interpolation.
 
         The spacing is halved until the error at the midpoints is below `tolerance` times the curve's range.
+
+        Parameters
+        ----------
+        tolerance : float
+            Largest error, as a share of the curve's range.
+        most : int
+            So many points at most.
+
+        Returns
+        -------
+        tuple[ndarray, ndarray]
         """
         size = 151
         while True:
@@ -42,6 +53,10 @@ class Curve:
 
         The running maximum is inverted, so a curve that falls somewhere still has one answer: the smallest charge that
         gives the torque.
+
+        Returns
+        -------
+        tuple[ndarray, ndarray]
         """
         u, torque = self.table()
         sign = 1.0 if torque[np.argmax(np.abs(torque))] >= 0 else -1.0
@@ -56,6 +71,12 @@ class Curve:
         return sign * level, u[before] + share * (u[reached] - u[before])
 
     def to_dict(self) -> dict:
+        """As MODEL.json has it.
+
+        Returns
+        -------
+        dict
+        """
         return {"basis": self.basis.to_dict() | {"coefficients_nm": [float(x) for x in self.coefficients_nm]}}
 
 
@@ -63,8 +84,8 @@ class Curve:
 class FixedShape:
     """A gain times a given curve, as a basis: for steps that estimate only the dynamics."""
 
-    curve: Curve
-    size: int = field(default=1, init=False)
+    curve: Curve  # the shape
+    size: int = field(default=1, init=False)  # of coefficients: 1
 
     @property
     def largest_us(self) -> float:
@@ -72,10 +93,28 @@ class FixedShape:
         return self.curve.basis.largest_us
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """Shape (..., 1)."""
+        """Shape (..., 1).
+
+        Parameters
+        ----------
+        pulse_width_us : ndarray
+            µs.
+        derivative : int
+            0: the values; 1: their slope.
+
+        Returns
+        -------
+        ndarray
+        """
         return self.curve(pulse_width_us, derivative)[..., None]
 
     def to_dict(self) -> dict:
+        """As MODEL.json has it.
+
+        Returns
+        -------
+        dict
+        """
         return self.curve.to_dict()
 
 
@@ -84,7 +123,17 @@ Basis = SplineBasis | PowerBasis | SigmoidBasis | FixedShape
 
 
 def basis_from_dict(data: dict[str, Any]) -> Basis:
-    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to."""
+    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to.
+
+    Parameters
+    ----------
+    data : dict
+        What `to_dict` of a basis gave.
+
+    Returns
+    -------
+    Basis
+    """
     match data["kind"]:
         case "cubic-spline":
             return SplineBasis(np.asarray(data["knots_us"], float))
@@ -105,6 +154,17 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
 
     `curve`: f(u); where it falls, its plateau is below zero. `covariance_nm2`: shape (basis.size, basis.size);
     covariance of the coefficients, N²·m².
+
+    Parameters
+    ----------
+    curve : Curve
+        The recruitment curve.
+    covariance_nm2 : ndarray, optional
+        Of the coefficients, N²·m².
+
+    Returns
+    -------
+    dict
     """
     width_us, torque_nm = curve.table()
     top = int(np.argmax(np.abs(torque_nm)))
@@ -146,7 +206,21 @@ def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:
 
 
 def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:
-    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search."""
+    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search.
+
+    Parameters
+    ----------
+    steepness_log : float
+        Log of the steepness.
+    middle_us : float
+        Of the sigmoid, µs.
+    largest_us : float
+        Largest pulse width, µs.
+
+    Returns
+    -------
+    SigmoidBasis
+    """
     a2 = float(np.exp(steepness_log))
     return SigmoidBasis(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
 
@@ -158,6 +232,19 @@ def fit_shape(
 
     `residual_of`: gives the residual for a shape, with all linear parameters solved for. `largest_us`: largest pulse
     width. `seen_us`: pulse widths that were applied, µs; they bound the middle.
+
+    Parameters
+    ----------
+    residual_of : callable
+        Residual of a shape.
+    largest_us : float
+        Largest pulse width, µs.
+    seen_us : ndarray
+        Widths that were applied, µs.
+
+    Returns
+    -------
+    SigmoidBasis
     """
     from scipy.optimize import least_squares
 
@@ -181,7 +268,19 @@ def fit_shape(
 
 
 def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:
-    """The sigmoid fitted to points, with its gain."""
+    """The sigmoid fitted to points, with its gain.
+
+    Parameters
+    ----------
+    width_us : ndarray
+        µs, shape (K,).
+    torque_nm : ndarray
+        N·m, shape (K,).
+
+    Returns
+    -------
+    Curve
+    """
     largest = float(np.max(width_us))
 
     def gain_and_residual(basis: SigmoidBasis) -> tuple[float, np.ndarray]:

@@ -69,6 +69,19 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, the record lacks a column
     it needs, or the torque grows without limit. Raises BadRequest: in the earlier trial no joint moves, or it is
     several recordings.
+
+    Parameters
+    ----------
+    model : Muscle
+        Of one muscle.
+    record : Record
+        Whose pulse widths, and angle, are used.
+    earlier_trial : Record, optional
+        A record of the same movement.
+
+    Returns
+    -------
+    ndarray
     """
     refuse_rate(model, record)
     grid = make_grid(record)

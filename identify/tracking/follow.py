@@ -78,7 +78,7 @@ class Step:
     after: State  # what is known after it
     coming: State  # what is expected of the next trial: of this the controller is told
     distance: float | None  # squared, of what was seen from what was expected, in sd; None if it moved nothing
-    effects: dict[str, dict[str, float]] = field(default_factory=dict)
+    effects: dict[str, dict[str, float]] = field(default_factory=dict)  # their states
 
     @property
     def disturbed_s(self) -> list[list[float]]:
@@ -88,7 +88,12 @@ class Step:
         return [list(stretch) for stretch in self.seen.disturbed]
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON: the levels of this trial and of the next with their bands, and what people may ask."""
+        """As JSON: the levels of this trial and of the next with their bands, and what people may ask.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "outcome": str(self.outcome),
             "trial": self.after.trials,
@@ -106,14 +111,36 @@ class Step:
 
 
 def levels_of(state: State) -> dict[str, dict[str, float]]:
-    """`value`, `low` and `high` (95 %) of each tracked quantity."""
+    """`value`, `low` and `high` (95 %) of each tracked quantity.
+
+    Parameters
+    ----------
+    state : State
+        What is known of the muscle.
+
+    Returns
+    -------
+    dict
+    """
     mean, half = state.mean[:LEVELS], 1.96 * np.sqrt(np.diag(state.covariance)[:LEVELS])
     ends = {"value": state.values, "low": Values.of(mean - half), "high": Values.of(mean + half)}
     return {name: {end: getattr(values, name) for end, values in ends.items()} for name in QUANTITIES}
 
 
 def begin(model: Model, rates: Rates = USUAL) -> State:
-    """What is expected of the first trial after an approval."""
+    """What is expected of the first trial after an approval.
+
+    Parameters
+    ----------
+    model : Model
+        The approved one.
+    rates : Rates
+        How fast muscles change.
+
+    Returns
+    -------
+    State
+    """
     return State.start(curve_covariance(model), rates)
 
 
@@ -135,6 +162,10 @@ def follow(
     rest_s : float, optional
         Rest between the end of what was seen last and this record's begin, s. None: by their clocks, `Part.begun_s`.
         If it is not known, or no rest (negative, not a number), the muscle is taken to have recovered.
+
+    Returns
+    -------
+    Step
 
     Raises
     ------
@@ -183,6 +214,10 @@ def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Mo
         Least and most of each quantity that may move; the others stay as approved. All three are followed
         nevertheless: one that was held would be taken for a change of the others. By default all move freely.
         Whether the expected values themselves are inside, the caller has to look.
+
+    Returns
+    -------
+    Model
     """
     coming, effects = step.coming, {effect: states["coming"] for effect, states in step.effects.items()}
     if bounds is None:
@@ -199,7 +234,17 @@ def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Mo
 
 
 def slow_forms(model: Model) -> dict[str, tuple[Form, dict[str, Any]]]:
-    """By effect id, the form and the parameters of each of the model's effects that has a slow state."""
+    """By effect id, the form and the parameters of each of the model's effects that has a slow state.
+
+    Parameters
+    ----------
+    model : Model
+        The model.
+
+    Returns
+    -------
+    dict]
+    """
     found = {}
     for entry in model.effects:
         known = known_form(entry)
@@ -244,6 +289,21 @@ def passed(model: Model, state: State, record: Record, rest_s: float | None = No
     For a record that teaches nothing else: the test before the session, or a trial that cannot be followed.
 
     Raises BadModel, BadRecord: as `stimrig.identify.tracking.trial.look`, of any pulse rate.
+
+    Parameters
+    ----------
+    model : Model
+        The model.
+    state : State
+        What is known of the muscle.
+    record : Record
+        The measurement.
+    rest_s : float, optional
+        Before the record, s; None: not known.
+
+    Returns
+    -------
+    State
     """
     if not slow_forms(model):
         return state
@@ -299,6 +359,21 @@ def moved_model(
     where `effects` says that they begin.
 
     Raises BadModel: the model's dynamics are not of second order.
+
+    Parameters
+    ----------
+    model : Model
+        The model.
+    values : Values
+        The levels.
+    curve_nm : ndarray or float
+        Added to the coefficients of the curve, N·m.
+    effects : mapping, optional
+        By effect id, where it begins.
+
+    Returns
+    -------
+    Model
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics are tracked", fix="Fit with maximum-likelihood.")

@@ -54,13 +54,23 @@ USUAL = Rates(
 class Values:
     """Gain and time scale as factors on the approved model's, the shift of its threshold in µs."""
 
-    gain: float = 1.0
-    threshold_shift_us: float = 0.0
-    time_scale: float = 1.0
+    gain: float = 1.0  # 1: as approved
+    threshold_shift_us: float = 0.0  # 0: as approved
+    time_scale: float = 1.0  # 1: as approved
 
     @classmethod
     def of(cls, levels: np.ndarray) -> Values:
-        """From log gain, µs, log time scale."""
+        """From log gain, µs, log time scale.
+
+        Parameters
+        ----------
+        levels : ndarray
+            Log gain, shift of the threshold (µs), log time scale.
+
+        Returns
+        -------
+        Values
+        """
         return cls(float(np.exp(levels[0])), float(levels[1]), float(np.exp(levels[2])))
 
     @property
@@ -77,8 +87,8 @@ class State:
     approved curve, N·m.
     """
 
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: np.ndarray  # of levels and trends
+    covariance: np.ndarray  # of the same
     trials: int = 0  # that it was learnt from
     odd: np.ndarray | None = None  # how far the last trial would have moved the levels, if it was odd
     unexplained: int = 0  # trials since the last one that gain, threshold and speed explained
@@ -87,7 +97,19 @@ class State:
 
     @classmethod
     def start(cls, curve_covariance: np.ndarray, rates: Rates = USUAL) -> State:
-        """Before the first trial; `curve_covariance` is that of the approved curve's coefficients, (N·m)²."""
+        """Before the first trial; `curve_covariance` is that of the approved curve's coefficients, (N·m)².
+
+        Parameters
+        ----------
+        curve_covariance : ndarray
+            Of the curve's coefficients, (N·m)².
+        rates : Rates
+            How fast muscles change.
+
+        Returns
+        -------
+        State
+        """
         size = len(curve_covariance)
         covariance = np.zeros((CURVE + size, CURVE + size))
         covariance[:CURVE, :CURVE] = np.diag(np.r_[rates.start, rates.trend_sd] ** 2)
@@ -110,19 +132,44 @@ class State:
         return np.r_[np.arange(LEVELS), np.arange(CURVE, self.mean.size)]
 
     def ahead(self, rates: Rates = USUAL) -> State:
-        """Before the next trial."""
+        """Before the next trial.
+
+        Parameters
+        ----------
+        rates : Rates
+            How fast muscles change.
+
+        Returns
+        -------
+        State
+        """
         move = np.eye(self.mean.size)
         move[:LEVELS, LEVELS:CURVE] = np.eye(LEVELS)
         spread = np.diag(np.r_[rates.step, rates.turn, np.zeros(self.mean.size - CURVE)] ** 2)
         return replace(self, mean=move @ self.mean, covariance=move @ self.covariance @ move.T + spread)
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """As JSON.
+
+        Returns
+        -------
+        dict
+        """
         return json_value(vars(self))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> State:
-        """The state that `to_dict` wrote."""
+        """The state that `to_dict` wrote.
+
+        Parameters
+        ----------
+        data : dict
+            What `to_dict` gave.
+
+        Returns
+        -------
+        State
+        """
         odd = data.get("odd")
         return cls(
             np.array(data["mean"], float),

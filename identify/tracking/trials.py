@@ -53,6 +53,10 @@ def track(model: Model, trials: Sequence[Record]) -> Tracked:
     trials : sequence of Record
         At least one, each with its rest before and after.
 
+    Returns
+    -------
+    Tracked
+
     Raises
     ------
     BadModel, BadRecord
