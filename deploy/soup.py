@@ -78,7 +78,10 @@ def _anomalies(told: dict[str, Any], known: dict[str, Any]) -> list[str]:
     Raises SoupError: one has none, an entry is of no package, or leaves a part out.
     """
     needed = {name for name, note in told.items() if note["class"] == "rig"}
-    for what, names in (("not looked at", needed - known.keys()), ("anomalies of no package", known.keys() - told.keys())):
+    for what, names in (
+        ("not looked at", needed - known.keys()),
+        ("anomalies of no package", known.keys() - told.keys()),
+    ):
         if names:
             raise SoupError(f"deploy/soup.toml: {what}: {', '.join(sorted(names))}")
     lines = ["| package | known | here | looked at |", "|---|---|---|---|"]
