@@ -40,6 +40,7 @@ def packages() -> list[Package]:
     return list(found.values())
 
 
+@cache
 def licences() -> Row:
     """What is allowed, and what metadata do not say."""
     return tomllib.loads(LICENCES.read_text("utf-8"))
@@ -96,46 +97,55 @@ def _is_allowed(parsed: Any, allowed: Row) -> bool:
 
 def build(version: str) -> str:
     """The bill as JSON, the same for the same locks: without a time and a serial number."""
-    from cyclonedx.model import ExternalReference, ExternalReferenceType, HashAlgorithm, HashType, XsUri
     from cyclonedx.model.bom import Bom
-    from cyclonedx.model.component import Component, ComponentScope, ComponentType
+    from cyclonedx.model.component import Component, ComponentType
     from cyclonedx.output.json import JsonV1Dot6
-    from packageurl import PackageURL
 
-    stated, factory = licences()["stated"], _licence_factory()
     root = Component(name="stimrig", version=version, type=ComponentType.APPLICATION, bom_ref="stimrig")
-    root.licenses.add(factory("MIT"))
-    parts: dict[str, list[Component]] = {}
-    for name, number, hashes, optional in packages():
-        purl = PackageURL("pypi", None, name, number)
-        scope = ComponentScope.OPTIONAL if optional else ComponentScope.REQUIRED
-        part = Component(
-            name=name, version=number, purl=purl, type=ComponentType.LIBRARY, scope=scope, bom_ref=str(purl)
-        )
-        files = [HashType(alg=HashAlgorithm.SHA_256, content=one) for one in hashes]
-        place = ExternalReference(
-            type=ExternalReferenceType.DISTRIBUTION,
-            url=XsUri(str(purl)),
-            comment="one of these files is installed, by platform",
-            hashes=files,
-        )
-        part.external_references.add(place)
-        if licence := licence_of(name, stated):
-            part.licenses.add(factory(licence))
-        parts.setdefault(name, []).append(part)
-    bom = Bom(components=[one for several in parts.values() for one in several])
+    root.licenses.add(_licence("MIT"))
+    parts: dict[str, list[Any]] = {}
+    for package in packages():
+        parts.setdefault(package[0], []).append(_component(*package))
+    bom: Any = Bom(components=[one for several in parts.values() for one in several])
     bom.metadata.component = root
     bom.register_dependency(root, _all(parts, _own_needs()))
     for name, several in parts.items():
         for part in several:
             bom.register_dependency(part, _all(parts, _needs(name)))
-    return _without_date(JsonV1Dot6(bom).output_as_string(indent=1))
+    return _without_date(JsonV1Dot6(bom).output_as_string())
 
 
-def _licence_factory() -> Any:
+def _component(name: str, version: str, hashes: tuple[str, ...], optional: bool) -> Any:
+    """A package as CycloneDX has it; the hashes are of its files for all platforms, of which one is installed."""
+    from cyclonedx.model import ExternalReference, ExternalReferenceType, HashAlgorithm, HashType, XsUri
+    from cyclonedx.model.component import Component, ComponentScope, ComponentType
+    from packageurl import PackageURL
+
+    purl = PackageURL("pypi", None, name, version)
+    files = ExternalReference(
+        type=ExternalReferenceType.DISTRIBUTION,
+        url=XsUri(str(purl)),
+        comment="one of these files is installed, by platform",
+        hashes=[HashType(alg=HashAlgorithm.SHA_256, content=one) for one in hashes],
+    )
+    licence = licence_of(name, licences()["stated"])
+    return Component(
+        name=name,
+        version=version,
+        purl=purl,
+        bom_ref=str(purl),
+        type=ComponentType.LIBRARY,
+        scope=ComponentScope.OPTIONAL if optional else ComponentScope.REQUIRED,
+        licenses=[_licence(licence)] if licence else [],
+        external_references=[files],
+    )
+
+
+@cache
+def _licence(expression: str) -> Any:
     from cyclonedx.contrib.license.factories import LicenseFactory
 
-    return LicenseFactory().make_from_string
+    return LicenseFactory().make_from_string(expression)
 
 
 def _all(parts: dict[str, list[Any]], names: set[str]) -> list[Any]:
