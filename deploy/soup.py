@@ -66,7 +66,7 @@ def render() -> str:
             raise SoupError(f"deploy/soup.toml: {name}: class must be one of {', '.join(CLASSES)}, with a purpose")
     lines = [written["head"], f"## Locked packages ({len(packages)})\n", *_table(locked, packages)]
     lines += ["", f"## Only with an extra ({len(extras)})", "", *_table(more, extras)]
-    lines += ["", "## Known anomalies", "", *_anomalies(packages | extras, written["anomalies"])]
+    lines += ["", "## What they must do, and known anomalies", "", *_anomalies(packages | extras, written["anomalies"])]
     lines += ["", "## Below them", "", "| software | version | class | what for |", "|---|---|---|---|"]
     lines += [f"| {name} | {n['version']} | {n['class']} | {n['for']} |" for name, n in written["below"].items()]
     return "\n".join(lines) + "\n"
@@ -84,11 +84,12 @@ def _anomalies(told: dict[str, Any], known: dict[str, Any]) -> list[str]:
     ):
         if names:
             raise SoupError(f"deploy/soup.toml: {what}: {', '.join(sorted(names))}")
-    lines = ["| package | known | here | looked at |", "|---|---|---|---|"]
+    lines = ["| package | must | known | here | looked at |", "|---|---|---|---|---|"]
     for name, note in sorted(known.items(), key=lambda one: (CLASSES.index(told[one[0]]["class"]), one[0])):
-        if not (note["known"].strip() and note["here"].strip() and isinstance(note["looked_at"], date)):
-            raise SoupError(f"deploy/soup.toml: anomalies.{name}: needs known, here and looked_at, a date")
-        lines.append(f"| {name} | {note['known']} | {note['here']} | {note['looked_at']} |")
+        said = [note["must"], note["known"], note["here"]]
+        if not (all(map(str.strip, said)) and isinstance(note["looked_at"], date)):
+            raise SoupError(f"deploy/soup.toml: anomalies.{name}: needs must, known, here and looked_at, a date")
+        lines.append(f"| {name} | {' | '.join(said)} | {note['looked_at']} |")
     rest = "; ".join(f"{one}: {sum(n['class'] == one for n in told.values())}" for one in CLASSES)
     return [*lines, "", f"Packages by class: {rest}. Those without a row were not looked at one by one."]
 

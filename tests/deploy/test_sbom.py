@@ -12,6 +12,7 @@ from deploy import soup
 from deploy.technical_file import audit, sbom
 
 
+@pytest.mark.slow
 def test_it_holds_each_pin_of_the_locks_with_licence_and_hashes_the_same_each_time() -> None:
     text = sbom.build("1.0.0")
     bill = json.loads(text)
