@@ -15,7 +15,7 @@ LETTERS = {"outside": "SR", "process": "STRIDE", "store": "TRID", "flow": "TID"}
 """What is looked at for each kind of element after STRIDE, and for a flow that crosses a boundary."""
 STATES = ("done", "partly", "not done")
 FILE_NAME = re.compile(r"[\w.-]+\.(json|lock|db|log|journal|sqlite|jsonl|csv|h5|pem|key)")
-ON_REQUEST = ("api/cohort/", "api/cli/", "api/centre/postgres.py", "api/web/", "rig/devices/")
+ON_REQUEST = ("api/cohort/", "api/exchange/", "api/cli/", "api/centre/postgres.py", "api/web/", "rig/devices/")
 """Code whose file names are of what somebody asked for, of PostgreSQL's demo, or of what is read only."""
 
 
