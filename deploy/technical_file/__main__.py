@@ -23,7 +23,7 @@ PAGES = (
     "data-protection", "outside",
 )  # fmt: skip
 """Pages of docs/safety in the order of the printed file."""
-MARK = re.compile(r"<!-- made: ([a-z-]+) -->")
+MARK = re.compile(r"<!-- table: ([a-z-]+) -->")
 STYLE = (
     "body{font:11pt/1.45 serif;max-width:60em;margin:2em auto;padding:0 1em}table{border-collapse:collapse;width:100%}"
     "td,th{border:1px solid #999;padding:.25em .4em;vertical-align:top;text-align:left;font-size:9pt}"
@@ -31,10 +31,9 @@ STYLE = (
 )
 
 
-def filled(page: str, tables: Tables, record: str) -> str:
-    """A page with its marks replaced by what the tables say. Raises KeyError: a mark that nothing is made for."""
+def filled(text: str, tables: Tables, record: str) -> str:
+    """A text with its marks replaced by what the tables say. Raises KeyError: a mark that nothing is made for."""
     made = {"release": lambda _: record, "soup": parts.soup_list}
-    text = (SAFETY / f"{page}.md").read_text("utf-8")
 
     def put(mark: re.Match[str]) -> str:
         name = mark[1].replace("-", "_")
@@ -67,7 +66,7 @@ def _html(text: str, pages: dict[str, str]) -> str:
 def write(to: Path, dist: Path | None, tests: Path | None) -> None:
     """Every page, and all of them as one."""
     tables, record = places.read(), release.record(dist, tests)
-    pages = {page: filled(page, tables, record) for page in PAGES}
+    pages = {page: filled((SAFETY / f"{page}.md").read_text("utf-8"), tables, record) for page in PAGES}
     to.mkdir(parents=True, exist_ok=True)
     for name, text in pages.items():
         (to / f"{name}.md").write_text(text, "utf-8")

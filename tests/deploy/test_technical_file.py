@@ -127,7 +127,7 @@ def test_the_printed_file_has_every_part(tmp_path: Path) -> None:
     report.write_text('<testsuites><testsuite tests="7" failures="0" errors="0" skipped="1"/></testsuites>')
     technical_file.write(tmp_path / "out", dist, report)
     page = (tmp_path / "out" / "technical-file.html").read_text("utf-8")
-    assert "<!-- made:" not in page
+    assert "<!-- table:" not in page
     for row in (*tables()["hazards"]["hazard"], *tables()["threats"]["threat"], *tables()["use"]["scenario"]):
         assert row["id"] in page
     for words in ("<svg", "17.89 mA", "ba599261", "7 tests", "H01", "pulse-limits", "page_sessions", "pyserial"):
