@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from functools import cache
+from pathlib import Path
 
 from deploy.technical_file import figures, places, traces
 from deploy.technical_file.places import ROOT, SAFETY, Row, Tables
@@ -141,6 +142,12 @@ def data_faults(data: Row) -> Iterator[str]:
     yield from (
         f"data map: no kind of file for {name}, in {where}" for where, name in written() if not is_mapped(name, data)
     )
+
+
+def unmapped(folder: Path, data: Row) -> list[str]:
+    """Files below a data folder of which the map has no kind."""
+    there = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    return [path for path in there if not is_mapped(path, data)]
 
 
 def is_mapped(path: str, data: Row) -> bool:
